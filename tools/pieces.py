@@ -138,6 +138,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import TrialSpec
     from suite.experiments.study import judging
+    from suite.experiments.study.cache import Place
 
     def piece(
         loaders: judging.Loaders, shares: Sequence[judging.Share]
@@ -147,13 +148,13 @@ def sweep(count: int, args: argparse.Namespace) -> None:
 
     judging._fly_piece = piece
     vehicle, trial, clock = load_vehicle("reference"), TrialSpec("zigzag", 0, 0), Clock()
-    fliers = (
-        judging.Flier("race", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)
+    setups = (
+        judging.Setup("race", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)
     )
-    orders = {k: judging.Order(flier, [trial]) for k, flier in enumerate(fliers)}
+    orders = {k: judging.Order(setup, [trial]) for k, setup in enumerate(setups)}
     with tempfile.TemporaryDirectory() as folder:
         for what in ("ordered and kept", "found again"):
-            judging.flown(orders, Path(folder), Silent(), "flying", workers=1)
+            judging.flown(orders, Place(Path(folder), Path(folder), 1), Silent(), "flying")
             clock.say(f"{count} vehicles {what}", count)
 
 

@@ -16,11 +16,6 @@ from tracks.common.grid import Grid, html_table
 TEMPLATE = Path(__file__).with_name("report.html")
 
 
-def ranged(mean: float, least: float, most: float, digits: int) -> str:
-    """Return a mean over training seeds as cells show it, with the least and the most of one."""
-    return f"{mean:.{digits}f} [{least:.{digits}f}, {most:.{digits}f}]"
-
-
 @dataclass(frozen=True)
 class Picture:
     """A picture, embedded."""

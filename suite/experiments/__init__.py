@@ -10,11 +10,8 @@ EXPERIMENTS: dict[str, str] = {
     "table2": "a policy on three tracks at all ten levels, next to the paper and the baseline",
     "robustness": "policies under every physical effect and under growing disturbances",
     "perception": "policies through every sensor model, as its magnitude grows",
-    "randomisation": "one recipe with randomised dynamics and with fixed ones, disturbed",
-    "seeds": "the policies of several training seeds on the same trials, and their median",
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
     "schemes": "PPO, our method, and it without the field, measured as they learn",
-    "hidden_vehicles": "loops that regain a hidden effect by its name and by a Delta Action Model",
     "faults": "faults of a log's interface put into good logs: how many are named, by kind",
     "simulators": "the shipped policies on the same trials in every simulator",
 }

@@ -11,8 +11,9 @@ from eval.judging.statistics import Interval, wilson
 from suite.common.console import Console, duration
 from suite.common.report import Picture
 from suite.experiments.pages import paper
-from suite.experiments.pages.document import Made, Place
+from suite.experiments.pages.document import Made
 from suite.experiments.study import options, training
+from suite.experiments.study.cache import Place
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
@@ -44,16 +45,16 @@ def document(config: Config, place: Place, console: Console) -> Made:
     from suite.experiments.pages.charts import bars_chart
 
     chosen = settings(config)
-    looks = training.Looks(0, config.trials, config.seed, config.seconds)
-    study = training.Study(chosen, config.training_seeds, looks)
-    runs = training.trained(study, place.cache, console, place.workers)
+    unseen = training.Unseen(0, config.trials, config.seed, config.seconds)
+    study = training.Study(chosen, config.training_seeds, unseen)
+    runs = training.trained(study, place, console)
     rows, recipe = summaries(chosen, runs), chosen[0].recipe
     whole = {row.key: row.at[-1] for row in rows if row.at}
     steps = config.iterations * recipe.episode.batch * recipe.episode.steps
     each = duration(float(np.median([run.seconds for run in runs])))
     chart = bars_chart(whole, paper.ablation()[1], KINDS)
     facts = {
-        "recipe": f"{options.recipe_words(config)} episode.gates={recipe.episode.gates}",
+        "recipe": f"{' '.join([config.recipe, *config.set])} episode.gates={recipe.episode.gates}",
         "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
         f"{recipe.episode.steps} steps, {steps:,} in all; {each} (median), at once "
         f"{place.at_once}",

@@ -24,8 +24,8 @@ from suite.common.console import Console
 from suite.experiments.injected.flights import TRUE_EFFECTS, as_log, flight_parts, real_logs
 from suite.experiments.injected.kinds import KINDS, Kind, inject
 from suite.experiments.injected.writers import WRITERS
-from suite.experiments.pages.document import Made, Place
-from suite.experiments.study.cache import code_digest, digest
+from suite.experiments.pages.document import Made
+from suite.experiments.study.cache import Place, code_digest, digest
 from suite.judging.collect import collect
 from suite.judging.requests import Collection
 from tracks.common.grid import Grid, table

@@ -8,7 +8,6 @@ from functools import partial
 from types import MappingProxyType
 
 import numpy as np
-import tyro
 
 from eval.judging.statistics import paired_success, wilson
 from eval.judging.tables import percent
@@ -18,41 +17,34 @@ from eval.sensors.sensors_file import PERFECT, SensorSet, grown, load_sensors, s
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.tables import points_cell
+from suite.experiments.pages.document import Made
 from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study.cache import Place
 from suite.experiments.study.conditions import Condition, Sweep, sweep_conditions
 from suite.experiments.study.disturbed import Tested
-from suite.judging.flying import default_policy
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
 from tracks.common.names import unknown_name
-from tracks.input.ranges import Seed, Trials
+from tracks.input.ranges import Trials
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
 """1: as the shipped files have it."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(options.Judged):
     """Judge policies through sensor models: all presets on every cell, and growing magnitudes.
 
     All fly the same trials under every condition. A policy trained with sensor models next to the
     first shows what that training gains, and what it costs with perfect sensors.
     """
 
-    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
-    Without it the shipped policy flies."""
     difficulty: str = "0,3,6,9"
     """Levels of the table of presets: 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 50
     """Trials of every policy on every track at every level through every preset."""
     growing_trials: Trials = 32
     """Trials of every policy on every track at level 3 at every magnitude."""
-    seed: Seed = 0
-    """Seed of the first trial; the others follow by one."""
-    vehicle: str = "reference"
-    """What flies: a shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Only these presets and models, by name; by default all."""
 
@@ -62,7 +54,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     from suite.experiments.pages.charts import sweeps_chart
 
     vehicle, sets = load_vehicle(config.vehicle), asked_sets(config.only)
-    policies = judging.named_policies(config.policy or (default_policy(),))
+    policies = judging.named_policies(config.policy)
     cells, growing = judging.trials_of(config), replace(config, trials=config.growing_trials)
     base = Condition("perfect", 0.0, "", vehicle)
     presets = [
@@ -70,16 +62,10 @@ def document(config: Config, place: Place, console: Console) -> Made:
         for name, sensors in sets.items()
         if name in shipped_sensors()
     ]
-    tested, _ = disturbed.flown_under(
-        [base, *presets], {}, {name: [(path, cells)] for name, path in policies.items()},
-        place.cache, console, place.workers,
-    )  # fmt: skip
+    tested, _ = disturbed.flown_under([base, *presets], {}, policies, cells, place, console)
     sweeps = {sweep: sweep_conditions(vehicle, sweep) for sweep in growing_sweeps(sets)}
     again = judging.trials_of(growing, [3])
-    (_, grown_points) = disturbed.flown_under(
-        [], sweeps, {name: [(path, again)] for name, path in policies.items()},
-        place.cache, console, place.workers,
-    )  # fmt: skip
+    _, grown_points = disturbed.flown_under([], sweeps, policies, again, place, console)
     facts = {
         **judging.policy_facts(policies),
         "presets": f"three tracks, levels {config.difficulty}, seeds "
@@ -153,7 +139,7 @@ def preset_grid(tested: Sequence[Tested]) -> Grid:
             change = paired_success(entry.won(name), base.won(name))
             speed, before = _speed(entry, name), _speed(base, name)
             same = entry.condition.sensors == PERFECT
-            line += [percent(entry.success(name)), "" if same else points_cell(change)]
+            line += [percent(entry.success(name)), "" if same else difference_cell(change)]
             line.append(f"{speed:.2f} ({speed / before - 1:+.1%})")
             lines.append(line)
     headers = ["sensors", "policy", *(f"level {level}" for level in levels)]

@@ -2,43 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import tyro
-
+from eval.judging.statistics import paired_success
+from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.tables import condition_grid
+from suite.experiments.pages.document import Made
 from suite.experiments.study import disturbed, judging, options
+from suite.experiments.study.cache import Place
 from suite.experiments.study.conditions import Condition
-from suite.judging.flying import default_policy
-from tracks.common.grid import Grid
-from tracks.input.ranges import Seed, Trials
-
-UNDISTURBED = "undisturbed"
+from suite.experiments.study.disturbed import Tested
+from suite.loop.compare import difference_cell
+from tracks.common.grid import Cell, Grid, table
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(options.Judged):
     """Judge policies under every physical effect and under growing disturbances.
 
     All fly the same trials under every condition. A policy trained with another randomisation
     next to the first shows what that randomisation gains.
     """
 
-    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
-    Without it the shipped policy flies."""
-    difficulty: str = "3"
-    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: Trials = 32
-    """Trials of every policy on every track at every level under every condition."""
-    seed: Seed = 0
-    """Seed of the first trial; the others follow by one."""
-    vehicle: str = "reference"
-    """What is disturbed: a shipped vehicle's name or a vehicle file (.toml)."""
     only: tuple[str, ...] = ()
     """Only these effects and sweeps, by name; by default all."""
 
@@ -47,14 +35,10 @@ def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; what is missing is flown first."""
     from suite.experiments.pages.charts import effects_chart, sweeps_chart
 
-    vehicle = load_vehicle(config.vehicle)
-    policies = judging.named_policies(config.policy or (default_policy(),))
+    vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
     alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
-    base, trials = Condition(UNDISTURBED, 0.0, "", vehicle), judging.trials_of(config)
-    fliers = {name: [(policy, trials)] for name, policy in policies.items()}
-    effects, grown = disturbed.flown_under(
-        [base, *alone], sweeps, fliers, place.cache, console, place.workers
-    )
+    base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.trials_of(config)
+    effects, grown = disturbed.flown_under([base, *alone], sweeps, policies, trials, place, console)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, level {config.difficulty}, seeds "
@@ -75,3 +59,33 @@ def document(config: Config, place: Place, console: Console) -> Made:
     tested = [*effects, *(point for points in grown.values() for point in points)]
     numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in tested]
     return Made(facts, parts, {"conditions": numbers})
+
+
+def condition_grid(
+    entries: Sequence[Tested], base: Tested, first: Sequence[str], title: str = ""
+) -> Grid:
+    """Return success and change under each of `entries`, a row each.
+
+    Args:
+        entries: conditions; their other policies are compared with the first.
+        base: the undisturbed one.
+        first: headers of what names a row: the size, or the name and the size.
+        title: of the table.
+    """
+    headers, names = list(first), list(base.results)
+    for name in names:
+        mine = f"{name}: " if len(names) > 1 else ""
+        headers += [f"{mine}success", f"{mine}change"]
+    headers += [f"{name} - {names[0]}" for name in names[1:]]
+    plain = (base.condition.vehicle, base.condition.sensors)
+    lines = []
+    for entry in entries:
+        line: list[str | Cell] = [*(entry.condition.name, entry.condition.words)[-len(first) :]]
+        same = entry.condition.vehicle is plain[0] and entry.condition.sensors == plain[1]
+        for name in names:
+            change = paired_success(entry.won(name), base.won(name))
+            line += [percent(entry.success(name)), "" if same else difference_cell(change)]
+        mine = entry.won(names[0])
+        line += [difference_cell(paired_success(entry.won(name), mine)) for name in names[1:]]
+        lines.append(line)
+    return table(headers, lines, title)

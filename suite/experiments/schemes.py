@@ -10,8 +10,9 @@ import numpy as np
 
 from suite.common.console import Console, duration
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made, Place
+from suite.experiments.pages.document import Made
 from suite.experiments.study import options, training
+from suite.experiments.study.cache import Place
 from suite.experiments.study.summary import METRICS, Summary, summaries
 from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
@@ -51,16 +52,16 @@ def document(config: Config, place: Place, console: Console) -> Made:
     from suite.experiments.pages.charts import curves_chart
 
     chosen = schemes(config)
-    looks = training.Looks(config.measurements, config.trials, config.seed, config.seconds)
-    study = training.Study(chosen, config.training_seeds, looks, by_seed=True)
-    runs = training.trained(study, place.cache, console, place.workers)
+    unseen = training.Unseen(config.measurements, config.trials, config.seed, config.seconds)
+    study = training.Study(chosen, config.training_seeds, unseen, by_seed=True)
+    runs = training.trained(study, place, console)
     rows, episode = summaries(chosen, runs), chosen[0].recipe.episode
     compiling = {
         row.key: float(np.mean([run.compile_s for run in runs if run.row == row.key]))
         for row in rows
     }
     facts = {
-        "recipe": f"{options.recipe_words(config)} episode.gates={episode.gates} "
+        "recipe": f"{' '.join([config.recipe, *config.set])} episode.gates={episode.gates} "
         f"lambda_p={config.progress:g}",
         "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
         **training.facts(config, runs),

@@ -17,11 +17,12 @@ from eval.worlds import REFERENCE, WORLDS, differences, world_class
 from eval.worlds.trial import TrialResult
 from policies import shipped
 from suite.common.console import Console
-from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.tables import points_cell
+from suite.experiments.pages.document import Made
 from suite.experiments.study import judging, options
+from suite.experiments.study.cache import Place
+from suite.loop.compare import difference_cell
 from tracks.common.grid import Grid, table
-from tracks.input.ranges import Seed, Trials
+from tracks.input.ranges import Trials
 
 BASE = "mujoco"
 """The simulator that the others are compared with."""
@@ -34,22 +35,18 @@ too; `rest`, neither."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(options.Judged):
     """Fly the shipped policies on the same trials in every simulator."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
     Without it all shipped policies fly."""
-    simulator: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A simulator besides mujoco; may be given several times. Without it mjx and rotorpy."""
     difficulty: str = "0,9"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 20
     """Trials of every policy on every track at every level in every simulator."""
-    seed: Seed = 0
-    """Seed of the first trial; the others follow by one."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml)."""
+    simulator: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A simulator besides mujoco; may be given several times. Without it mjx and rotorpy."""
 
 
 class Column(NamedTuple):
@@ -101,13 +98,12 @@ def document(config: Config, place: Place, console: Console) -> Made:
     trials = judging.trials_of(config)
     orders = {
         (name, column.label): judging.Order(
-            judging.Flier(policy, column.vehicle, world=column.simulator), trials
+            judging.Setup(policy, column.vehicle, simulator=column.simulator), trials
         )
         for name, policy in policies.items()
         for column in flown_in
     }
-    what = "flying in every simulator"
-    results = judging.flown(orders, place.cache, console, what, place.workers)
+    results = judging.flown(orders, place, console, "flying in every simulator")
     changed = changes(names, flown_in, results)
     facts = {
         **judging.policy_facts(policies),
@@ -169,7 +165,7 @@ def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -
             gaps = (found["lap_apart_s"], found["v_mean_apart"])
             alike = f"{found['ends_alike']} of {found['trials']}"
             shown = ["-" if gap is None else f"{gap:.3f}" for gap in gaps]
-            lines.append([*line, points_cell(less), f"{less.p_value:.2g}", alike, *shown])
+            lines.append([*line, difference_cell(less), f"{less.p_value:.2g}", alike, *shown])
     return table(headers, lines)
 
 

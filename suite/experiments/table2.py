@@ -6,18 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from eval.judging.tables import Tally, percent
+from eval.judging.tables import Tally, grids, percent, summarise
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import load_sensors
 from eval.worlds.trial import TrialResult
 from suite.common.choices import LEVELS
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made, Place
-from suite.experiments.pages.goals import goal_grid, goals
-from suite.experiments.pages.paper import sim_to_sim
-from suite.experiments.pages.tables import every_cell
+from suite.experiments.pages.document import Made
+from suite.experiments.pages.paper import goal_grid, goals, sim_to_sim
 from suite.experiments.study import judging, options
+from suite.experiments.study.cache import Place
 from suite.judging.flying import default_policy
 from suite.loop import compare
 from tracks.common.grid import Grid, table
@@ -69,14 +68,16 @@ def document(config: Config, place: Place, console: Console) -> Made:
     about = judging.policy_facts(policies)
     orders = {
         name: judging.Order(
-            judging.Flier(policy, vehicle, sensors),
+            judging.Setup(policy, vehicle, sensors),
             judging.trials_of(config, LEVELS if name == OURS else printed.levels),
         )
         for name, policy in policies.items()
     }
-    results, cells = judging.judged_cells(
-        orders, place.cache, console, "judging all levels", place.workers
-    )
+    results = judging.flown(orders, place, console, "judging all levels")
+    cells = {
+        name: summarise([row._replace(policy=name) for row in rows])["cells"]
+        for name, rows in results.items()
+    }
     lines = _merit(results)
     everything = [cell for some in cells.values() for cell in some]
     facts = {
@@ -93,7 +94,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         **{f"Goals by cell: {name}": [goal_grid(some)] for name, some in cells.items()},
         "All ten levels": [
             Picture(level_chart(named), "Success and v_max at every level"),
-            *every_cell(everything),
+            *grids({"cells": everything, "paired": []}),
         ],
     }
     numbers = {

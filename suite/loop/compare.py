@@ -15,6 +15,7 @@ import numpy as np
 
 from eval.judging.statistics import (
     Interval,
+    PairedDifference,
     bootstrap_mean,
     bootstrap_median,
     paired_bootstrap,
@@ -177,10 +178,15 @@ def value_text(interval: Interval, scale: float, digits: int) -> str:
     return f"{value} [{low}, {high}]"
 
 
-def difference_cell(interval: Interval, scale: float, digits: int) -> Cell:
-    """Return a difference with its interval and sign, toned where it does not hold zero."""
+def difference_cell(
+    interval: Interval | PairedDifference, scale: float = 100, digits: int = 0
+) -> Cell:
+    """Return a difference with its interval and sign, toned where it does not hold zero.
+
+    By default it is one of rates, in percentage points.
+    """
     # Adding zero to what is rounded turns -0, which reads as if something had been lost, into +0.
-    value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval)
+    value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
 
@@ -194,7 +200,7 @@ def told_apart(difference: Interval) -> str:
 
 def points(difference: Interval) -> str:
     """Return a difference of success rates with its interval, in percentage points."""
-    value, interval = difference_cell(difference, 100, 0).text.split(" ", 1)
+    value, interval = difference_cell(difference).text.split(" ", 1)
     return f"{value} points {interval}"
 
 

@@ -49,7 +49,7 @@ class LoopSize:
 SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
 """Sizes by recipe; "" is that of the others."""
 HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
-"""The same of a loop with a hidden vehicle, as the page hidden_vehicles shows it."""
+"""The same of a loop with a hidden vehicle."""
 
 
 @dataclass(frozen=True)

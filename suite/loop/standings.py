@@ -94,7 +94,7 @@ def overall_grid(
         for other in references:
             row += [Cell(""), Cell("")]
             if other in apart:
-                row[-2] = difference_cell(apart[other].success, 100, 0)
+                row[-2] = difference_cell(apart[other].success)
                 row[-1] = Cell(f"{apart[other].p_value:.2g}")
         row += [Cell(value_text(value, 1, 2)) for value in (one.gates, one.v_mean)]
         rows.append(row)

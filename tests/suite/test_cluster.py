@@ -140,7 +140,7 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
     "command",
     [
         "collect --policy race-paper --track zigzag --difficulty 0 --trials 6",
-        "reproduce seeds --policies race-paper race --trials 2",
+        "reproduce robustness --policy race-paper --policy race --trials 2 --only wind",
         "loop --recipe quick --iterations 4 --finetune-iterations 2 --fit-iterations 4 --trials 2 "
         "--flights 2 --track zigzag --difficulty 0 --set episode.batch=4 episode.steps=20",
         "blind make --simulator continuous --seed 5 --count 2",
@@ -159,7 +159,7 @@ def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root):
                 assert cli.main(args) == 0
     assert digest(here) == digest(there)
     # A document has none of the files that a digest is of.
-    pages = [path.name for path in here.glob("seeds.*")]
+    pages = [path.name for path in here.glob("robustness*")]
     assert all((here / page).read_bytes() == (there / page).read_bytes() for page in pages)
     assert pages or digest(here) != "nothing"
 

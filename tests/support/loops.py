@@ -8,16 +8,6 @@ import numpy as np
 import eval.judging.judge
 import suite.train.run
 from eval.worlds.trial import Rules, TrialResult
-from suite.loop.hidden_effect import BOTH, CONTROL, NAMED, NOMINAL
-
-WON = {NOMINAL: 4, "before": 2, CONTROL: 2, "delta": 3, NAMED: 4, BOTH: 3}
-"""Trials of four that each policy of a loop with a hidden effect wins, made up."""
-EFFECT = {
-    "name": "weak_motor",
-    "alternatives": [],
-    "parameters": {"scale": {"value": [0.7, 1.0, 1.0, 1.0], "unit": "1", "ci95": None}},
-}
-"""What a diagnosis named, made up."""
 
 
 class Small:
@@ -71,8 +61,3 @@ def trial_result(seed, success, level=0):
         "zigzag", level, seed, "p", "v", "w", success, 8 if success else 3, "finished", None,
         0.0, 0.0, 0.0, 5.0, 4.0, 3.0, **rest,
     )  # fmt: skip
-
-
-def four_trials(won, seed=0):
-    """Return four trials of which so many were won."""
-    return [trial_result(seed + k, k < won) for k in range(4)]

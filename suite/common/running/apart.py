@@ -31,8 +31,6 @@ class Job(NamedTuple):
     """What is to be done there."""
     folder: Path
     """Its own, with what an earlier call left in it, which it goes on with."""
-    reads: Path | None = None
-    """Another folder that it reads."""
 
 
 class Parcel(NamedTuple):
@@ -42,30 +40,24 @@ class Parcel(NamedTuple):
     name: str
     """Of its folder."""
     folder: Content
-    reads: Content | None
 
 
 def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
     """Yield jobs with the content of their folders, read as they are asked for."""
     for job in jobs:
-        reads = None if job.reads is None else content(job.reads)
-        yield Parcel(job.task, job.folder.name, content(job.folder), reads)
+        yield Parcel(job.task, job.folder.name, content(job.folder))
 
 
 def do_apart(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[Result, Content]]:
     """Do a job on this machine and yield its result and the content of its folder."""
     keep_compiled()
     with _place(hashlib.sha256(pack((do, parcel))).hexdigest()[:16]) as place:
-        folder, reads = place / parcel.name, None
+        folder = place / parcel.name
         if not folder.exists():
             fill(folder, parcel.folder)
-        if parcel.reads is not None:
-            reads = place / "reads"
-            fill(reads, parcel.reads)
-        result = do(Job(parcel.task, folder, reads))
+        result = do(Job(parcel.task, folder))
         found = content(folder)
-        for path in filter(None, (folder, reads)):
-            shutil.rmtree(path)
+        shutil.rmtree(folder)
     yield result, found
 
 

@@ -16,8 +16,7 @@ from suite.common.charts import LINES, plain_axes, png, titled
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
 from suite.experiments.study.disturbed import Tested
-from suite.experiments.study.intervals import Spread
-from suite.experiments.study.summary import METRICS, Summary
+from suite.experiments.study.summary import METRICS, Spread, Summary
 from tracks.families import JUDGED
 
 
@@ -79,24 +78,6 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
     return png(figure)
 
 
-def cells_chart(cells: Mapping[str, Sequence[Tally]]) -> bytes:
-    """Return success of every policy, cell by cell, as dots with intervals."""
-    figure = Figure(figsize=(10.4, 3.6), layout="constrained")
-    axes = figure.subplots()
-    first = next(iter(cells.values()))
-    for number, (name, some) in enumerate(cells.items()):
-        at = np.arange(len(some)) + 0.12 * (number - (len(cells) - 1) / 2)
-        label, colour = f"{name}, {some[0].trials} trials a cell", LINES[number % len(LINES)]
-        _dots(axes, at, [c.success for c in some], 100, label, fmt="o", ms=4, color=colour)
-    titled(axes, "Success with 95 % Wilson intervals")
-    axes.set_ylabel("success [%]", fontsize=9)
-    _percent_axis(axes, min(100 * cell.success.low for some in cells.values() for cell in some))
-    axes.set_xticks(range(len(first)), [f"{c.track}\nlevel {c.difficulty}" for c in first])
-    axes.tick_params(labelsize=7)
-    _legend(figure, axes, columns=6)
-    return png(figure)
-
-
 def effects_chart(entries: Sequence[Tested]) -> bytes:
     """Return success under each effect, the worst on top; the first entry is undisturbed."""
     first, *others = entries
@@ -124,9 +105,9 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
     return png(figure)
 
 
-def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]], names: Sequence[str] = ()) -> bytes:
-    """Return success against the size of each disturbance, a panel each; of `names` or of all."""
-    names = names or list(next(iter(grown.values()))[0].results)
+def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
+    """Return success against the size of each disturbance, a panel each."""
+    names = list(next(iter(grown.values()))[0].results)
     rows = -(-len(grown) // 4)
     columns = -(-len(grown) // rows)
     figure = Figure(figsize=(10.4, 0.5 + 2.5 * rows), layout="constrained")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,33 +16,15 @@ from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS
-from suite.experiments.study.cache import FLIES, code_digest
+from suite.experiments.study.cache import FLIES, Place, code_digest
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
-from tracks.common.work import Workers
 
 SCHEMA = 1
 """Version of NAME.json."""
 BEGIN, END = "<!-- made by suite reproduce -->", "<!-- end of what suite reproduce made -->"
 """The lines between which a page is made anew."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where an experiment's files go, and who works on it."""
-
-    out: Path
-    """Folder of the documents."""
-    cache: Path
-    """Folder of what was computed before, by any experiment."""
-    workers: Workers | None = None
-    """Who trains and flies; None trains one after the other, and flies in processes."""
-
-    @property
-    def at_once(self) -> str:
-        """Trainings at once: their number, or the address of the cluster."""
-        return str(self.workers or 1)
 
 
 class Made(NamedTuple):

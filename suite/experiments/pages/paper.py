@@ -1,11 +1,20 @@
-"""What the paper prints, read from paper.toml."""
+"""What the paper prints (paper.toml), and by how much a policy misses what is asked of a cell."""
 
 from __future__ import annotations
 
 import functools
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from eval.judging.tables import Tally, percent
+from tracks.common.grid import Grid, table
+
+SURE = 0.90
+"""Where others won all of their few trials, our Wilson interval must reach down to this."""
+FLOORS = {0: 0.99, 3: 0.98, 6: 0.97, 9: 0.95}
+"""Success that the shipped policy must reach, by level."""
 
 
 class Printed(NamedTuple):
@@ -54,20 +63,87 @@ def _table(name: str) -> dict[str, Any]:
 @functools.cache
 def ablation() -> tuple[str, dict[str, Ablated]]:
     """Return the source and the rows of the table "Performance Comparison with and without AVF"."""
-    table = _table("ablation")
-    return table["source"], {key: Ablated(**row) for key, row in table["rows"].items()}
+    found = _table("ablation")
+    return found["source"], {key: Ablated(**row) for key, row in found["rows"].items()}
 
 
 @functools.cache
 def sim_to_sim() -> SimToSim:
     """Return the table "Sim-to-sim Performance"."""
-    table = _table("sim_to_sim")
-    names = {key: method["name"] for key, method in table["methods"].items()}
+    found = _table("sim_to_sim")
+    names = {key: method["name"] for key, method in found["methods"].items()}
     cells = [
-        Printed(key, track, level, won, table["trials"], v_max)
-        for key, method in table["methods"].items()
+        Printed(key, track, level, won, found["trials"], v_max)
+        for key, method in found["methods"].items()
         for track, rows in method.items()
         if track != "name"
-        for level, won, v_max in zip(table["levels"], rows["won"], rows["v_max"], strict=True)
+        for level, won, v_max in zip(found["levels"], rows["won"], rows["v_max"], strict=True)
     ]
-    return SimToSim(table["source"], tuple(table["levels"]), names, tuple(cells))
+    return SimToSim(found["source"], tuple(found["levels"]), names, tuple(cells))
+
+
+class Goal(NamedTuple):
+    """One cell against what is asked of it; a miss of 0 is met."""
+
+    track: str
+    level: int
+    success: float
+    """What is asked: the best printed rate; 1 asks for an interval from `SURE` up."""
+    success_miss: float
+    floor: float
+    """The shipped policy's success."""
+    floor_miss: float
+    v_max: float
+    """What is asked: the largest printed [m/s]."""
+    v_max_miss: float
+    """By how much the median over trials misses it [m/s]."""
+    of_ten_miss: float | None = None
+    """By how much the mean largest of ten trials misses it; None with fewer trials [m/s]."""
+
+
+def goals(cells: Sequence[Tally]) -> list[Goal]:
+    """Return the goal of every cell that the paper prints."""
+    printed = sim_to_sim()
+    found = []
+    for cell in cells:
+        others = printed.at(cell.track, cell.difficulty)
+        if not others:
+            continue
+        rate = max(other.won / other.trials for other in others)
+        v_max = max(other.v_max for other in others)
+        missed = SURE - cell.success.low if rate == 1 else rate - cell.success.value
+        floor = FLOORS[cell.difficulty]
+        of_floor, of_speed = floor - cell.success.value, v_max - cell.v_max.value
+        rates = rate, max(0.0, missed), floor, max(0.0, of_floor)
+        of_ten = cell.v_max_of_ten
+        ten_miss = None if of_ten is None else max(0.0, v_max - of_ten)
+        speed = v_max, max(0.0, of_speed), ten_miss
+        found.append(Goal(cell.track, cell.difficulty, *rates, *speed))
+    return found
+
+
+def goal_grid(cells: Sequence[Tally]) -> Grid:
+    """Return by how much each cell of one policy misses what is asked of it."""
+    by_key = {(cell.track, cell.difficulty): cell for cell in cells}
+    headers = ["track", "level", "success", "best of the others", "missed by", "floor",
+               "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip
+    lines = [
+        (
+            goal.track,
+            str(goal.level),
+            percent(by_key[goal.track, goal.level].success),
+            f"{100 * goal.success:.0f} %",
+            _missed(100 * goal.success_miss, "points"),
+            f"{100 * goal.floor:.0f} %",
+            _missed(100 * goal.floor_miss, "points"),
+            f"{by_key[goal.track, goal.level].v_max.value:.2f}",
+            f"{goal.v_max:.1f}",
+            _missed(goal.v_max_miss, "m/s", digits=2),
+        )
+        for goal in goals(cells)
+    ]
+    return table(headers, lines)
+
+
+def _missed(by: float, unit: str, digits: int = 1) -> str:
+    return f"{by:.{digits}f} {unit}" if by else "met"

@@ -1,9 +1,10 @@
-"""Names in the cache: what is found again must have been made by the same inputs and code."""
+"""Where experiments keep what they made, and under which names: by its inputs and its code."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,22 +12,30 @@ from typing import Any
 from suite.common.provenance import machine, package_versions
 from tracks.common.files import digest_of
 from tracks.common.names import added_entries
+from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "faults", "envs")
 """Folders whose code changes no flight."""
-LOOP_ROOMS = (
-    "tracks",
-    "policies",
-    "eval",
-    "suite/judging",
-    "suite/train",
-    "suite/delta",
-    "suite/loop",
-)
-"""Code that flies, fits and fine-tunes in a `suite loop`, but for a diagnosis."""
 FLIES = ("tracks", "policies", "eval")
 """The rooms whose code sets how a policy flies."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an experiment's files go, and who works on it."""
+
+    out: Path
+    """Folder of the documents."""
+    cache: Path
+    """Folder of what was computed before, by any experiment."""
+    workers: Workers | None = None
+    """Who trains and flies; None trains one after the other, and flies in processes."""
+
+    @property
+    def at_once(self) -> str:
+        """Trainings at once: their number, or the address of the cluster."""
+        return str(self.workers or 1)
 
 
 def digest(value: Any) -> str:

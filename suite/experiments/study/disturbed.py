@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +18,8 @@ from suite.experiments.study.conditions import (
     sweep_conditions,
     sweeps,
 )
-from suite.experiments.study.judging import Flier, Order, flown
+from suite.experiments.study.judging import Order, Place, Setup, flown
 from tracks.common.names import unknown_name
-from tracks.common.work import Workers
 
 
 class Tested(NamedTuple):
@@ -64,44 +62,33 @@ def asked_conditions(
     )
 
 
-Flights = Sequence[tuple[str, Sequence[TrialSpec]]]
-"""Policies and the trials of each."""
-
-
 def flown_under(
     alone: Sequence[Condition],
     grown: Mapping[Sweep, Sequence[Condition]],
-    fliers: Mapping[str, Flights],
-    cache: Path,
+    policies: Mapping[str, str],
+    trials: Sequence[TrialSpec],
+    place: Place,
     console: Console,
-    workers: Workers | None = None,
 ) -> tuple[list[Tested], Grown]:
     """Return conditions, and those of sweeps, with every policy's trials under them.
 
     Args:
         alone: conditions.
         grown: conditions of sweeps.
-        fliers: by what tables call them; several policies under one name fly one after the other.
-        cache: folder of the flights.
+        policies: by what tables call them.
+        trials: that each flies under every condition.
+        place: of the kept flights, and who flies.
         console: where progress goes.
-        workers: who flies; None takes as many processes of this machine as are worth it.
     """
     conditions = [*alone, *(point for points in grown.values() for point in points)]
     orders = {
-        (at, name, part): Order(Flier(policy, condition.vehicle, condition.sensors), trials)
-        for name, parts in fliers.items()
+        (at, name): Order(Setup(policy, condition.vehicle, condition.sensors), trials)
+        for name, policy in policies.items()
         for at, condition in enumerate(conditions)
-        for part, (policy, trials) in enumerate(parts)
     }
-    rows = flown(orders, cache, console, "flying under disturbances", workers)
+    rows = flown(orders, place, console, "flying under disturbances")
     tested = [
-        Tested(
-            condition,
-            {
-                name: [row for part in range(len(parts)) for row in rows[at, name, part]]
-                for name, parts in fliers.items()
-            },
-        )
+        Tested(condition, {name: rows[at, name] for name in policies})
         for at, condition in enumerate(conditions)
     ]
     rest = iter(tested[len(alone) :])

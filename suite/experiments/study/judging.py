@@ -12,12 +12,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from eval.judging.judge import MOST_A_PIECE, JudgeOptions, Task, fly_share
 from eval.judging.results import Journal
-from eval.judging.tables import Tally, summarise
 from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
@@ -26,9 +24,16 @@ from policies.spec import NeedsTrust, PolicyError
 from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.stages import announce
-from suite.experiments.study.cache import FLIES, code_digest, digest, engines
+from suite.experiments.study.cache import FLIES, Place, code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
-from suite.judging.flying import TRIALS_A_PROCESS, cost_of, flying_needs, labels, trial_list
+from suite.judging.flying import (
+    TRIALS_A_PROCESS,
+    cost_of,
+    default_policy,
+    flying_needs,
+    labels,
+    trial_list,
+)
 from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 
@@ -36,8 +41,8 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Flier:
-    """Who flies on what: with a trial it sets the outcome."""
+class Setup:
+    """Which policy flies on what: with a trial it sets the outcome."""
 
     policy: str
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
@@ -45,50 +50,46 @@ class Flier:
     """On what."""
     sensors: SensorSet = PERFECT
     """What it sees of the truth."""
-    world: str = "mujoco"
-    """In which world."""
+    simulator: str = "mujoco"
+    """Where."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """Trials wanted of one flier."""
+    """Trials wanted of one setup."""
 
-    flier: Flier
+    setup: Setup
     trials: Sequence[TrialSpec]
 
 
 def flown(
-    orders: Mapping[Key, Order],
-    cache: Path,
-    console: Console,
-    what: str,
-    workers: Workers | None = None,
+    orders: Mapping[Key, Order], place: Place, console: Console, what: str
 ) -> dict[Key, list[TrialResult]]:
-    """Return the results of every order; those not in `cache` are flown first.
+    """Return the results of every order; those not in the cache are flown first.
 
     An interrupt keeps what was flown.
 
     Args:
-        orders: what is wanted; the same flier may be in several.
-        cache: folder of the journals.
+        orders: what is wanted; the same setup may be in several.
+        place: of the journals, and who flies; with no workers as many processes of this machine as
+            are worth it.
         console: where progress goes.
         what: a few words on what is flown.
-        workers: who flies; None takes as many processes of this machine as are worth it.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
-    policies = {order.flier.policy for order in orders.values()}
+    policies = {order.setup.policy for order in orders.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
-    about = {key: _about(order.flier, digests) for key, order in orders.items()}
+    about = {key: _about(order.setup, digests) for key, order in orders.items()}
     names = {key: digest(entry) for key, entry in about.items()}
-    fliers = {names[key]: order.flier for key, order in orders.items()}
-    wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in fliers}
+    setups = {names[key]: order.setup for key, order in orders.items()}
+    wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
     for key, order in orders.items():
         wanted[names[key]].update(dict.fromkeys(order.trials))
     with ExitStack() as stack:
         journals = {
-            name: stack.enter_context(Journal(cache / "trials" / f"{name}.jsonl", entry))
+            name: stack.enter_context(Journal(place.cache / "trials" / f"{name}.jsonl", entry))
             for name, entry in {names[key]: entry for key, entry in about.items()}.items()
         }
         missing = [journals[name].missing(list(trials)) for name, trials in wanted.items()]
@@ -96,9 +97,8 @@ def flown(
         if left < total:
             console.note(f"{what}: {total - left} of {total} trials were flown before")
         if left:
-            if workers is None:
-                workers = min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            costs = [cost_of(flier.world) for flier in fliers.values()]
+            workers = place.workers or min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
+            costs = [cost_of(setup.simulator) for setup in setups.values()]
             cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
             announce(console, f"{what}: {left} trials", flying_needs(cost, workers))
             numbers, all_journals = count(total - left + 1), list(journals.values())
@@ -111,27 +111,12 @@ def flown(
                     all_journals[number].close()
                     update(next(numbers))
 
-                loaders = _loaders(fliers.values(), workers)
-                pieces = _pieces(list(fliers.values()), missing, crew(workers))
+                loaders = _loaders(policies, workers)
+                pieces = _pieces(list(setups.values()), missing, crew(workers))
                 work_off(partial(_fly_piece, loaders), pieces, workers, keep)
     return {
         key: [journals[names[key]].done[trial] for trial in order.trials]
         for key, order in orders.items()
-    }
-
-
-def judged_cells(
-    orders: Mapping[str, Order],
-    cache: Path,
-    console: Console,
-    what: str,
-    workers: Workers | None = None,
-) -> tuple[dict[str, list[TrialResult]], dict[str, list[Tally]]]:
-    """Return results and their cells, as `flown` does, by what tables call the policies."""
-    results = flown(orders, cache, console, what, workers)
-    return results, {
-        name: summarise([row._replace(policy=name) for row in rows])["cells"]
-        for name, rows in results.items()
     }
 
 
@@ -151,7 +136,8 @@ def name_of(policy: str) -> str:
 
 
 def named_policies(asked: Sequence[str]) -> dict[str, str]:
-    """Return the policies that are asked for by what tables call them."""
+    """Return the policies that are given, or the shipped one, by what tables call them."""
+    asked = asked or (default_policy(),)
     return dict(zip(labels(asked, [name_of(path) for path in asked]), asked, strict=True))
 
 
@@ -166,65 +152,64 @@ def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpe
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _about(flier: Flier, digests: Mapping[str, str]) -> dict[str, Any]:
+def _about(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
     """Return all that sets the outcome of a trial besides the trial."""
     return {
-        "policy_sha256": digests[flier.policy],
-        "vehicle": flier.vehicle,
-        "sensors": flier.sensors,
-        "world": flier.world,
+        "policy_sha256": digests[setup.policy],
+        "vehicle": setup.vehicle,
+        "sensors": setup.sensors,
+        "world": setup.simulator,
         "code": code_digest(*FLIES),
         "engines": engines(),
     }
 
 
 Loaders = dict[str, Callable[[], Policy]]
-"""How each policy is loaded where it flies, by what fliers call it."""
+"""How each policy is loaded where it flies, by what setups call it."""
 
 
 class Share(NamedTuple):
-    """Trials of one flier."""
+    """Trials of one setup."""
 
     number: int
-    """Of the flier."""
-    flier: Flier
+    """Of the setup."""
+    setup: Setup
     trials: Sequence[TrialSpec]
 
 
-def _loaders(fliers: Iterable[Flier], workers: Workers) -> Loaders:
+def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
     """Return how policies are loaded: by name on this machine, by content on others."""
-    names = {flier.policy for flier in fliers}
     if isinstance(workers, int):
-        return {name: partial(load_policy, name) for name in names}
-    return {name: PolicyContent.of(name) for name in names}
+        return {name: partial(load_policy, name) for name in policies}
+    return {name: PolicyContent.of(name) for name in policies}
 
 
 def _pieces(
-    fliers: Sequence[Flier], missing: Sequence[Sequence[TrialSpec]], processes: int
+    setups: Sequence[Setup], missing: Sequence[Sequence[TrialSpec]], processes: int
 ) -> list[list[Share]]:
-    """Cut the trials of all fliers into pieces for so many processes, each of about as many."""
+    """Cut the trials of all setups into pieces for so many processes, each of about as many."""
     total = sum(map(len, missing))
     most = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
     pieces: list[list[Share]] = [[]]
     held = 0
-    for number, (flier, trials) in enumerate(zip(fliers, missing, strict=True)):
+    for number, (setup, trials) in enumerate(zip(setups, missing, strict=True)):
         cut = math.ceil(len(trials) / most) if trials else 0
         for part in (trials[k::cut] for k in range(cut)):
             if held and held + len(part) > most:
                 pieces.append([])
                 held = 0
-            pieces[-1].append(Share(number, flier, part))
+            pieces[-1].append(Share(number, setup, part))
             held += len(part)
     return pieces
 
 
 def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, TrialResult]]:
-    """Yield (number of the flier, result) of trials flown here; each policy is loaded once."""
+    """Yield (number of the setup, result) of trials flown here; each policy is loaded once."""
     loaded: dict[str, Policy] = {}
-    for number, flier, trials in piece:
-        if flier.policy not in loaded:
-            loaded[flier.policy] = loaders[flier.policy]()
-        options = JudgeOptions(workers=1, sensors=flier.sensors)
-        task = Task(loaded[flier.policy], flier.vehicle, flier.world, options)
+    for number, setup, trials in piece:
+        if setup.policy not in loaded:
+            loaded[setup.policy] = loaders[setup.policy]()
+        options = JudgeOptions(workers=1, sensors=setup.sensors)
+        task = Task(loaded[setup.policy], setup.vehicle, setup.simulator, options)
         for _, result, _ in fly_share(task, list(enumerate(trials))):
             yield number, result

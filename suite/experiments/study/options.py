@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
+import tyro
+
 from suite.common.choices import parse_levels
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_owned
@@ -12,6 +14,23 @@ from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 
 GATES = 4
 """Of the paper's tracks in its ablation and its comparison of schemes."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the experiments on judged policies have in common; their options derive from it."""
+
+    policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
+    Without it the shipped policy flies."""
+    difficulty: str = "3"
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    trials: Trials = 32
+    """Trials of every policy on every track at every level under every condition."""
+    seed: Seed = 0
+    """Seed of the first trial; the others follow by one."""
+    vehicle: str = "reference"
+    """What flies: a shipped vehicle's name or a vehicle file (.toml)."""
 
 
 @dataclass(frozen=True)
@@ -57,40 +76,22 @@ def check(config: Any) -> None:
         parse_levels(given["difficulty"])
 
 
-def asked_recipe(config: Any) -> TrainConfig:
-    """Return --recipe with --set and, unless it is None, --iterations.
-
-    Raises:
-        ValueError: for a recipe or a change that does not exist.
-    """
-    from suite.train.overrides import changed, check_phases
-    from suite.train.recipes import named_recipe, with_iterations
-
-    recipe = changed(named_recipe(config.recipe), config.set)
-    if config.iterations is not None:
-        recipe = with_iterations(recipe, config.iterations)
-    check_phases(recipe)
-    return recipe
-
-
 def four_gate_recipe(config: FourGates) -> TrainConfig:
     """Return the recipe that `config` asks for on tracks of four gates.
 
     Raises:
         ValueError: for a recipe or a change that does not exist, or no field: that is compared.
     """
+    from suite.train.overrides import changed, check_phases
+    from suite.train.recipes import named_recipe, with_iterations
+
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
-    base = asked_recipe(config)
+    base = with_iterations(changed(named_recipe(config.recipe), config.set), config.iterations)
+    check_phases(base)
     if base.loss.field_gain == 0.0:
         raise ValueError("loss.field_gain is 0, allowed is a number above: the field is compared")
     return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
-
-
-def recipe_words(config: Any) -> str:
-    """Return --recipe, --set and, where there is one, --init-from as they were asked for."""
-    start = getattr(config, "init_from", None)
-    return " ".join([config.recipe, *config.set, *([] if start is None else ["init-from", start])])
 
 
 def judged_seeds(config: Any) -> str:

@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from suite.common.report import ranged
-from suite.experiments.study.intervals import Spread, spread
+import numpy as np
+
 from suite.experiments.study.training import Row, Trained
+
+
+class Spread(NamedTuple):
+    """A number over training seeds."""
+
+    mean: float
+    least: float
+    most: float
 
 
 class Metric(NamedTuple):
@@ -49,13 +57,13 @@ class Summary(NamedTuple):
         """Return a number of each training that did not diverge, at its end."""
         return [points[-1][name] for points in self.whole]
 
-    def text(self, name: str, at: int = -1, digits: int | None = None) -> str:
-        """Return a number's mean with the least and the most of a seed, as cells show it."""
+    def text(self, name: str) -> str:
+        """Return a number's mean at the end with the least and the most of a seed, for cells."""
         if not self.at:
             return "diverged"
-        _, scale, usual = METRICS[name]
-        mean, least, most = (scale * value for value in self.at[at][name])
-        return ranged(mean, least, most, usual if digits is None else digits)
+        _, scale, digits = METRICS[name]
+        mean, least, most = (f"{scale * value:.{digits}f}" for value in self.at[-1][name])
+        return f"{mean} [{least}, {most}]"
 
 
 def summaries(rows: Sequence[Row], runs: Sequence[Trained]) -> list[Summary]:
@@ -65,8 +73,12 @@ def summaries(rows: Sequence[Row], runs: Sequence[Trained]) -> list[Summary]:
         mine = [run for run in runs if run.row == row.key]
         whole = [run.points for run in mine if not run.diverged]
         at = [
-            {name: spread([point[name] for point in seeds]) for name in seeds[0]}
+            {name: _spread([point[name] for point in seeds]) for name in seeds[0]}
             for seeds in zip(*whole, strict=True)
         ]
         found.append(Summary(row.key, row.words, row.recipe, len(mine), whole, at))
     return found
+
+
+def _spread(values: Sequence[float]) -> Spread:
+    return Spread(float(np.mean(values)), min(values), max(values))

@@ -21,11 +21,10 @@ from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
 from suite.common.stages import Estimate, announce
 from suite.common.work import all_done
-from suite.experiments.study.cache import digest
+from suite.experiments.study.cache import Place, digest
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tracks.common.names import unknown_name
-from tracks.common.work import Workers
 
 if TYPE_CHECKING:
     from suite.train.rollout import Note
@@ -42,7 +41,7 @@ class Row(NamedTuple):
     """A `TrainConfig` or a `PpoConfig`, with the seed left as it is."""
 
 
-class Looks(NamedTuple):
+class Unseen(NamedTuple):
     """How policies are flown in worlds that no training has seen."""
 
     measurements: int
@@ -77,19 +76,14 @@ class Trained(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """What is trained, how often, and how it is looked at."""
+    """What is trained, how often, and how it is measured."""
 
     rows: Sequence[Row]
     seeds: Sequence[int]
-    looks: Looks | None = None
-    """Flights in unseen worlds of the training's dynamics; None flies none."""
+    unseen: Unseen
+    """Flights in unseen worlds of the training's dynamics."""
     by_seed: bool = False
     """Whether the rows take turns, so that they meet the same load of the machine."""
-    may_diverge: bool = True
-    """Whether the others go on where a training diverges."""
-    start: str | None = None
-    """The policy that all are trained on from, a shipped name or a checkpoint's folder; None:
-    from nothing. Not for PPO."""
 
     def pieces(self) -> list[tuple[str, Any]]:
         """Return key and whole configuration of every training, in the order they are done."""
@@ -111,21 +105,17 @@ def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]
     return [row for row in rows if not only or row.key in only]
 
 
-def trained(
-    study: Study, cache: Path, console: Console, workers: Workers | None = None
-) -> list[Trained]:
+def trained(study: Study, place: Place, console: Console) -> list[Trained]:
     """Return every training of `study`; it is done, or gone on with, where missing.
+
+    The others go on where one diverges.
 
     Args:
         study: what is trained.
-        cache: where trainings are found again.
+        place: where trainings are found again, and who trains; with no or one worker one training
+            after the other on all cores.
         console: where progress goes.
-        workers: who trains; None or 1 does one training after the other on all cores.
-
-    Raises:
-        WorkFailed: where one diverges that may not.
     """
-    from suite.judging.flying import checkpoint_folder
     from suite.train.ppo.run import estimate as ppo_estimate
     from suite.train.run import estimate
 
@@ -134,40 +124,28 @@ def trained(
         return []
     needs = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
     memory = max(need.memory_bytes for need in needs)
-    memory *= workers if isinstance(workers, int) else 1
+    memory *= place.workers if isinstance(place.workers, int) else 1
     whole = Estimate(sum(need.seconds for need in needs), memory)
     announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    do = functools.partial(train_one, looks=study.looks, may_diverge=study.may_diverge)
-    start = None if study.start is None else checkpoint_folder(study.start, "--init-from")
-    jobs = [Job(piece, cache / _place_of(piece, study), start) for piece in pieces]
-    ended = all_done(do, jobs, workers, console, "training")
+    jobs = [Job(piece, place.cache / _folder_of(piece, study.unseen)) for piece in pieces]
+    do = functools.partial(train_one, unseen=study.unseen)
+    ended = all_done(do, jobs, place.workers, console, "training")
     return [_read(job, *end) for job, end in zip(jobs, ended, strict=True)]
 
 
-def _place_of(piece: tuple[str, Any], study: Study) -> Path:
+def _folder_of(piece: tuple[str, Any], unseen: Unseen) -> Path:
     """Return the folder of a training within the cache."""
-    from suite.judging.content import policy_digest
-
-    (key, config), looks = piece, study.looks
-    if looks and looks.measurements:
-        return Path("schemes", digest([key, config, looks]))
-    if study.start is None:
-        return Path("trainings", digest(config))
-    return Path("trainings", digest([config, policy_digest(study.start)]))
+    key, config = piece
+    if unseen.measurements:
+        return Path("schemes", digest([key, config, unseen]))
+    return Path("trainings", digest(config))
 
 
-def train_one(
-    job: Job, console: Console, looks: Looks | None = None, may_diverge: bool = False
-) -> tuple[str, list[dict[str, float]]]:
-    """Train one of `Study.pieces` in the job's folder, or find it, and measure it as `looks` says.
-
-    It starts from the checkpoint that the job reads, if it reads one.
+def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dict[str, float]]]:
+    """Train one of `Study.pieces` in the job's folder, or find it, and measure it.
 
     Returns:
         `Trained.diverged`, and what was measured of the finished policy alone.
-
-    Raises:
-        WorkFailed: where it diverges and may not.
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
@@ -176,40 +154,36 @@ def train_one(
     from suite.train.training_loop import Watch
 
     (key, config), folder, watch = job.task, job.folder, None
-    is_ppo, diverged = isinstance(config, PpoConfig), ""
-    if looks and looks.measurements:
+    is_ppo = isinstance(config, PpoConfig)
+    if unseen.measurements:
         shared = config.shared if is_ppo else phase_configs(config)[-1]
         iterations = config.iterations if is_ppo else config.optimizer.iterations
-        measure = make_validation(shared, *looks[1:], rewarded(shared))
-        watch = Watch(max(1, iterations // looks.measurements), measure)
-    begin: dict[str, Any] = {}
-    if job.reads is not None:
-        begin = {"params": started_from(str(job.reads), config.spec)}
+        measure = make_validation(shared, *unseen[1:], rewarded(shared))
+        watch = Watch(max(1, iterations // unseen.measurements), measure)
     try:
-        (train_ppo if is_ppo else train)(config, folder, console, watch=watch, **begin)
+        (train_ppo if is_ppo else train)(config, folder, console, watch=watch)
     except WorkFailed as failure:
-        if not may_diverge:
-            raise
-        diverged = str(failure)
-        console.note(f"{key}, seed {config.seed}: {diverged}")
-    points = []
-    if looks and not (watch or diverged):
-        last = phase_configs(config)[-1]
-        params = started_from(str(folder / "policy"), last.spec)
-        found = make_validation(last, *looks[1:])(params)
-        points = [found]
-        console.note(
-            f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
-            f"collision-free {found['collision_free']:.0%}, v_max {found['v_max']:.1f} m/s"
-        )
-    return diverged, points
+        console.note(f"{key}, seed {config.seed}: {failure}")
+        return str(failure), []
+    if watch:
+        return "", []
+    last = phase_configs(config)[-1]
+    params = started_from(str(folder / "policy"), last.spec)
+    found = make_validation(last, *unseen[1:])(params)
+    console.note(
+        f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
+        f"collision-free {found['collision_free']:.0%}, v_max {found['v_max']:.1f} m/s"
+    )
+    return "", [found]
 
 
 def _read(job: Job, diverged: str, found: list[dict[str, float]]) -> Trained:
     """Return a training from its folder."""
     (key, config), policy = job.task, job.folder / "policy"
     points, compile_s = curve_of(job.folder, config.episode.batch * config.episode.steps)
-    about = (str(policy), seconds_of(policy), compile_s, commit_of(policy))
+    rows = curve.read(job.folder)
+    seconds = sum(row["seconds"] for row in rows if not row["cold"])
+    about = (str(policy), seconds, compile_s, commit_of(policy))
     return Trained(key, config.seed, *about, diverged, found or points)
 
 
@@ -243,11 +217,6 @@ def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
     return points, compiling
 
 
-def seconds_of(policy: Path) -> float:
-    """Return how long `policy` (RUN/policy) was trained, without steps that compiled [s]."""
-    return sum(row["seconds"] for row in curve.read(policy.parent) if not row["cold"])
-
-
 def commit_of(policy: Path) -> str:
     """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so.
 
@@ -265,11 +234,6 @@ def facts(config: Any, runs: Sequence[Trained]) -> dict[str, str]:
     """Return what a page says of trainings that flew unseen worlds: seeds, commits, worlds."""
     return {
         "training seeds": " ".join(map(str, config.training_seeds)),
-        "trained at commit": commits(runs),
+        "trained at commit": ", ".join(sorted({run.commit for run in runs})),
         "unseen worlds": f"{config.trials}, seed {config.seed}, {config.seconds:g} s each",
     }
-
-
-def commits(runs: Sequence[Trained]) -> str:
-    """Return the commits of all trainings, each once."""
-    return ", ".join(sorted({run.commit for run in runs}))

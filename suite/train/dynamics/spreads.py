@@ -1,4 +1,4 @@
-"""What a recipe varies of its dynamics: by name, taken away, and as vehicles for environments."""
+"""What a recipe varies of its dynamics, as vehicles for environments."""
 
 from __future__ import annotations
 
@@ -8,48 +8,8 @@ from typing import Any
 import numpy as np
 
 from eval.vehicles.vehicle import Vehicle, with_effects
-from suite.train.config import PointMassConfig, QuadrotorConfig, TrainConfig
-from suite.train.overrides import in_every_phase, phase_configs
-
-STILL = (0.0, 0.0, 0.0)
-"""No wind."""
-QUADROTOR: dict[str, dict[str, Any]] = {
-    "mass": {"mass_std": 0.0},
-    "thrust": {"thrust_spread": 0.0},
-    "rotor lag": {"lag_spread": 0.0, "lag_spread_s": 0.0},
-    "drag": {"drag_spread": 0.0},
-    "delay": {"delay_spread_s": 0.0},
-    "rate gain": {"gain_spread": 0.0},
-    "centre of mass": {"com_std_m": 0.0},
-    "torque trim": {"trim_std": 0.0},
-    "wind": {"wind_std": STILL},
-}
-"""Settings of `QuadrotorConfig` that leave the vehicle as its file says."""
-IMAGE = {"depth_noise": 0.0, "fov_scale": (1.0, 1.0)}
-"""Settings of `PointMassConfig` that quadrotors heed as well."""
-
-
-def spreads(config: TrainConfig) -> dict[str, TrainConfig]:
-    """Return `config` without each of the spreads that it has, by the spread's name.
-
-    What is drawn from a range has the range's middle instead; what is drawn around the vehicle's
-    own has that.
-    """
-    part = "physics" if config.quadrotor is None else "quadrotor"
-    settings = _of_point_mass(config.physics) if config.quadrotor is None else QUADROTOR
-    named = [(name, part, changes) for name, changes in settings.items()]
-    found = {
-        name: in_every_phase(config, part, **changes)
-        for name, part, changes in [*named, ("image", "physics", IMAGE)]
-    }
-    return {name: without for name, without in found.items() if without != config}
-
-
-def fixed(config: TrainConfig) -> TrainConfig:
-    """Return `config` without any of its spreads."""
-    for name in spreads(config):
-        config = spreads(config)[name]
-    return config
+from suite.train.config import QuadrotorConfig
+from suite.train.overrides import phase_configs
 
 
 @dataclass(frozen=True)
@@ -91,17 +51,3 @@ def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
     config = with_quadrotor(last, load_vehicle(vehicle))
     assert config.quadrotor is not None
     return {"spec": config.spec, "vehicle": DrawnVehicle(config.quadrotor)}
-
-
-def _of_point_mass(physics: PointMassConfig) -> dict[str, dict[str, Any]]:
-    def middle(bounds: tuple[float, float]) -> tuple[float, float]:
-        centre = sum(bounds) / 2
-        return centre, centre
-
-    return {
-        "rotor lag": {"lag_std": 0.0},
-        "drag": {"drag": middle(physics.drag), "drag_up": middle(physics.drag_up)},
-        "delay": {"action_delay": middle(physics.action_delay)},
-        "wind": {"wind_std": STILL},
-        "time step": {"time_step_std": 0.0},
-    }

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from suite.common.charts import DPI, png
 from suite.common.choices import parse_levels, parse_tracks
-from suite.common.report import Details, Links, Picture, Report, Section, ranged, write_report
+from suite.common.report import Details, Links, Picture, Report, Section, write_report
 from tracks.common.grid import Cell, Grid
 
 GRID = Grid(
@@ -33,10 +33,6 @@ def test_a_page_holds_everything_and_escapes_what_is_text(tmp_path):
     assert "data:image/png;base64," + base64.b64encode(b"a png").decode() in page
     assert '<a href="a.md">' in page and "<pre>1 &amp; 2</pre>" in page
     assert "<script" not in page and "http" not in page
-
-
-def test_a_mean_with_its_least_and_most():
-    assert ranged(2.0, 1.25, 3.0, 1) == "2.0 [1.2, 3.0]"
 
 
 def test_a_figure_is_a_png_file_of_its_size():

@@ -6,8 +6,6 @@ import pytest
 
 from eval.worlds.trial import Rules
 from suite.experiments.study import judging
-from suite.train.training_loop import Outcome
-from tests.support.documents import another_racer
 
 
 class Sky:
@@ -33,18 +31,3 @@ class Sky:
 @pytest.fixture
 def sky(monkeypatch):
     return Sky(monkeypatch)
-
-
-@pytest.fixture
-def made(monkeypatch):
-    """Return the configurations that were trained; each gives race-paper, with another digest."""
-    configs = []
-
-    def stand_in(config, folder, console, params=None, watch=None):
-        if not (folder / "policy").is_dir():
-            configs.append(config)
-            another_racer(folder / "policy", 1000 + len(configs))
-        return Outcome(folder / "policy", 1, {})
-
-    monkeypatch.setattr("suite.train.run.train", stand_in)
-    return configs

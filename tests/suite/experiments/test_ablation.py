@@ -6,8 +6,7 @@ from eval.judging.statistics import wilson
 from suite.common.errors import WorkFailed
 from suite.experiments.ablation import Config, _main, pooled, settings
 from suite.experiments.pages.paper import ablation as printed
-from suite.experiments.study.intervals import Spread
-from suite.experiments.study.summary import summaries
+from suite.experiments.study.summary import Spread, summaries
 from suite.experiments.study.training import Trained
 from suite.train import run as training_run
 from tests.support.documents import page, reproduce

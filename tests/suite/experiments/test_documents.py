@@ -2,17 +2,12 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
-from policies import shipped
-from suite.common.curve import append
-from suite.experiments.seeds import repeats
 from suite.experiments.simulators import WHY, Column, Config, changes, columns
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
-from tests.support.judged_cells import cell
 from tests.support.loops import trial_result
 
 
@@ -51,37 +46,6 @@ def test_perception(sky, tmp_path):
     assert (tmp_path / "docs" / "perception.png").is_file()
 
 
-def test_the_median_policy_and_the_repeats():
-    rates = {"a": (0.9, 0.7), "b": (1.0, 1.0), "c": (0.2, 0.4), "d": (0.9, 0.8)}
-    cells = {n: [cell("zigzag", k, r) for k, r in enumerate(of)] for n, of in rates.items()}
-    found = repeats({name: cells[name] for name in "abc"})
-    assert found.median == "a" and found.mean_success["c"] == pytest.approx(0.3)
-    assert found.mean == pytest.approx(0.7)
-    assert found.standard_deviation == pytest.approx(np.std([0.8, 1.0, 0.3], ddof=1))
-    assert repeats(cells).median == "a", "of an even number the lower of the middle two"
-    assert np.isnan(repeats({"a": cells["a"]}).standard_deviation)
-
-
-def test_seeds_are_trained_once_and_compared(sky, made, tmp_path):
-    recipe = ["--recipe", "quick", "--iterations", "3", "--set", "episode.batch=2"]
-    args = [*recipe, "--training-seeds", "0", "4", "--trials", "1"]
-    assert reproduce(tmp_path, "seeds", *args) == 0
-    assert [(c.seed, c.optimizer.iterations, c.episode.batch) for c in made] == [
-        (0, 3, 2),
-        (4, 3, 2),
-    ]
-    assert reproduce(tmp_path, "seeds", *args) == 0
-    assert len(made) == 2 and len(sky.flown) == 24
-    text, numbers = page(tmp_path, "seeds")
-    assert set(numbers["spread"]["mean_success"]) == {"seed 0", "seed 4"}
-    assert "- recipe: quick episode.batch=2\n" in text
-    digest = next((tmp_path / "cache" / "trainings").glob("*/policy"))
-    rows = [{"iteration": k, "seconds": 45.2, "cold": k == 0} for k in range(3)]
-    append(digest.parent, rows)
-    assert reproduce(tmp_path, "seeds", *args) == 0
-    assert "trained at commit unknown in 1 min 30 s" in page(tmp_path, "seeds")[0]
-
-
 def test_table2_and_all_levels(sky, tmp_path, capfd):
     sky.stop_after = 11
     assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7") == 130
@@ -99,17 +63,15 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
     assert "seeds: 7 to 7, 1 trials a cell" in text
     # Other documents find the flights of this one.
-    asked = ("--policies", shipped.DEFAULT, "--trials", "1", "--seed", "7")
-    assert reproduce(tmp_path, "seeds", *asked) == 0
-    assert len(sky.flown) == 30
-    text, numbers = page(tmp_path, "seeds")
-    assert numbers["spread"]["median"] == shipped.DEFAULT
+    asked = ("--trials", "1", "--seed", "7", "--difficulty", "0", "--only", "wind")
+    assert reproduce(tmp_path, "robustness", *asked) == 0
+    assert len(sky.flown) == 30 + 3 * 4, "the undisturbed is there"
     # A second time nothing is flown and the same is written.
     capfd.readouterr()
     assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
     said = json.loads(capfd.readouterr().out)
     assert said["out"].endswith("table2.md") and len(said["cells"]) == 30
-    assert len(sky.flown) == 30
+    assert len(sky.flown) == 30 + 3 * 4
 
 
 def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):

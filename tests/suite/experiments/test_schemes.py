@@ -5,8 +5,7 @@ import pytest
 from suite.experiments.ablation import Config as AblationConfig
 from suite.experiments.ablation import settings
 from suite.experiments.schemes import Config, first_times, schemes
-from suite.experiments.study.intervals import Spread
-from suite.experiments.study.summary import summaries
+from suite.experiments.study.summary import Spread, summaries
 from suite.experiments.study.training import Trained
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig

@@ -4,18 +4,14 @@ import json
 import math
 from importlib.metadata import EntryPoint, EntryPoints
 
-import numpy as np
-import pytest
-
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from suite.common.console import Console
 from suite.experiments.study import cache, disturbed
-from suite.experiments.study.cache import added_digest, code_digest, digest
+from suite.experiments.study.cache import Place, added_digest, code_digest, digest
 from suite.experiments.study.conditions import Condition
-from suite.experiments.study.intervals import nested
-from suite.experiments.study.judging import Flier, Order, flown
-from suite.experiments.study.training import Row, Study, curve_of
+from suite.experiments.study.judging import Order, Setup, flown
+from suite.experiments.study.training import Row, Study, Unseen, curve_of
 from suite.train.recipes import named_recipe
 from tracks.common import names as registry
 
@@ -24,34 +20,34 @@ RECIPE = named_recipe("race-paper")
 
 
 def test_rows_take_turns_where_they_are_to_meet_the_same_load():
-    study = Study([Row("a", "", RECIPE), Row("b", "", RECIPE)], (4, 5))
+    rows, unseen = [Row("a", "", RECIPE), Row("b", "", RECIPE)], Unseen(0, 3, 9, 1.0)
+    study = Study(rows, (4, 5), unseen)
     assert [(key, c.seed) for key, c in study.pieces()] == [("a", 4), ("a", 5), ("b", 4), ("b", 5)]
-    turns = Study(study.rows, study.seeds, by_seed=True)
+    turns = Study(rows, (4, 5), unseen, by_seed=True)
     assert [(key, c.seed) for key, c in turns.pieces()] == [("a", 4), ("b", 4), ("a", 5), ("b", 5)]
 
 
-def test_the_same_flier_in_two_orders_flies_a_trial_once(sky, tmp_path):
+def test_the_same_setup_in_two_orders_flies_a_trial_once(sky, tmp_path):
     one, two = TrialSpec("zigzag", 0, 1), TrialSpec("zigzag", 0, 2)
-    flier = Flier("race-paper", VEHICLE)
-    orders = {"a": Order(flier, [one, two]), "b": Order(flier, [two])}
-    found = flown(orders, tmp_path, Console(), "flying")
+    setup = Setup("race-paper", VEHICLE)
+    orders = {"a": Order(setup, [one, two]), "b": Order(setup, [two])}
+    found = flown(orders, Place(tmp_path, tmp_path), Console(), "flying")
     assert len(sky.flown) == 2 and found["b"] == found["a"][1:]
     assert [row.trial for row in found["a"]] == [one, two]
 
 
-def test_several_policies_under_one_name_fly_one_after_the_other(sky, tmp_path):
+def test_policies_fly_the_same_trials_under_every_condition(sky, tmp_path):
     trials = [TrialSpec("zigzag", 0, seed) for seed in (1, 2, 3)]
     alone, grown = disturbed.asked_conditions(VEHICLE, ("wind", "mass_offset"))
     assert [c.name for c in alone] == ["mass_offset"] * 2
     (wind,) = grown
-    base = Condition("undisturbed", 0.0, "", VEHICLE)
-    fliers = {"both": [("race-paper", trials[:1]), ("race", trials[1:])]}
+    base, policies = Condition("undisturbed", 0.0, "", VEHICLE), {"p": "race-paper", "r": "race"}
     (tested,), points = disturbed.flown_under(
-        [base], {wind: grown[wind][:2]}, fliers, tmp_path, Console()
+        [base], {wind: grown[wind][:2]}, policies, trials, Place(tmp_path, tmp_path), Console()
     )
-    assert [row.trial for row in tested.results["both"]] == trials
-    assert len(points[wind]) == 2 and len(sky.flown) == 2 * 3, "the undisturbed once for both"
-    numbers = disturbed.tested_numbers(points[wind][1], tested)["policies"]["both"]
+    assert [row.trial for row in tested.results["p"]] == trials
+    assert len(points[wind]) == 2 and len(sky.flown) == 2 * 2 * 3, "the undisturbed once"
+    numbers = disturbed.tested_numbers(points[wind][1], tested)["policies"]["r"]
     assert numbers["success"].value == 0 and math.isclose(numbers["change"].value, 0)
 
 
@@ -66,20 +62,6 @@ def test_time_leaves_compilation_out(tmp_path):
         (0, 0.0, 0.0), (30, 3 + 2 + 3, 3.0), (50, 3 + 2 + 3 + 3 + 4, 5.0),
     ]  # fmt: skip
     assert compiling == 27 + 8
-
-
-def test_intervals_are_as_wide_as_seeds_differ():
-    steady, torn = np.full((4, 400), 0.0), np.zeros((4, 400))
-    steady[:, ::2] = torn[::2] = 1.0
-    one, other = nested(list(steady)).difference, nested(list(torn)).difference
-    assert one.value == other.value == 0.5
-    assert other.low <= 0.01 and other.high >= 0.99
-    # Half of 1,600 trials in all, whatever the seed.
-    assert one.high - one.low == pytest.approx(4 * np.sqrt(0.25 / 1600), rel=0.1)
-
-
-def test_seeds_with_more_trials_weigh_more():
-    assert nested([np.ones(30), np.zeros(10)]).difference.value == 0.75
 
 
 def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
