@@ -14,9 +14,15 @@ from suite.common.curve import tensorboard
 from suite.common.running.hosts import Joined, join, member
 from suite.common.startup import use_device
 from suite.common.work import Silent
-from suite.train.config import SensorsConfig, TrainConfig
+from suite.train.config import TrainConfig
 from suite.train.overrides import changed, check_phases
-from suite.train.recipes import chosen_model, named_recipe, with_iterations
+from suite.train.recipes import (
+    chosen_model,
+    finetune,
+    named_recipe,
+    with_iterations,
+    with_sensors,
+)
 from tracks.common.files import check_no_input, plain
 from tracks.input.ranges import Iterations, Range, Seed
 
@@ -55,6 +61,9 @@ class Config:
     init_from: str | None = None
     """Start from this policy instead of fresh parameters: a checkpoint's folder or a shipped
     policy's name."""
+    finetune: bool = False
+    """Fine-tune the policy of --init-from: the recipe's last phase alone, a quarter of its gradient
+    steps, 0.3 times its learning rate."""
     delta: Path | None = None
     """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
     set: tuple[str, ...] = ()
@@ -85,16 +94,12 @@ def resolve(config: Config) -> TrainConfig:
     """
     run = replace(named_recipe(config.recipe), seed=config.seed)
     run = chosen_model(run, config.model, config.vehicle)
+    if config.finetune:
+        if config.init_from is None:
+            raise ValueError("--finetune needs --init-from: the policy to fine-tune")
+        run = replace(finetune(run), seed=config.seed)
     if config.sensors is not None:
-        from eval.sensors.sensors_file import load_sensors
-
-        seen = load_sensors(config.sensors)
-        if seen.estimator:
-            raise ValueError(
-                f"--sensors {config.sensors}: its estimator follows flights of the judge, not of "
-                "the trainer; train with vio, or with what suite identify --sensors writes"
-            )
-        run = replace(run, sensors=SensorsConfig(seen))
+        run = with_sensors(run, config.sensors)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
     named = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}

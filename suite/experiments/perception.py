@@ -75,7 +75,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "vehicle": config.vehicle,
     }
     parts: dict[str, list[Grid | Picture]] = {
-        "Presets on every cell": [preset_grid(tested)],
+        "Presets on every cell": [preset_grid(tested), *gain_grids(tested)],
         "Growing magnitudes": [
             Picture(sweeps_chart(grown_points), "Success against the magnitude of each"),
             magnitude_grid(grown_points),
@@ -144,6 +144,21 @@ def preset_grid(tested: Sequence[Tested]) -> Grid:
             lines.append(line)
     headers = ["sensors", "policy", *(f"level {level}" for level in levels)]
     return table([*headers, "all", "change", "v_mean [m/s]"], lines)
+
+
+def gain_grids(tested: Sequence[Tested]) -> list[Grid]:
+    """Return how the other policies differ from the first under each preset, if there are any."""
+    first, *others = tested[0].results
+    lines = []
+    for entry in tested:
+        cells = []
+        for name in others:
+            change = difference_cell(paired_success(entry.won(name), entry.won(first)))
+            faster = _speed(entry, name) / _speed(entry, first) - 1
+            cells.append(Cell(f"{change.text}, {faster:+.1%}", change.tone))
+        lines.append([entry.condition.name, *cells])
+    title = f"Success in points and median v_mean against {first}, on the same trials"
+    return [table(["sensors", *others], lines, title)] if others else []
 
 
 def magnitude_grid(grown_points: Mapping[Sweep, Sequence[Tested]]) -> Grid:

@@ -16,6 +16,7 @@ from suite.train.config import (
     Phase,
     PointMassConfig,
     QuadrotorConfig,
+    SensorsConfig,
     TrainConfig,
     check_decides_in_time,
 )
@@ -199,6 +200,23 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
         ),
         seed=config.seed + 1,
     )
+
+
+def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
+    """Return `config` through the models of a sensors file or a shipped name.
+
+    Raises:
+        ValueError: for sensors that cannot be used, or that need the judge's state estimator.
+    """
+    from eval.sensors.sensors_file import load_sensors
+
+    seen = load_sensors(sensors)
+    if seen.estimator:
+        raise ValueError(
+            f"--sensors {sensors}: its estimator follows flights of the judge, not of the "
+            "trainer; train with vio, or with what suite identify --sensors writes"
+        )
+    return replace(config, sensors=SensorsConfig(seen))
 
 
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:

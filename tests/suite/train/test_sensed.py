@@ -111,3 +111,12 @@ def test_the_command_trains_through_a_file(tmp_path):
         resolve(Config(recipe="quick", set=("sensors.magnitude=(0.0,1.5)",)))
     with pytest.raises(ValueError, match="Did you mean 'stereo-depth'"):
         resolve(Config(recipe="quick", sensors="stereo-dept"))
+
+
+def test_a_fine_tuning_is_the_last_phase_at_small_steps():
+    run = resolve(Config(sensors="vio", finetune=True, init_from="race"))
+    assert run.phases == () and run.spec.rate_hz == 30.0 and run.sensors is not None
+    assert (run.optimizer.iterations, run.optimizer.rate) == (525, pytest.approx(1.2e-4))
+    assert resolve(Config(finetune=True, init_from="race", iterations=9)).optimizer.iterations == 9
+    with pytest.raises(ValueError, match="--finetune needs --init-from"):
+        resolve(Config(finetune=True))
