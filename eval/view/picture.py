@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from eval.logs.flight import Flight
@@ -75,6 +78,7 @@ def write_picture(
         top.set_title(_outcome(result), fontsize=10, loc="left", color="#444444")
     if flight is not None:
         _colour_bar(figure, [top, side], speed)
+    _legend(figure, [(track, flight, result)])
     return _save(figure, path, dpi)
 
 
@@ -95,7 +99,7 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
     shape = np.clip(shape, 0.3, 1.1)
     tall = [shape[row * columns : (row + 1) * columns].max() for row in range(rows)]
     panel = 4.2
-    height = sum(panel * part + 0.55 for part in tall) + 0.3
+    height = sum(panel * part + 0.85 for part in tall) + 0.5
     figure = Figure(figsize=(panel * columns + 0.9, height), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, height_ratios=tall)
     speed = _speed_range([flight for _, flight, _ in trials])
@@ -107,6 +111,8 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
         axes.set_anchor("N")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
+        axes.set_xlabel("x [m]", fontsize=8)
+        axes.set_ylabel("y [m]", fontsize=8)
         axes.set_title(_title(track), fontsize=9, fontweight="bold", loc="left", pad=16)
         if result is not None:
             where = {"xycoords": "axes fraction", "textcoords": "offset points"}
@@ -114,6 +120,7 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
             axes.annotate(text, (0, 1), xytext=(0, 4), fontsize=8, color="#444444", **where)
     if any(flight is not None for _, flight, _ in trials):
         _colour_bar(figure, list(grid.flat), speed)
+    _legend(figure, trials)
     return _save(figure, path, dpi)
 
 
@@ -123,10 +130,7 @@ def _draw(
     track, flight, result = shown
     if flight is not None and not len(flight.time_s):
         flight = None  # a trial that ended at its first step
-    gates = track.scene.gates
-    passed = 0 if flight is None else int(flight.gate.max())
-    if result is not None:
-        passed = result.gates_passed
+    gates, passed = track.scene.gates, _passed(flight, result)
     solids = track_solids(track)
     obstacles = [solid.vertices for solid in solids if solid.gate is None]
     # What is nearer to the eye is drawn later: higher from above, lower y from the side.
@@ -162,6 +166,13 @@ def _draw(
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=7 if small else 9)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _passed(flight: Flight | None, result: TrialResult | None) -> int:
+    """Return how many gates were passed."""
+    if result is not None:
+        return result.gates_passed
+    return 0 if flight is None or not len(flight.time_s) else int(flight.gate.max())
 
 
 def _gate_colour(number: int | None, passed: int) -> str:
@@ -245,6 +256,25 @@ def _colour_bar(figure: Figure, axes: list[Axes], speed: Normalize) -> None:
     bar.outline.set_visible(False)
 
 
+def _legend(figure: Figure, trials: Sequence[Shown]) -> None:
+    """Name the marks that are drawn, above the views."""
+    passed = [_passed(flight, result) for _, flight, result in trials]
+    gates = [len(track.scene.gates.center_w) for track, _, _ in trials]
+    grey = (hexed(colours.SOLID), hexed(colours.SOLID_EDGE))
+    marks: list[Artist] = [
+        Line2D([], [], ls="", marker="o", mfc="white", mec=START, mew=1.8, ms=7, label="start"),
+        Patch(facecolor=grey[0], edgecolor=grey[1], label="obstacle"),
+    ]
+    if any(done < of for done, of in zip(passed, gates, strict=True)):
+        words = "gate ahead" if any(passed) else "gate"
+        marks.insert(1, Line2D([], [], color=hexed(colours.AHEAD), lw=4, label=words))
+    if any(passed):
+        marks.insert(1, Line2D([], [], color=PASSED, lw=4, label="gate passed"))
+    figure.legend(
+        handles=marks, loc="outside upper right", ncols=len(marks), fontsize=8, frameon=False
+    )
+
+
 def _title(track: Track) -> str:
     return f"{track.family}  ·  level {track.level}  ·  seed {track.seed}"
 
@@ -255,7 +285,7 @@ def _outcome(result: TrialResult, short: bool = False) -> str:
     if short:
         return text
     text += f", v_max {result.v_max:.1f} m/s, mean {result.v_mean:.1f} m/s"
-    return f"{text}\npolicy {result.policy}, vehicle {result.vehicle}, world {result.world}"
+    return f"{text}\npolicy {result.policy}, vehicle {result.vehicle}, simulator {result.world}"
 
 
 def _save(figure: Figure, path: str | Path, dpi: int) -> Path:

@@ -190,6 +190,15 @@ def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
     text = f"depth it saw, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
     middle = corner[0] + width / 2
     draw.text((middle, corner[1] - 6), text, fill=colours.DRONE, font=font, anchor="mb")
+    # The scale of its colours.
+    left, top, wide = int(corner[0] + 0.1 * width), corner[1] + size[1] + 8, int(0.8 * width)
+    scale = colours.depth_colours(np.linspace(0.0, DEPTH_RANGE_M, wide)[None], DEPTH_RANGE_M)
+    high = max(4, frame.height // 60)
+    frame.paste(Image.fromarray(scale).resize((wide, high), Image.Resampling.NEAREST), (left, top))
+    for share in (0.0, 0.5, 1.0):
+        mark = (left + share * wide, top + high + 3)
+        label = f"{share * DEPTH_RANGE_M:g}" + (" m" if share == 1.0 else "")
+        draw.text(mark, label, fill=colours.DRONE, font=font, anchor="mt")
 
 
 def _font_size(frame: Image.Image) -> int:

@@ -26,7 +26,7 @@ class Config:
     seed: Seed = 0
     """The track's seed."""
     out: Path = Path("runs/tracks")
-    """Folder for the pictures (PNG)."""
+    """Folder for the pictures (PNG); several levels also share one."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -39,7 +39,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     if not config.track:
         return _list(console)
-    from eval.view.picture import write_picture
+    from eval.view.picture import write_grid, write_picture
     from tracks.families import check_family, make_track
 
     drawn = []
@@ -58,7 +58,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))
         console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
         drawn.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
-    return {"tracks": drawn}
+    found: dict[str, Any] = {"tracks": drawn}
+    if len(tracks) > 1:
+        found["picture"] = config.out / f"{config.track}-{config.seed}.png"
+        write_grid(found["picture"], [(track, None, None) for track in tracks], columns=2)
+        console.say(f"{found['picture']}: all of them")
+    return found
 
 
 def _list(console: Console) -> dict[str, Any]:

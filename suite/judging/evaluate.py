@@ -124,10 +124,8 @@ def evaluate(
         console.say(sentence)
     for one in (one for one in over if one.finished):
         whose = f"{one.policy}: " if len(over) > 1 else ""
-        console.say(
-            f"{whose}lap over plan: median {with_interval(one.ratio)} over {one.finished} planned "
-            "tracks"
-        )
+        tracks = f"{one.finished} planned track{'s' * (one.finished != 1)}"
+        console.say(f"{whose}lap over plan: median {with_interval(one.ratio)} over {tracks}")
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 

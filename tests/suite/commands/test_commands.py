@@ -15,7 +15,7 @@ def test_tracks_command_lists_and_draws(tmp_path, capfd):
     args = ["tracks", "zigzag", "--difficulty", "0,9", "--seed", "4", "--out", str(tmp_path)]
     assert cli.main(args) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["zigzag-0-4.png", "zigzag-9-4.png"]
+    assert names == ["zigzag-0-4.png", "zigzag-4.png", "zigzag-9-4.png"]
     assert (tmp_path / names[0]).read_bytes().startswith(b"\x89PNG")
 
 
