@@ -95,7 +95,7 @@ def one(seed: list[int]) -> tuple[list[bool], list[str], str]:
     def logs(strength: float) -> tuple[FlightLog, ...]:
         again = np.random.default_rng(chance)
         extra = Push(strength, truth.mass, law)
-        return simulator.fly(truth, ways, again, extra).logs(again)
+        return simulator.fly(truth, ways, again, extra)(again)
 
     _, noise = gap_with(logs(0.0), truth, None)
     strength = FIRST * OFF / gap_with(logs(FIRST), truth, noise)[0]

@@ -13,7 +13,7 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import Case
 from suite.blind.oracle.information import (
-    ALLOWED,
+    LONG_S,
     REQUIRED,
     THRESHOLD,
     Information,
@@ -22,25 +22,15 @@ from suite.blind.oracle.information import (
     detectable,
     information,
     left_over,
+    linearised,
     log_ratio,
-    signatures,
-    start_of,
-)
-from suite.blind.oracle.stretches import (
-    EVERY_S,
-    LONG_S,
-    cut,
-    replay,
-    stretch_plant,
-    whitened,
-    without_start,
 )
 from suite.blind.outside import KINDS, changed_values, draw_change, make_outside, true_parameters
-from suite.blind.simulators import Flights, Simulator, simulator_for
+from suite.blind.simulators import Logged, Simulator, simulator_for
 from suite.common.errors import WorkFailed
-from suite.diagnose.plans.follow import FlightFailed, Recording
+from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.plan import SEPARATIONS
-from suite.diagnose.plans.simulate import FALL_V_PER_S, SENSORS, Sensors, fly
+from suite.diagnose.plans.simulate import FALL_V_PER_S, SENSORS, Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 TRIES = 6
@@ -57,8 +47,6 @@ class Built:
     """Flown."""
     trajectories: tuple[Trajectory, ...]
     logs: tuple[FlightLog, ...]
-    recordings: tuple[Recording, ...]
-    """Without noise."""
     answer: dict[str, Any]
     """Locked away."""
 
@@ -85,7 +73,7 @@ class _Unsuitable(Exception):
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
     simulator = simulator_for(case, rng)
-    nominal = simulator.judged
+    nominal = simulator.given
     if case.kind == "outside":
         return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}
@@ -103,7 +91,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     truth = with_effects(simulator.given, effects)
     flown = simulator.fly(truth, ways, rng)
     named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
-    judged = _judged(case, nominal, flown.recordings, sensors, ways, named) if named else {}
+    judged = _judged(case, nominal, flown(None), sensors, named) if named else {}
     answer = {
         "kind": case.kind,
         "verdict": "named" if case.hidden else "no_gap",
@@ -123,23 +111,21 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
 def _judged(
     case: Case,
     nominal: Vehicle,
-    flights: Sequence[Recording],
+    logs: Sequence[FlightLog],
     sensors: Sensors,
-    ways: Sequence[Trajectory],
     named: dict[str, np.ndarray],
 ) -> dict[str, dict[str, Any]]:
     """Return for each effect in `named` how strong it is and which names may stand for it."""
-    info = _information(nominal, flights, sensors, ways, EVERY_S)
+    info = information(nominal, logs, sensors)
     if case.kind == "pair":
         _check_pair(info, named, nominal)
-    length = min(LONG_S, 0.5 * max(way.duration_s for way in ways))
-    long = _information(nominal, flights, sensors, ways, length)
-    rests, hidden = (alternatives(i, named, nominal, bool(sensors.acc)) for i in (info, long))
+    long = information(nominal, logs, sensors, horizon_s=LONG_S)
+    rests, hidden = (alternatives(each, named, nominal) for each in (info, long))
     return {
         name: {
             "sigma": float(np.sqrt(2.0 * log_ratio(info.block(name), change))),
             "required": [o for o in rests[name] if hidden[name].get(o, np.inf) < REQUIRED],
-            "allowed": [other for other, rest in rests[name].items() if rest < ALLOWED],
+            "allowed": list(rests[name]),
             "left_over": rests[name],
             "left_over_of_long_stretches": hidden[name],
         }
@@ -158,19 +144,6 @@ def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[
             changes[name] = np.array([c.value(effects[name]) - c.value(given) for c in columns])
 
 
-def _information(
-    nominal: Vehicle,
-    flights: Sequence[Recording],
-    sensors: Sensors,
-    ways: Sequence[Trajectory],
-    length_s: float,
-) -> Information:
-    """Return what stretches of `length_s` say; of long flights every fourth, counted as often."""
-    stride = 4 if max(way.duration_s for way in ways) > 30.0 else 1
-    found = information(nominal, cut(flights, stride * length_s, length_s), sensors)
-    return Information(found.columns, stride * found.matrix)
-
-
 def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
     """Return `change` scaled to `case.multiple` times what the gentle flights alone can show.
 
@@ -179,7 +152,8 @@ def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarra
     sensors = SENSORS["capture"]
     ways = SEPARATIONS[case.separation].blurred
     flights = fly(nominal, nominal, [*ways, *ways], sensors.rate_hz)
-    info = information(nominal, cut(flights), sensors)
+    logs = [log_of(flight, nominal, sensors, None) for flight in flights]
+    info = information(nominal, logs, sensors, [name])
     return case.multiple * detectable(info.block(name), change) * change
 
 
@@ -195,19 +169,18 @@ def _outside(
     Its strength is worked out on a flight at the usual strength: `case.multiple` times what can
     just be detected after the whole catalogue was fitted to it.
     """
-    name, nominal = case.hidden[0], simulator.judged
+    name, nominal = case.hidden[0], simulator.given
     kind = KINDS[name]
 
-    def flown_at(strength: float) -> tuple[Flights, float]:
+    def flown_at(strength: float) -> tuple[Logged, float]:
         extra = make_outside(name, strength, nominal.mass)
-        flown = simulator.fly(simulator.given, ways, rng, extra)
-        return flown, unnameable(nominal, flown.recordings, sensors)
+        flown = simulator.fly(nominal, ways, rng, extra)
+        return flown, unnameable(nominal, flown(None), sensors)
 
     _, rest = flown_at(kind.usual)
     wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
     strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
     flown, rest = flown_at(strength)
-    pushed = np.concatenate([flight.extra.force_b for flight in flown.recordings]) / nominal.mass
     answer = {
         "kind": case.kind,
         "verdict": "unknown",
@@ -217,21 +190,15 @@ def _outside(
             "strength": strength,
             "unit": kind.unit,
             "multiple": float(np.sqrt(rest / THRESHOLD)),
-            "rms_m_s2": float(np.sqrt((pushed**2).sum(-1).mean())),
         },
     }
     return _built(case, simulator, simulator.given, ways, flown, answer, rng)
 
 
-def unnameable(nominal: Vehicle, flights: Sequence[Recording], sensors: Sensors) -> float:
+def unnameable(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
     """Return the log-likelihood ratio that the whole catalogue, fitted together, leaves over."""
-    stretches = cut(flights)
-    basis, base = start_of(nominal, stretches, sensors)
-    plant = stretch_plant(nominal)
-    with_it = replay(stretches, plant, outside=True, has_voltage=bool(sensors.voltage))
-    seen = without_start(basis, whitened(sensors, with_it, base)).ravel()
-    _, columns = signatures(nominal, stretches, sensors)
-    flat = columns.reshape(len(columns), -1).T
+    block = linearised(nominal, logs, sensors, columns_of(bool(sensors.voltage)))
+    seen, flat = block.residual.ravel(), block.slope.reshape(block.residual.size, -1)
     size = np.linalg.norm(flat, axis=0)
     flat = flat[:, size > 0.0] / size[size > 0.0]
     fitted = np.linalg.lstsq(flat, seen, rcond=1e-6)[0]
@@ -262,11 +229,11 @@ def _built(
     simulator: Simulator,
     truth: Vehicle,
     ways: Sequence[Trajectory],
-    flown: Flights,
+    flown: Logged,
     answer: dict[str, Any],
     rng: np.random.Generator,
 ) -> Built:
-    logs = flown.logs(rng)
+    logs = flown(rng)
     answer = {
         **answer,
         **({"conditions": simulator.conditions} if simulator.conditions else {}),
@@ -275,4 +242,4 @@ def _built(
         # Without it the hash of a short answer could be guessed.
         "salt": rng.bytes(16).hex(),
     }
-    return Built(simulator.given, truth, tuple(ways), logs, tuple(flown.recordings), answer)
+    return Built(simulator.given, truth, tuple(ways), logs, answer)

@@ -11,21 +11,19 @@ from dataclasses import astuple, replace
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.plant import Motion, Wrench, unpacked
+from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
-from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery, rotation
+from suite.blind.continuous.body import POS, QUAT, Battery
 from suite.blind.continuous.engine import Flown, Rows, fly
-from suite.blind.continuous.log import Noise, log_of_flight, state_at
+from suite.blind.continuous.log import Noise, log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
-from suite.diagnose.plans.follow import Gains, Recording, check_flights, steer
+from suite.diagnose.plans.follow import Gains, check_flights, steer
 from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 
 ROLL_S = 0.25
 """Flown before the first row and after the last, for poses that are logged late or early [s]."""
-GRID_HZ = 500.0
-"""Of the recordings that an oracle works with; commands and rows of a log do not lie on it."""
 
 
 def with_loop(vehicle: Vehicle, frequency: float) -> Vehicle:
@@ -112,44 +110,6 @@ class _Pilot:
         time_s = seen.time_s[:, None]
         # Arrays of one number a flight, where other simulators have one for all.
         return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
-
-
-def recordings_of(
-    flown: Flown, trajectories: Sequence[Trajectory], rate_hz: float
-) -> list[Recording]:
-    """Return the flights on an even grid, with rows at `rate_hz`, for what works on one.
-
-    A command is there from the first moment of the grid at or after its own.
-    """
-    return [_recording(flown, index, way, rate_hz) for index, way in enumerate(trajectories)]
-
-
-def _recording(flown: Flown, index: int, way: Trajectory, rate_hz: float) -> Recording:
-    dt, period = 1.0 / GRID_HZ, round(GRID_HZ / rate_hz)
-    time_s = np.arange(round(way.duration_s * GRID_HZ)) * dt
-    state = state_at(flown, index, time_s)
-    stamps = flown.schedule.stamp_s[:-1, index]
-    ends = flown.time_s[:, index]
-    row = np.searchsorted(stamps, time_s + 1e-9, side="right") - 1
-    step = np.clip(np.searchsorted(ends, time_s + 1e-9, side="right") - 1, 0, len(ends) - 2)
-
-    def between(ends: np.ndarray, series: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(time_s, ends, column) for column in series.T], axis=1)
-
-    push_b = flown.push_b[step, index]
-    return Recording(
-        dt=dt,
-        period=period,
-        time_s=time_s,
-        motion=Motion(state[:, POS], rotation(state[:, QUAT]), state[:, VEL], state[:, RATE]),
-        quat_wxyz=state[:, QUAT],
-        rotor_speed=between(ends, flown.speed[:, index]),
-        command=unpacked(flown.command[row, index]),
-        acc_b=between(stamps, flown.acc_b[:, index]),
-        voltage=np.interp(time_s, stamps, flown.voltage[:, index]),
-        acting=unpacked(flown.acting[row, index]),
-        extra=Wrench(push_b, np.zeros_like(push_b)),
-    )
 
 
 def logs_of(

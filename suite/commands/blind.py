@@ -121,11 +121,10 @@ def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any
 
 
 def _strengths(console: Console) -> dict[str, Any]:
-    from suite.blind.oracle.strength import make_table, save_table, table_size, table_text
+    from suite.blind.oracle.strength import write_table
 
-    with console.progress("strengths", table_size()) as update:
-        path = save_table(make_table(update))
-    console.say(table_text())
+    path = write_table(console)
+    console.say(f"written: {path}")
     return {"table": str(path)}
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from eval.logs.flight_log import FlightLog
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
@@ -135,19 +136,8 @@ def state_at(flown: Flown, index: int, time_s: np.ndarray) -> np.ndarray:
 
 def turned(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
     """Return quaternions (T, 4) turned further by rotation vectors (T, 3) in body axes [rad]."""
-    size = np.sqrt((angle_b * angle_b).sum(axis=1, keepdims=True))
-    small = np.concatenate([np.cos(0.5 * size), 0.5 * angle_b * np.sinc(size / (2 * np.pi))], 1)
-    w, x, y, z = quat_wxyz.T
-    a, b, c, d = small.T
-    return np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=1,
-    )
+    before = Rotation.from_quat(quat_wxyz, scalar_first=True)
+    return (before * Rotation.from_rotvec(angle_b)).as_quat(scalar_first=True)
 
 
 class _Draws:

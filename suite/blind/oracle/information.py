@@ -4,46 +4,49 @@ With g the whitened change of all logged channels for a unit of each parameter, 
 G = g^T g decides everything to first order: parameters theta away from the given vehicle raise the
 expected log-likelihood ratio to theta^T G theta / 2, and what another effect leaves of it when it
 is fitted in its place is a Schur complement of G.
+
+g is the linearisation of the diagnosis's own rollouts at the given vehicle, along flights without
+noise. An error of that linearisation is in the oracle, too; what flies the cases is independent of
+it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear, root_scalar
 
 from eval.effects import EFFECTS, all_values, nameable_effects
-from eval.effects.interface import GRAVITY, Parameter, Sample, Values, as_arrays, at, neutral
-from eval.effects.log_faults import lateness, measured
-from eval.vehicles.vehicle import Vehicle
-from suite.blind.oracle.stretches import (
-    DELAY_STEP_S,
-    Channels,
-    Stretches,
-    replay,
-    state_columns,
-    stretch_plant,
-    whitened,
-    without_start,
-)
-from suite.diagnose.plans.simulate import Sensors
-from tracks.geometry.rotation import exp_rot, to_world
+from eval.effects.interface import Parameter, Values, at, neutral
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle, with_effects
+from suite.diagnose.data.colour import Noise
+from suite.diagnose.data.windows import LENGTH_S, cut
+from suite.diagnose.estimate.block import Block
+from suite.diagnose.estimate.parameters import make_space
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
+from suite.diagnose.plans.simulate import Sensors, fly, log_of
+from suite.diagnose.plans.trajectory import Trajectory
+from suite.diagnose.thresholds import THRESHOLDS
 
+SHORT_S, LONG_S = 0.5, LENGTH_S
+"""Lengths of rollouts [s]; an error of force grows with the square of time."""
 THRESHOLD = 12.5
 """Expected log-likelihood ratio at which an effect can just be detected: five sigma."""
 REQUIRED = 2.0
-"""A name that leaves less log-likelihood ratio than this (two sigma) on long stretches cannot be
-told from the truth and must be among the alternatives."""
+"""A name that leaves less log-likelihood ratio than this (two sigma) in long rollouts cannot be
+separated from the truth and must be among the alternatives."""
 ALLOWED = THRESHOLD
-"""A name that leaves less than this on short stretches may be among them, any other may not."""
+"""A name that leaves less than this in short ones may be among them, any other may not."""
 MOSTLY = 0.25
 """A name may stand for another only where it leaves less than this share of what that explains."""
 GUST_DRAWS = 24
-"""Simulated draws of random wind."""
-FAULT_STEP = 1e-4
-"""By which a fault of the log is changed, in its own unit."""
+"""Flights with random wind on each trajectory."""
+LIMITS = replace(THRESHOLDS, most_windows=100_000)
+"""Every stretch counts."""
 
 
 class Column(NamedTuple):
@@ -89,60 +92,68 @@ class Information:
 
 
 def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
-    """Return every component that flights can tell, of `names` or of all, but for random wind."""
+    """Return every component that is identifiable, of `names` or of all, but for random wind."""
     return tuple(
         Column(name, parameter.name, component)
         for name, effect in EFFECTS.items()
-        if not effect.random and (names is None or name in names)
+        if effect.by_state and (names is None or name in names)
         for parameter, component in effect.components(has_voltage)
     )
 
 
 def information(
-    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
+    nominal: Vehicle,
+    logs: Sequence[FlightLog],
+    sensors: Sensors,
+    names: Sequence[str] | None = None,
+    horizon_s: float = SHORT_S,
 ) -> Information:
-    """Return what stretches say about effects (all, or `names`), from the `nominal` vehicle on."""
-    columns, moved = signatures(nominal, stretches, sensors, names)
-    flat = moved.reshape(len(columns), -1)
-    return Information(columns, flat @ flat.T)
+    """Return what flights say about effects (all, or `names`), from the `nominal` vehicle on.
+
+    Arguments are those of `linearised`.
+    """
+    columns = columns_of(bool(sensors.voltage), names)
+    matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations().sums()
+    return Information(columns, matrix)
 
 
-def signatures(
-    nominal: Vehicle, stretches: Stretches, sensors: Sensors, names: Sequence[str] | None = None
-) -> tuple[tuple[Column, ...], np.ndarray]:
-    """Return the columns and (P, W, D) what a unit of each does to the logged channels."""
-    has_voltage = bool(sensors.voltage)
-    columns = columns_of(has_voltage, names)
-    basis, base = start_of(nominal, stretches, sensors)
-    flown = [c for c in columns if EFFECTS[c.effect].in_flight]
-    moved = {
-        column: whitened(sensors, _faulty(column, base, nominal), base) / FAULT_STEP
-        for column in columns
-        if column not in flown
-    }
-    if flown:
-        # Times act by whole physics steps.
-        steps = np.array(
-            [DELAY_STEP_S if c.spec.unit == "s" else 0.1 * c.spec.typical[0] for c in flown]
-        )
-        plant = stretch_plant(nominal, _changed(nominal, flown, steps))
-        apart = whitened(sensors, replay(stretches, plant, has_voltage=has_voltage), base)
-        moved |= dict(zip(flown, apart / steps[:, None, None], strict=True))
-    return columns, without_start(basis, np.stack([moved[column] for column in columns]))
+def linearised(
+    nominal: Vehicle,
+    logs: Sequence[FlightLog],
+    sensors: Sensors,
+    columns: Sequence[Column],
+    horizon_s: float = SHORT_S,
+) -> Block:
+    """Return rollouts of `nominal` along logs, over the noise, less what unknown starts explain.
 
-
-def start_of(
-    nominal: Vehicle, stretches: Stretches, sensors: Sensors
-) -> tuple[np.ndarray, Channels]:
-    """Return the basis of what an unknown start explains, and the stretches of `nominal`."""
-    plant = stretch_plant(nominal)
-    base = replay(stretches, plant, has_voltage=bool(sensors.voltage))
-    return state_columns(stretches, plant, sensors, base), base
+    Args:
+        nominal: the given vehicle.
+        logs: without noise.
+        sensors: their noise; rows at another rate than theirs count as much a second.
+        columns: the block is along these.
+        horizon_s: length of a rollout, and from the start of one to the next's [s].
+    """
+    space = make_space(nominal)
+    place = [Column(entry.effect, entry.parameter, entry.component or 0) for entry in space.entries]
+    along = [place.index(column) for column in columns]
+    stepped = logs[0].integrator or "continuous"
+    model = RolloutModel(nominal, space, False, bool(sensors.voltage), stepped)
+    windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, stepped)
+    assert windows is not None, "flights of a case have a whole second"
+    row_s = np.asarray(windows.row_s)
+    windows = windows._replace(seen=windows.seen & (row_s < horizon_s + 1e-6)[..., None])
+    begin = start_estimate(model, windows)
+    linear = model.linearise(begin.theta, begin.free, windows, [*along, *model.starts])
+    each = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
+    sigma = np.array([*np.repeat(each, 3), *[sensors.rotor] * 4])
+    rows = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
+    sigma = np.where(sigma > 0.0, sigma * np.sqrt(rows / sensors.rate_hz), np.nan)
+    return weighed_by(model, windows, linear, LIMITS, Noise(sigma, {}), along)[1]
 
 
 def gust_strength(
     nominal: Vehicle,
-    stretches: Stretches,
+    ways: Sequence[Trajectory],
     sensors: Sensors,
     name: str,
     rng: np.random.Generator,
@@ -153,25 +164,21 @@ def gust_strength(
     It adds a covariance to the noise; with lambda its whitened eigenvalues for s = 1, a stretch
     adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
     """
-    basis, base = start_of(nominal, stretches, sensors)
     wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
-    plant = stretch_plant(nominal, {**nominal.effects, name: wind})
-    count = len(stretches.start_s)
-    draws = rng.standard_normal((len(stretches.command) + 1, GUST_DRAWS, count, 3))
-    channels = replay(stretches, plant, has_voltage=bool(sensors.voltage), draws=draws)
-    moved = without_start(basis, whitened(sensors, channels, base))
-    gram = np.einsum("kwd,lwd->wkl", moved, moved) / GUST_DRAWS
+    blown = with_effects(nominal, {name: wind})
+    flights = fly(nominal, blown, [*ways] * GUST_DRAWS, sensors.rate_hz, rng=rng)
+    logs = [log_of(flight, nominal, sensors, None) for flight in flights]
+    left = linearised(nominal, logs, sensors, ()).residual
+    left = left.reshape(GUST_DRAWS, -1, left.shape[1])
+    gram = np.einsum("kwd,lwd->wkl", left, left) / GUST_DRAWS
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)
 
-    def ratio(intensity: float) -> float:
-        raised = intensity**2 * eigenvalues
-        return float(0.5 * (raised - np.log1p(raised)).sum())
+    def beyond(log_size: float) -> float:
+        raised = np.exp(2.0 * log_size) * eigenvalues
+        return float(0.5 * (raised - np.log1p(raised)).sum()) - THRESHOLD
 
-    low, high = 1e-4, 100.0
-    for _ in range(60):
-        middle = np.sqrt(low * high)
-        low, high = (middle, high) if ratio(middle) < THRESHOLD else (low, middle)
-    return float(high) if ratio(high) >= THRESHOLD else float("inf")
+    ends = np.log((1e-4, 100.0))
+    return float(np.exp(root_scalar(beyond, bracket=ends).root)) if beyond(ends[1]) > 0 else np.inf
 
 
 def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
@@ -203,8 +210,6 @@ def left_over(
         nominal: the given vehicle.
         one: number of a column.
     """
-    from scipy.optimize import lsq_linear
-
     kept = [row for name in truth if name != instead_of for row in info.rows_of(name)]
     mine, theirs = info.rows_of(instead_of), info.rows_of(other)
     theirs = theirs if one is None else [theirs[one]]
@@ -221,13 +226,12 @@ def left_over(
 
 
 def alternatives(
-    info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle, has_acc: bool
+    info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle
 ) -> dict[str, dict[str, float]]:
     """Return for each true effect the names that may stand for it, with what they leave over."""
     found: dict[str, dict[str, float]] = {name: {} for name in truth}
     for other in nameable_effects():
-        effect = EFFECTS[other]
-        if other in truth or effect.random or ("acc_b" in effect.needs and not has_acc):
+        if other in truth or EFFECTS[other].random:
             continue
         # All four rotors together imitate a thrust scale; a weak motor is one of them.
         rows = info.rows_of(other)
@@ -239,35 +243,3 @@ def alternatives(
             if rest < min(ALLOWED, MOSTLY * whole):
                 found[name][other] = rest
     return found
-
-
-def _changed(nominal: Vehicle, columns: Sequence[Column], steps: np.ndarray) -> dict[str, Any]:
-    """Return every effect's values with leading axes (P, 1), each changed in its own columns."""
-    changed = {
-        name: type(values)(*(np.tile(v, (len(columns), 1, *(1,) * v.ndim)) for v in values))
-        for name, values in all_values(nominal).items()
-        if EFFECTS[name].by_state
-    }
-    for row, column in enumerate(columns):
-        field = getattr(changed[column.effect], column.parameter)
-        field.reshape(len(columns), -1)[row, column.component] += steps[row]
-    return changed
-
-
-def _faulty(column: Column, base: Channels, nominal: Vehicle) -> Channels:
-    """Return `base` with a fault of the log of size `FAULT_STEP`."""
-    none = as_arrays(neutral(EFFECTS[column.effect], nominal))
-    field = getattr(none, column.parameter)
-    step = FAULT_STEP * np.eye(max(field.size, 1))[column.component].reshape(field.shape)
-    fault = {column.effect: none._replace(**{column.parameter: field + step})}
-    sample = Sample(*base[: len(Sample._fields)])
-    if EFFECTS[column.effect].late:
-        late = lateness(fault)  # along the true motion: poses of a moment earlier
-        acc_w = to_world(base.rot_w, base.acc_b) - np.array([0.0, 0.0, GRAVITY])
-        acc_w[0] = acc_w[1]
-        sample = sample._replace(
-            pos_w=base.pos_w - late * base.vel_w,
-            vel_w=base.vel_w - late * acc_w,
-            rot_w=np.matmul(base.rot_w, exp_rot(-late * base.rate_b)),
-        )
-    return Channels(*measured(fault, sample), base.rotor_speed)

@@ -9,9 +9,9 @@ its flights against the given vehicle is `information.THRESHOLD`. The committed 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from copy import deepcopy
+from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,10 @@ from suite.blind.oracle.information import (
     gust_strength,
     information,
 )
-from suite.blind.oracle.stretches import EVERY_S, Stretches, cut
-from suite.diagnose.plans.simulate import SENSORS, fly
+from suite.common.console import Console
+from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from suite.diagnose.plans.trajectory import long_flights, ordinary_flights
 from tracks.common.files import write_json
-from tracks.common.grid import markdown, table
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
@@ -39,8 +38,6 @@ TABLE = Path(__file__).parent / "strengths.json"
 VEHICLES = Path(__file__).parents[1] / "vehicles"
 FLIGHTS_SEED = 7_000_000
 """Of the flights that the table is made from; no case uses it."""
-LONG_STRIDE = 4
-"""Of the stretches of long flights, every so many is looked at and counted as often."""
 
 
 def given_vehicle(name: str) -> Vehicle:
@@ -53,73 +50,38 @@ def vehicle_names() -> list[str]:
     return sorted(path.stem for path in VEHICLES.glob("*.toml"))
 
 
-def make_table(progress: Callable[[float, str], None] | None = None) -> dict[str, Any]:
-    """Return the table: `strengths` of every effect by vehicle and sensors.
-
-    Args:
-        progress: called with how many of `table_size()` parts are done and a note.
-    """
+def write_table(console: Console) -> Path:
+    """Write the table, `strengths` of every effect by vehicle and sensors, and return its path."""
+    places = list(product(vehicle_names(), SENSORS))
     entries: dict[str, Any] = {name: {} for name in vehicle_names()}
-    for done, (name, sensors) in enumerate(_places(), 1):
-        entries[name][sensors] = strengths(name, sensors, nameable_effects())
-        if progress is not None:
-            progress(done, f"{name}, {sensors}")
-    return {**stamp(SCHEMA, FLIGHTS_SEED), "threshold": THRESHOLD, "vehicles": entries}
-
-
-def _places() -> list[tuple[str, str]]:
-    """Return the vehicles and sensors of the table."""
-    return [(name, sensors) for name in vehicle_names() for sensors in SENSORS]
+    with console.progress("strengths", len(places)) as update:
+        for done, (name, sensors) in enumerate(places, 1):
+            entries[name][sensors] = strengths(name, sensors, nameable_effects())
+            update(done, f"{name}, {sensors}")
+    found = {**stamp(SCHEMA, FLIGHTS_SEED), "threshold": THRESHOLD, "vehicles": entries}
+    write_json(TABLE, found)
+    _entry.cache_clear()
+    return TABLE
 
 
 def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any]:
     """Return the table's entries of the effects `names`, worked out on flights of the vehicle."""
-    given, found = given_vehicle(vehicle), {}
+    given, found, about = given_vehicle(vehicle), {}, SENSORS[sensors]
+    rng = np.random.default_rng(FLIGHTS_SEED)
+    ways = ordinary_flights(rng), long_flights(rng)
     for slow in (False, True):
         wanted = [n for n in names if EFFECTS[n].slow == slow and not EFFECTS[n].random]
         if wanted:
-            flown, _ = _flown(vehicle, sensors, slow)
-            info = information(given, flown, SENSORS[sensors], wanted)
-            weight = LONG_STRIDE if slow else 1
+            flights = fly(given, given, ways[slow], about.rate_hz)
+            logs = [log_of(flight, given, about, None) for flight in flights]
+            info = information(given, logs, about, wanted)
             for name in wanted:
-                found[name] = {
-                    "columns": [list(info.columns[row][1:]) for row in info.rows_of(name)],
-                    "matrix": (weight * info.block(name)).tolist(),
-                }
+                columns = [list(info.columns[row][1:]) for row in info.rows_of(name)]
+                found[name] = {"columns": columns, "matrix": info.block(name).tolist()}
     for name in (n for n in names if EFFECTS[n].random):
-        flown, rng = _flown(vehicle, sensors, False)
-        size = gust_strength(given, flown, SENSORS[sensors], name, deepcopy(rng))
+        size = gust_strength(given, ways[0], about, name, np.random.default_rng(FLIGHTS_SEED))
         found[name] = {"columns": [[EFFECTS[name].parameters[0].name, 0]], "detectable": size}
     return found
-
-
-@cache
-def _flown(vehicle: str, sensors: str, slow: bool) -> tuple[Stretches, np.random.Generator]:
-    """Return the stretches that strengths are worked out on, and the random numbers after them."""
-    given, rng = given_vehicle(vehicle), np.random.default_rng(FLIGHTS_SEED)
-    ways = ordinary_flights(rng), long_flights(rng)
-    flights = fly(given, given, ways[slow], SENSORS[sensors].rate_hz)
-    return cut(flights, every_s=(LONG_STRIDE if slow else 1) * EVERY_S), rng
-
-
-def table_size() -> int:
-    """Return the number of parts of the table."""
-    return len(_places())
-
-
-def save_table(table: dict[str, Any], path: Path = TABLE) -> Path:
-    """Write the table."""
-    write_json(path, table)
-    _load.cache_clear()
-    _entry.cache_clear()
-    return path
-
-
-@cache
-def _load() -> dict[str, Any]:
-    if not TABLE.is_file():
-        raise ValueError(f"{TABLE}: missing; make it with `suite blind strengths`")
-    return json.loads(TABLE.read_text(encoding="utf-8"))
 
 
 def columns_in_table(vehicle: str, sensors: str, effect: str) -> list[Column]:
@@ -136,25 +98,7 @@ def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndar
     return float("inf") if alone is None else alone / float(abs(direction[0]))
 
 
-def table_text() -> str:
-    """Return the table (Markdown): each component alone, just detectable, in its unit."""
-    found: dict[Column, dict[tuple[str, str], str]] = {}
-    for name in nameable_effects():
-        for where in _places():
-            columns = columns_in_table(*where, name)
-            for column, alone in zip(columns, np.eye(len(columns)), strict=True):
-                value = detectable_along(*where, name, alone)
-                found.setdefault(column, {})[where] = f"{value:.2g}" if np.isfinite(value) else "–"
-    lines = [
-        [c.effect, f"{c.parameter} {c.component + 1}", c.spec.unit]
-        + [values.get(where, "–") for where in _places()]
-        for c, values in found.items()
-    ]
-    heads = ["effect", "component", "unit", *(", ".join(where) for where in _places())]
-    return markdown(table(heads, lines))
-
-
 @cache
 def _entry(vehicle: str, sensors: str, effect: str) -> dict[str, Any]:
-    stored = _load()["vehicles"][vehicle][sensors].get(effect)
+    stored = json.loads(TABLE.read_text(encoding="utf-8"))["vehicles"][vehicle][sensors].get(effect)
     return strengths(vehicle, sensors, [effect])[effect] if stored is None else stored

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from eval.effects.log_faults import apply_log_faults
 from eval.logs.flight_log import FlightLog
@@ -236,7 +237,9 @@ def log_of(
     pos_w, rate_b = measured(seen["pos_w"], sensors.pos), measured(seen["rate_b"], sensors.gyro)
     quat = np.array(seen["quat_wxyz"][rows])
     if rng is not None:
-        quat = _turned(quat, sensors.attitude * rng.standard_normal((len(quat), 3)))
+        # A small turn about body axes.
+        turn = Rotation.from_rotvec(sensors.attitude * rng.standard_normal((len(quat), 3)))
+        quat = (Rotation.from_quat(quat, scalar_first=True) * turn).as_quat(scalar_first=True)
         lost = rng.random(len(quat)) < sensors.lost / 3.0
         lost[:2] = lost[-4:] = False
         for row in np.flatnonzero(lost):
@@ -257,20 +260,4 @@ def log_of(
         about=about,
         # Not written to a file, as if it had not been measured.
         velocity_derived=not sensors.vel,
-    )
-
-
-def _turned(quat: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
-    """Return quat (T, 4) turned by the small rotations angle_b (T, 3) about body axes [rad]."""
-    size = np.linalg.norm(angle_b, axis=1, keepdims=True)
-    # sinc(x / pi) is sin(x) / x.
-    vector = 0.5 * angle_b * np.sinc(0.5 * size / np.pi)
-    scalar = np.cos(0.5 * size)
-    w, xyz = quat[:, :1], quat[:, 1:]
-    return np.concatenate(
-        [
-            w * scalar - (xyz * vector).sum(1, keepdims=True),
-            w * vector + scalar * xyz + np.cross(xyz, vector),
-        ],
-        axis=1,
     )

@@ -25,7 +25,6 @@ def test_a_continuous_case_is_the_same_to_the_bit_and_its_vehicle_has_the_loop_t
     assert first.nominal.name == "bare" and not first.nominal.effects
     about = dict(first.logs[0].about)
     assert about == {"source": "suite blind", "vehicle": "bare"}, "nothing of the conditions"
-    assert first.recordings[0].dt == 0.002, "for the oracle"
     spacing = np.median(np.diff(first.logs[0].time_s))
     assert spacing == pytest.approx(1.0 / conditions["row_hz"], rel=0.1)
     # Thirty sigma on flights like those of the table; this one is short.
@@ -45,7 +44,6 @@ def test_conditions_are_drawn_from_the_cases_seed():
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
     assert simulator.given.controller.frequency == drawn.loop_hz
-    assert simulator.judged.controller.frequency == 500.0
     assert not simulator_for(
         Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
     ).conditions

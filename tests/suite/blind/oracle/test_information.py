@@ -1,0 +1,83 @@
+"""How much flights tell of each number of the catalogue, and the table of strengths made of it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from eval.effects import nameable_effects
+from suite.blind.oracle import strength
+from suite.blind.oracle.information import (
+    Column,
+    alternatives,
+    columns_of,
+    detectable,
+    information,
+    left_over,
+)
+from suite.blind.oracle.strength import columns_in_table, detectable_along, strengths
+from suite.diagnose.plans.simulate import SENSORS, log_of
+from tests.support.ways import BARE, bare_flights
+
+NAMES = ("rotor_drag", "linear_drag", "com_offset", "gyro_bias", "weak_motor")
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return [log_of(flight, BARE, SENSORS["capture"], None) for flight in bare_flights()]
+
+
+@pytest.fixture(scope="module")
+def info(flights):
+    return information(BARE, flights, SENSORS["capture"])
+
+
+def test_information_grows_with_flights_and_knows_hand_worked_parts(flights, info):
+    one = information(BARE, flights[:1], SENSORS["capture"], NAMES)
+    of_both = [info.columns.index(column) for column in one.columns]
+    assert (np.diag(info.matrix)[of_both] >= np.diag(one.matrix) - 1e-9).all()
+    # A gyro bias moves one channel by itself; each row says 1 / sigma^2, less what the unknown
+    # start takes (its rate and its drift in attitude).
+    index = one.columns.index(Column("gyro_bias", "bias", 2))
+    stretches = int(flights[0].time_s[-1] - 0.3)
+    most = 101 * stretches / SENSORS["capture"].gyro ** 2
+    assert 0.1 * most < one.matrix[index, index] < most
+
+
+def test_lookalikes_look_alike_and_strangers_do_not(info):
+    change = {"rotor_drag": 6.0 * detectable(info.block("rotor_drag"), np.ones(1)) * np.ones(1)}
+    near = left_over(info, change, "rotor_drag", "linear_drag", BARE)
+    far = left_over(info, change, "rotor_drag", "com_offset", BARE)
+    whole = 36.0 * 12.5
+    assert near < 0.05 * whole and 0.5 * whole < far <= whole * (1 + 1e-6)
+    (found,) = alternatives(info, change, BARE).values()
+    assert "com_offset" not in found and "accelerometer_bias" not in found
+
+
+def test_every_effect_has_columns_but_what_cannot_be_told():
+    names = {column.effect for column in columns_of(False)}
+    assert names == set(nameable_effects()) - {"gusts"}
+    assert Column("com_offset", "offset", 2) not in columns_of(False)
+    sag = [c.parameter for c in columns_of(True) if c.effect == "battery_sag"]
+    assert sag == ["per_volt"]
+
+
+@pytest.mark.slow
+def test_the_committed_table_is_what_is_worked_out():
+    stored = json.loads(strength.TABLE.read_text())["vehicles"]["dragged"]["full"]
+    found = strengths("dragged", "full", ["rotor_drag", "clock_offset", "weak_motor", "gusts"])
+    for name, entry in found.items():
+        assert entry["columns"] == stored[name]["columns"]
+        for key in ("matrix", "detectable"):
+            if key in entry:
+                np.testing.assert_allclose(entry[key], stored[name][key], rtol=1e-6)
+    assert list(stored) and set(stored) == set(nameable_effects())
+
+
+def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
+    monkeypatch.setattr(strength, "_entry", strength._entry.__wrapped__)
+    entry = {"columns": [["turn", 0], ["late", 0]], "matrix": [[25.0, 0.0], [0.0, 100.0]]}
+    monkeypatch.setattr(strength, "strengths", lambda vehicle, sensors, names: {names[0]: entry})
+    assert columns_in_table("bare", "full", "imu_fault")[1] == Column("imu_fault", "late", 0)
+    assert detectable_along("bare", "full", "imu_fault", np.eye(2)[0]) == pytest.approx(1.0)
+    assert detectable_along("bare", "full", "imu_fault", np.eye(2)[1]) == pytest.approx(0.5)
