@@ -112,18 +112,18 @@ def grid_of(log: FlightLog) -> FlightGrid:
     there = {name: v for name, v in (measured | asked).items() if v is not None and _enough(v)}
     in_turn = tuple(name for name, values in there.items() if _whole_rows(values) < 2)
     for name, values in there.items():
-        known[name] = (_joined if name in measured else _held)(time_s, values, grid)
+        known[name] = (joined if name in measured else _held)(time_s, values, grid)
     if "rotor_speed" in there:
-        known[ROTOR_NOISE] = _joined(time_s, noise_like(there["rotor_speed"]), grid)
+        known[ROTOR_NOISE] = joined(time_s, noise_like(there["rotor_speed"]), grid)
     if "pos_w" in known and "vel_w" not in known:
         known[PATH_VELOCITY] = _slope(known["pos_w"])
     if _whole_rows(log.quat_wxyz) > 1:
-        known["rot_w"] = _attitude(time_s, log.quat_wxyz, grid)
+        known["rot_w"] = attitude_on(time_s, log.quat_wxyz, grid)
         turning = turning_of(time_s, log.quat_wxyz)
         if "rate_b" not in known and _enough(turning):
-            known["rate_b"] = _joined(time_s, turning, grid)
+            known["rate_b"] = joined(time_s, turning, grid)
     elif {"pos_w", "vel_w"} & {*known}:
-        known[LEANING] = _attitude(time_s, np.asarray(rot_to_quat(leaning(log))), grid)
+        known[LEANING] = attitude_on(time_s, np.asarray(rot_to_quat(leaning(log))), grid)
     if log.voltage is not None and _enough(log.voltage):
         good = np.isfinite(log.voltage)
         volts = np.interp(grid, time_s[good], log.voltage[good])
@@ -140,8 +140,11 @@ def _whole_rows(values: np.ndarray) -> int:
     return int(np.isfinite(values.reshape(len(values), -1)).all(axis=1).sum())
 
 
-def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) joined by lines, each column over the rows that have it."""
+def joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return `values` (T, C) joined by lines, each column over the rows that have it.
+
+    (G, C) on `grid`, NaN in holes and beyond a column's rows.
+    """
     out = np.empty((len(grid), values.shape[1]))
     for k, column in enumerate(values.T):
         good = np.isfinite(column)
@@ -150,9 +153,9 @@ def _joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndar
     return out
 
 
-def _attitude(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return attitudes (G, 3, 3) of quaternions (T, 4)."""
-    found = _joined(time_s, on_one_side(quat), grid)
+def attitude_on(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return attitudes (G, 3, 3) of quaternions (T, 4), as `joined`."""
+    found = joined(time_s, on_one_side(quat), grid)
     return quat_to_rot(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog
-from tracks.geometry.rotation import quat_to_rot, to_local
+from suite.diagnose.identify.grid import attitude_on, joined
+from tracks.geometry.rotation import to_local
 
 PARTS = {"position": "pos", "velocity": "vel", "attitude": "quat"}
 """Parts of the state, three axes each, and the columns that hold them."""
@@ -16,10 +19,6 @@ SLOPE_ROWS = 15
 """The reference is differentiated over so many rows."""
 SETTLES_S = 2.0
 """So much after the first row and before the last is left out: the ground is near [s]."""
-HOLE_STEPS = 4.0
-"""Rows further apart than so many median steps are a hole."""
-
-
 LEAST_S = 8.0
 """Shorter flights say too little of errors that last [s]."""
 
@@ -64,8 +63,8 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         )
         raise FlightLogError(log.name, None, None, reason)
     then = grid - late_s
-    vel_w = _on(then, log.time_s, log.vel_w)
-    rot_w = quat_to_rot(_unit(_on(then, log.time_s, _continuous(log.quat_wxyz))))
+    vel_w = joined(log.time_s, log.vel_w, then)
+    rot_w = attitude_on(log.time_s, log.quat_wxyz, then)
     value, nothing = np.full((len(grid), 9), np.nan), np.full((len(grid), 3), np.nan)
     for k, (part, group) in enumerate(PARTS.items()):
         if part not in there:
@@ -73,23 +72,21 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         own = _estimate(log, group)
         assert own is not None
         if group == "quat":
-            estimate = quat_to_rot(_unit(_on(grid, log.time_s, _continuous(own))))
+            estimate = attitude_on(log.time_s, own, grid)
             off = rotation_between(rot_w, estimate)
         else:
             reference = log.pos_w if group == "pos" else log.vel_w
-            off = _on(grid, log.time_s, own) - _on(then, log.time_s, reference)
+            off = joined(log.time_s, own, grid) - joined(log.time_s, reference, then)
             off = to_local(rot_w, off) if group == "vel" else off
         value[:, 3 * k : 3 * k + 3] = off
     acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
-    rate_b = _on(then, log.time_s, log.rate_b) if np.isfinite(log.rate_b).any() else nothing
+    rate_b = joined(log.time_s, log.rate_b, then) if np.isfinite(log.rate_b).any() else nothing
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
     return Errors(log.name, step_s, value, slope, to_local(rot_w, vel_w))
 
 
 def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
     """Return the vector (T, 3) of the turn from `rot_w` to `other_w`, in the body; NaN is kept."""
-    from scipy.spatial.transform import Rotation
-
     turn = np.matmul(np.swapaxes(rot_w, -1, -2), other_w)
     good = np.isfinite(turn).all(axis=(1, 2))
     out = np.full((len(turn), 3), np.nan)
@@ -107,32 +104,8 @@ def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
     return values if np.isfinite(values).all(axis=1).sum() > 1 else None
 
 
-def _on(grid: np.ndarray, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) joined by lines on the grid; NaN in holes."""
-    good = np.isfinite(values).all(axis=1)
-    t = time_s[good]
-    out = np.stack([np.interp(grid, t, column) for column in values[good].T], axis=1)
-    place = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
-    wide = np.diff(t) > HOLE_STEPS * float(np.median(np.diff(t)))
-    out[wide[place] | (grid < t[0]) | (grid > t[-1])] = np.nan
-    return out
-
-
-def _continuous(quat: np.ndarray) -> np.ndarray:
-    good = np.flatnonzero(np.isfinite(quat).all(axis=1))
-    out, flips = quat.copy(), np.sum(quat[good[1:]] * quat[good[:-1]], axis=1) < 0.0
-    out[good[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    return out
-
-
-def _unit(quat: np.ndarray) -> np.ndarray:
-    return quat / np.linalg.norm(quat, axis=1, keepdims=True)
-
-
 def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
     """Return the slope (T, C) of a parabola over `SLOPE_ROWS` rows; NaN near holes."""
-    from scipy.signal import savgol_filter
-
     if len(values) < SLOPE_ROWS:
         return np.full_like(values, np.nan)
     how = {"deriv": 1, "delta": step_s, "axis": 0, "mode": "nearest"}
