@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def follow(
     gains, summed_w = gains or Gains(), np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
     acc_b = np.zeros((count, 3)) + [0.0, 0.0, GRAVITY]
-    motions, quats, commands, accs, stepped = [], [], [], [], []
+    rows = []
     for step in range(max(steps)):
         motion, quat = bodies.motion()
         if step % period == 0:
@@ -128,28 +128,23 @@ def follow(
             check_flights(motion, now, np.full(count, step * dt))
             summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
             command = steer(nominal, gains, now, motion, summed_w)
-        entry = bodies.step(motion, command, step * dt)
-        motions.append(motion)
-        quats.append(quat)
-        commands.append(command)
-        accs.append(acc_b)
-        stepped.append(entry)
-        acc_b = entry.acc_b
-    whole = Recording(
-        dt,
-        period,
-        np.arange(max(steps)) * dt,
-        Motion(*map(np.array, zip(*motions, strict=True))),
-        np.array(quats),
-        np.array([entry.rotor_speed for entry in stepped]),
-        Command(*map(np.array, zip(*commands, strict=True))),
-        np.array(accs),
-        np.array([entry.voltage for entry in stepped]),
-        Command(*map(np.array, zip(*(entry.acting for entry in stepped), strict=True))),
-        Wrench(*map(np.array, zip(*(entry.extra for entry in stepped), strict=True))),
-        bodies.integrator,
-    )
-    return [_flight(whole, index, count) for index, count in enumerate(steps)]
+        speed, voltage, acting, extra, next_acc_b = bodies.step(motion, command, step * dt)
+        rows.append((motion, quat, speed, command, acc_b, voltage, acting, extra))
+        acc_b = next_acc_b
+    time_s = np.arange(max(steps)) * dt
+    return [
+        Recording(dt, period, time_s[:length], *_of(rows[:length], index), bodies.integrator)
+        for index, length in enumerate(steps)
+    ]
+
+
+def _of(rows: Sequence[Any], index: int) -> Any:
+    """Return flight `index` (K, ...) of K rows, tuples of arrays (N, ...) or of such tuples."""
+    if not isinstance(rows[0], tuple):
+        return np.array([row[index] for row in rows])
+    parts = (_of(field, index) for field in zip(*rows, strict=True))
+    kind = type(rows[0])
+    return kind(*parts) if hasattr(kind, "_fields") else tuple(parts)
 
 
 def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
@@ -168,25 +163,6 @@ def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None
             f"flight {bad + 1} failed at {time_s[bad]:.2f} s, {off[bad]:.1f} m off its trajectory; "
             "make the trajectory gentler or the effect weaker"
         )
-
-
-def _flight(whole: Recording, index: int, steps: int) -> Recording:
-    """Return one flight of N that were recorded together, (K, N, ...)."""
-
-    def mine(part: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(part[:steps, index])
-
-    return whole._replace(
-        time_s=whole.time_s[:steps],
-        motion=Motion(*map(mine, whole.motion)),
-        quat_wxyz=mine(whole.quat_wxyz),
-        rotor_speed=mine(whole.rotor_speed),
-        command=Command(*map(mine, whole.command)),
-        acc_b=mine(whole.acc_b),
-        voltage=mine(whole.voltage),
-        acting=Command(*map(mine, whole.acting)),
-        extra=Wrench(*map(mine, whole.extra)),
-    )
 
 
 @dataclass(frozen=True)
