@@ -31,6 +31,8 @@ class Job(NamedTuple):
     """What is to be done there."""
     folder: Path
     """Its own, with what an earlier call left in it, which it goes on with."""
+    reads: Path | None = None
+    """Another folder that it reads."""
 
 
 class Parcel(NamedTuple):
@@ -40,24 +42,30 @@ class Parcel(NamedTuple):
     name: str
     """Of its folder."""
     folder: Content
+    reads: Content | None
 
 
 def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
     """Yield jobs with the content of their folders, read as they are asked for."""
     for job in jobs:
-        yield Parcel(job.task, job.folder.name, content(job.folder))
+        reads = None if job.reads is None else content(job.reads)
+        yield Parcel(job.task, job.folder.name, content(job.folder), reads)
 
 
 def do_apart(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[Result, Content]]:
     """Do a job on this machine and yield its result and the content of its folder."""
     keep_compiled()
     with _place(hashlib.sha256(pack((do, parcel))).hexdigest()[:16]) as place:
-        folder = place / parcel.name
+        folder, reads = place / parcel.name, None
         if not folder.exists():
             fill(folder, parcel.folder)
-        result = do(Job(parcel.task, folder))
+        if parcel.reads is not None:
+            reads = place / "reads"
+            fill(reads, parcel.reads)
+        result = do(Job(parcel.task, folder, reads))
         found = content(folder)
-        shutil.rmtree(folder)
+        for path in filter(None, (folder, reads)):
+            shutil.rmtree(path)
     yield result, found
 
 

@@ -133,7 +133,9 @@ def follow(
         acc_b = next_acc_b
     time_s = np.arange(max(steps)) * dt
     return [
-        Recording(dt, period, time_s[:length], *_of(rows[:length], index), bodies.integrator)
+        Recording(dt, period, time_s[:length], *_of(rows[:length], index))._replace(
+            integrator=bodies.integrator
+        )
         for index, length in enumerate(steps)
     ]
 

@@ -21,7 +21,7 @@ def count_on(mark, job):
     """Add a line to a file of the job's own folder, and end badly after the first if told to."""
     job.folder.mkdir(exist_ok=True)
     with open(job.folder / "lines", "a") as file:
-        file.write(f"{job.task}\n")
+        file.write((job.reads / "deep" / "word").read_text() + "\n")
     if mark and not Path(mark).exists():
         Path(mark).touch()
         raise KeyboardInterrupt
@@ -29,15 +29,17 @@ def count_on(mark, job):
 
 
 def make_job(folder):
+    (folder / "in" / "deep").mkdir(parents=True)
+    (folder / "in" / "deep" / "word").write_text("said")
     fill(folder / "out", {"lines": b"before\n", "kept/deep": b"1"})
     (folder / "out" / ".lock").touch()
-    return Job(7, folder / "out")
+    return Job(7, folder / "out", folder / "in")
 
 
 def test_a_folder_goes_there_and_comes_back_with_what_was_done(tmp_path, far):
     (parcel,) = parcels([make_job(tmp_path)])
     ((result, files),) = do_apart(partial(count_on, ""), parcel)
-    assert result == 7 and files == {"lines": b"before\n7\n", "kept/deep": b"1"}
+    assert result == 7 and files == {"lines": b"before\nsaid\n", "kept/deep": b"1"}
     assert content(tmp_path / "out")["lines"] == b"before\n" and not list(far.glob("*"))
 
 
@@ -47,7 +49,7 @@ def test_what_was_cut_off_there_is_gone_on_with(tmp_path, far):
     with pytest.raises(KeyboardInterrupt):
         list(do_apart(work, parcel))
     ((_, files),) = do_apart(work, parcel)
-    assert files["lines"] == b"before\n7\n7\n"
+    assert files["lines"] == b"before\nsaid\nsaid\n"
 
 
 def test_a_place_that_another_works_in_is_left_to_it(tmp_path, far):
@@ -58,5 +60,5 @@ def test_a_place_that_another_works_in_is_left_to_it(tmp_path, far):
     (place,) = far.glob("*")
     with one_writer(place):
         ((_, files),) = do_apart(work, parcel)
-    assert files["lines"] == b"before\n7\n"
+    assert files["lines"] == b"before\nsaid\n"
     assert os.listdir(place / "out") == ["lines", "kept"] or len(os.listdir(place / "out")) == 2
