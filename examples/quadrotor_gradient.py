@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.effects.mass_offset import MassOffset
+from eval.effects.body import MassOffset
 from eval.quadrotor.plant import Command, Motion, fit_plant
 from eval.quadrotor.stepper import Inputs, rollout
 from eval.quadrotor.vehicle_file import load_vehicle

@@ -15,7 +15,7 @@ from typing import final
 
 import numpy as np
 
-from policies.spec import Doubt, NoAnswer, PolicyError, PolicySpec
+from policies.spec import NoAnswer, Note, PolicyError, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
@@ -43,7 +43,7 @@ class BlockPolicy:
     """Rows the model is called with."""
     rows: int = BLOCK
     """Rows of a block that are used, the first ones: `block`, or 1."""
-    notes: tuple[Doubt, ...] = ()
+    notes: tuple[Note, ...] = ()
     """What is assumed of it."""
 
     def start(self, n: int) -> np.ndarray:
@@ -60,7 +60,7 @@ class BlockPolicy:
         hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
         if len(state) == self.rows == self.block:
-            return _told(*self.model(*inputs))
+            return _refuse_lost_memory(*self.model(*inputs))
         actions = np.empty((len(state), self.spec.action.size), np.float32)
         remembered = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
@@ -68,7 +68,7 @@ class BlockPolicy:
             action, after = self.model(*(self._padded(x[used]) for x in inputs))
             actions[used] = action[: used.stop - low]
             remembered[used] = after[: used.stop - low]
-        return _told(actions, remembered)
+        return _refuse_lost_memory(actions, remembered)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
         if len(rows) == self.block:
@@ -168,7 +168,7 @@ def _drawn(
     return state, image, hidden
 
 
-def _told(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _refuse_lost_memory(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Answer NaN where the memory is no number any more: such a row does not fly, it is counted."""
     lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
     if lost.any():

@@ -84,8 +84,8 @@ def observe(
     numbers += [vector(view) for key, vector in EXTRA_VECTORS.items() if getattr(spec, key)]
     xp = rot_w.__array_namespace__()
     if spec.speed_input:
-        told = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
-        numbers.append(told[..., None])
+        speed_input = xp.full_like(vel_b[..., 0], spec.speed) if speed is None else speed
+        numbers.append(speed_input[..., None])
     state = xp.concatenate(numbers, axis=-1)
     if view.depth_m is None:
         return Observation(state, None)

@@ -117,7 +117,7 @@ def _missing(text: str, path: Path) -> PolicyError:
     if not looks_like_path:
         error = unknown_name("policy", text, shipped.names())
         return PolicyError(f"{error} A checkpoint's folder or a policy file will do, too.")
-    beside = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-    guess = closest(path.name, beside)
+    siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+    guess = closest(path.name, siblings)
     meant = f" Did you mean {path.parent / guess}?" if guess else ""
     return PolicyError(f"{path}: no such file or folder.{meant}")

@@ -196,7 +196,7 @@ def check_network(spec: PolicySpec) -> None:
             )
 
 
-class Doubt(NamedTuple):
+class Note(NamedTuple):
     """Something about a policy's interface that looks wrong, or has to be assumed."""
 
     fault: str

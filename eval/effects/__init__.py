@@ -1,7 +1,8 @@
-"""The catalogue of physical effects; adding one is adding its file and its name here.
+"""The catalogue of physical effects; the files of this folder group them by physical cause.
 
-Another package adds one with an entry point of the group `diffracing_suite.effects`, a program for
-its own process with `EFFECTS.register(effect.name, effect)`.
+To add an effect, write its `Effect` and list it here. Another package adds one with an entry point
+of the group `diffracing_suite.effects`; a program adds one for its own process with
+`EFFECTS.register(effect.name, effect)`.
 """
 
 from __future__ import annotations
@@ -9,34 +10,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from eval.effects import (
-    accelerometer_bias,
-    angular_damping,
-    battery_sag,
-    blade_flapping,
-    clock_offset,
-    com_offset,
-    command_delay,
-    constant_wind,
-    frame_tilt,
-    ground_effect,
-    gusts,
-    gyro_bias,
-    inertia_scale,
-    inflow,
-    linear_drag,
-    mass_offset,
-    motor_lag,
-    quadratic_drag,
-    rate_gain,
-    rotor_drag,
-    rotor_gyroscopic,
-    rotor_spin_up,
+    body,
+    drag,
+    measurement,
+    response,
+    rotor_flow,
+    rotor_inertia,
     slung_load,
-    thrust_scale,
-    thrust_tilt,
-    torque_trim,
-    translational_lift,
+    thrust,
     weak_motor,
+    wind,
 )
 from eval.effects.interface import Effect, as_arrays, neutral
 from tracks.common.names import Registry
@@ -46,6 +29,7 @@ if TYPE_CHECKING:
 
 
 def _wrong(name: str, effect: Any) -> str | None:
+    """Return why `effect` cannot be registered under `name`; None where it can."""
     if not isinstance(effect, Effect):
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
     if effect.name != name:
@@ -63,42 +47,41 @@ def _wrong(name: str, effect: Any) -> str | None:
     return None
 
 
-_OWN = {
-    module.EFFECT.name: module.EFFECT
-    for module in (
-        linear_drag,
-        quadratic_drag,
-        rotor_drag,
-        inflow,
-        translational_lift,
-        blade_flapping,
-        ground_effect,
-        constant_wind,
-        gusts,
-        motor_lag,
-        command_delay,
-        thrust_scale,
-        battery_sag,
-        mass_offset,
-        com_offset,
-        torque_trim,
-        inertia_scale,
-        rotor_gyroscopic,
-        rotor_spin_up,
-        rate_gain,
-        angular_damping,
-        weak_motor,
-        thrust_tilt,
-        gyro_bias,
-        accelerometer_bias,
-        frame_tilt,
-        clock_offset,
-        slung_load,
-    )
-}
-# In the order in which they act: what scales a thrust stands after what adds to it, and random
-# wind after the steady wind that it is relative to; what other packages add acts last.
-EFFECTS: Registry[Effect] = Registry("effect", "diffracing_suite.effects", _OWN, _wrong)
+_OWN = (
+    drag.LINEAR_DRAG,
+    drag.QUADRATIC_DRAG,
+    drag.ROTOR_DRAG,
+    rotor_flow.INFLOW,
+    rotor_flow.TRANSLATIONAL_LIFT,
+    rotor_flow.BLADE_FLAPPING,
+    rotor_flow.GROUND_EFFECT,
+    wind.CONSTANT_WIND,
+    wind.GUSTS,
+    response.MOTOR_LAG,
+    response.COMMAND_DELAY,
+    thrust.THRUST_SCALE,
+    thrust.BATTERY_SAG,
+    body.MASS_OFFSET,
+    body.COM_OFFSET,
+    body.TORQUE_TRIM,
+    body.INERTIA_SCALE,
+    rotor_inertia.ROTOR_GYROSCOPIC,
+    rotor_inertia.ROTOR_SPIN_UP,
+    response.RATE_GAIN,
+    drag.ANGULAR_DAMPING,
+    weak_motor.WEAK_MOTOR,
+    thrust.THRUST_TILT,
+    measurement.GYRO_BIAS,
+    measurement.ACCELEROMETER_BIAS,
+    measurement.FRAME_TILT,
+    measurement.CLOCK_OFFSET,
+    slung_load.SLUNG_LOAD,
+)
+"""In the order in which they act: an effect that scales a thrust follows those that add to it, and
+random wind follows the steady wind that it is relative to. Effects of other packages act last."""
+EFFECTS: Registry[Effect] = Registry(
+    "effect", "diffracing_suite.effects", {effect.name: effect for effect in _OWN}, _wrong
+)
 
 
 def find_effect(name: str) -> Effect:

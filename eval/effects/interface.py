@@ -1,8 +1,8 @@
-"""What an effect is: a few numbers, and hooks where they act on the nominal quadrotor.
+"""The `Effect` dataclass: its parameters, and the hooks by which it acts on the nominal quadrotor.
 
-An effect is written once, for numpy and JAX arrays of any leading batch shape, and serves the
-MuJoCo judge, the MJX world and the differentiable quadrotor. With its neutral values it changes
-nothing, so that a model may hold every effect at once and fit any of them.
+Each effect is written once, for numpy and JAX arrays of any leading batch shape. The MuJoCo judge,
+the MJX simulator and the differentiable quadrotor all use it. With its neutral values it changes
+nothing, so a model may hold every effect at once and fit any of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GRAVITY = 9.81
 
 
 class Constants(NamedTuple):
-    """The true constants of a quadrotor; what the controller believes is in `plant.Nominal`."""
+    """The true constants of a quadrotor; the controller's nominal ones are in `plant.Nominal`."""
 
     mass: Array
     """(...,) [kg]."""
@@ -51,7 +51,7 @@ class Constants(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """What an effect sees of one physics step."""
+    """Inputs of an effect's hooks in one physics step."""
 
     constants: Constants
     pos_w: Array
@@ -71,34 +71,34 @@ class Flow(NamedTuple):
     voltage_drop: Array | None
     """(...,) battery voltage at the start minus now [V]; None where there is no voltage."""
     rotor_acc: Array | None = None
-    """(..., 4) mean change of the rotor speeds over the step [rad/s^2]; only where an effect says
-    `rotor_acc`, and None where it is not known."""
+    """(..., 4) mean change of the rotor speeds over the step [rad/s^2]; given only where an effect
+    sets `rotor_acc`, and None where it is unknown."""
     memory: Any = None
-    """What this effect carries from step to step; None for one without `start` and `carry`."""
+    """This effect's own state before the step; None for one without `start` and `carry`."""
     dt: Any = None
-    """Length of the step [s]; only for an effect that carries something."""
+    """Length of the step [s]; given only to an effect with a state."""
 
 
 class Gust(NamedTuple):
-    """What an effect that makes wind sees of one physics step."""
+    """Inputs of the `wind` hook in one physics step."""
 
     velocity_w: Array
     """(..., 3) of this effect's wind in the step before [m/s]."""
     air_vel_w: Array
     """(..., 3) velocity of the centre of mass relative to the mean wind [m/s]."""
     noise: Array | None
-    """(..., 3) standard normal draws of this step; None for none."""
+    """(..., 3) standard normal draws of this step; None for no turbulence."""
     dt: Array
     """Length of the step [s]."""
 
 
 Bound = float | Callable[["Vehicle"], float]
-"""A number, or how to read it off the vehicle that has the effect."""
+"""A number, or a function that returns it for the vehicle that has the effect."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect: what it may be and what it usually is."""
+    """One parameter of an effect: its bounds and its usual size."""
 
     name: str
     """As in a vehicle file and in a diagnosis."""
@@ -117,22 +117,22 @@ class Parameter:
     required: bool = True
     """Whether a vehicle file must give it; the neutral value stands for one left out."""
     fitted: bool = True
-    """Whether flights can tell it; a given constant of the vehicle otherwise."""
+    """Whether it is identifiable from flights; otherwise a given constant of the vehicle."""
     unseen: tuple[int, ...] = ()
-    """Components that no flight can tell; a diagnosis reports them as null."""
+    """Components that are not identifiable from flights; a diagnosis reports them as null."""
     voltage: bool | None = None
-    """True where it acts only with a voltage in the log, False only without, None with both."""
+    """True: acts only with a voltage in the log; False: only without; None: in both cases."""
     one_at_a_time: bool = False
-    """Each component is a fault of its own, and a vehicle mostly has one of them."""
+    """Each component is a separate fault, and a vehicle usually has only one of them."""
     whole: bool = False
-    """Usual magnitudes are values, not differences from neutral."""
+    """Usual magnitudes are absolute values instead of differences from neutral."""
     signs: tuple[int, ...] = (1,)
-    """Ways in which it usually differs from neutral, as far as they are not mirror images."""
+    """Usual signs of the difference from neutral, mirror images left out."""
     direction: tuple[float, ...] = ()
-    """Unit vector along which the components usually share a size; else each has all of it."""
+    """Unit vector that splits the usual size among the components; (): each has all of it."""
 
     def upwards(self, vehicle: Vehicle) -> bool:
-        """Return whether it can only be above the value with which nothing acts."""
+        """Return whether its lower bound is the value with which nothing acts."""
         return at(self.low, vehicle) >= (0.0 if self.whole else at(self.neutral, vehicle))
 
 
@@ -141,7 +141,7 @@ Memory = Any  # arrays (..., K), or nested tuples and dicts of them
 
 
 class Sample(NamedTuple):
-    """What a log may hold of N moments; a fault of the log changes it."""
+    """Logged signals at one or many times; a fault of the log changes them."""
 
     pos_w: Array
     """(..., 3) [m]."""
@@ -164,9 +164,9 @@ class Effect:
     summary: str
     """One sentence for people."""
     equation: str
-    """Against the nominal quadrotor."""
+    """The change to the nominal quadrotor's equations."""
     source: str
-    """Where the form comes from."""
+    """Publication of the equation."""
     values: type
     """NamedTuple class with a field for each parameter, in order."""
     parameters: tuple[Parameter, ...]
@@ -183,67 +183,69 @@ class Effect:
     torque: Callable[[Values, Flow], Array] | None = None
     """Returns an added torque in body axes (..., 3) [N m]."""
     start: Callable[[Values, Flow], Memory] | None = None
-    """For an effect with a motion of its own, such as a load's, together with `carry`: returns what
-    it carries at the start, of a vehicle that has hovered until now. The hooks above see it as
-    `Flow.memory`."""
+    """For an effect with its own state, such as a swinging load; needs `carry` as well. Returns the
+    state of a vehicle that hovered until now. The other hooks read it as `Flow.memory`."""
     carry: Callable[[Values, Flow, Array], Memory] | None = None
-    """Returns what it carries after the step, from the acceleration of the centre of mass during it
-    by all that acts, in the world (..., 3) [m/s^2]."""
+    """Returns the state after the step, from the acceleration of the centre of mass during the step
+    in the world (..., 3) [m/s^2]."""
     measure: Callable[[Values, Sample], Sample] | None = None
-    """A fault of the log: returns what is logged of what truly was. Values as far on the other side
-    of neutral undo it, at least to first order."""
+    """A fault of the log: returns the logged sample for the true one. Values mirrored about neutral
+    undo it, at least to first order."""
     late: Callable[[Values], Array] | None = None
-    """A fault of the log: by how much later than they were poses and velocities are logged [s]."""
+    """A fault of the log: delay with which poses and velocities are logged [s]."""
     of_log: bool = False
-    """Marks the log and not the vehicle, also where it acts in flight as a tilted frame does."""
+    """Belongs to the log instead of the vehicle, even where it acts in flight (a tilted frame)."""
     needs: tuple[str, ...] = ()
-    """What a log must have to show it: `acc_b`, or `command` for what acts between commands and
+    """Signals that a log needs to show it: `acc_b`, or `command` for an effect between commands and
     rotor speeds."""
     rotor_acc: bool = False
     """Uses `Flow.rotor_acc`."""
     slow: bool = False
-    """Shows over minutes of flight and hardly within seconds."""
+    """Visible over minutes of flight, hardly within seconds."""
     with_voltage: Callable[[Values, float], Values] | None = None
-    """For parameters that hang on the voltage: returns the values that act by a voltage which falls
-    by so many V/s as these act by time."""
+    """For parameters that depend on the voltage: returns the values that have the same effect by a
+    voltage that falls at the given rate [V/s] as these have by time."""
     read: Callable[[Mapping[str, Any]], Values] | None = None
-    """Reads a vehicle file's table where it is not simply the parameters."""
+    """Reads a vehicle file's table whose keys differ from the parameters."""
     write: Callable[[Values], dict[str, Any]] | None = None
     """The inverse of `read`."""
 
     @property
     def in_flight(self) -> bool:
-        """Whether it changes the flight, and not only its log."""
+        """Whether it changes the flight itself; False where it changes only the log."""
         return self.measure is None and self.late is None
 
     @property
     def random(self) -> bool:
-        """Whether it acts by chance, so that no rollout repeats it."""
+        """Whether it draws random numbers, so that no rollout repeats it."""
         return self.gust is not None
 
     @property
     def by_state(self) -> bool:
-        """Whether it follows from the vehicle's own state, so that a stretch may begin anywhere."""
+        """Whether the vehicle's state alone sets it, so that a rollout may start at any row."""
         return not self.random and self.start is None
 
     @property
     def nameable(self) -> bool:
-        """Whether a diagnosis may name it: flights can tell a number of it."""
-        return bool(self.told(True) or self.told(False))
+        """Whether a diagnosis may name it: at least one parameter is identifiable from flights."""
+        return bool(self.identifiable(True) or self.identifiable(False))
 
-    def told(self, voltage: bool) -> tuple[Parameter, ...]:
-        """Return the parameters that flights can tell with a voltage in their logs, or without.
+    def identifiable(self, voltage: bool) -> tuple[Parameter, ...]:
+        """Return the parameters that are identifiable from logs with a voltage, or without one.
 
-        An effect with a motion of its own has none: a log does not show where that stands.
+        An effect with its own state has none, since a log does not contain that state.
         """
         if self.start is not None:
             return ()
         return tuple(p for p in self.parameters if p.fitted and p.voltage in (None, voltage))
 
     def components(self, voltage: bool) -> tuple[tuple[Parameter, int], ...]:
-        """Return the components of these that can be seen; 0 stands for a plain number."""
+        """Return (parameter, component) of all identifiable components; 0 for a plain number."""
         return tuple(
-            (p, k) for p in self.told(voltage) for k in range(p.size or 1) if k not in p.unseen
+            (p, k)
+            for p in self.identifiable(voltage)
+            for k in range(p.size or 1)
+            if k not in p.unseen
         )
 
 

@@ -1,4 +1,4 @@
-"""What the faults of a log make of a flight: of logged arrays, and of samples of a simulation."""
+"""Apply the faults of a log to logged arrays and to samples of a simulation, and undo them."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from tracks.geometry.rotation import quat_to_rot, rot_to_quat
 
 
 def lateness(effects: Mapping[str, Values]) -> Any:
-    """Return by how much later than they were poses are logged [s]; 0 where no effect says so."""
+    """Return the delay with which poses are logged [s]; 0 where no effect delays them."""
     late = [of(effects[name]) for name, of in _hooks(effects, "late")]
     return sum(late[1:], late[0]) if late else 0.0
 
 
 def measured(effects: Mapping[str, Values], sample: Sample) -> Sample:
-    """Return what is logged of `sample`, whose pose was read as late as `lateness` says."""
+    """Return the logged sample for the true `sample`, whose pose is already delayed."""
     for name, measure in _hooks(effects, "measure"):
         sample = measure(effects[name], sample)
     return sample
 
 
 def restored(effects: Mapping[str, Values], sample: Sample) -> Sample:
-    """Return what truly was where `sample` was logged, to first order, but for its lateness."""
+    """Return the true sample for the logged `sample`, to first order; the delay is kept."""
     for name, measure in reversed(_hooks(effects, "measure")):
-        # Values as far on the other side of neutral, which are numbers for a fault of a log.
+        # Values mirrored about neutral, which is a number for every fault of a log.
         neutral = (cast(float, parameter.neutral) for parameter in EFFECTS[name].parameters)
         pairs = zip(neutral, effects[name], strict=True)
         sample = measure(type(effects[name])(*(2.0 * n - value for n, value in pairs)), sample)
@@ -37,9 +37,9 @@ def apply_log_faults(effects: Mapping[str, Values], log: Mapping[str, Array]) ->
     """Return the arrays of `log` (T rows, by their names in a flight log) with every fault applied.
 
     Args:
-        effects: the vehicle's effects; those that are no fault of a log are passed over.
-        log: `time_s` (T,), `pos_w` (T, 3), `quat_wxyz` (T, 4), `vel_w`, `rate_b` and, where
-            there is one, `acc_b`; other entries are kept. A log's or a flight's own fields fit.
+        effects: the vehicle's effects; only faults of a log are applied.
+        log: `time_s` (T,), `pos_w` (T, 3), `quat_wxyz` (T, 4), `vel_w`, `rate_b` and optionally
+            `acc_b`, as the fields of a flight or a flight log; other entries are kept.
     """
     log = dict(log)
     if _hooks(effects, "late"):
@@ -64,9 +64,9 @@ def apply_log_faults(effects: Mapping[str, Values], log: Mapping[str, Array]) ->
 
 
 def shifted(time_s: Array, series: Array, offset: Array) -> Array:
-    """Return `series` (T, K) as it was at `time_s` (T,) - `offset`, linear between rows.
+    """Return `series` (T, K) at the times `time_s` (T,) - `offset`, linear between rows.
 
-    Beyond the ends the first and the last two rows are extended.
+    Beyond the ends the line through the first or the last two rows is extended.
     """
     xp = time_s.__array_namespace__()
     wanted = time_s - offset

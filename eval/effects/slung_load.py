@@ -97,7 +97,7 @@ def _lag(flow: Flow) -> Array:
     return 1.0 + 2.0 * DAMPING * STIFFNESS * flow.dt + (STIFFNESS * flow.dt) ** 2
 
 
-EFFECT = Effect(
+SLUNG_LOAD = Effect(
     name="slung_load",
     summary="A load swings on a line under the centre of mass",
     equation="F_w += T q, m_L dv_L/dt = m_L g - T q; q to the load, T >= 0 holds the line's length",
@@ -105,21 +105,14 @@ EFFECT = Effect(
     values=SlungLoad,
     parameters=(
         Parameter(
-            name="mass",
-            unit="kg",
+            "mass",
+            "kg",
             neutral=0.0,
             low=0.0,
             high=lambda vehicle: vehicle.mass,
             typical=(0.02, 0.1),
         ),
-        Parameter(
-            name="length",
-            unit="m",
-            neutral=0.5,
-            low=0.05,
-            high=20.0,
-            typical=(0.3, 1.0),
-        ),
+        Parameter("length", "m", neutral=0.5, low=0.05, high=20.0, typical=(0.3, 1.0)),
     ),
     force=force_of,
     start=start_of,

@@ -64,7 +64,7 @@ def write(values: WeakMotor) -> dict[str, Any]:
     return {"index": [i for i, _ in weak], "scale": [s for _, s in weak]}
 
 
-EFFECT = Effect(
+WEAK_MOTOR = Effect(
     name="weak_motor",
     summary="One or several rotors give less than the others",
     equation="rotor index: thrust and torque x scale",
@@ -72,8 +72,8 @@ EFFECT = Effect(
     values=WeakMotor,
     parameters=(
         Parameter(
-            name="scale",
-            unit="1",
+            "scale",
+            "1",
             neutral=1.0,
             low=0.0,
             high=1.5,

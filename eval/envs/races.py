@@ -293,7 +293,7 @@ class Races:
     def info(self, slot: int) -> dict[str, Any]:
         """Return what there is to say of an episode besides observation and reward."""
         how = self.ended_by(slot)
-        told = {
+        info = {
             "track_seed": int(self.track_seed[slot]),
             "level": int(self.level[slot]),
             "gates": int(self.gates[slot]),
@@ -303,5 +303,5 @@ class Races:
             "message": "",
         }
         if how == BAD_ACTION:
-            told["message"] = "the action is not finite: look for NaN in the learner's network"
-        return told
+            info["message"] = "the action is not finite: look for NaN in the learner's network"
+        return info

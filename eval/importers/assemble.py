@@ -8,14 +8,14 @@ from eval.importers.checks.airborne import airborne
 from eval.importers.checks.glitches import clean
 from eval.importers.checks.late import check_delay
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
-from eval.importers.findings import asked_of
+from eval.importers.findings import usable_for
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
 from eval.importers.rows import HOLE_S, HOLE_STEPS, own_rows, row_times, rows_at, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
-from eval.logs.faults.check import CLOCK, DRIVE, POSE, Against, run_checks
-from eval.logs.faults.finding import Finding, said
+from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, run_checks
+from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
@@ -48,7 +48,7 @@ def assemble(
         findings += more
     recording = with_readings(recording, options.read)
     _need(recording, options.partial, findings)
-    against = Against(options.vehicle)
+    against = CheckContext(options.vehicle)
     more, readings, _ = run_checks(
         {"time": recording.signals[slowest(recording)].time_s}, CLOCK, against, options.fix
     )
@@ -82,7 +82,7 @@ def assemble(
     columns = _columns(rows)
     lacks = _lacks(rows)
     if lacks == ["command"] and not options.partial:
-        lines = "".join(f"\n{line}" for line in said(tuple(findings)))
+        lines = "".join(f"\n{line}" for line in finding_lines(tuple(findings)))
         reason = (
             "neither a thrust and rate command nor motor speeds nor motor commands could be read; "
             f"--partial keeps the rest{lines}"
@@ -97,7 +97,7 @@ def assemble(
     if options.vehicle is not None:
         about["vehicle"] = options.vehicle.name
     if lacks:
-        findings.append(asked_of(rows, lacks))
+        findings.append(usable_for(rows, lacks))
         about["partial"] = lacks
         about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)

@@ -30,7 +30,7 @@ UNSEEN = {
 """Signal -> what a log without it, and without a pose, does not show."""
 
 
-def asked_of(rows: dict[str, np.ndarray], lacks: list[str]) -> Finding:
+def usable_for(rows: dict[str, np.ndarray], lacks: list[str]) -> Finding:
     """Return what a log without the groups `lacks` can be asked."""
     no_pose = "pos" in lacks and "quat" in lacks
     can = [

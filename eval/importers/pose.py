@@ -21,7 +21,7 @@ from eval.importers.rows import averaged, continuous, row_times, rows_at
 from eval.importers.signals import Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.pose import GOOD, TIMES_BETTER, look_at_pose
+from eval.logs.faults.pose import GOOD, TIMES_BETTER, fit_pose_readings
 from eval.logs.faults.reading import TIMES, read_as
 from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
@@ -145,11 +145,11 @@ def _moved(recording: Recording, pose: Recording, quat: Signal, alignment: Align
 def _has_a_sign(recording: Recording) -> bool:
     """Return whether the path shows that an angle's sign, no turned body, parts pose and gyro."""
     times = row_times(recording, COARSE_HZ, 0.0, None)
-    looked = look_at_pose({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
-    if looked is None or looked.given.force is None or looked.best.force is None:
+    fits = fit_pose_readings({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
+    if fits is None or fits.given.force is None or fits.best.force is None:
         return False
-    better = looked.best.force < GOOD and looked.given.force > TIMES_BETTER * looked.best.force
-    return better and looked.best.quat in SIGNS
+    better = fits.best.force < GOOD and fits.given.force > TIMES_BETTER * fits.best.force
+    return better and fits.best.quat in SIGNS
 
 
 def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:

@@ -15,7 +15,7 @@ import numpy as np
 from eval.judging.guard import ActionLimits, Guarded
 from eval.worlds.trial import TrialResult
 from policies.policy import Policy
-from policies.spec import ActionSpec, Doubt, PolicySpec
+from policies.spec import ActionSpec, Note, PolicySpec
 
 LIMITED_MOST = 0.05
 """Share of limited actions above which there is a warning."""
@@ -88,24 +88,24 @@ def _twice(action: ActionSpec) -> str:
 
 def _warnings(
     results: Sequence[TrialResult], action: ActionSpec, limited: float, bad: float
-) -> list[Doubt]:
+) -> list[Note]:
     found, plain = [], action.kind == "acceleration" and action.is_plain
     largest = [row.output_max for row in results]
     if limited > LIMITED_MOST:
         seen = f"{limited:.0%} of its actions were limited"
-        found.append(Doubt("action_limited", seen, UNIT_FIX + _twice(action)))
+        found.append(Note("action_limited", seen, UNIT_FIX + _twice(action)))
     if bad:
         seen = f"{bad:.1%} of its actions were not finite and the last good one was flown"
-        found.append(Doubt("action_not_finite", seen, "check its weights and its normalisation"))
+        found.append(Note("action_not_finite", seen, "check its weights and its normalisation"))
     if plain and 0.0 < max(largest) <= UNIT:
         seen = "its outputs are always within -1 to 1 m/s^2 and look unscaled"
         fix = "export it with the contract of its environment, or give action.scale"
-        found.append(Doubt("action_scale", seen, fix))
+        found.append(Note("action_scale", seen, fix))
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
         seen = f"its outputs contain gravity: {up:.1f} m/s^2 upwards on average"
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        found.append(Doubt("action_gravity", seen, fix))
+        found.append(Note("action_gravity", seen, fix))
     return found
 
 
@@ -113,15 +113,15 @@ def _warnings(
 class FromFile(Protocol):
     """A policy that was read from a file."""
 
-    notes: tuple[Doubt, ...]
+    notes: tuple[Note, ...]
 
 
-def notes_of(policy: Policy) -> tuple[Doubt, ...]:
+def notes_of(policy: Policy) -> tuple[Note, ...]:
     """Return what is assumed of a policy's file, and what its answers look like."""
     return (*policy.notes, *doubts(policy)) if isinstance(policy, FromFile) else ()
 
 
-def doubts(policy: Policy) -> tuple[Doubt, ...]:
+def doubts(policy: Policy) -> tuple[Note, ...]:
     """Return every usual mistake of unit and frame that the policy's answers look like."""
     if policy.spec.action.kind != "acceleration":
         return ()
@@ -130,36 +130,36 @@ def doubts(policy: Policy) -> tuple[Doubt, ...]:
     left, right, above, below, _ = action
     if not np.isfinite(action).all():
         seen = f"{name}: answers NaN or infinity in level flight towards a gate"
-        return (Doubt("action_not_finite", seen, "check its weights and its normalisation"),)
+        return (Note("action_not_finite", seen, "check its weights and its normalisation"),)
     largest = float(np.linalg.norm(action, axis=-1).max())
     if largest > ActionLimits().size:
         seen = f"{name}: wants up to {largest:.0f} m/s^2 in level flight, more than the limit"
-        return (Doubt("action_limited", seen, UNIT_FIX + _twice(policy.spec.action)),)
+        return (Note("action_limited", seen, UNIT_FIX + _twice(policy.spec.action)),)
     found = []
     aside, up = left[1] - right[1], above[2] - below[2]
     if aside < -CLEAR and up < -CLEAR:
         seen = (
             f"{name}: accelerates away from gates to its left and above, as if its action were FRD"
         )
-        found.append(Doubt("action_frame", seen, "the suite's is FLU: negate y and z"))
+        found.append(Note("action_frame", seen, "the suite's is FLU: negate y and z"))
     elif min(aside, up) < -CLEAR:
         axis, side = ("y", "left") if aside < up else ("z", "up")
         seen = f"{name}: accelerates away from a gate aside along {axis}, as if {axis} were negated"
-        found.append(Doubt("action_frame", seen, f"the suite's {axis} points {side}: negate it"))
+        found.append(Note("action_frame", seen, f"the suite's {axis} points {side}: negate it"))
     if action[:, 2].min() > LIFT:
         seen = (
             f"{name}: wants {action[:, 2].min():.1f} m/s^2 upwards and more in level flight, as if "
         )
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        found.append(Doubt("action_gravity", seen + "its action contained gravity", fix))
+        found.append(Note("action_gravity", seen + "its action contained gravity", fix))
     if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
         seen = f"{name}: answers within -1 to 1 m/s^2 to gates far aside, as if unscaled"
         fix = "export it with the contract of its environment, or give action.scale"
-        found.append(Doubt("action_scale", seen, fix))
+        found.append(Note("action_scale", seen, fix))
     if _divides_images(policy):
         seen = f"{name}: answers alike to an image and to {TIMES:g} times that image"
         fix = "without its scale an image says nothing of distance: do not divide by its maximum"
-        found.append(Doubt("image_scale", seen, fix))
+        found.append(Note("image_scale", seen, fix))
     return tuple(found)
 
 

@@ -68,8 +68,8 @@ def write_trials(
         metadata={"suite": to_json(header)},
     )
     columns = {name: [getattr(result, name) for result in results] for name in TrialResult._fields}
-    with replacing_file(path) as beside:
-        pq.write_table(pa.table(columns, schema=schema), beside)
+    with replacing_file(path) as temporary:
+        pq.write_table(pa.table(columns, schema=schema), temporary)
 
 
 def _kinds() -> dict[str, str]:

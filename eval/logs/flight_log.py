@@ -97,8 +97,8 @@ class FlightLog:
 
         Where `pos`, `quat` or `rate` is among them, that array is NaN in every row.
         """
-        told = self.about.get("partial")
-        return tuple(str(group) for group in told) if isinstance(told, list) else ()
+        groups = self.about.get("partial")
+        return tuple(str(group) for group in groups) if isinstance(groups, list) else ()
 
     @property
     def whole(self) -> np.ndarray:
@@ -255,7 +255,7 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
     return columns
 
 
-def told_about(text: str | None, name: str) -> tuple[dict[str, Any], list[str]]:
+def flight_metadata(text: str | None, name: str) -> tuple[dict[str, Any], list[str]]:
     """Return what the metadata's JSON text says of a flight, and warnings; {} without a text."""
     if text is None:
         return {}, []
@@ -276,7 +276,7 @@ def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
             the column, the first bad row (counted from 1) and the reason.
     """
     columns, text, warnings = read_columns(Path(path))
-    about, more = told_about(text, str(path))
+    about, more = flight_metadata(text, str(path))
     warnings += more
     log = log_from_columns(columns, about, str(path))
     if log.partial and not partial:

@@ -1,8 +1,8 @@
-"""From a policy's action to a command: wanted force, attitude error, body rates.
+"""The attitude loop: computes thrust and body rates from a policy's wanted acceleration.
 
-The tilt error is corrected along the shortest arc, so that the thrust points the right way
-whatever the heading does; the heading error is what is left about the thrust (the reduced
-attitude of Brescianini and D'Andrea 2018).
+The tilt error is corrected along the shortest arc, so that the thrust direction is independent of
+the heading; the heading error is the remaining angle about the thrust (the reduced attitude of
+Brescianini and D'Andrea 2018).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from tracks.geometry.scene import Array
 HEADING_RATE = 6.0
 """Of the first-order blend of the heading [1/s]."""
 LEAST_FORCE = 0.1
-"""Below this wanted specific force its direction means nothing and the tilt is held [m/s^2]."""
+"""Below this wanted specific force its direction is undefined and the tilt is held [m/s^2]."""
 SMALL = 1e-6
 
 
 class AttitudeLoop(Protocol):
-    """Gains and limits of an attitude loop: those of a vehicle file, or (..., 3) arrays."""
+    """Gains and limits of an attitude loop: a vehicle file's, or (..., 3) arrays."""
 
     @property
     def attitude_gain(self) -> Any:
@@ -39,8 +39,8 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
     """Return the wanted specific force f_w = R u + g e_z (..., 3) [m/s^2], world.
 
     Args:
-        action_b: (..., 3) wanted net acceleration in the body axes of this moment [m/s^2].
-        rot_w: (..., 3, 3) body to world, of the same moment.
+        action_b: (..., 3) wanted net acceleration in current body axes [m/s^2].
+        rot_w: (..., 3, 3) body to world, at the same time.
     """
     xp = action_b.__array_namespace__()
     return to_world(rot_w, action_b) + xp.asarray([0.0, 0.0, GRAVITY])
@@ -76,8 +76,8 @@ def attitude_command(
 def blend_heading(heading_w: Array, to_gate_w: Array, dt: float) -> Array:
     """Return the heading after it turned towards the gate for `dt` (first order, 6 1/s).
 
-    The angle is what decays, so that a gate right behind is turned to as well. A gate straight
-    above or below leaves the heading as it is.
+    The blend acts on the angle, so that it also works for a gate right behind. A gate straight
+    above or below does not change the heading.
 
     Args:
         heading_w: (..., 3) unit vector, horizontal.
@@ -97,7 +97,7 @@ def blend_heading(heading_w: Array, to_gate_w: Array, dt: float) -> Array:
 
 
 def level_heading(rot_w: Array) -> Array:
-    """Return body x laid flat (..., 3), a unit vector: the heading to start from.
+    """Return the horizontal unit vector (..., 3) along body x: the heading at the start.
 
     Where body x is vertical it is the world's x axis.
     """
@@ -115,8 +115,8 @@ def _tilt_error(xp: Any, up_b: Array) -> tuple[Array, Array]:
     tilted = across > SMALL**2
     sine = xp.sqrt(xp.where(tilted, across, 1.0))
     angle = xp.arctan2(xp.where(tilted, sine, 0.0), up_b[..., 2])
-    # Upright the ratio of angle and sine is 1: its slope is that of the tilt. Upside down there is
-    # no slope, and x is turned about. Taken from zero, so that an error of nothing is not -0.
+    # Upright the ratio of angle and sine is 1, so its slope is that of the tilt. Upside down the
+    # slope is undefined, and the rotation is about x. `0.0 - ...` avoids -0 for a zero error.
     upright = up_b[..., 2] > 0.0
     x = xp.where(tilted, -up_b[..., 1] * angle / sine, xp.where(upright, 0.0 - up_b[..., 1], xp.pi))
     y = xp.where(tilted, up_b[..., 0] * angle / sine, xp.where(upright, up_b[..., 0], 0.0))

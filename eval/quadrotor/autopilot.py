@@ -1,7 +1,7 @@
-"""From a policy's action to the wrench on the body: one physics step of what flies the vehicle.
+"""One physics step of the controllers: from a policy's action to force and torque on the body.
 
 The attitude loop gives a new command every `attitude_every` steps; the plant (rate loop, mixer,
-rotors, effects) runs at every one. Pure, for numpy and JAX, over N vehicles at once.
+rotors, effects) runs at every step. Pure functions, for numpy and JAX, over N vehicles at once.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ ATTITUDE_HZ = 100.0
 
 @dataclass(frozen=True)
 class Autopilot:
-    """The loops and the plant that they fly: what stays the same during a flight."""
+    """The control loops and their plant: the constants of a flight."""
 
     plant: Plant
     controller: Controller
     dt: float
     """Length of a physics step [s]."""
     attitude_every: int
-    """Physics steps a command of the attitude loop holds."""
+    """Physics steps for which a command of the attitude loop is held."""
     action: ActionSpec = field(default_factory=ActionSpec)
-    """What is commanded: an acceleration goes through the attitude loop, body rates and thrust go
-    to the rate loop, motors past both."""
+    """The policy's output: an acceleration goes through the attitude loop, body rates and thrust
+    go to the rate loop, motor commands bypass both."""
     speed_max: float = 0.0
     """A rotor's largest commanded speed [rad/s]."""
 
 
 class AutopilotState(NamedTuple):
-    """What the loops of N vehicles carry from step to step."""
+    """State of N vehicles' loops between steps."""
 
     plant: PlantState
     """(N, ...)."""
@@ -51,7 +51,7 @@ class AutopilotState(NamedTuple):
 
 
 def make_autopilot(vehicle: Vehicle, action: ActionSpec | None = None) -> Autopilot:
-    """Return what flies `vehicle` by a kind of action, at its rate loop's frequency."""
+    """Return the loops of `vehicle` for a kind of action, at its rate loop's frequency."""
     dt = 1.0 / vehicle.controller.frequency
     every = max(1, round(vehicle.controller.frequency / ATTITUDE_HZ))
     plant, speed_max = make_plant(vehicle, dt), vehicle.rotors.speed_max
@@ -61,7 +61,7 @@ def make_autopilot(vehicle: Vehicle, action: ActionSpec | None = None) -> Autopi
 def start_autopilot(
     autopilot: Autopilot, motion: Motion, noise: Array | None = None
 ) -> AutopilotState:
-    """Return the loops of N vehicles that hovered until now, heading as their body x does.
+    """Return the state of N vehicles that hovered until now, with the heading of body x.
 
     Args:
         autopilot: from `make_autopilot`.
@@ -73,7 +73,7 @@ def start_autopilot(
     plant = hover_state(autopilot.plant, (n,), xp, noise)
     hover = Command(xp.full((n,), GRAVITY), xp.zeros((n, 3)))
     if autopilot.action.kind == "motors":
-        # What is remembered for the delay are rotor speeds, not a command.
+        # The delay stores rotor speeds instead of commands.
         past = xp.zeros_like(plant.past_commands) + plant.rotor_speed[..., None]
         plant = plant._replace(past_commands=past)
     return packed(AutopilotState(plant, hover, level_heading(motion.rot_w)))
@@ -88,7 +88,7 @@ def autopilot_step(
     step: Array,
     noise: Array | None = None,
 ) -> tuple[AutopilotState, Wrench]:
-    """Return the loops after a physics step and the wrench to hold during it.
+    """Return the state after a physics step, and the force and torque to hold during it.
 
     Args:
         autopilot: from `make_autopilot`.
@@ -113,10 +113,10 @@ def attitude_step(
     gate_w: Array,
     step: Array,
 ) -> AutopilotState:
-    """Return the loops with the command that the attitude loop gives at a physics step, or holds.
+    """Return the state with the attitude loop's command, new or held, at a physics step.
 
-    The arguments are those of `autopilot_step`; the plant is left as it is. Body rates and thrust
-    act at once, at any step; motors have no command, and what is recorded of it is NaN.
+    The arguments are those of `autopilot_step`; the plant's state is unchanged. Body rates and
+    thrust act at once, at any step. Motor commands have no such command; NaN is recorded.
     """
     if autopilot.action.kind == "ctbr":
         return state._replace(command=unpacked(action_b))
@@ -125,7 +125,7 @@ def attitude_step(
         return state._replace(command=unpacked(nothing))
     due = step % autopilot.attitude_every == 0
     if nowhere(due):
-        return state  # most steps hold the command
+        return state  # most steps only hold the command
     period = autopilot.attitude_every * autopilot.dt
     heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)
     force_w = action_to_force(action_b, motion.rot_w)
@@ -135,7 +135,7 @@ def attitude_step(
 
 
 def speed_asked(autopilot: Autopilot, action: Array) -> Array | None:
-    """Return the rotor speeds (N, 4) that motor commands ask for [rad/s]; None of other actions."""
+    """Return the rotor speeds (N, 4) of motor commands [rad/s]; None for other actions."""
     if autopilot.action.kind != "motors":
         return None
     xp = action.__array_namespace__()

@@ -1,11 +1,10 @@
-"""The quadrotor in continuous time: steps of any length, a rate loop that looks at its own times.
+"""The quadrotor in continuous time: steps of any length, a rate loop with its own update times.
 
-A simulator's step is its own affair. Where a flight is only known by its log, its commands act
-from the times of its rows on, whatever those are, and its rate loop has a frequency of its own. So
-steps end where commands change, and are otherwise as long as accuracy allows. The body is moved by
-the explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with what the air
-does half a step on taken from the step before; rotors follow their first-order lag exactly.
-Flights that MuJoCo's Euler integrator has made are met by the same steps under its own rule.
+A log gives commands at the times of its rows, and the rate loop has a frequency of its own. So
+steps end where commands change, and are otherwise as long as accuracy allows. The body moves by
+the explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with aerodynamic
+forces at half a step predicted from the step before. Rotors follow their first-order lag exactly.
+For flights of MuJoCo's Euler integrator the same steps use its own rule.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from eval.quadrotor.stepper import (
     Feedback,
     Inputs,
     from_start,
-    loop_look,
+    loop_update,
     mass_of,
     rotor_wrench,
     still_thrust,
@@ -40,41 +39,41 @@ from eval.quadrotor.stepper import (
 from tracks.geometry.rotation import exp_rot
 
 INTEGRATORS = ("continuous", "euler")
-"""How the body moves: by the equations themselves, or as MuJoCo's Euler steps of that length."""
+"""How the body moves: continuous equations, or MuJoCo's Euler steps of the given length."""
 SHORTEST_S = 1e-9
-"""A step of no length is one of this [s], which moves nothing."""
+"""Steps of zero length count as this long [s]; they do not move the body."""
 
 
 class Steps(NamedTuple):
     """T steps of flights; (T, ...) each."""
 
     length_s: Array
-    """Of the step [s]; those of no length move nothing."""
-    looks: Array
-    """Bool: the rate loop looks at the rates, and the command may change, when the step begins."""
+    """Of the step [s]; a step of zero length leaves the body where it is."""
+    updates: Array
+    """Bool: the rate loop updates, and the command may change, when the step begins."""
     lead_s: Array
-    """By how much later than that the loop looks on average until its next look here [s].
+    """Mean delay of the loop's real updates that this one update replaces [s].
 
-    Looks of a fast loop are taken together: the rates of now, carried on by so much along their
-    slope, stand for all of them.
+    Several updates of a fast loop are merged into one, which uses the rates extrapolated by this
+    time along their slope.
     """
 
 
 class Carry(NamedTuple):
-    """What a quadrotor carries from step to step."""
+    """State of a quadrotor between steps, besides its motion."""
 
     rotor_speed: Array
     """(..., 4) [rad/s]."""
     wanted_speed: Array
-    """(..., 4) what the loop has asked for since its last look [rad/s]."""
+    """(..., 4) commanded since the loop's last update [rad/s]."""
     turn_b: Array
     """(..., 3) angular acceleration of the last step [rad/s^2]."""
     air: Wrench
-    """(..., 3) what acted in the last step besides the rotors' own thrust."""
+    """(..., 3) force and torque of the last step without the rotors' own thrust."""
     loop: Any = ()
-    """What a firmware's rate loop remembers."""
+    """State of a firmware's rate loop."""
     since_s: Any = 0.0
-    """(...,) time since its last look [s]."""
+    """(...,) time since its last update [s]."""
 
 
 class Flight(NamedTuple):
@@ -85,7 +84,7 @@ class Flight(NamedTuple):
     rotor_speed: Array
     """(T + 1, ..., 4) [rad/s]."""
     acc_b: Array
-    """(T, ..., 3) specific force as each step ends; under Euler that during the step [m/s^2]."""
+    """(T, ..., 3) specific force at the end of each step; with Euler, during it [m/s^2]."""
 
 
 def fly(
@@ -100,17 +99,17 @@ def fly(
 ) -> Flight:
     """Fly `inputs` (T, ...) for `steps` from `motion` (...) in JAX.
 
-    Commands are those that act: a delay is theirs, not the plant's.
+    The commands already contain the delay; the plant's own delay is not used.
 
     Args:
-        plant: the plant; its `dt` and `delay_weight` are not used.
+        plant: its `dt` and `delay_weight` are not used.
         motion: at the start.
         steps: T of them.
-        inputs: of T steps; a command counts where the loop looks.
+        inputs: of T steps; a command is read where the loop updates.
         rotor_speed: (..., 4) at the start [rad/s].
         start_s: (...,) since the start of the flight [s].
         integrator: one of `INTEGRATORS`.
-        feedback: what pushes in place of `inputs.push_b`.
+        feedback: computes a push that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
@@ -121,11 +120,11 @@ def fly(
     start = Carry(rotor_speed, rotor_speed, still, none, memory)
     if plant.loop is not None:
         start = start._replace(since_s=jnp.zeros(rotor_speed.shape[:-1]))
-    # What the air does at the start, so that the first step is as good as the others.
+    # Aerodynamic forces at the start, so that the first step is as accurate as the others.
     first = jax.tree.map(lambda given: given[0], inputs)._replace(push_b=None)
     held = steady(rotor_speed)
     whole = _wrench(plant, motion, held, first, start_s)
-    start = start._replace(air=_beside(whole, _still(plant, held)))
+    start = start._replace(air=_remainder(whole, _still(plant, held)))
 
     def one(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
         (now, motion, time_s, remembered), (index, span, given) = carry, row
@@ -143,39 +142,40 @@ def fly(
     return Flight(motions, speeds, acc_b)
 
 
-def look(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array) -> Carry:
-    """Return `carry` after the loop has looked at `rate_b` (..., 3), where it does."""
+def update_loop(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array) -> Carry:
+    """Return `carry` after the loop's update with `rate_b` (..., 3), in rows with an update."""
     xp = rate_b.__array_namespace__()
     ahead_b = rate_b + span.lead_s[..., None] * carry.turn_b
     if plant.loop is not None:
-        return _look_with_memory(plant, carry, span, command, ahead_b)
-    asked = wanted_speed(plant, command, ahead_b)
-    return carry._replace(wanted_speed=xp.where(span.looks[..., None], asked, carry.wanted_speed))
+        return _update_firmware_loop(plant, carry, span, command, ahead_b)
+    wanted = wanted_speed(plant, command, ahead_b)
+    speed = xp.where(span.updates[..., None], wanted, carry.wanted_speed)
+    return carry._replace(wanted_speed=speed)
 
 
-def _look_with_memory(
+def _update_firmware_loop(
     plant: Plant, carry: Carry, span: Steps, command: Command, ahead_b: Array
 ) -> Carry:
-    """Return `carry` after a firmware's loop has looked; looks taken together are one long one."""
+    """Return `carry` after an update of a firmware's loop; merged updates count as one long one."""
     import jax
 
     xp = ahead_b.__array_namespace__()
     dt = xp.maximum(carry.since_s, plant.dt)
-    memory, asked = loop_look(plant, carry.loop, command, ahead_b, dt[..., None])
+    memory, wanted = loop_update(plant, carry.loop, command, ahead_b, dt[..., None])
 
     def where(new: Array, old: Array) -> Array:
-        looks = span.looks.reshape(span.looks.shape + (1,) * (new.ndim - span.looks.ndim))
-        return xp.where(looks, new, old)
+        updates = span.updates.reshape(span.updates.shape + (1,) * (new.ndim - span.updates.ndim))
+        return xp.where(updates, new, old)
 
     return carry._replace(
-        wanted_speed=where(asked, carry.wanted_speed),
+        wanted_speed=where(wanted, carry.wanted_speed),
         loop=jax.tree.map(where, memory, carry.loop),
-        since_s=xp.where(span.looks, 0.0, carry.since_s) + span.length_s,
+        since_s=xp.where(span.updates, 0.0, carry.since_s) + span.length_s,
     )
 
 
 def turn_rotors(plant: Plant, carry: Carry, span: Steps) -> tuple[Carry, RotorStep]:
-    """Return what the rotors do in a step towards what was asked of them."""
+    """Return `carry` and the rotors' step towards their commanded speeds."""
     xp = span.length_s.__array_namespace__()
     length_s = xp.maximum(span.length_s, SHORTEST_S)
     rotors = follow(carry.rotor_speed, carry.wanted_speed, plant.constants.time_constant, length_s)
@@ -195,20 +195,20 @@ def step(
 
     The arguments are those of `fly`, of one step.
     """
-    before, asked = carry.rotor_speed, None
+    before, wanted = carry.rotor_speed, None
     length = span.length_s[..., None]
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         carry = carry._replace(rotor_speed=rotors.end)
     else:
         assert inputs.command is not None, "neither a command nor rotor speeds are given"
-        carry = look(plant, carry, span, inputs.command, motion.rate_b)
+        carry = update_loop(plant, carry, span, inputs.command, motion.rate_b)
         carry, rotors = turn_rotors(plant, carry, span)
-        asked = carry.wanted_speed
+        wanted = carry.wanted_speed
     rotor_acc = None
     if uses_rotor_acc(plant):
         lag = plant.constants.time_constant
-        rotor_acc = acceleration(before, rotors, asked, lag, length)
+        rotor_acc = acceleration(before, rotors, wanted, lag, length)
     if integrator == "euler":
         whole = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
         acc_w, turn_b = accelerations(plant, motion, whole)
@@ -220,17 +220,17 @@ def step(
     middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
     middle_s = time_s + 0.5 * span.length_s
     whole = _wrench(plant, middle, rotors, inputs, middle_s, rotor_acc)
-    air = _beside(whole, thrust)
+    air = _remainder(whole, thrust)
     acc_w, turn_b = accelerations(plant, middle, whole)
     end = _midpoint(motion, acc_w, turn_b, length)
-    # Rotors may have sped up within the step; the air hardly does more at its end.
+    # Rotor speeds change within the step, aerodynamic forces hardly do.
     ends = _still(plant, steady(rotors.end))
     acc_b = (ends.force_b + air.force_b) / mass_of(plant)
     return carry._replace(turn_b=turn_b, air=air), end, acc_b
 
 
 def _still(plant: Plant, rotors: RotorStep) -> Wrench:
-    """Return what the rotors do in still air."""
+    """Return the rotors' force and torque in still air."""
     return rotor_wrench(plant, rotors, still_thrust(plant, rotors))
 
 
@@ -242,14 +242,14 @@ def _wrench(
     time_s: Array,
     rotor_acc: Array | None = None,
 ) -> Wrench:
-    """Return all that acts on the body."""
+    """Return the whole force and torque on the body."""
     _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
     flow = flow._replace(rotor_acc=rotor_acc)
     return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
 
 
-def _beside(whole: Wrench, thrust: Wrench) -> Wrench:
-    """Return what of the `whole` is not the rotors' own `thrust`."""
+def _remainder(whole: Wrench, thrust: Wrench) -> Wrench:
+    """Return `whole` less the rotors' own `thrust`."""
     return Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
 
 

@@ -1,4 +1,4 @@
-"""What the flight controller does: torque for wanted body rates, rotor thrusts for a torque."""
+"""The nominal flight controller: torque from body rates, rotor thrusts from torque."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from tracks.geometry.rotation import cross
 from tracks.geometry.scene import Array
 
 NEGLIGIBLE = 1e-9
-"""Thrusts below this are rounding [N]."""
+"""Thrusts below this are rounding errors [N]."""
 
 
 def largest(values: Array) -> Array:
-    """Return the largest of the last axis, one value of the first after the other.
+    """Return the largest value along the last axis, by pairwise `maximum`.
 
-    The gradient of `max` counts the values that equal it and divides by how many: by none, where a
-    compiler works them out twice and rounds differently. That of `maximum` divides by nothing.
+    The gradient of `max` divides by the number of values that equal it. That number is zero where a
+    compiler evaluates them twice with different rounding. `maximum` does not divide.
     """
     xp = values.__array_namespace__()
     return reduce(xp.maximum, [values[..., k] for k in range(values.shape[-1])])
 
 
 def least(values: Array) -> Array:
-    """Return the least of the last axis, as `largest`."""
+    """Return the least value along the last axis, as `largest` does."""
     xp = values.__array_namespace__()
     return reduce(xp.minimum, [values[..., k] for k in range(values.shape[-1])])
 
 
 def rate_torque(rate_cmd_b: Array, rate_b: Array, gain: Array, inertia: Array) -> Array:
-    """Return the torque wanted, J (K (rate_cmd - rate)) + rate x (J rate), (..., 3) [N m].
+    """Return the wanted torque J (K (rate_cmd - rate)) + rate x (J rate), (..., 3) [N m].
 
     Args:
         rate_cmd_b: (..., 3) [rad/s].
         rate_b: (..., 3) [rad/s].
         gain: (..., 3) diagonal of K [1/s].
-        inertia: (..., 3) diagonal of J as the controller believes it [kg m^2].
+        inertia: (..., 3) diagonal of the nominal J [kg m^2].
     """
     return inertia * gain * (rate_cmd_b - rate_b) + cross(rate_b, inertia * rate_b)
 
@@ -57,9 +57,9 @@ def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np
 def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> Array:
     """Return the rotor thrusts (..., 4) [N], each in [0, thrust_max].
 
-    Where the exact solution is out of range, roll and pitch are scaled down together until they
-    fit side by side, the collective is clamped to what is then feasible, and yaw gets what is
-    left: direction of thrust before its size, size before heading.
+    Where the exact solution is out of range, roll and pitch are scaled down together until their
+    spread fits, the collective is clamped to the feasible range, and yaw gets the remaining room.
+    The direction of thrust has priority over its size, and its size over the heading.
 
     Args:
         unmixer: (4, 4) inverse of `mixer_matrix`.
@@ -85,7 +85,7 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
     room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
     asked = xp.abs(yaw)
-    # What is asked beyond the room by rounding alone is left to the clip.
+    # The clip removes what exceeds the room by rounding alone.
     beyond = asked > xp.maximum(room, NEGLIGIBLE)
     share = xp.where(beyond, room / xp.where(beyond, asked, 1.0), 1.0)
     limited = without_yaw + least(share)[..., None] * yaw

@@ -1,10 +1,10 @@
-"""The quadrotor as a MuJoCo body: what a MuJoCo user expects, with the true mass and inertia.
+"""The quadrotor as a MuJoCo body, with the true mass and inertia.
 
-A world that flies the plant leaves the actuators at zero and puts the plant's wrench into
-`qfrc_applied` of the free joint: `[R force_b, torque_b]`, since a free joint's forces are in
-world axes and its torques in body axes, and the body's origin is its centre of mass. (The rotors'
-actuators alone could not carry the drag, tilt and trim of the effects.) A user without the plant
-flies the four actuators, whose control is a rotor's thrust in newton.
+The suite's simulators leave the actuators at zero and write the plant's force and torque into
+`qfrc_applied` of the free joint as `[R force_b, torque_b]`. (A free joint's forces are in world
+axes, its torques in body axes, and the body's origin is its centre of mass. The rotors' actuators
+alone could not apply drag, tilt and trim of the effects.) Without the plant, a user controls the
+four actuators, whose control is a rotor's thrust in newton.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CAMERA = "depth"
 COLLIDES = "quadrotor box"
 """Name of the only geom of the quadrotor that collides."""
 VISUAL_GROUP = 2
-"""Geom group of what is only looked at; rays that collide with nothing else skip it."""
+"""Geom group of visual geoms, which rays and contacts skip."""
 
 
 def rotor_name(index: int) -> str:
@@ -33,14 +33,14 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Add `vehicle` to the world body of `spec`, with its effects on mass, inertia and gravity.
 
     The body's origin is the true centre of mass. Gravity of the whole model is set, for a tilted
-    frame. `compile_quadrotor` is what makes a model of it.
+    frame. `compile_quadrotor` compiles the result.
 
     Args:
         spec: to be added to; its integrator must stay Euler for parity with the JAX quadrotor.
-        vehicle: what is added.
+        vehicle: to be added.
 
     Raises:
-        ValueError: where an effect leaves no mass.
+        ValueError: where the effects make the mass zero or negative.
     """
     constants = make_plant(vehicle, 1.0 / vehicle.controller.frequency).constants
     spec.option.gravity = constants.gravity_w
@@ -49,7 +49,7 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     body.explicitinertial = True
     body.mass = float(constants.mass)
     body.inertia = _possible(constants.inertia)
-    # Geometry is given from the nominal centre of mass, the body's frame sits in the true one.
+    # Geometry refers to the nominal centre of mass, the body's frame to the true one.
     origin = -constants.com_offset_b
     body.add_geom(
         name=COLLIDES,
@@ -80,8 +80,8 @@ def compile_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle, dt: float) -> mujoc
     """Return the model of `spec` with `vehicle` in it, for steps of `dt` [s].
 
     MuJoCo's compiler refuses moments of inertia that break the triangle inequality, which a
-    fitted or assumed `inertia_scale` of a flat quadrotor easily does by a few percent; its
-    dynamics do not mind. The true ones are set in the compiled model.
+    fitted `inertia_scale` of a flat quadrotor easily does by a few percent. Its dynamics work with
+    any values, so the true ones are set in the compiled model.
     """
     spec.option.timestep = dt
     add_quadrotor(spec, vehicle)
@@ -101,14 +101,14 @@ def _possible(inertia: np.ndarray) -> np.ndarray:
 def _add_visuals(
     body: mujoco.MjsBody, name: str, origin: np.ndarray, hub: np.ndarray, spin: int
 ) -> None:
-    look = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0.0}
+    visual = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0.0}
     body.add_geom(
         name=f"{name} arm",
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         fromto=[*origin, *hub],
         size=[0.006, 0.0, 0.0],
         rgba=[0.15, 0.15, 0.18, 1.0],
-        **look,
+        **visual,
     )
     # One colour a direction of spin.
     rgba = [0.9, 0.35, 0.1, 0.5] if spin > 0 else [0.2, 0.5, 0.9, 0.5]
@@ -118,7 +118,7 @@ def _add_visuals(
         pos=hub + [0.0, 0.0, 0.012],
         size=[0.0635, 0.002, 0.0],
         rgba=rgba,
-        **look,
+        **visual,
     )
 
 

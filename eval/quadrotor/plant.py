@@ -1,8 +1,8 @@
-"""What is stepped: the nominal quadrotor and every effect of its vehicle, as arrays.
+"""The `Plant`: the nominal quadrotor and every effect of its vehicle, as arrays.
 
-A `Plant` is a pytree of numpy or JAX arrays with any leading batch shape, so that it can be built
-inside a differentiated function, of traced values. `eval.quadrotor.stepper` steps it.
-Its rigid body in free flight is here, stepped as MuJoCo's Euler integrator steps it.
+A `Plant` is a pytree of numpy or JAX arrays with any leading batch shape, so it can be built from
+traced values inside a differentiated function. `eval.quadrotor.stepper` steps it. This file also
+has the rigid body in free flight, which steps as MuJoCo's Euler integrator does.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Motion(NamedTuple):
 
 
 class Wrench(NamedTuple):
-    """What acts on the rigid body besides gravity and its own gyroscopic terms."""
+    """Force and torque on the rigid body, without gravity and its own gyroscopic terms."""
 
     force_b: Array
     """(..., 3) on the centre of mass [N]."""
@@ -67,7 +67,7 @@ class Wrench(NamedTuple):
 
 
 class Nominal(NamedTuple):
-    """What the controller believes."""
+    """The nominal constants, which the controller uses."""
 
     mass: Array
     """[kg]."""
@@ -88,8 +88,8 @@ class Plant(NamedTuple):
 
     nominal: Nominal
     constants: Constants
-    """The true ones, with every effect that changes one; a world needs mass, inertia, gravity_w
-    and com_offset_b."""
+    """The true constants, with every effect applied; a simulator uses mass, inertia, gravity_w and
+    com_offset_b."""
     effects: dict[str, Any]
     """Values of all effects, as arrays, by name."""
     delay_weight: Array
@@ -109,12 +109,12 @@ def make_plant(
     """Return the plant of `vehicle` for steps of `dt` [s].
 
     Args:
-        vehicle: what it is; its nominal values are constants.
+        vehicle: its nominal values are constants.
         dt: 1 / controller.frequency.
         effects: values in place of `vehicle.effects`, by name; traced JAX arrays may be among
             them, also with leading batch axes (one vehicle a trial).
-        max_delay: room to remember commands [s]; needed where a delay is traced, otherwise
-            exactly what the delay needs.
+        max_delay: longest delay for which commands are stored [s]; required for a traced delay,
+            otherwise the delay itself.
 
     Raises:
         ValueError: for an effect that is not in the catalogue.
@@ -128,7 +128,7 @@ def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = N
     """Return a plant that holds every effect of the catalogue at once, to fit any of them.
 
     Args:
-        vehicle: its nominal values, and the effects that it has already.
+        vehicle: its nominal values and its own effects.
         effects: values to use in their place, by name; may be traced.
         dt: length of a step [s]; 1 / controller.frequency if not given.
     """
@@ -137,7 +137,7 @@ def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = N
 
 
 def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
-    """Return what the controller believes of `vehicle`, and its constants without any effect."""
+    """Return the controller's nominal constants, and the constants without any effect."""
     rotors = vehicle.rotors
     constants = Constants(
         mass=np.asarray(vehicle.mass),
@@ -149,7 +149,7 @@ def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
         torque_coefficient=np.full(4, rotors.torque_coefficient),
         thrust_axis_b=np.array([0.0, 0.0, 1.0]),
         time_constant=np.asarray(rotors.time_constant),
-        # A firmware's loop is scaled as a whole: its gains are no numbers per second.
+        # A firmware's loop is scaled as a whole: its gains are not in 1/s.
         rate_gain=np.asarray(vehicle.controller.rate_gain)
         if vehicle.controller.kind == NOMINAL
         else np.ones(3),
@@ -197,12 +197,12 @@ def uses_noise(plant: Plant) -> bool:
 
 
 def uses_rotor_acc(plant: Plant) -> bool:
-    """Return whether an effect of `plant` acts by the change of the rotor speeds."""
+    """Return whether an effect of `plant` depends on the change of the rotor speeds."""
     return any(EFFECTS[name].rotor_acc for name in plant.effects)
 
 
 def uses_memory(plant: Plant) -> bool:
-    """Return whether an effect of `plant` has a motion of its own, which is carried along."""
+    """Return whether an effect of `plant` has a state of its own."""
     return any(EFFECTS[name].start is not None for name in plant.effects)
 
 

@@ -1,8 +1,8 @@
-"""Rotor speed follows its command, late and with a first-order lag; thrust goes with its square.
+"""Rotors: speed follows its command with a delay and a first-order lag.
 
-A delay that is no multiple of the step makes a step's command the mean of the two that share it,
-so that a delay has a gradient. A flight whose commands are all known needs no memory of them: the
-diagnosis takes means over its own steps (`suite/diagnose/evidence/rollout.py`).
+If the delay is not a multiple of the step, a step's command is the weighted mean of two commands,
+so that the delay has a gradient. The diagnosis knows all commands in advance and takes means over
+its own steps instead (`suite/diagnose/evidence/rollout.py`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from tracks.geometry.scene import Array
 
 SHORT_S = 1e-4
-"""Changes over shorter steps are taken to last so long [s]."""
+"""Shortest time over which a change of speed is divided [s]."""
 NEGLIGIBLE = 1e-6
-"""Thrusts below this are none [N]."""
+"""Thrusts below this count as zero [N]."""
 
 
 class RotorStep(NamedTuple):
-    """What the rotors do during one physics step; means are exact for a constant command."""
+    """Rotor speeds in one physics step; the means are exact for a constant command."""
 
     end: Array
     """(..., 4) speed at the end of the step [rad/s]."""
@@ -32,10 +32,9 @@ class RotorStep(NamedTuple):
 
 
 def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
-    """Return the speeds (..., 4) [rad/s] that nominally give `thrust` (..., 4) >= 0 [N]."""
+    """Return the speeds (..., 4) [rad/s] that nominally produce `thrust` (..., 4) >= 0 [N]."""
     xp = thrust.__array_namespace__()
-    # A rotor at its lower limit is asked for zero or for what rounding left of it, where the
-    # root's slope has no bound; gradients would drown in it.
+    # Near zero thrust the root's slope has no bound, and it would dominate all gradients.
     pushes = thrust > NEGLIGIBLE
     return xp.where(pushes, xp.sqrt(xp.where(pushes, thrust, 1.0) / thrust_coefficient), 0.0)
 
@@ -43,9 +42,8 @@ def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
 def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> RotorStep:
     """Return the rotors' step under dOmega/dt = (command - Omega) / time_constant.
 
-    The thrust of a step is that of the mean square and not of the speed at one of its ends, so
-    that lags far shorter than a step still count, to first order: a time constant of 0 follows
-    at once, and the gradient with respect to it exists there.
+    Thrust is computed from the mean square speed, so that lags far shorter than a step count to
+    first order. A time constant of 0 follows at once, and the gradient with respect to it exists.
 
     Args:
         speed: (..., 4) at the start of the step [rad/s].
@@ -74,8 +72,8 @@ def acceleration(
 ) -> Array:
     """Return the mean change of the rotor speeds (..., 4) over a step [rad/s^2].
 
-    By the lag's own equation where it is longer than the step, so that a step of no length has a
-    slope as well; else what changed over the step's length.
+    If the lag is longer than the step, the lag's equation gives the slope, even for a step of zero
+    length. Otherwise the slope is the change divided by the step.
 
     Args:
         start: (..., 4) at the start of the step [rad/s].
@@ -95,12 +93,12 @@ def acceleration(
 
 
 def steady(speed: Array) -> RotorStep:
-    """Return the step of rotors that hold `speed` (..., 4) [rad/s], as when it was measured."""
+    """Return the step of rotors with a constant speed (..., 4), such as a measured one [rad/s]."""
     return RotorStep(speed, speed, speed**2)
 
 
 def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
-    """Return `delay` (...,) [s] as whole steps of `dt` [s] and the share of a step that is left."""
+    """Return `delay` (...,) [s] as whole steps of `dt` [s] and the remaining share of a step."""
     steps = delay / dt
     # 0.043 s are 43 steps of 0.001 s in spite of rounding.
     whole = steps.__array_namespace__().floor(steps + 1e-9)
@@ -108,9 +106,9 @@ def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
 
 
 def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
-    """Return the share (..., L) of each remembered command in the one that acts, newest first.
+    """Return the weight (..., L) of each stored command in the delayed one, newest first.
 
-    L is what `max_delay` [s] needs, 0 where that is 0.
+    L is the number of commands that `max_delay` [s] requires, 0 for no delay.
     """
     xp = delay.__array_namespace__()
     length = math.ceil(max_delay / dt - 1e-9) + 1 if max_delay > 0.0 else 0
@@ -120,7 +118,7 @@ def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
 
 
 def delayed(weight: Array, past: Array, command: Array) -> tuple[Array, Array]:
-    """Return the remembered commands (..., C, L) with `command` (..., C), and the one that acts.
+    """Return the stored commands (..., C, L) with `command` (..., C), and the delayed one.
 
     Args:
         weight: (..., L) from `delay_weight`, L > 0.

@@ -1,11 +1,10 @@
 """The stepper: one step of a quadrotor, for numpy and JAX and any leading batch shape.
 
-Command, delay, rate loop, mixer, rotors, effects: `plant_step` makes of them the force and the
-torque on the body, which a world gives to MuJoCo's engine. `step` moves the rigid body with them
-itself, as MuJoCo's Euler integrator does, and `rollout` is many steps in JAX, which can be
-compiled, mapped over flights and differentiated with respect to the state it starts from, its
-inputs, and the values of every effect of its plant, delay and lag included: the differentiable
-quadrotor.
+`plant_step` computes the force and torque on the body from command, delay, rate loop, mixer, rotors
+and effects; a simulator passes them to MuJoCo's engine. `step` also moves the rigid body, as
+MuJoCo's Euler integrator does. `rollout` is many steps in JAX: the differentiable quadrotor. It can
+be compiled, mapped over flights and differentiated with respect to its start, its inputs and the
+values of every effect, delay and lag included.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from tracks.geometry.rotation import to_local
 
 
 class PlantState(NamedTuple):
-    """What a plant carries from step to step."""
+    """State of a plant between steps."""
 
     rotor_speed: Array
     """(..., 4) at the start of the step [rad/s]."""
@@ -45,20 +44,20 @@ class PlantState(NamedTuple):
     wind: dict[str, Array]
     """(..., 3) of each effect that makes random wind [m/s]."""
     loop: Any = ()
-    """What a firmware's rate loop remembers; nothing for the nominal one."""
+    """State of a firmware's rate loop; empty for the nominal one."""
     carried: dict[str, Memory] = {}
-    """What each effect with a motion of its own carries."""
+    """State of each effect that has one, such as a slung load, by name."""
 
 
 class Inputs(NamedTuple):
-    """What acts on a quadrotor during one step; (T, ...) for `rollout`'s T steps."""
+    """Inputs of a quadrotor during one step; (T, ...) for `rollout`'s T steps."""
 
     command: Command | None = None
     """Held during the step."""
     rotor_speed: Array | None = None
-    """(..., 4) measured and held during the step, in place of what the command asks for [rad/s]."""
+    """(..., 4) measured and held during the step, in place of the command [rad/s]."""
     noise: Array | None = None
-    """(..., 3) normal draws for random wind; without them there is none."""
+    """(..., 3) normal draws for random wind; None for no random wind."""
     voltage_drop: Array | None = None
     """(...,) battery voltage at the start of the flight minus now [V]."""
     push_b: Array | None = None
@@ -68,16 +67,16 @@ class Inputs(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """A push that follows from the simulated state, such as a network's."""
+    """A function of the simulated state that adds a push, such as a network."""
 
     start: Any
-    """What it carries, at the start."""
+    """Its own state at the start."""
     act: Callable[[Any, Motion, Inputs, Array], tuple[Any, Array]]
-    """(carry, motion, inputs, number of the step) -> (carry, `Inputs.push_b`)."""
+    """(state, motion, inputs, number of the step) -> (state, `Inputs.push_b`)."""
 
 
 class Rollout(NamedTuple):
-    """A flown stretch of T steps."""
+    """T simulated steps."""
 
     motion: Motion
     """(T + 1, ...): the start and the state after each step."""
@@ -86,7 +85,7 @@ class Rollout(NamedTuple):
     acc_b: Array
     """(T, ..., 3) specific force during each step [m/s^2]."""
     state: PlantState
-    """(...) after the last step, to fly on from."""
+    """(...) after the last step, from which a rollout can continue."""
 
 
 def hover_state(
@@ -98,8 +97,7 @@ def hover_state(
         plant: the plant.
         batch_shape: leading shape of the states that will be flown.
         xp: numpy or jax.numpy.
-        noise: (*batch_shape, 3) normal draws for the random wind at the start; without them it
-            starts from none.
+        noise: (*batch_shape, 3) normal draws for the random wind at the start; None: no wind.
     """
     still = xp.zeros((*batch_shape, 3))
     hover = Command(xp.full(batch_shape, GRAVITY), still)
@@ -116,7 +114,7 @@ def hover_state(
 
 
 def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[str, Memory]:
-    """Return what effects with a motion of their own carry where plants hovered until now."""
+    """Return the states of effects that have one, for plants that hovered until now."""
     carried = {}
     if uses_memory(plant):
         level = Motion(still, still[..., None] + np.eye(3), still, still)
@@ -130,31 +128,33 @@ def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[st
 
 
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
-    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer ask for.
+    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer command.
 
-    A firmware's loop looks for the first time.
+    For a firmware's loop this is its first update.
     """
     xp = rate_b.__array_namespace__()
     memory = loops.start(plant.loop, rate_b.shape[:-1], xp)
-    return loop_look(plant, memory, command, rate_b, plant.dt)[1]
+    return loop_update(plant, memory, command, rate_b, plant.dt)[1]
 
 
-def loop_look(
+def loop_update(
     plant: Plant, memory: Any, command: Command, rate_b: Array, dt: Array
 ) -> tuple[Any, Array]:
-    """Return the rate loop's memory after a look, and the rotor speeds (..., 4) it asks for.
+    """Return the rate loop's state after an update, and the commanded rotor speeds (..., 4).
 
     Args:
         plant: the plant.
         memory: of the loop; see `PlantState.loop`.
-        command: that acts.
+        command: with its delay already applied.
         rate_b: (..., 3) [rad/s].
-        dt: (...,) time since the last look [s].
+        dt: (...,) time since the last update [s].
     """
     nominal = plant.nominal
     if plant.loop is not None:
         force_z, scale = nominal.mass * command.thrust, plant.constants.rate_gain
-        memory, thrust = loops.look(plant.loop, memory, force_z, command.rate_b, rate_b, dt, scale)
+        memory, thrust = loops.update(
+            plant.loop, memory, force_z, command.rate_b, rate_b, dt, scale
+        )
         return memory, speed_command(thrust, nominal.thrust_coefficient)
     torque_b = rate_torque(command.rate_b, rate_b, plant.constants.rate_gain, nominal.inertia)
     thrust = mix(nominal.unmixer, nominal.thrust_max, nominal.mass * command.thrust, torque_b)
@@ -164,7 +164,7 @@ def loop_look(
 def rotor_step(
     plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, RotorStep]:
-    """Return the state after one step and what the rotors do in it; see `rotor_command`."""
+    """Return the state after one step and the rotors' step; see `rotor_command`."""
     state, wanted = rotor_command(plant, state, command, rate_b, speed_cmd)
     rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
     return state._replace(rotor_speed=rotors.end), rotors
@@ -173,7 +173,7 @@ def rotor_step(
 def rotor_command(
     plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, Array]:
-    """Return the state that remembers `command` or `speed_cmd`, and the rotor speeds now asked."""
+    """Return the state with `command` or `speed_cmd` stored, and the commanded rotor speeds."""
     if plant.delay_weight.shape[-1] > 0:
         asked = command.packed if speed_cmd is None else speed_cmd
         past, acting = delayed(plant.delay_weight, state.past_commands, asked)
@@ -181,7 +181,7 @@ def rotor_command(
         speed_cmd = None if speed_cmd is None else acting
     if speed_cmd is not None:
         return state, speed_cmd
-    memory, wanted = loop_look(plant, state.loop, command, rate_b, plant.dt)
+    memory, wanted = loop_update(plant, state.loop, command, rate_b, plant.dt)
     return state._replace(loop=memory), wanted
 
 
@@ -194,7 +194,7 @@ def plant_step(
         plant: the plant.
         state: from `hover_state` or the step before.
         motion: at the start of the step.
-        inputs: a command or measured rotor speeds, and what else acts.
+        inputs: a command or measured rotor speeds, voltage, wind and pushes.
         time_s: (...,) since the start of the flight [s].
     """
     before = state.rotor_speed
@@ -238,7 +238,7 @@ def rollout(
         inputs: of T steps.
         state: (...) at the start; that of a hover if not given.
         start_s: (...,) time since the start of the flight at the first step [s].
-        feedback: what pushes in place of `inputs.push_b`.
+        feedback: computes a push that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
@@ -272,7 +272,7 @@ def from_start(start: Any, rest: Any) -> Any:
 
 
 def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
-    """Return `wrench` with what `Inputs.push_b` adds to it, if anything."""
+    """Return `wrench` plus the push `Inputs.push_b`, if there is one."""
     if push_b is None:
         return wrench
     return Wrench(
@@ -282,7 +282,7 @@ def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
 
 
 def mass_of(plant: Plant) -> Array:
-    """Return the true mass beside vectors (..., 3); one of a single plant stays a plain number.
+    """Return the true mass (..., 1) to divide vectors (..., 3) by; a plain number for one plant.
 
     XLA rounds a division by a number otherwise than one by an array of one.
     """
@@ -298,7 +298,7 @@ def wind_and_flow(
     inputs: Inputs,
     time_s: Array | float,
 ) -> tuple[dict[str, Array], Flow]:
-    """Return the random winds of this step, after `wind`, and what the effects see of it."""
+    """Return the random winds of this step, after `wind`, and the inputs of the effects."""
     winds, air_vel_w = winds_on(plant, wind, motion, inputs.noise)
     return winds, Flow(
         constants=plant.constants,
@@ -340,7 +340,7 @@ def still_thrust(plant: Plant, rotors: RotorStep) -> Array:
 
 
 def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
-    """Return what the rotors do to the body when they push with `thrust` (..., 4) [N]."""
+    """Return the rotors' force and torque on the body for thrusts (..., 4) [N]."""
     constants, arm = plant.constants, plant.constants.rotor_position_b
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
     about_z = -(plant.nominal.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
@@ -354,10 +354,10 @@ def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
 def wrench_on(
     plant: Plant, rotors: RotorStep, flow: Flow, carried: Mapping[str, Memory] | None = None
 ) -> Wrench:
-    """Return what the rotors and the effects do to the body; `carried` is `PlantState.carried`.
+    """Return the force and torque of rotors and effects; `carried` is `PlantState.carried`.
 
     Raises:
-        ValueError: where that lacks what an effect carries.
+        ValueError: where the state of an effect is missing in `carried`.
     """
     thrust = still_thrust(plant, rotors)
     for name, value in in_order(plant.effects):
@@ -374,12 +374,12 @@ def wrench_on(
 
 
 def _seen(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | None) -> Flow:
-    """Return `flow` as the effect `name` sees it: with what it carries, where it does."""
+    """Return `flow` with the state of the effect `name`, if the effect has one."""
     if EFFECTS[name].start is None:
         return flow
     if not carried or name not in carried:
         raise ValueError(
-            f"effects.{name} has a motion of its own, which is not followed here; leave it out of "
+            f"effects.{name} has a state of its own, which is not simulated here; leave it out of "
             "the vehicle, or fly it with eval.quadrotor.stepper from hover_state on"
         )
     return flow._replace(memory=carried[name], dt=plant.dt)
@@ -388,7 +388,7 @@ def _seen(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | N
 def _carried_on(
     plant: Plant, carried: Mapping[str, Memory], motion: Motion, flow: Flow, wrench: Wrench
 ) -> dict[str, Memory]:
-    """Return what effects with a motion of their own carry after a step under `wrench`."""
+    """Return the states of effects that have one, after a step under `wrench`."""
     after = {}
     if uses_memory(plant):
         acc_w, _ = accelerations(plant, motion, wrench)

@@ -4,7 +4,7 @@ Body frame: x forward, y left, z up, origin at the nominal centre of mass. SI un
 
 A motor's thrust by `[motors]` is `T = t1 u + t2 u^2` with `u = command (V / V0)^n`: command from 0
 to 1, V the battery's voltage, V0 the nominal one. n = 1 where the command is a share of the
-battery's voltage (PWM of a brushed motor), n = 0 where the firmware makes up for the battery.
+battery's voltage (PWM of a brushed motor), n = 0 where the firmware compensates the battery.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Rotors:
 
     @property
     def thrust_max(self) -> float:
-        """Largest thrust that is asked of one rotor, f_max [N]."""
+        """Largest commanded thrust of one rotor, f_max [N]."""
         return self.thrust_coefficient * self.speed_max**2
 
 
@@ -47,7 +47,7 @@ class Controller:
     """The loops that turn an attitude into rates and rates into torque."""
 
     rate_gain: Vector
-    """K of the rate loop [1/s]; a firmware's loop has its settings in place of it."""
+    """K of the rate loop [1/s]; a firmware's loop uses its settings instead."""
     frequency: float
     """Of the rate loop, which is the physics rate too [Hz]."""
     attitude_gain: Vector = (8.0, 8.0, 4.0)
@@ -62,19 +62,19 @@ class Controller:
 
 @dataclass(frozen=True)
 class MotorMap:
-    """What thrust a motor command gives: the vehicle file's `[motors]`; see `motor_thrust`."""
+    """Thrust of a motor command: the vehicle file's `[motors]`; see `motor_thrust`."""
 
     thrust: tuple[float, float]
     """t1, t2 of T = t1 u + t2 u^2 [N], u the applied command."""
     voltage: float
     """V0, the battery's nominal voltage [V]."""
     voltage_exponent: float = 1.0
-    """n of u = command (V / V0)^n; 0 where the firmware makes up for the battery."""
+    """n of u = command (V / V0)^n; 0 where the firmware compensates the battery."""
 
 
 @dataclass(frozen=True)
 class CollisionBox:
-    """What collides: the vehicle file's `[body]`."""
+    """The box for collisions: the vehicle file's `[body]`."""
 
     half_size: Vector = (0.064, 0.064, 0.025)
     """Half of the edges of a box around the origin [m]."""
@@ -82,7 +82,7 @@ class CollisionBox:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A quadrotor: what its controller believes (the nominal), and the effects that are true."""
+    """A quadrotor: the nominal constants that its controller uses, and its effects."""
 
     name: str
     mass: float
@@ -94,7 +94,7 @@ class Vehicle:
     body: CollisionBox = field(default_factory=CollisionBox)
     camera: Camera = field(default_factory=Camera)
     motors: MotorMap | None = None
-    """What motor commands give, where it is known."""
+    """Thrust of motor commands; None where unknown."""
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
 
@@ -132,10 +132,10 @@ def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
 
 
 def command_of_thrust(curve: tuple[Any, Any], thrust: Any) -> Any:
-    """Return what is applied, u of `T = t1 u + t2 u^2`, for thrusts (...) from 0 [N].
+    """Return the applied command u of `T = t1 u + t2 u^2` for thrusts (...) >= 0 [N].
 
     Args:
-        curve: t1, t2 [N], which grows.
+        curve: t1, t2 [N] of an increasing curve.
         thrust: [N].
     """
     first, second = curve
@@ -152,8 +152,8 @@ def motor_speed(vehicle: Vehicle, command: Any, voltage: Any = None) -> Any:
     """
     if vehicle.motors is None:
         raise ValueError(
-            f"vehicle {vehicle.name!r} has no [motors]: nothing says what thrust a motor command "
-            "gives; add it, or let `suite identify` find it"
+            f"vehicle {vehicle.name!r} has no [motors]: the thrust of a motor command is unknown; "
+            "add it, or let `suite identify` estimate it"
         )
     thrust = motor_thrust(vehicle.motors, command, voltage)
     xp = thrust.__array_namespace__()

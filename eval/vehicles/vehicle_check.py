@@ -1,4 +1,4 @@
-"""Whether a vehicle can exist and fly: the physical checks behind the vehicle file."""
+"""Physical checks of a vehicle file: can such a vehicle exist, and can it hover?"""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _check_rotors(vehicle: Vehicle) -> None:
     matrix = mixer_matrix(
         rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
     )
-    # Rows of one size, so that the rank says something about the layout and not about units.
+    # Rows of equal size, so that the rank depends on the layout instead of the units.
     rows = matrix / np.maximum(np.linalg.norm(matrix, axis=1, keepdims=True), 1e-300)
     if np.linalg.matrix_rank(rows, tol=1e-6) < 4:
         raise ValueError(
@@ -79,7 +79,7 @@ def _check_rotors(vehicle: Vehicle) -> None:
         )
     given = {f"rotors.speed_max = {rotors.speed_max}": rotors.thrust_max}
     if vehicle.motors is not None and vehicle.controller.settings is not None:
-        # Behind a firmware's loop a motor gives what its curve says at full command.
+        # With a firmware's loop the motor's own curve limits its thrust.
         full = motor_thrust(vehicle.motors, 1.0)
         given[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
     for entry, most in given.items():

@@ -64,7 +64,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
         line_grid=False,
         eye_controls=_overview(tab),
     )
-    beside: list[rrb.View] = [
+    side_views: list[rrb.View] = [
         rrb.Spatial3DView(
             # In the drone's frame, so that the eye is carried along and turns with it.
             origin=f"{world}/drone",
@@ -82,7 +82,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
     ]
     if tab.has_depth:
         camera = f"{world}/drone/camera"
-        beside.append(rrb.Spatial2DView(origin=camera, name="depth image it saw"))
+        side_views.append(rrb.Spatial2DView(origin=camera, name="depth image it saw"))
     plots = {
         "speed": "speed [m/s]",
         "rates": "body rates [rad/s]",
@@ -99,7 +99,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
         columns=rrb.archetypes.TextLogColumns(text_log_columns=["body"]),
     )
     return rrb.Vertical(
-        rrb.Horizontal(overview, rrb.Vertical(*beside), column_shares=[2.2, 1.0]),
+        rrb.Horizontal(overview, rrb.Vertical(*side_views), column_shares=[2.2, 1.0]),
         rrb.Horizontal(speed, rates, rrb.Tabs(*others), events, column_shares=[2, 2, 2, 1]),
         row_shares=[3.0, 1.0],
         name=tab.title,

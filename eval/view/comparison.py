@@ -85,8 +85,8 @@ def write_comparison(
     if not flights:
         raise ValueError("a recording needs at least one flight; got none")
     recording = rr.RecordingStream(APPLICATION)
-    with replacing_file(path) as beside:
-        recording.save(beside, default_blueprint=_layout(flights))
+    with replacing_file(path) as temporary:
+        recording.save(temporary, default_blueprint=_layout(flights))
         try:
             texts = {k: str(v) for k, v in stamp(SCHEMA, None).items() if v is not None}
             recording.send_property("suite", rr.AnyValues(drop_untyped_nones=True, **texts))

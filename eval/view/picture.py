@@ -292,6 +292,6 @@ def _save(figure: Figure, path: str | Path, dpi: int) -> Path:
     FigureCanvasAgg(figure)
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # a name of a policy or a track may hold dollar signs
-    with replacing_file(path) as beside:
-        figure.savefig(beside, dpi=dpi)
+    with replacing_file(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
     return Path(path)

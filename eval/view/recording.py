@@ -77,8 +77,8 @@ def write_recording(
     tabs = [_tab(k, *rollout, several) for k, rollout in enumerate(rollouts)]
     # Nothing goes out until the file is named, so that it holds the blueprint first.
     recording = rr.RecordingStream(APPLICATION)
-    with replacing_file(path) as beside:
-        recording.save(beside, default_blueprint=layout(tabs, _shown(rollouts)))
+    with replacing_file(path) as temporary:
+        recording.save(temporary, default_blueprint=layout(tabs, _shown(rollouts)))
         try:
             about = stamp(SCHEMA, rollouts[0][2].seed)
             texts = {key: str(value) for key, value in about.items() if value is not None}

@@ -133,11 +133,11 @@ class Multirotor:
         import torch
 
         theirs, cpu = rotorpy(), torch.device("cpu")
-        told = rotorpy_vehicle.rotorpy_parameters(vehicle, STEPS_A_LAG * dt)
-        self._dt, self._rows, self._mass = dt, torch.arange(count), told["mass"]
+        parameters = rotorpy_vehicle.rotorpy_parameters(vehicle, STEPS_A_LAG * dt)
+        self._dt, self._rows, self._mass = dt, torch.arange(count), parameters["mass"]
         start = {"x": torch.zeros(count, 3, dtype=torch.float64)}
         self._theirs = theirs.BatchedMultirotor(
-            theirs.BatchedMultirotorParams([told] * count, count, cpu),
+            theirs.BatchedMultirotorParams([parameters] * count, count, cpu),
             count,
             start,
             cpu,

@@ -92,9 +92,9 @@ def as_flown(vehicle: Vehicle) -> Vehicle:
     known = (*ROTORPY_EFFECTS, *OUTSIDE)
     kept = {name: value for name, value in vehicle.effects.items() if name in known}
     if AT_HOVER in vehicle.effects:
-        told = rotorpy_parameters(vehicle)
+        parameters = rotorpy_parameters(vehicle)
         for name, key in (("rotor_drag", "k_d"), ("inflow", "k_z")):
-            kept[name] = EFFECTS[name].values(told[key])
+            kept[name] = EFFECTS[name].values(parameters[key])
     return replace(vehicle, name=f"{vehicle.name}, as RotorPy flies it", effects=kept)
 
 

@@ -80,9 +80,9 @@ def save_arrays(
     if clash:
         raise ValueError(f"extra: {clash} are written by the checkpoint itself; use other names")
     config |= dict(extra or {})
-    with replacing_folder(folder) as beside:
-        (beside / WEIGHTS).write_bytes(weights)
-        (beside / CONFIG).write_text(to_json(config, indent=2) + "\n", encoding="utf-8")
+    with replacing_folder(folder) as temporary:
+        (temporary / WEIGHTS).write_bytes(weights)
+        (temporary / CONFIG).write_text(to_json(config, indent=2) + "\n", encoding="utf-8")
     return folder
 
 

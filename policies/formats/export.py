@@ -65,8 +65,8 @@ def export_policy(
             _, write = _WRITERS[wanted]
             files = {main_file(name, wanted): write(checkpoint, texts)}
         for file, data in files.items():
-            with replacing_file(out / file) as beside:
-                beside.write_bytes(data)
+            with replacing_file(out / file) as temporary:
+                temporary.write_bytes(data)
             written.append(out / file)
     return written
 
@@ -74,7 +74,7 @@ def export_policy(
 def export_module(
     module: torch.nn.Module,
     path: str | Path,
-    told: PolicySpec | contract.Contract,
+    trained_under: PolicySpec | contract.Contract,
     memory: tuple[int, ...] | None = None,
 ) -> Path:
     """Write a torch module as ONNX with its contract, and load it once as the judge does.
@@ -86,7 +86,7 @@ def export_module(
         module: its forward takes (state, image) or (state, image, hidden), float32 with the batch
             first, and returns the action, or (action, hidden).
         path: ends in .onnx.
-        told: what the module was trained under: `env.unwrapped.contract`, or a spec.
+        trained_under: its contract (`env.unwrapped.contract`) or its spec.
         memory: shape of one row's hidden state; None without memory.
 
     Returns:
@@ -100,7 +100,11 @@ def export_module(
 
     from policies.policy import load_policy
 
-    spec = told if isinstance(told, PolicySpec) else contract.spec_of(told, str(path))
+    spec = (
+        trained_under
+        if isinstance(trained_under, PolicySpec)
+        else contract.spec_of(trained_under, str(path))
+    )
     made = contract.contract_of(spec, memory or ())
     sizes = [(spec.state_size,), spec.image_shape, *([memory] if memory else [])]
     names = INPUTS[: len(sizes)]
@@ -126,8 +130,8 @@ def export_module(
         module.train(training)
     proto = onnx.load_model_from_string(buffer.getvalue())
     onnx.helper.set_model_props(proto, {contract.KEY: made.text})
-    with replacing_file(path) as beside:
-        beside.write_bytes(proto.SerializeToString())
+    with replacing_file(path) as temporary:
+        temporary.write_bytes(proto.SerializeToString())
     load_policy(path)
     return Path(path)
 

@@ -11,7 +11,7 @@ import onnx
 import onnx.inliner
 
 from policies.block_policy import BlockPolicy, proven
-from policies.formats.apart_process import Apart
+from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import (
     INPUTS,
     check_inputs,
@@ -35,17 +35,17 @@ def load_onnx(path: Path) -> BlockPolicy:
             outside its folder, or its inputs and outputs do not fit.
     """
     proto = read_checked(path)
-    said = extract({entry.key: entry.value for entry in proto.metadata_props}, str(path))
-    spec = said.spec
-    loaded = Apart(proto.SerializeToString(), str(path), "onnx")
+    metadata = extract({entry.key: entry.value for entry in proto.metadata_props}, str(path))
+    spec = metadata.spec
+    loaded = ModelProcess(proto.SerializeToString(), str(path), "onnx")
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
             raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
     found = {value.name: value.shape for value in loaded.inputs}
     order = sorted(found, key=(*INPUTS, *found).index)
     block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
-    check_memory(said, hidden_shape, str(path))
-    notes = (*said.notes, *dropped_inputs(found, str(path)))
+    check_memory(metadata, hidden_shape, str(path))
+    notes = (*metadata.notes, *dropped_inputs(found, str(path)))
     outputs = [value.name for value in loaded.outputs]
     if len(outputs) != 1 + (hidden_shape != (0,)):
         raise PolicyError(

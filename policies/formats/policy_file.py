@@ -58,8 +58,12 @@ def save_policy(
     Raises:
         OSError: where the disk refuses; what was there stays.
     """
-    told = contract.contract_of(spec, (spec.hidden_size,)).to_json()
-    extra = {"spec": spec_to_json(spec), contract.KEY: told, "training": dict(training or {})}
+    stored_contract = contract.contract_of(spec, (spec.hidden_size,)).to_json()
+    extra = {
+        "spec": spec_to_json(spec),
+        contract.KEY: stored_contract,
+        "training": dict(training or {}),
+    }
     return save_arrays(folder, params, kind=POLICY, seed=seed, extra=extra)
 
 
@@ -77,8 +81,8 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
     check_shapes(folder / WEIGHTS, stored.arrays, expected_shapes(spec, str(folder / CONFIG)))
     if contract.KEY in stored.config:
         where, own = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
-        told = contract.read_contract(stored.config[contract.KEY], where)
-        contract.refuse_other(told, own, where, "the spec beside it")
+        stored_contract = contract.read_contract(stored.config[contract.KEY], where)
+        contract.refuse_other(stored_contract, own, where, "the spec beside it")
     return PolicyCheckpoint(stored.arrays, spec, stored.config)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from policies.block_policy import BLOCK
-from policies.formats.spec_json import KEY, Said
-from policies.spec import EXTRAS, Doubt, PolicyError, PolicySpec
+from policies.formats.spec_json import KEY, PolicyMetadata
+from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
 
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory leaves the last out."""
@@ -65,25 +65,25 @@ def check_inputs(
     return block, tuple(hidden)
 
 
-def check_memory(said: Said, hidden_shape: tuple[int, ...], where: str) -> None:
+def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where: str) -> None:
     """Refuse a memory of another shape than the contract's.
 
     Raises:
         PolicyError: naming both.
     """
-    told = said.contract.memory if said.contract else None
-    if told is not None and tuple(told) != (hidden_shape if hidden_shape != (0,) else ()):
+    shape = metadata.contract.memory if metadata.contract else None
+    if shape is not None and tuple(shape) != (hidden_shape if hidden_shape != (0,) else ()):
         raise PolicyError(
-            f"{where}: its contract says a memory of shape {list(told)}, its input 'hidden' has "
+            f"{where}: its contract says a memory of shape {list(shape)}, its input 'hidden' has "
             f"{list(hidden_shape)}; export the policy again with its own contract"
         )
 
 
-def dropped_inputs(names: Iterable[str], where: str) -> tuple[Doubt, ...]:
+def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
     """Return what to say where an exporter has left out an input that nothing uses."""
     missing = [name for name in INPUTS[:2] if name not in names]
     return tuple(
-        Doubt(
+        Note(
             "dropped_input",
             f"{where}: has no input {name!r}: exporters drop what no operator uses, and it flies "
             "without",

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from policies import contract
-from policies.spec import Doubt, PolicyError, PolicySpec, check_spec
+from policies.spec import Note, PolicyError, PolicySpec, check_spec
 from tracks.common.files import to_json
 from tracks.common.names import unknown_name
 from tracks.common.provenance import stamp
@@ -51,14 +51,14 @@ KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec", contrac
 """Of the object; what a policy says of itself stands under `spec` and `contract`."""
 
 
-class Said(NamedTuple):
+class PolicyMetadata(NamedTuple):
     """What a file says of its policy."""
 
     spec: PolicySpec
     """The default one where it says nothing."""
     contract: contract.Contract | None
     """As the file has it."""
-    notes: tuple[Doubt, ...]
+    notes: tuple[Note, ...]
     """What is assumed."""
 
 
@@ -74,7 +74,7 @@ def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
     return to_json({**stamp(SCHEMA, seed), **about})
 
 
-def extract(texts: Mapping[str, str | bytes | None], where: str) -> Said:
+def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetadata:
     """Return what a file says of its policy.
 
     Args:
@@ -93,19 +93,19 @@ def extract(texts: Mapping[str, str | bytes | None], where: str) -> Said:
         own = contract.contract_of(spec)
         for one, place in read:
             contract.refuse_other(one, own, place, f"the spec in {KEY}")
-        return Said(spec, read[0][0] if read else None, ())
+        return PolicyMetadata(spec, read[0][0] if read else None, ())
     if read:
         for one, place in read[1:]:
             contract.refuse_other(one, read[0][0], place, f"the entry {contract.KEY}")
-        return Said(contract.spec_of(*read[0]), read[0][0], ())
+        return PolicyMetadata(contract.spec_of(*read[0]), read[0][0], ())
     spec = spec_from_json({}, where)
     assumed = contract.summary(contract.contract_of(spec))
-    doubt = Doubt(
+    doubt = Note(
         "no_contract",
         f"{where}: no contract in it; assumed: {assumed}",
         "where it was trained otherwise, export it with env.unwrapped.contract",
     )
-    return Said(spec, None, (doubt,))
+    return PolicyMetadata(spec, None, (doubt,))
 
 
 def _object(text: str | bytes | None, where: str) -> dict[str, Any]:

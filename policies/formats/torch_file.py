@@ -3,7 +3,7 @@
 Neither is loaded without trust: `torch.jit.load` runs what a file says by design, and
 `torch.export.load` unpickles sample inputs and some weights, resolves operators by dotted paths and
 evaluates expressions, all from the file; torch has no safe mode for it. The process of their own
-(`apart_process.py`) keeps a module that hangs or aborts from taking the suite along, no more.
+(`model_process.py`) keeps a module that hangs or aborts from taking the suite along, no more.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from policies import contract
 from policies.block_policy import BlockPolicy, Model, proven
-from policies.formats.apart_process import Apart
+from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, inputs_message
 from policies.formats.spec_json import KEY, extract
 from policies.spec import NeedsTrust, PolicyError
@@ -31,13 +31,13 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     loaded = _loaded(path, "program", "a torch exported program", trust)
-    said = extract(loaded.labels, str(path))
-    spec, shapes = said.spec, {port.name: port.shape for port in loaded.inputs}
+    metadata = extract(loaded.labels, str(path))
+    spec, shapes = metadata.spec, {port.name: port.shape for port in loaded.inputs}
     _check_names(path, tuple(shapes))
     block, hidden_shape = check_inputs(shapes, spec, str(path))
-    check_memory(said, hidden_shape, str(path))
+    check_memory(metadata, hidden_shape, str(path))
     model = _as_model(loaded, path, hidden_shape)
-    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, said.notes)
+    policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, metadata.notes)
     return proven(policy, str(path))
 
 
@@ -49,15 +49,17 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
             fit.
     """
     loaded = _loaded(path, "script", "TorchScript", trust)
-    said = extract(loaded.labels, str(path))
-    spec, names = said.spec, tuple(port.name for port in loaded.inputs)
+    metadata = extract(loaded.labels, str(path))
+    spec, names = metadata.spec, tuple(port.name for port in loaded.inputs)
     _check_names(path, names)
     hidden_shape = (spec.hidden_size,) if names == INPUTS else (0,)
     model = _as_model(loaded, path, hidden_shape)
-    return proven(BlockPolicy(path.name, spec, model, hidden_shape, notes=said.notes), str(path))
+    return proven(
+        BlockPolicy(path.name, spec, model, hidden_shape, notes=metadata.notes), str(path)
+    )
 
 
-def _loaded(path: Path, kind: str, words: str, trust: bool) -> Apart:
+def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
     if not trust:
         raise NeedsTrust(
             f"{path}: {words} can run any code of its maker's while torch loads it; if you trust "
@@ -75,7 +77,7 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> Apart:
             f"{path}: this file contains weights without a program (a state_dict or a pickled "
             "module); load them into the module and export it: examples/sb3_race.py"
         )
-    return Apart(data, str(path), kind, (KEY, contract.KEY))
+    return ModelProcess(data, str(path), kind, (KEY, contract.KEY))
 
 
 def _check_names(path: Path, names: tuple[str, ...]) -> None:
@@ -93,7 +95,7 @@ def _is_weights(data: bytes) -> bool:
     return pickled and not any("/code/" in name for name in names)
 
 
-def _as_model(loaded: Apart, path: Path, hidden_shape: tuple[int, ...]) -> Model:
+def _as_model(loaded: ModelProcess, path: Path, hidden_shape: tuple[int, ...]) -> Model:
     memory = hidden_shape != (0,)
 
     def model(

@@ -239,7 +239,7 @@ def changed_values(
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
     """Return what a diagnosis should find: totals, with null for what no flight can tell."""
     found: dict[str, Any] = {}
-    for parameter in EFFECTS[effect].told(has_voltage):
+    for parameter in EFFECTS[effect].identifiable(has_voltage):
         value = getattr(values, parameter.name)
         if parameter.size:
             value = [None if i in parameter.unseen else v for i, v in enumerate(value)]

@@ -68,7 +68,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from eval.importers import import_log
     from eval.importers.options import ImportOptions
-    from eval.logs.faults.finding import said
+    from eval.logs.faults.finding import finding_lines
     from eval.logs.faults.reading import parse_readings
     from eval.logs.flight_log import columns_from_log, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
@@ -93,7 +93,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     log, findings = import_log(config.file, config.format or None, options)
     write_flight(config.out, log)
-    for line in said(findings):
+    for line in finding_lines(findings):
         console.say(line)
     for warning in log.warnings:
         console.say(f"note      file: {warning}")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from eval.logs.faults.check import Against, first_stage, lines_of, not_examined
+from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of, not_examined
 from eval.logs.flight_log import FlightLog, read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -78,7 +78,7 @@ def diagnose_files(
     truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths), partial=True)
     before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])
-    findings = first_stage([*logs, *before], Against(vehicle), accept)
+    findings = check_before_diagnosis([*logs, *before], CheckContext(vehicle), accept)
     warnings = [*warnings, *told, *lines_of(findings)]
     logs, slow = without_slow_rotors(logs)
     before, slow_before = without_slow_rotors(before)

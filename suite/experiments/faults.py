@@ -15,7 +15,7 @@ import numpy as np
 
 from eval.importers import import_log
 from eval.importers.options import ImportOptions
-from eval.logs.faults.check import Against, check_files, check_log, rows_of
+from eval.logs.faults.check import CheckContext, check_files, check_log, rows_of
 from eval.logs.faults.finding import Finding
 from eval.logs.flight_log import FlightLog, read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
@@ -195,7 +195,7 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
     vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
     fov = tuple(kind.fov * angle for angle in vehicle.camera.fov_deg)
     hz = POLICY_HZ if case.format != "real" else None
-    against = Against(vehicle, hz, (fov[0], fov[1]))
+    against = CheckContext(vehicle, hz, (fov[0], fov[1]))
     try:
         found = _findings(case, wrong, vehicle, against)
     except ValueError as error:
@@ -204,7 +204,7 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
     yield [f._asdict() for f in found if f.fault and f.status != "ok"]
 
 
-def _findings(case: Case, parts: dict[str, np.ndarray], vehicle: Vehicle, against: Against
+def _findings(case: Case, parts: dict[str, np.ndarray], vehicle: Vehicle, against: CheckContext
               ) -> list[Finding]:  # fmt: skip
     if case.format in WRITERS:
         with tempfile.TemporaryDirectory() as folder:

@@ -48,14 +48,20 @@ def check_flight_files(
     """
     from dataclasses import replace
 
-    from eval.logs.faults.check import Against, check_files, check_log, not_identifiable, with_fixes
-    from eval.logs.faults.finding import Finding, said
+    from eval.logs.faults.check import (
+        CheckContext,
+        check_files,
+        check_log,
+        not_identifiable,
+        with_fixes,
+    )
+    from eval.logs.faults.finding import Finding, finding_lines
     from eval.logs.flight_log import read_flights, write_flight
     from eval.quadrotor.vehicle_file import load_vehicle
     from suite.delta.run import flight_files
 
     spec = None if policy is None else policy.spec
-    against = Against(
+    against = CheckContext(
         load_vehicle(vehicle) if vehicle else None,
         None if spec is None else spec.rate_hz,
         None if spec is None else spec.camera.fov_deg,
@@ -77,7 +83,7 @@ def check_flight_files(
             written.append(str(path))
     for name in (None, *(log.name for log in logs)):
         told = [finding for finding, flight in found if flight == name and finding.status != "ok"]
-        for text in said(told):
+        for text in finding_lines(told):
             console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
     if written:
         console.say(f"written: {', '.join(written)}")

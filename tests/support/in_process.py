@@ -4,13 +4,13 @@ import importlib
 
 import numpy as np
 
-from policies.formats.apart_process import REMEDIES, Port
-from policies.formats.apart_server import KINDS
+from policies.formats.model_process import REMEDIES, Port
+from policies.formats.model_server import KINDS
 from policies.spec import NoAnswer, PolicyError
 
 
 class InProcess:
-    """Stands for `Apart`, with its answers and its words where the engine refuses."""
+    """Stands for `ModelProcess`, with its answers and its words where the engine refuses."""
 
     def __init__(self, model, where, kind, labels=()):
         name, load = KINDS[kind]

@@ -84,12 +84,12 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     final = Path(path)
     final.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
-    beside = folder / final.name
+    temporary = folder / final.name
     try:
         with naming(final):
-            yield beside
-            _sync(beside)
-        os.replace(beside, final)
+            yield temporary
+            _sync(temporary)
+        os.replace(temporary, final)
         _sync(final.parent)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -108,17 +108,17 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     final = Path(path)
     final.parent.mkdir(parents=True, exist_ok=True)
     parent = Path(tempfile.mkdtemp(prefix=_prefix(final), suffix=PART, dir=final.parent))
-    beside = parent / final.name
-    beside.mkdir()
+    temporary = parent / final.name
+    temporary.mkdir()
     retired = parent / "replaced"
     try:
         with naming(final):
-            yield beside
-            for written in sorted(beside.rglob("*")):
+            yield temporary
+            for written in sorted(temporary.rglob("*")):
                 _sync(written)
         if final.exists():
             os.replace(final, retired)
-        os.replace(beside, final)
+        os.replace(temporary, final)
         _sync(final.parent)
     finally:
         # Also for an interrupt that comes between the two renames.
@@ -258,9 +258,9 @@ def _sync(path: Path) -> None:
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` to `path` as UTF-8, whole or not at all."""
-    with replacing_file(path) as beside:
+    with replacing_file(path) as temporary:
         # A name that is not UTF-8, as a folder's above may be, is written as an escape.
-        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

@@ -27,7 +27,7 @@ _SLIVER = 1e-12
 """A triangle's area over that of a square of its part's largest extent at which it is none."""
 
 
-class _Beside:
+class _Resolver:
     """The files beside a mesh, for its loader: buffers of a glTF, with the limits of the mesh."""
 
     def __init__(self, folder: Path, left: int) -> None:
@@ -62,8 +62,8 @@ def convex_parts(path: Path) -> list[np.ndarray]:
         options["skip_materials"] = True
     try:
         data = read_bytes(path, MESH_BYTES)
-        beside: Any = _Beside(path.parent, MESH_BYTES - len(data))
-        scene = trimesh.load_scene(io.BytesIO(data), kind, beside, **options)
+        resolver: Any = _Resolver(path.parent, MESH_BYTES - len(data))
+        scene = trimesh.load_scene(io.BytesIO(data), kind, resolver, **options)
         found = scene.dump()
     except InputError:
         raise
@@ -72,8 +72,8 @@ def convex_parts(path: Path) -> list[np.ndarray]:
     except MemoryError:
         raise
     except Exception as error:  # the loaders raise whatever they like on a damaged file
-        said = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"{path}: cannot be read as a mesh ({said})") from None
+        reason_text = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: cannot be read as a mesh ({reason_text})") from None
     meshes = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not meshes or not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
         raise ValueError(f"{path}: holds no triangles or corners that are not finite")

@@ -113,8 +113,8 @@ def _ask(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
         late.cancel()
     if process.wait() == -signal.SIGALRM:  # it stopped waiting for us at this moment
         return _ask(paths, names)
-    said = late_s or f"to the end, its reader ended with {process.returncode}"
-    raise ValueError(f"{names}: cannot be read as a mesh {said}; use a simpler one")
+    how = late_s or f"to the end, its reader ended with {process.returncode}"
+    raise ValueError(f"{names}: cannot be read as a mesh {how}; use a simpler one")
 
 
 def _answer_of(process: subprocess.Popen[bytes], paths: list[str]) -> tuple[dict[str, Any], bytes]:

@@ -134,8 +134,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         text = "no setpoint columns: sticks are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
-        told = box.unit("vbatLatest")
-        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), told, options.fix, findings)
+        unit = box.unit("vbatLatest")
+        parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
     poles = box.header.get("motor_poles", options.motor_poles)
     parts |= _motors(box, poles if options.motor_poles == 14 else options.motor_poles, findings)
     parts |= _outputs(box, findings)

@@ -62,7 +62,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
-    told, motor_side = _told(options.map)
+    topic_of, motor_side = _choices(options.map)
     found = _messages(path)
     chosen: dict[str, list[tuple[int, int, Any]]] = {}
     findings: list[Finding] = []
@@ -70,17 +70,17 @@ def read(path: Path, options: ImportOptions) -> Recording:
         topics = {topic: held for (k, topic), held in found.items() if k == kind}
         if not topics:
             continue
-        topic = told.get(kind) or max(topics, key=lambda name: len(topics[name]))
+        topic = topic_of.get(kind) or max(topics, key=lambda name: len(topics[name]))
         if topic not in topics:
             reason = f"topic {topic!r} has no {' or '.join(KINDS[kind])}; {', '.join(topics)} do"
             raise FlightLogError(str(path), None, None, reason)
-        if len(topics) > 1 and kind not in told:
+        if len(topics) > 1 and kind not in topic_of:
             text = f"{kind} from {topic}; also there: {', '.join(sorted(topics.keys() - {topic}))}"
             findings.append(Finding("note", "topics", text + ". Choose with [topics] in --map"))
         chosen[kind] = topics[topic]
-    missing = sorted(told.keys() - chosen.keys())
+    missing = sorted(topic_of.keys() - chosen.keys())
     if missing:
-        reason = f"topic {told[missing[0]]!r} of the mapping is not there"
+        reason = f"topic {topic_of[missing[0]]!r} of the mapping is not there"
         raise FlightLogError(str(path), None, None, reason)
     messages = _on_one_clock(chosen, findings)
     findings += _motor_count(messages)
@@ -88,7 +88,9 @@ def read(path: Path, options: ImportOptions) -> Recording:
     return Recording(str(path), signals, (*findings, *more), motor_side)
 
 
-def _told(map_path: Path | None) -> tuple[dict[str, str], tuple[tuple[float, float], ...] | None]:
+def _choices(
+    map_path: Path | None,
+) -> tuple[dict[str, str], tuple[tuple[float, float], ...] | None]:
     """Return the topics that a mapping file chooses, by kind, and where it has the motors."""
     if map_path is None:
         return {}, None

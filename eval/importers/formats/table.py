@@ -21,7 +21,7 @@ from eval.importers.signals import Recording
 from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.files import first_line, read_columns
-from eval.logs.flight_log import told_about
+from eval.logs.flight_log import flight_metadata
 from tracks.common.names import closest
 
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
@@ -49,12 +49,12 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
     """Return what the table at `path` holds, read as the mapping at `map_path` says; see `read`."""
-    told = None if map_path is None else read_map(map_path)
+    described_by = None if map_path is None else read_map(map_path)
     columns, text, warnings = read_columns(path)
-    mapping = told or own_map(columns)
+    mapping = described_by or own_map(columns)
     name, about = str(path), {}
-    if told is None:  # a log of ours says how it was flown
-        about, more = told_about(text, name)
+    if described_by is None:  # a log of ours says how it was flown
+        about, more = flight_metadata(text, name)
         warnings += more
     time_s = _time(columns, mapping, name, map_path is not None)
 

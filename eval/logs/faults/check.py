@@ -14,7 +14,7 @@ from eval.logs.faults.clock import check_clock, check_time
 from eval.logs.faults.commands import check_controller_rate, check_rate_command, check_throttle
 from eval.logs.faults.finding import Finding, findings_of, line
 from eval.logs.faults.motors import check_lift, check_motors
-from eval.logs.faults.pose import Rows, check_pose, look_at_pose
+from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
@@ -28,7 +28,7 @@ LEAST_ROWS = 50
 
 
 @dataclass(frozen=True)
-class Against:
+class CheckContext:
     """What a log is held against."""
 
     vehicle: Vehicle | None = None
@@ -36,11 +36,11 @@ class Against:
     policy_fov: tuple[float, float] | None = None
 
 
-Check = Callable[[Rows, Against], list[Finding]]
+Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
 """In which unit the time is: before there can be rows."""
 POSE: tuple[Check, ...] = (
-    lambda rows, _: check_pose(rows, look_at_pose(rows)),
+    lambda rows, _: check_pose(rows, fit_pose_readings(rows)),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
     lambda rows, _: check_accelerometer(rows),
@@ -59,7 +59,7 @@ DRIVE: tuple[Check, ...] = (
 
 
 def run_checks(
-    rows: Rows, checks: Sequence[Check], against: Against, fix: bool
+    rows: Rows, checks: Sequence[Check], against: CheckContext, fix: bool
 ) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
     """Return the findings, the readings that put right what is overwhelming, and the rows by them.
 
@@ -84,7 +84,7 @@ def run_checks(
 
 
 def check_log(
-    log: FlightLog, against: Against = Against(), fix: bool = False
+    log: FlightLog, against: CheckContext = CheckContext(), fix: bool = False
 ) -> tuple[list[Finding], Readings]:
     """Return what is wrong with a log in our columns, and the readings that put it right.
 
@@ -119,8 +119,8 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     return log_from_columns(columns, log.about, log.name)
 
 
-def first_stage(
-    logs: Sequence[FlightLog], against: Against, accept: Sequence[str] = ()
+def check_before_diagnosis(
+    logs: Sequence[FlightLog], against: CheckContext, accept: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Return the records of what the logs and the files show, before anything is concluded of it.
 
@@ -174,7 +174,7 @@ def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def check_files(against: Against) -> list[Finding]:
+def check_files(against: CheckContext) -> list[Finding]:
     """Return what is wrong with the vehicle file and the policy's camera."""
     found = [] if against.vehicle is None else check_vehicle_numbers(against.vehicle)
     return found + check_camera(against.policy_fov, against.vehicle)

@@ -41,7 +41,7 @@ def unseen(signal: str, evidence: str, *faults: str) -> list[Finding]:
     return [Finding("not identifiable", signal, evidence, fault) for fault in faults]
 
 
-def said(findings: Iterable[Finding]) -> list[str]:
+def finding_lines(findings: Iterable[Finding]) -> list[str]:
     """Return the findings as lines for people, the serious ones first."""
     ranked = sorted(findings, key=lambda finding: STATUSES.index(finding.status))
     together: dict[tuple[str, str, str], list[Finding]] = {}
@@ -68,8 +68,8 @@ def findings_of(about: Mapping[str, Any]) -> tuple[Finding, ...]:
     for record in records if isinstance(records, list) else ():
         if not isinstance(record, dict):
             continue
-        told = {old.get(key, key): value for key, value in record.items()}
-        told = {key: value for key, value in told.items() if key in Finding._fields}
-        if {"status", "signal", "evidence"} <= told.keys() and told["status"] in STATUSES:
-            found.append(Finding(**told))
+        fields = {old.get(key, key): value for key, value in record.items()}
+        fields = {key: value for key, value in fields.items() if key in Finding._fields}
+        if {"status", "signal", "evidence"} <= fields.keys() and fields["status"] in STATUSES:
+            found.append(Finding(**fields))
     return tuple(found)

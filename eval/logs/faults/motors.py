@@ -114,10 +114,10 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
         _scores(mean[part], turning[part], mixer) for part in (slice(half), slice(half, None))
     ]
     given, best = scores[AS_GIVEN], _best(scores)
-    told = ", ".join(
+    values = ", ".join(
         f"{axis} {value:+.2f}" for axis, value in zip(("roll", "pitch", "yaw"), given, strict=True)
     )
-    figures = f"correlations of their torques with how the body turns are {told}"
+    figures = f"correlations of their torques with how the body turns are {values}"
     gain = float(scores[best][:2].sum() - given[:2].sum())
     if gain > CLEAR and scores[best][:2].min() > RIGHT and all(best == _best(h) for h in halves):
         order = ",".join(str(k + 1) for k in best)

@@ -76,7 +76,7 @@ class Reading(NamedTuple):
     gyro: Match | None
 
 
-class Looked(NamedTuple):
+class PoseFits(NamedTuple):
     """What a log shows of its pose."""
 
     given: Reading
@@ -89,7 +89,7 @@ class Looked(NamedTuple):
     """Turns by the gyro [its unit]."""
 
 
-def look_at_pose(rows: Rows) -> Looked | None:
+def fit_pose_readings(rows: Rows) -> PoseFits | None:
     """Return how well every reading fits; None where the rows hold no attitude."""
     if "quat" not in rows:
         return None
@@ -129,7 +129,7 @@ def look_at_pose(rows: Rows) -> Looked | None:
     others = [one for one in found if one is not best and one.steps <= best.steps + 1]
     second = min((o.misfit + EACH * (o.steps - best.steps) for o in others), default=np.inf)
     rate = 0.0 if gyro is None else rms(gyro)
-    return Looked(found[0], best, second, level, rate)
+    return PoseFits(found[0], best, second, level, rate)
 
 
 def _is_right(one: Reading) -> bool:
@@ -138,18 +138,18 @@ def _is_right(one: Reading) -> bool:
     return one.force is not None and one.misfit < RIGHT and not turned
 
 
-def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
+def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
     """Return what is wrong with how attitude and position are written."""
-    if looked is None:
+    if fits is None:
         return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
-    given, best = looked.given, looked.best
+    given, best = fits.given, fits.best
     figures = _figures(given)
     if not figures:
         return []
-    calm = looked.level < CALM_ACC and (given.force is None or given.force < BAD)
-    if calm and (given.turns is None or looked.rate < CALM_RATE):
+    calm = fits.level < CALM_ACC and (given.force is None or given.force < BAD)
+    if calm and (given.turns is None or fits.rate < CALM_RATE):
         text = (
-            f"accelerations of {looked.level:.2g} m/s^2 and turns of {looked.rate:.2g} rad/s are "
+            f"accelerations of {fits.level:.2g} m/s^2 and turns of {fits.rate:.2g} rad/s are "
             "too small to check it by"
         )
         return unseen("attitude", text, *SHOWN)
@@ -161,7 +161,7 @@ def check_pose(rows: Rows, looked: Looked | None) -> list[Finding]:
         sure = 0.9 if given.misfit > 1.0 else 0.6
         return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]
     better = given.misfit / max(best.misfit, 1e-3)
-    clear = looked.second - best.misfit
+    clear = fits.second - best.misfit
     sure = best.misfit < GOOD and better > TIMES_BETTER and clear > 0.5 * EACH
     readings = _readings(best, rows)
     text = f"{figures}; {_figures(best)} if {_words(best)}"
@@ -216,19 +216,19 @@ def _words(best: Reading) -> str:
         "-pitch": "pitch has the other sign",
         "-yaw": "yaw has the other sign",
     }
-    told = [words[step] for step in best.quat.split("+") if step]
-    told += [f"the position's axes are {best.pos}"] if best.pos else []
-    told += [f"it is in {'cm' if best.length == 0.01 else 'mm'}"] if best.length != 1.0 else []
-    return " and ".join(told)
+    parts = [words[step] for step in best.quat.split("+") if step]
+    parts += [f"the position's axes are {best.pos}"] if best.pos else []
+    parts += [f"it is in {'cm' if best.length == 0.01 else 'mm'}"] if best.length != 1.0 else []
+    return " and ".join(parts)
 
 
 def _figures(one: Reading) -> str:
-    told = []
+    parts = []
     if one.force is not None:
-        told.append(f"the force off body z is {100 * one.force:.0f} % of the acceleration")
+        parts.append(f"the force off body z is {100 * one.force:.0f} % of the acceleration")
     if one.turns is not None:
-        told.append(f"its turns are off the gyro's by {100 * one.turns:.0f} %")
-    return ", ".join(told)
+        parts.append(f"its turns are off the gyro's by {100 * one.turns:.0f} %")
+    return ", ".join(parts)
 
 
 def _bases() -> Iterator[str]:

@@ -227,9 +227,9 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
         best = ("", 1.0)
     if best == ("", 1.0) or residual[best] * TIMES_BETTER > given or residual[best] > GOOD:
         if given < OK:
-            beside = match(force, readings["", 1.0])
-            if beside.is_turned:
-                return [_turned(beside, "acc", "accelerometer")]
+            matched = match(force, readings["", 1.0])
+            if matched.is_turned:
+                return [_turned(matched, "acc", "accelerometer")]
             return [Finding("ok", "accelerometer", figures + lateral)]
         sure = 0.9 if given > 0.8 else 0.6
         text = f"{figures}, and no unit, sign or frame of it fits"
@@ -237,9 +237,9 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
     steps, scale = best
     words = {"": "", "-x,-y,-z": "of the other sign", "x,-y,-z": "in forward-right-down axes",
              "from-world": "in world axes", "plus-gravity": "without gravity"}  # fmt: skip
-    told = [unit] if scale != 1.0 else []
-    told += [words.get(steps, f"with axes {steps}")] if steps else []
-    text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {' and '.join(told)}"
+    reasons = [unit] if scale != 1.0 else []
+    reasons += [words.get(steps, f"with axes {steps}")] if steps else []
+    text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {' and '.join(reasons)}"
     fault = "accelerometer_unit" if scale != 1.0 else "accelerometer_axes"
     fault = "accelerometer_gravity" if steps == "plus-gravity" else fault
     parts = [f"{1.0 / scale:.10g}"] if scale != 1.0 else []

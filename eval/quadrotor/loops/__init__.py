@@ -1,8 +1,8 @@
 """Rate loops of flight controllers' firmwares, one file each: `[controller] kind`.
 
-A kind's module has `Settings` (its keys, as the firmware names them), `GROUP` (the table under
-`[controller]` that they stand in, "" for none), `gains`, `start` and `look`. The nominal loop, kind
-`p`, is `eval.quadrotor.mixer.rate_torque` and has no memory.
+A kind's module has `Settings` (keys as in the firmware), `GROUP` (their table under `[controller]`,
+"" for none), `gains`, `start` and `update`. The nominal loop, kind `p`, is
+`eval.quadrotor.mixer.rate_torque` and has no state.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from tracks.geometry.scene import Array
 
 NOMINAL = "p"
 KINDS: dict[str, Any] = {"betaflight": betaflight, "px4": px4, "crazyflie": crazyflie}
-"""Modules by kind; `p` besides."""
+"""Modules by kind, without `p`."""
 _MODULES = {module.Gains: module for module in KINDS.values()}
 
 
 class Loop(NamedTuple):
-    """A firmware's rate loop, and what its motor commands give."""
+    """A firmware's rate loop and the thrust curve of its motors."""
 
     gains: Any
     """`Gains` of the kind's module."""
@@ -32,8 +32,8 @@ class Loop(NamedTuple):
 def loop_of(vehicle: Vehicle) -> Loop | None:
     """Return the vehicle's loop, or None for the nominal one.
 
-    Without `[motors]` a command is a share of full speed, under the Crazyflie's firmware, which
-    makes up for its motors' curve, one of full thrust.
+    Without `[motors]` a command is a share of full speed. For the Crazyflie, whose firmware
+    compensates the motors' curve, it is a share of full thrust.
     """
     controller = vehicle.controller
     if controller.kind == NOMINAL:
@@ -49,11 +49,11 @@ def loop_of(vehicle: Vehicle) -> Loop | None:
 
 
 def start(loop: Loop | None, shape: tuple[int, ...], xp: Any) -> Any:
-    """Return the memory of loops of this batch shape before their first look."""
+    """Return the state of loops of this batch shape before their first update."""
     return () if loop is None else _MODULES[type(loop.gains)].start(shape, xp)
 
 
-def look(
+def update(
     loop: Loop,
     memory: Any,
     force_z: Array,
@@ -62,21 +62,21 @@ def look(
     dt: Array,
     scale: Array,
 ) -> tuple[Any, Array]:
-    """Return the memory after a look and the rotors' thrusts (..., 4) [N] that it asks for.
+    """Return the loop's state after an update and the commanded rotor thrusts (..., 4) [N].
 
     Args:
         loop: the loop.
-        memory: from `start` or the look before.
+        memory: from `start` or the update before.
         force_z: (...,) wanted collective [N].
         rate_cmd_b: (..., 3) [rad/s].
         rate_b: (..., 3) [rad/s].
-        dt: time since the last look [s].
-        scale: (..., 3) by which the loop is stronger than nominal [1].
+        dt: time since the last update [s].
+        scale: (..., 3) factor on the loop's output [1].
     """
     xp = rate_b.__array_namespace__()
     first, second = loop.thrust
     each = xp.maximum(0.25 * force_z, 0.0)
     throttle = xp.clip(command_of_thrust(loop.thrust, each), 0.0, 1.0)
     module = _MODULES[type(loop.gains)]
-    memory, command = module.look(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
+    memory, command = module.update(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
     return memory, first * command + second * command**2

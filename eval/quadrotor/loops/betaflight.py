@@ -25,9 +25,9 @@ from tracks.geometry.scene import Array
 GROUP = ""
 DEG = float(180.0 / np.pi)
 P_UNIT, I_UNIT, D_UNIT, F_UNIT = 0.032029, 0.244381, 0.000529, 0.00013754
-"""What one unit of p, i, d and f is, in thousandths of a motor's range per deg/s and so on."""
+"""One unit of p, i, d and f, in thousandths of a motor's range per deg/s, deg or deg/s^2."""
 YAW_I = 2.5
-"""What the firmware multiplies yaw's i by."""
+"""The firmware's factor on yaw's i."""
 SUM = 1000.0
 LIMITS = {
     "iterm_windup": (0.0, 100.0),
@@ -35,9 +35,9 @@ LIMITS = {
     "tpa_breakpoint": (1000.0, 2000.0),
     "dshot_idle_value": (0.0, 2000.0),
 }
-"""Settings that may not be any number from 0 on."""
+"""Allowed ranges of settings that are not simply 0 or more."""
 RELAXED = 40.0
-"""A set point so far from its slow part stops the integral [deg/s]."""
+"""Difference between the set point and its slow part that stops the integral [deg/s]."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,15 @@ class Settings:
     pidsum_limit: float = 500.0
     pidsum_limit_yaw: float = 400.0
     tpa_rate: float = 65.0
-    """By how much D falls to full throttle [%]."""
+    """Reduction of D at full throttle [%]."""
     tpa_breakpoint: float = 1350.0
-    """From which throttle on, 1000 to 2000."""
+    """Throttle at which the reduction begins, 1000 to 2000."""
     dshot_idle_value: float = 550.0
     """Motor command at zero throttle [0.01 %]."""
 
 
 class Gains(NamedTuple):
-    """The loop's numbers as arrays (3,), plain ones (,)."""
+    """The loop's constants as arrays (3,), or scalars."""
 
     p: Array
     i: Array
@@ -100,16 +100,16 @@ class Gains(NamedTuple):
     relaxed: Array
     """(3,) 1 for the axes that are relaxed."""
     tpa: Array
-    """(2,) fall of D to full throttle, and the throttle where it begins."""
+    """(2,) reduction of D at full throttle, and the throttle where it begins."""
     idle: Array
     layout: Layout
 
 
 class State(NamedTuple):
-    """What the loop remembers."""
+    """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first look."""
+    """(...,) 0 before the first update."""
     gyro: Array
     """(..., 2, 3) outputs of the gyro's filters [deg/s]."""
     dterm: Array
@@ -123,11 +123,11 @@ class State(NamedTuple):
     yaw: Array
     """(..., 1) filtered P of yaw."""
     span: Array
-    """(...,) range of the motors' turning at the last look, before it was scaled."""
+    """(...,) range of the motors' differences at the last update, before scaling."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
-    """Return the numbers of `settings` as arrays."""
+    """Return the constants of `settings` as arrays."""
 
     def each(key: str, unit: float) -> np.ndarray:
         values = [getattr(settings, f"{key}_{axis}") for axis in ("roll", "pitch", "yaw")]
@@ -156,13 +156,13 @@ def gains(settings: Settings, layout: Layout) -> Gains:
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state before the first look of loops of this batch shape."""
+    """Return the state of loops of this batch shape before the first update."""
     none, still = xp.zeros(shape), xp.zeros((*shape, 3))
     two, three = xp.zeros((*shape, 2, 3)), xp.zeros((*shape, 3, 3))
     return State(none, two, two, three, still, still, xp.zeros((*shape, 1)), none)
 
 
-def look(
+def update(
     gain: Gains,
     state: State,
     throttle: Array,
@@ -171,7 +171,7 @@ def look(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after a look and the motor commands; see `crazyflie.look`."""
+    """Return the state after an update and the motor commands; see `crazyflie.update`."""
     xp = rate_b.__array_namespace__()
     fresh = state.started
     gyro = _chain(fresh, state.gyro, DEG * rate_b, gain.gyro_hz, dt)
@@ -205,7 +205,7 @@ def look(
 
 
 def mixed(gain: Gains, level: Array, turning: Array) -> tuple[Array, Array]:
-    """Return the range of the motors' turning (...,), and their commands (..., 4).
+    """Return the range of the motors' differences (...,), and the motor commands (..., 4).
 
     Args:
         gain: the layout and the idle command.

@@ -3,8 +3,8 @@
     out = kp e + ki integral(e) + kd (-d rate/dt) + kff setpoint, within 16 bits
     motor = thrust -+ roll/2 -+ pitch/2 -+ yaw, all in 1/65535 of a motor's full command
 
-Where a motor would pass its full command all are lowered alike: attitude before thrust. Left out:
-that the firmware stops all motors and forgets its integrals at a thrust of exactly 0. Source:
+Where a motor would exceed its full command, all are lowered equally. Left out:
+that the firmware stops all motors and resets its integrals at a thrust of exactly 0. Source:
 Bitcraze's documentation of the firmware ("Controllers", "PID tuning", parameter groups `pid_rate`),
 its values for the Crazyflie 2.x.
 """
@@ -25,7 +25,7 @@ FULL = 65535.0
 SIGNED = 32767.0
 GROUP = "pid_rate"
 LIMITS: dict[str, tuple[float, float]] = {}
-"""Settings that may not be any number from 0 on."""
+"""Allowed ranges of settings that are not simply 0 or more."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Settings:
 
 
 class Gains(NamedTuple):
-    """The loop's numbers as arrays (3,)."""
+    """The loop's constants as arrays (3,)."""
 
     p: Array
     i: Array
@@ -65,20 +65,20 @@ class Gains(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the loop remembers."""
+    """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first look."""
+    """(...,) 0 before the first update."""
     integral: Array
     """(..., 3) [deg]."""
     rate: Array
-    """(..., 3) of the last look [deg/s]."""
+    """(..., 3) at the last update [deg/s]."""
     slope: Pair
     """(..., 3) of the derivative's filter."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
-    """Return the numbers of `settings` as arrays."""
+    """Return the constants of `settings` as arrays."""
 
     def each(key: str) -> np.ndarray:
         return np.array([getattr(settings, f"{axis}_{key}") for axis in ("roll", "pitch", "yaw")])
@@ -93,12 +93,12 @@ def gains(settings: Settings, layout: Layout) -> Gains:
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state before the first look of loops of this batch shape."""
+    """Return the state of loops of this batch shape before the first update."""
     still = xp.zeros((*shape, 3))
     return State(xp.zeros(shape), still, still, Pair(still, still))
 
 
-def look(
+def update(
     gain: Gains,
     state: State,
     throttle: Array,
@@ -107,16 +107,16 @@ def look(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after a look and the motor commands (..., 4) from 0 to 1.
+    """Return the state after an update and the motor commands (..., 4) from 0 to 1.
 
     Args:
-        gain: the loop's numbers.
+        gain: the loop's constants.
         state: before.
-        throttle: (...,) of each motor without any turning, from 0 to 1.
+        throttle: (...,) motor command without roll, pitch and yaw, from 0 to 1.
         rate_cmd_b: (..., 3) [rad/s].
         rate_b: (..., 3) [rad/s].
-        dt: time since the last look [s].
-        scale: (..., 3) by which the outputs are stronger than nominal [1].
+        dt: time since the last update [s].
+        scale: (..., 3) factor on the outputs [1].
     """
     xp = rate_b.__array_namespace__()
     wanted, rate = DEG * rate_cmd_b, DEG * rate_b
@@ -134,6 +134,6 @@ def look(
 
 
 def turning(layout: Layout, out: Array) -> Array:
-    """Return what the outputs (..., 3) add to each motor (..., 4): roll and pitch count half."""
+    """Return the outputs' share (..., 4) in each motor; roll and pitch count half."""
     half = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
     return half + out[..., 2, None] * layout.yaw

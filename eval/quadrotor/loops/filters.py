@@ -1,6 +1,6 @@
-"""What firmwares' rate loops share: low-pass filters, and the signs of a mixer from the rotors.
+"""Low-pass filters of the firmwares' rate loops, and the mixer's signs from the rotors.
 
-The filters are discrete, for numpy and JAX; a cutoff of 0 passes all.
+The filters are discrete, for numpy and JAX; a cutoff of 0 disables a filter.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from eval.vehicles.vehicle import Rotors
 from tracks.geometry.scene import Array
 
 PT3_SCALE = 1.961459177
-"""Three equal first-order filters are at -3 dB together where each is at this many times it:
+"""Three equal first-order filters have -3 dB together where each has this many times the cutoff:
 1 / sqrt(2^(1/3) - 1)."""
 
 
 class Pair(NamedTuple):
-    """Memory of a filter of second order."""
+    """State of a second-order filter."""
 
     first: Array
     second: Array
@@ -36,7 +36,7 @@ def pt1(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
 
 
 def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tuple[Pair, Array]:
-    """Return the memory and the output of a second-order Butterworth low pass (bilinear).
+    """Return the state and the output of a second-order Butterworth low pass (bilinear).
 
     `H(s) = 1 / (s^2 + sqrt(2) s + 1)` with the cutoff prewarped to `tan(pi f dt)`; at a cutoff of
     half the sampling rate or more, or 0, it passes all.
@@ -54,12 +54,12 @@ def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tupl
 
 
 def settled(value: Array, cutoff_hz: Array, dt: Array) -> Pair:
-    """Return the memory of `butterworth` after it saw `value` for long."""
+    """Return the state of `butterworth` after a long constant input `value`."""
     xp = value.__array_namespace__()
     on = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
     warped = xp.tan(xp.pi * xp.where(on, cutoff_hz * dt, 0.25))
     below = 1.0 + 2.0**0.5 * warped + warped**2
-    # In rest w (1 + a1 + a2) = x, and the sum is 4 tan^2 / below.
+    # At rest w (1 + a1 + a2) = x, and the sum is 4 tan^2 / below.
     rest = value * below / (4.0 * warped**2)
     return Pair(rest, rest)
 
@@ -71,7 +71,7 @@ def pick(fresh: Array, then: Any, otherwise: Any) -> Any:
 
 
 class Layout(NamedTuple):
-    """Shares (4,) of each motor, up to 1, in turning the body about its axes (FLU)."""
+    """Shares (4,) of each motor, up to 1, in roll, pitch and yaw torque (FLU)."""
 
     roll: Array
     pitch: Array
@@ -79,7 +79,7 @@ class Layout(NamedTuple):
 
 
 def layout_of(rotors: Rotors) -> Layout:
-    """Return the layout of `rotors`: arms over the longest arm, and against the spin."""
+    """Return the layout of `rotors`: arms divided by the longest arm, and minus the spin."""
     x, y, _ = np.asarray(rotors.position, dtype=float).T
     spin = np.asarray(rotors.spin, dtype=float)
     return Layout(y / np.max(np.abs(y)), -x / np.max(np.abs(x)), -spin)

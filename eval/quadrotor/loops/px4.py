@@ -24,12 +24,12 @@ from tracks.geometry.scene import Array
 
 GROUP = ""
 FAST = float(np.deg2rad(400.0))
-"""Errors beyond this add nothing to the integral [rad/s]."""
+"""Errors larger than this do not change the integral [rad/s]."""
 YAW_ROOM = 0.15
 """Room above full command in which yaw is mixed."""
 SMALL = 1e-6
 LIMITS = {"THR_MDL_FAC": (0.0, 1.0)}
-"""Settings that may not be any number from 0 on."""
+"""Allowed ranges of settings that are not simply 0 or more."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Settings:
 
 
 class Gains(NamedTuple):
-    """The loop's numbers as arrays (3,), plain ones (,)."""
+    """The loop's constants as arrays (3,), or scalars."""
 
     k: Array
     p: Array
@@ -79,18 +79,18 @@ class Gains(NamedTuple):
     model: Array
     layout: Layout
     unmixer: Array
-    """(3, 4) from the motors' relative thrusts to the torque that they give."""
+    """(3, 4) from the motors' relative thrusts to their torque."""
 
 
 class State(NamedTuple):
-    """What the loop remembers."""
+    """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first look."""
+    """(...,) 0 before the first update."""
     integral: Array
     """(..., 3) normalised torque."""
     rate: Array
-    """(..., 3) filtered rate of the last look [rad/s]."""
+    """(..., 3) filtered rate at the last update [rad/s]."""
     gyro: Pair
     """(..., 3) of the gyro's filter."""
     accel: Array
@@ -98,11 +98,11 @@ class State(NamedTuple):
     yaw: Array
     """(..., 1) filtered yaw torque."""
     lost: Array
-    """(..., 3) torque asked for beyond what the last look could give."""
+    """(..., 3) commanded torque less the torque that the last update could produce."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
-    """Return the numbers of `settings` as arrays."""
+    """Return the constants of `settings` as arrays."""
 
     def each(key: str) -> np.ndarray:
         return np.array(
@@ -118,19 +118,19 @@ def gains(settings: Settings, layout: Layout) -> Gains:
         slope_cutoff_hz=np.asarray(settings.IMU_DGYRO_CUTOFF),
         model=np.asarray(settings.THR_MDL_FAC),
         layout=layout,
-        # Of all four columns: on uneven arms thrust alone would else count as roll or pitch.
+        # All four columns: on uneven arms pure thrust would otherwise count as roll or pitch.
         unmixer=np.linalg.inv(np.stack([np.ones(4), *columns(layout)], axis=-1))[1:],
     )
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state before the first look of loops of this batch shape."""
+    """Return the state of loops of this batch shape before the first update."""
     still = xp.zeros((*shape, 3))
     gyro = Pair(still, still)
     return State(xp.zeros(shape), still, still, gyro, still, xp.zeros((*shape, 1)), still)
 
 
-def look(
+def update(
     gain: Gains,
     state: State,
     throttle: Array,
@@ -139,7 +139,7 @@ def look(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after a look and the motor commands; see `crazyflie.look`."""
+    """Return the state after an update and the motor commands; see `crazyflie.update`."""
     xp = rate_b.__array_namespace__()
     rest = settled(rate_b, gain.gyro_cutoff_hz, dt)
     gyro = Pair(*(pick(state.started, a, b) for a, b in zip(rest, state.gyro, strict=True)))
@@ -149,10 +149,10 @@ def look(
     error = rate_cmd_b - rate
     torque = gain.k * (gain.p * error - gain.d * accel) + state.integral + gain.f * rate_cmd_b
     torque = scale * torque
-    # The integral that acts is that of before: it is updated after the torque is known.
+    # The torque uses the previous integral, which is updated afterwards.
     further = xp.where(state.lost * error > 0.0, 0.0, error)
     share = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
-    # With K in it, as the firmware keeps it: the limit is one of torque.
+    # The integral contains K, as in the firmware: its limit is a torque.
     added = state.integral + share * gain.k * gain.i * further * dt
     integral = xp.clip(added, -gain.i_limit, gain.i_limit)
     asked = torque[..., 2:]
@@ -160,7 +160,7 @@ def look(
     torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
     thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
     given = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)
-    # Of what is left when clipped: with yaw's room the allocation may end below zero.
+    # From the clipped thrusts: with yaw's room the allocation may end below zero.
     lost = torque - (given[..., None, :] * gain.unmixer).sum(axis=-1)
     lost = xp.where(xp.abs(lost) > SMALL, lost, 0.0)
     state = State(xp.ones_like(state.started), integral, rate, gyro, accel, yaw, lost)
@@ -174,7 +174,7 @@ def columns(layout: Layout) -> tuple[Array, Array, Array]:
 
 
 def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
-    """Return relative motor thrusts (..., 4), in [0, 1] but for what cannot be mended."""
+    """Return relative motor thrusts (..., 4), within [0, 1] as far as possible."""
     xp = torque.__array_namespace__()
     roll, pitch, yaw = columns(layout)
     down = -xp.ones(4)
@@ -195,15 +195,15 @@ def signal(model: Array, thrust: Array) -> Array:
 
 
 def _alpha(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
-    """Return a first-order low pass, which from half the sampling rate on passes all, as PX4's."""
+    """Return a first-order low pass; as in PX4, cutoffs from half the sampling rate pass all."""
     xp = value.__array_namespace__()
     return pt1(before, value, xp.where(cutoff_hz * dt < 0.5, cutoff_hz, 0.0), dt)
 
 
 def _fit(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:
-    """Return the motors moved along a column so that they fit into [0, top], as far as they can.
+    """Return the motors moved along a column so that they fit into [0, top] as far as possible.
 
-    Half a second move settles in the middle between motors that pass either end.
+    A second, half move balances the motors that exceed either end.
     """
     xp = motor.__array_namespace__()
     gain = _gain(motor, along, top)

@@ -9,10 +9,10 @@ from typing import final
 
 import numpy as np
 
-from policies.formats.apart_process import ANSWER_BYTES, Apart
 from policies.formats.c.compiler import compiled_library
+from policies.formats.model_process import ANSWER_BYTES, ModelProcess
 from policies.formats.spec_json import KEY, extract
-from policies.spec import Doubt, NeedsTrust, PolicyError, PolicySpec
+from policies.spec import NeedsTrust, Note, PolicyError, PolicySpec
 
 _STATE_MOST = 2**26
 """Bytes of one flight's `policy_state`."""
@@ -31,11 +31,11 @@ class CPolicy:
     """The rate, camera and scaling it expects of the world."""
     library: Path
     """The shared library."""
-    loaded: Apart
+    loaded: ModelProcess
     """It, in its process."""
     state_bytes: int
     """Size of `policy_state`."""
-    notes: tuple[Doubt, ...] = ()
+    notes: tuple[Note, ...] = ()
     """What is assumed of it."""
 
     def start(self, n: int) -> np.ndarray:
@@ -71,10 +71,10 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             "made the file, pass --trust; a policy to be shared needs none as .onnx"
         )
     library = compiled_library(file)
-    loaded = Apart(str(library).encode(), str(file), "library", (KEY,))
+    loaded = ModelProcess(str(library).encode(), str(file), "library", (KEY,))
     (state_bytes, *sizes), text = loaded.sizes, loaded.labels[KEY]
-    said = extract(loaded.labels, str(file))
-    spec = said.spec
+    metadata = extract(loaded.labels, str(file))
+    spec = metadata.spec
     expected = [spec.state_size, spec.camera.height, spec.camera.width]
     if sizes != expected or not 0 < state_bytes <= _STATE_MOST:
         raise PolicyError(
@@ -83,7 +83,7 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             f"up to {_STATE_MOST} bytes; export it again"
         )
     named = json.loads(text).get("name") if text else None
-    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes, said.notes)
+    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes, metadata.notes)
     return _proven(policy, file)
 
 

@@ -30,12 +30,12 @@ def find_compiler() -> list[str] | None:
     Raises:
         PolicyError: where CC is no command line.
     """
-    told = os.environ.get("CC", "cc")
+    command = os.environ.get("CC", "cc")
     try:
-        words = shlex.split(told) or ["cc"]
+        words = shlex.split(command) or ["cc"]
     except ValueError as error:
         raise PolicyError(
-            f"CC is {told!r} in the environment, no command line ({error}); set it to a compiler, "
+            f"CC is {command!r} in the environment, no command line ({error}); set it to one "
             "such as gcc, or unset it"
         ) from None
     return words if shutil.which(words[0]) else None
@@ -83,8 +83,8 @@ def compiled_library(policy_c: Path) -> Path:
         key.update(hashlib.sha256(text).digest())
     library = _cache() / f"{key.hexdigest()}.so"
     if not library.is_file():
-        with replacing_file(library) as beside:
-            _compile(compiler, files, beside)
+        with replacing_file(library) as temporary:
+            _compile(compiler, files, temporary)
     return library
 
 

@@ -182,7 +182,7 @@ def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> li
     """
     found = []
     for name, effect in EFFECTS.items():
-        told = {parameter.name: parameter for parameter in effect.told(voltage)}
+        told = {parameter.name: parameter for parameter in effect.identifiable(voltage)}
         at_ = [i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in told]
         if not at_ or not set(effect.needs) <= set(has):
             continue

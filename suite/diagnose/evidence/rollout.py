@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from eval.effects.interface import Sample
 from eval.effects.log_faults import lateness, measured, restored
-from eval.quadrotor.continuous import Carry, Steps, fly, look, turn_rotors
+from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loop
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpacked
 from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
 from suite.diagnose.data.sampling import LONGEST_S
@@ -150,7 +150,7 @@ def _burned_in(
 
     def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
         span, acting, rate_b = row
-        carry = look(plant, carry, span, unpacked(acting), rate_b)
+        carry = update_loop(plant, carry, span, unpacked(acting), rate_b)
         return turn_rotors(plant, carry, span)[0], None
 
     # The rates where the loop looks are known here: none has to be carried on.

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.effects.com_offset import ComOffset
+from eval.effects.body import ComOffset
 from eval.logs.flight_log import FlightLog, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import with_effects

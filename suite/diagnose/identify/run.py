@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.logs.faults.check import Against, first_stage, lines_of
+from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.common.console import Console
@@ -55,7 +55,7 @@ def identify_files(
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
-    findings = first_stage(logs, Against(start), accept)
+    findings = check_before_diagnosis(logs, CheckContext(start), accept)
     logs, slow = without_slow_rotors(logs)
     warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, all_values
+from eval.effects.body import MASS_OFFSET as MASS
 from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays
 from eval.effects.log_faults import apply_log_faults, lateness, measured, restored
-from eval.effects.mass_offset import EFFECT as MASS
 from eval.effects.slung_load import SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step

@@ -7,7 +7,7 @@ import pytest
 
 from eval.importers import import_log
 from eval.importers.assemble import assemble
-from eval.importers.findings import asked_of
+from eval.importers.findings import usable_for
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
@@ -118,12 +118,12 @@ def test_the_serious_come_first_and_the_rest_in_order():
 
 def test_motor_commands_and_positions_tell_weight_and_balance():
     rows = {"pos": np.zeros((3, 3)), "pwm": np.zeros((3, 4))}
-    text = asked_of(rows, ["quat", "rate"]).evidence
+    text = usable_for(rows, ["quat", "rate"]).evidence
     assert "no attitude and no body rates" in text
     assert "balance of the rotors in hover" in text
     assert "its torque" not in text
 
 
 def test_a_path_alone_tells_nothing_more():
-    text = asked_of({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).evidence
+    text = usable_for({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).evidence
     assert text.endswith("nothing but its path")

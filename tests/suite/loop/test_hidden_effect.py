@@ -12,8 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from eval.effects.com_offset import ComOffset
-from eval.effects.torque_trim import TorqueTrim
+from eval.effects.body import ComOffset, TorqueTrim
 from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle

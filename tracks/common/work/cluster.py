@@ -215,9 +215,9 @@ def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
                 f"--workers {address}: a worker cannot find what it should do ({error}); install "
                 "the same version of the suite there, and the packages that it was extended by"
             )
-        said = f": {error}" if error else ", or its scheduler is gone"
+        why = f": {error}" if error else ", or its scheduler is gone"
         raise WorkerDied(
-            f"the cluster at {address} gave up piece {in_air[future]}{said}; what was finished is "
+            f"the cluster at {address} gave up piece {in_air[future]}{why}; what was finished is "
             "kept, the same command goes on"
         )
 
@@ -249,9 +249,9 @@ def _unpacked(packed: bytes) -> Callable[[Any], Iterable[Any]]:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     set_threads()
     wanted, work = unpack(packed)
-    if said := differences(software(), wanted):
+    if why := differences(software(), wanted):
         raise UnusableCluster(
-            f"a worker on {os.uname().nodename} would come to other numbers ({said}); install the "
+            f"a worker on {os.uname().nodename} would come to other numbers ({why}); install the "
             "same versions there"
         )
     return work

@@ -5,7 +5,7 @@ import pytest
 
 from eval.logs.faults import commands
 from eval.logs.faults.catalogue import FAULTS
-from eval.logs.faults.check import CLOCK, DRIVE, POSE, Against, check_files, run_checks
+from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, check_files, run_checks
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.commands import check_controller_rate
 from eval.logs.faults.reading import read_rows
@@ -37,7 +37,9 @@ def good(seed=0, end=16.0):
 
 
 def checked(parts, vehicle=PLAIN, fov=1.0):
-    against = Against(vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg))
+    against = CheckContext(
+        vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg)
+    )
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}

@@ -25,7 +25,7 @@ RIGHT_LEFT = np.array([-1.0, -1.0, 1.0, 1.0])
 
 def betaflight_look(state, throttle, wanted, rate, settings=UNFILTERED):
     gains = betaflight.gains(settings, LAYOUT)
-    return betaflight.look(
+    return betaflight.update(
         gains, state, np.asarray(throttle), np.array(wanted), np.array(rate), 0.002, np.ones(3)
     )
 
@@ -88,7 +88,7 @@ ONE = np.ones(3)
 
 
 def crazyflie_look(state, throttle, wanted, rate):
-    return crazyflie.look(
+    return crazyflie.update(
         CRAZYFLIE, state, np.asarray(throttle), np.array(wanted), np.array(rate), 0.002, ONE
     )
 
@@ -119,7 +119,7 @@ def test_the_crazyflies_yaw_counts_whole_and_against_the_spin():
 def test_the_crazyflies_limit_of_0_is_none_as_in_the_firmware():
     free = crazyflie.gains(crazyflie.Settings(roll_ilimit=0.0), CRAZYFLIE.layout)
     state = crazyflie.start((), np)._replace(integral=np.array([40.0, 0.0, 0.0]))
-    state, _ = crazyflie.look(
+    state, _ = crazyflie.update(
         free, state, np.asarray(0.5), np.array([0.1, 0.0, 0.0]), np.zeros(3), 0.002, ONE
     )
     np.testing.assert_allclose(state.integral[0], 40.0 + 5.729578 * 0.002)
@@ -140,7 +140,7 @@ ROOT = 2.0**-0.5
 
 def px4_look(state, throttle, wanted, rate, settings=PLAIN):
     gains = px4.gains(settings, LAYOUT)
-    return px4.look(
+    return px4.update(
         gains, state, np.asarray(throttle), np.array(wanted), np.array(rate), 0.002, np.ones(3)
     )
 
@@ -199,7 +199,7 @@ def test_thrust_is_no_torque_on_uneven_arms():
     hubs = [(x if x > 0.0 else 0.5 * x, y, z) for x, y, z in rotors.position]
     gains = px4.gains(PLAIN, layout_of(replace(rotors, position=tuple(hubs))))
     asked = np.array([0.1, -0.1, 0.05])
-    state, motor = px4.look(
+    state, motor = px4.update(
         gains, px4.start((), np), np.asarray(0.5), asked, np.zeros(3), 0.002, np.ones(3)
     )
     assert 0.0 < motor.min() and motor.max() < 1.0

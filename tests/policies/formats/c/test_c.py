@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from policies.formats import apart_process as process
+from policies.formats import model_process as process
 from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import STRICT, find_compiler

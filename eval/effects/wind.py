@@ -1,10 +1,45 @@
-"""Turbulence: zero-mean wind, coloured to first order, on top of the mean wind."""
+"""Wind: a steady part and turbulence. Both act through the effects that use the airspeed."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from eval.effects.interface import Array, Effect, Gust, Parameter, per_axis
+
+
+class ConstantWind(NamedTuple):
+    """Values of `constant_wind`."""
+
+    velocity: Array
+    """(..., 3) of the air in the world [m/s]."""
+
+
+def constant_wind_wind(values: ConstantWind, gust: Gust) -> Array:
+    """Return the air's velocity in the world (..., 3) [m/s]."""
+    return values.velocity
+
+
+CONSTANT_WIND = Effect(
+    name="constant_wind",
+    summary="Steady wind; acts through the effects that use the airspeed",
+    equation="v_b = R^T (v_w - velocity)",
+    source="definition",
+    values=ConstantWind,
+    parameters=(
+        Parameter(
+            "velocity",
+            "m/s",
+            neutral=0.0,
+            low=-30.0,
+            high=30.0,
+            typical=(1.0, 5.0),
+            size=3,
+            direction=(-0.6, 0.8, 0.0),
+        ),
+    ),
+    wind=constant_wind_wind,
+)
+
 
 VERTICAL = 0.5
 """Vertical intensity over the horizontal one [1]."""
@@ -19,13 +54,13 @@ class Gusts(NamedTuple):
     """(...,) over which the wind changes [m]."""
 
 
-def start_of(values: Gusts, noise: Array) -> Array:
+def gusts_start(values: Gusts, noise: Array) -> Array:
     """Return a stationary draw of the wind (..., 3) [m/s] from normal draws `noise` (..., 3)."""
     xp = noise.__array_namespace__()
     return per_axis(values.intensity) * xp.asarray([1.0, 1.0, VERTICAL]) * noise
 
 
-def wind_of(values: Gusts, gust: Gust) -> Array:
+def gusts_wind(values: Gusts, gust: Gust) -> Array:
     """Return the wind of this step (..., 3) [m/s], exact for a constant airspeed.
 
     Without noise there are no gusts: the wind that was there is forgotten.
@@ -36,33 +71,19 @@ def wind_of(values: Gusts, gust: Gust) -> Array:
     airspeed = xp.sqrt(xp.maximum(xp.sum(gust.air_vel_w**2, axis=-1), 1.0))
     kept = per_axis(xp.exp(-gust.dt * airspeed / values.length))
     fresh = xp.sqrt(1.0 - kept**2)
-    return kept * gust.velocity_w + fresh * start_of(values, gust.noise)
+    return kept * gust.velocity_w + fresh * gusts_start(values, gust.noise)
 
 
-EFFECT = Effect(
+GUSTS = Effect(
     name="gusts",
     summary="Random wind, coloured; half as strong vertically",
     equation="wind: dw/dt = -w/tau + white noise, tau = length / max(airspeed, 1)",
     source="after the Dryden model, MIL-F-8785C",
     values=Gusts,
     parameters=(
-        Parameter(
-            name="intensity",
-            unit="m/s",
-            neutral=0.0,
-            low=0.0,
-            high=10.0,
-            typical=(0.5, 2.0),
-        ),
-        Parameter(
-            name="length",
-            unit="m",
-            neutral=5.0,
-            low=0.1,
-            high=1000.0,
-            typical=(2.0, 10.0),
-        ),
+        Parameter("intensity", "m/s", neutral=0.0, low=0.0, high=10.0, typical=(0.5, 2.0)),
+        Parameter("length", "m", neutral=5.0, low=0.1, high=1000.0, typical=(2.0, 10.0)),
     ),
-    wind=wind_of,
-    gust=start_of,
+    wind=gusts_wind,
+    gust=gusts_start,
 )

@@ -12,8 +12,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from policies.formats import apart_process as process
-from policies.formats.apart_process import Apart
+from policies.formats import model_process as process
+from policies.formats.model_process import ModelProcess
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
 
@@ -88,7 +88,7 @@ def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
 def test_the_process_ends_itself_where_its_parent_is_gone(monkeypatch):
     monkeypatch.setattr(process, "GRACE_S", -1.5)
     monkeypatch.setattr(process, "ANSWER_S", 2.0)
-    model = Apart(_endless("state").SerializeToString(), "it", "onnx")
+    model = ModelProcess(_endless("state").SerializeToString(), "it", "onnx")
     with pytest.raises(PolicyError, match="it ended by SIGALRM"):
         model.run({"state": np.ones((1, 12)), "image": np.ones((1, 24, 32))})
 
@@ -118,7 +118,7 @@ def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
     onnx.save(PLAIN, path)
     # Below what the engine has already and may have besides.
     script = (
-        "import resource, sys; from policies.formats.apart_process import Apart, MEMORY_BYTES\n"
+        "import resource, sys; from policies.formats.model_process import Apart, MEMORY_BYTES\n"
         "resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))\n"
         "print(Apart(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
     )
@@ -140,14 +140,14 @@ def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
 
 
 def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
-    model = Apart(PLAIN.SerializeToString(), "it", "onnx")
+    model = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
     feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
     np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
     child = model._process.pid
     os.kill(child, signal.SIGABRT)
     with pytest.raises(PolicyError, match="it ended by SIGABRT"):
         model.run(feed)
-    other = Apart(PLAIN.SerializeToString(), "it", "onnx")
+    other = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
     child = other._process.pid
     del other
     gc.collect()
@@ -157,7 +157,7 @@ def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
 
 def test_after_a_question_without_an_answer_the_next_goes_to_a_fresh_process(monkeypatch):
     monkeypatch.setattr(process, "ANSWER_S", 0.5)
-    model = Apart(PLAIN.SerializeToString(), "it", "onnx")
+    model = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
     feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
     stopped = model._process.pid
     os.kill(stopped, signal.SIGSTOP)

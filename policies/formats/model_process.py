@@ -2,7 +2,7 @@
 
 A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node of ONNX, also one that is
 worked out while the file is loaded; TorchScript has `while`, and C anything. So onnxruntime, torch
-and a compiled policy.c have a process with limits of time and memory (`apart_server.py`), and who
+and a compiled policy.c have a process with limits of time and memory (`model_server.py`), and who
 does not answer in time is killed. That is for what goes wrong: torch files and C are code and may
 do more.
 """
@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from policies.formats.apart_server import KINDS, data_bytes
+from policies.formats.model_server import KINDS, data_bytes
 from policies.spec import NoAnswer, PolicyError
 
 LOAD_S = 60.0
@@ -41,7 +41,7 @@ PIPE_BYTES = 2**20
 """Of a pipe between the two; the most that Linux gives to everybody."""
 GRACE_S = 5.0
 """Later than we give up, the process ends itself [s]; it may have lost us."""
-SERVER = Path(__file__).with_name("apart_server.py")
+SERVER = Path(__file__).with_name("model_server.py")
 
 
 REMEDIES = {
@@ -64,7 +64,7 @@ class Port(NamedTuple):
     """None where a size is free; of TorchScript not known."""
 
 
-class Apart:
+class ModelProcess:
     """A loaded model in its process, which ends with this object.
 
     A process that gave no answer is killed; the next question goes to a fresh one.
@@ -76,7 +76,7 @@ class Apart:
         Args:
             model: a serialised model, or a library's path.
             where: the file it came from, for messages.
-            kind: one of `apart_server.KINDS`.
+            kind: one of `model_server.KINDS`.
             labels: names of texts that a torch file may carry; of a C library one, of its JSON.
 
         Raises:

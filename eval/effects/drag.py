@@ -1,0 +1,117 @@
+"""Drag of airframe and rotors: forces against the airspeed, and a torque against turning."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, per_axis
+
+
+class LinearDrag(NamedTuple):
+    """Values of `linear_drag`."""
+
+    coefficient: Array
+    """(..., 3) D along body x, y, z [1/s]."""
+
+
+def linear_drag_force(values: LinearDrag, flow: Flow) -> Array:
+    """Return -m D v_b (..., 3) [N], with the true mass."""
+    return -per_axis(flow.constants.mass) * values.coefficient * flow.air_vel_b
+
+
+LINEAR_DRAG = Effect(
+    name="linear_drag",
+    summary="Drag proportional to the airspeed",
+    equation="F_b += -m D v_b",
+    source="Faessler, Franchi and Scaramuzza 2018",
+    values=LinearDrag,
+    parameters=(
+        Parameter("coefficient", "1/s", neutral=0.0, low=0.0, high=5.0, typical=(0.2, 0.5), size=3),
+    ),
+    force=linear_drag_force,
+)
+
+
+class QuadraticDrag(NamedTuple):
+    """Values of `quadratic_drag`."""
+
+    coefficient: Array
+    """(..., 3) C along body x, y, z [1/m]."""
+
+
+def quadratic_drag_force(values: QuadraticDrag, flow: Flow) -> Array:
+    """Return -m C |v_b| v_b (..., 3) [N], with the true mass."""
+    xp = flow.air_vel_b.__array_namespace__()
+    squared = xp.sum(flow.air_vel_b**2, axis=-1, keepdims=True)
+    # The root's slope is infinite at rest, where the force and its slope are zero.
+    moving = squared > 0.0
+    speed = xp.where(moving, xp.sqrt(xp.where(moving, squared, 1.0)), 0.0)
+    return -per_axis(flow.constants.mass) * values.coefficient * speed * flow.air_vel_b
+
+
+QUADRATIC_DRAG = Effect(
+    name="quadratic_drag",
+    summary="Drag proportional to the square of the airspeed",
+    equation="F_b += -m C |v_b| v_b",
+    source="parasitic drag; Hattenberger, Bronz and Condomines 2023",
+    values=QuadraticDrag,
+    parameters=(
+        Parameter(
+            "coefficient", "1/m", neutral=0.0, low=0.0, high=1.0, typical=(0.005, 0.04), size=3
+        ),
+    ),
+    force=quadratic_drag_force,
+)
+
+
+class RotorDrag(NamedTuple):
+    """Values of `rotor_drag`."""
+
+    coefficient: Array
+    """(...,) k [kg/rad]."""
+
+
+def rotor_drag_force(values: RotorDrag, flow: Flow) -> Array:
+    """Return -k (sum Omega_i) (v_b - (v_b . e3) e3) (..., 3) [N]."""
+    in_plane = flow.air_vel_b - along_z(flow.air_vel_b[..., 2])
+    return -per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * in_plane
+
+
+ROTOR_DRAG = Effect(
+    name="rotor_drag",
+    summary="Drag in the rotor plane, proportional to airspeed and rotor speed",
+    equation="F_b += -k (sum Omega_i) (v_b - (v_b.e3) e3)",
+    source="Svacha, Mohta and Kumar 2017",
+    values=RotorDrag,
+    parameters=(
+        Parameter("coefficient", "kg/rad", neutral=0.0, low=0.0, high=1e-3, typical=(1e-5, 1e-4)),
+    ),
+    force=rotor_drag_force,
+)
+
+
+class AngularDamping(NamedTuple):
+    """Values of `angular_damping`."""
+
+    coefficient: Array
+    """(..., 3) d about body x, y, z [1/s]."""
+
+
+def angular_damping_torque(values: AngularDamping, flow: Flow) -> Array:
+    """Return -J d w (..., 3) [N m], with the true inertia."""
+    return -flow.constants.inertia * values.coefficient * flow.rate_b
+
+
+ANGULAR_DAMPING = Effect(
+    name="angular_damping",
+    summary="The air resists turning",
+    equation="tau_b += -J d w",
+    source="Faessler, Franchi and Scaramuzza 2018",
+    values=AngularDamping,
+    parameters=(
+        Parameter(
+            "coefficient", "1/s", neutral=0.0, low=0.0, high=30.0, typical=(0.2, 3.0), size=3
+        ),
+    ),
+    torque=angular_damping_torque,
+)

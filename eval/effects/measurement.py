@@ -1,0 +1,114 @@
+"""Faults of the log: biased sensors, a tilted frame, clocks that differ."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eval.effects.interface import GRAVITY, Array, Constants, Effect, Parameter, Sample, tilted_e3
+
+
+class GyroBias(NamedTuple):
+    """Values of `gyro_bias`."""
+
+    bias: Array
+    """(3,) added to the true value, body axes [rad/s]."""
+
+
+def gyro_bias_measured(values: GyroBias, sample: Sample) -> Sample:
+    """Return the sample with the bias on its `rate_b`."""
+    return sample._replace(rate_b=sample.rate_b + values.bias)
+
+
+GYRO_BIAS = Effect(
+    name="gyro_bias",
+    summary="A constant error of the logged gyro values",
+    equation="rate_b in the log = true + bias",
+    source="sensor model",
+    values=GyroBias,
+    parameters=(
+        Parameter("bias", "rad/s", neutral=0.0, low=-2.0, high=2.0, typical=(0.01, 0.2), size=3),
+    ),
+    measure=gyro_bias_measured,
+    of_log=True,
+)
+
+
+class AccelerometerBias(NamedTuple):
+    """Values of `accelerometer_bias`."""
+
+    bias: Array
+    """(3,) added to the true value, body axes [m/s^2]."""
+
+
+def accelerometer_bias_measured(values: AccelerometerBias, sample: Sample) -> Sample:
+    """Return the sample with the bias on its `acc_b`."""
+    return sample._replace(acc_b=sample.acc_b + values.bias)
+
+
+ACCELEROMETER_BIAS = Effect(
+    name="accelerometer_bias",
+    summary="A constant error of the logged accelerometer values",
+    equation="acc_b in the log = true + bias",
+    source="sensor model",
+    values=AccelerometerBias,
+    parameters=(
+        Parameter("bias", "m/s^2", neutral=0.0, low=-10.0, high=10.0, typical=(0.05, 0.5), size=3),
+    ),
+    measure=accelerometer_bias_measured,
+    of_log=True,
+    needs=("acc_b",),
+)
+
+
+class FrameTilt(NamedTuple):
+    """Values of `frame_tilt`."""
+
+    angle: Array
+    """(..., 2) of gravity about world x, then y [rad]."""
+
+
+def frame_tilt_constants(values: FrameTilt, constants: Constants) -> Constants:
+    """Return the constants with gravity along Rot(a_x, a_y, 0) (0, 0, -1)."""
+    return constants._replace(gravity_w=-GRAVITY * tilted_e3(values.angle))
+
+
+FRAME_TILT = Effect(
+    name="frame_tilt",
+    summary="The log's frame is not level",
+    equation="gravity = Rot(a_x, a_y, 0) (0, 0, -9.81)",
+    source="motion capture levelled badly",
+    values=FrameTilt,
+    parameters=(
+        Parameter(
+            "angle",
+            "rad",
+            neutral=0.0,
+            low=-0.35,
+            high=0.35,
+            typical=(0.005, 0.035),
+            size=2,
+            direction=(0.6, 0.8),
+        ),
+    ),
+    constants=frame_tilt_constants,
+    of_log=True,
+)
+
+
+class ClockOffset(NamedTuple):
+    """Values of `clock_offset`."""
+
+    offset: Array
+    """() how much later a pose is logged than it was [s]."""
+
+
+CLOCK_OFFSET = Effect(
+    name="clock_offset",
+    summary="Pose and velocity are logged late against rates and commands",
+    equation="row t: pose and velocity of t - offset, everything else of t",
+    source="clocks of motion capture and flight controller not aligned",
+    values=ClockOffset,
+    parameters=(Parameter("offset", "s", neutral=0.0, low=-0.2, high=0.2, typical=(0.002, 0.02)),),
+    late=lambda values: values.offset,
+    of_log=True,
+)

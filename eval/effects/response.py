@@ -1,0 +1,93 @@
+"""How late and how strongly the vehicle follows its commands."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eval.effects.interface import Array, Constants, Effect, Parameter
+
+
+class MotorLag(NamedTuple):
+    """Values of `motor_lag`."""
+
+    time_constant: Array
+    """(...,) tau_m [s]."""
+
+
+def motor_lag_constants(values: MotorLag, constants: Constants) -> Constants:
+    """Return the constants with this rotor time constant in place of the vehicle file's."""
+    return constants._replace(time_constant=values.time_constant)
+
+
+MOTOR_LAG = Effect(
+    name="motor_lag",
+    summary="The rotors' time constant, in place of the vehicle file's",
+    equation="dOmega/dt = (Omega_c - Omega) / tau_m",
+    source="first-order motor model; Faessler, Falanga and Scaramuzza 2017",
+    values=MotorLag,
+    parameters=(
+        Parameter(
+            "time_constant",
+            "s",
+            neutral=lambda vehicle: vehicle.rotors.time_constant,
+            low=0.0,
+            high=0.5,
+            typical=(0.02, 0.06),
+            whole=True,
+        ),
+    ),
+    constants=motor_lag_constants,
+    needs=("command",),
+)
+
+
+class CommandDelay(NamedTuple):
+    """Values of `command_delay`."""
+
+    delay: Array
+    """(...,) how much later a command acts [s]."""
+
+
+def command_delay_constants(values: CommandDelay, constants: Constants) -> Constants:
+    """Return the constants with this delay added."""
+    return constants._replace(delay=constants.delay + values.delay)
+
+
+COMMAND_DELAY = Effect(
+    name="command_delay",
+    summary="Commands act later",
+    equation="command(t) acts at t + delay",
+    source="transport delay of the command link",
+    values=CommandDelay,
+    parameters=(Parameter("delay", "s", neutral=0.0, low=0.0, high=0.1, typical=(0.005, 0.04)),),
+    constants=command_delay_constants,
+    needs=("command",),
+)
+
+
+class RateGain(NamedTuple):
+    """Values of `rate_gain`."""
+
+    scale: Array
+    """(..., 3) true gain over nominal gain, body axes [1]."""
+
+
+def rate_gain_constants(values: RateGain, constants: Constants) -> Constants:
+    """Return the constants with the rate loop's gain scaled per axis."""
+    return constants._replace(rate_gain=constants.rate_gain * values.scale)
+
+
+RATE_GAIN = Effect(
+    name="rate_gain",
+    summary="True rate-loop gain over nominal",
+    equation="K = scale x nominal, per axis",
+    source="flight controller tuned otherwise than believed",
+    values=RateGain,
+    parameters=(
+        Parameter(
+            "scale", "1", neutral=1.0, low=0.1, high=5.0, typical=(0.1, 0.3), size=3, signs=(-1, 1)
+        ),
+    ),
+    constants=rate_gain_constants,
+    needs=("command",),
+)

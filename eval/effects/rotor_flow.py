@@ -1,0 +1,138 @@
+"""Rotors in moving air and close to the ground: their thrust and tilt change."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from eval.effects.interface import Array, Effect, Flow, Parameter, along_z, cross_e3, per_axis
+
+
+class Inflow(NamedTuple):
+    """Values of `inflow`."""
+
+    coefficient: Array
+    """(...,) k [N s^2/(m rad)]."""
+
+
+def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
+    """Return the thrusts (..., 4) [N] less k Omega_i v_b . e3 each."""
+    climb = flow.air_vel_b[..., 2]
+    return thrust - per_axis(values.coefficient * climb) * flow.rotor_speed
+
+
+INFLOW = Effect(
+    name="inflow",
+    summary="Thrust lost in a climb, won in a descent",
+    equation="rotor thrust += -k Omega_i v_b.e3",
+    source="blade element theory; Svacha, Mohta and Kumar 2017",
+    values=Inflow,
+    parameters=(
+        Parameter(
+            "coefficient", "N s^2/(m rad)", neutral=0.0, low=0.0, high=1e-3, typical=(3e-5, 1.2e-4)
+        ),
+    ),
+    thrust=inflow_thrust,
+)
+
+
+class TranslationalLift(NamedTuple):
+    """Values of `translational_lift`."""
+
+    coefficient: Array
+    """(...,) k [1/m]."""
+
+
+def translational_lift_force(values: TranslationalLift, flow: Flow) -> Array:
+    """Return m k (v_bx^2 + v_by^2) e3 (..., 3) [N], with the true mass."""
+    sideways = flow.air_vel_b[..., 0] ** 2 + flow.air_vel_b[..., 1] ** 2
+    return along_z(flow.constants.mass * values.coefficient * sideways)
+
+
+TRANSLATIONAL_LIFT = Effect(
+    name="translational_lift",
+    summary="Lift won in forward flight",
+    equation="F_b += m k (v_bx^2 + v_by^2) e3",
+    source="Svacha, Mohta and Kumar 2017",
+    values=TranslationalLift,
+    parameters=(
+        Parameter("coefficient", "1/m", neutral=0.0, low=0.0, high=0.3, typical=(0.005, 0.03)),
+    ),
+    force=translational_lift_force,
+)
+
+
+class BladeFlapping(NamedTuple):
+    """Values of `blade_flapping`."""
+
+    coefficient: Array
+    """(...,) k [N s^2/rad]."""
+
+
+def blade_flapping_torque(values: BladeFlapping, flow: Flow) -> Array:
+    """Return k (sum Omega_i) (v_b x e3) (..., 3) [N m]."""
+    return per_axis(values.coefficient * flow.rotor_speed.sum(axis=-1)) * cross_e3(flow.air_vel_b)
+
+
+BLADE_FLAPPING = Effect(
+    name="blade_flapping",
+    summary="The rotors lean back from the wind and pitch the body up",
+    equation="tau_b += k (sum Omega_i) (v_b x e3)",
+    source="Mahony, Kumar and Corke 2012",
+    values=BladeFlapping,
+    parameters=(
+        Parameter(
+            "coefficient", "N s^2/rad", neutral=0.0, low=-1e-5, high=1e-5, typical=(1e-7, 1e-6)
+        ),
+    ),
+    torque=blade_flapping_torque,
+)
+
+
+LARGEST = 1.0 / 3.0
+"""Largest g (r / 4 z)^2: caps the factor on the thrust at 1.5."""
+LOWEST = 1e-3
+"""Heights below this count as this [m]: a rotor does not fly below the ground."""
+
+
+class GroundEffect(NamedTuple):
+    """Values of `ground_effect`."""
+
+    strength: Array
+    """(...,) g; 1 is Cheeseman and Bennett's rotor [1]."""
+    rotor_radius: Array
+    """(...,) r [m]."""
+
+
+def ground_effect_thrust(values: GroundEffect, flow: Flow, thrust: Array) -> Array:
+    """Return the thrusts (..., 4) [N] times 1 / (1 - g (r / 4 z_i)^2), the factor at most 1.5.
+
+    z_i is the height of each rotor's hub above z = 0.
+    """
+    xp = thrust.__array_namespace__()
+    lift_w = (flow.rot_w[..., None, 2, :] * flow.constants.rotor_position_b).sum(axis=-1)
+    height = xp.maximum(flow.pos_w[..., 2, None] + lift_w, LOWEST)
+    share = per_axis(values.strength) * (per_axis(values.rotor_radius) / (4.0 * height)) ** 2
+    return thrust / (1.0 - xp.minimum(share, LARGEST))
+
+
+GROUND_EFFECT = Effect(
+    name="ground_effect",
+    summary="More thrust close above the ground",
+    equation="rotor thrust x 1 / (1 - g (r / 4 z_i)^2), at most 1.5",
+    source="Cheeseman and Bennett 1955, ARC R&M 3021",
+    values=GroundEffect,
+    parameters=(
+        Parameter("strength", "1", neutral=0.0, low=0.0, high=20.0, typical=(1.0, 8.0)),
+        Parameter(
+            "rotor_radius",
+            "m",
+            neutral=0.0635,
+            low=0.005,
+            high=1.0,
+            typical=(0.03, 0.1),
+            required=False,
+            fitted=False,
+        ),
+    ),
+    thrust=ground_effect_thrust,
+)
