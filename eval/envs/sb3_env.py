@@ -71,15 +71,15 @@ class RaceVecEnv(VecEnv):
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Fly them; an episode that ends starts anew, as this library has it."""
         seen, reward, terminated, truncated, infos = self.races.step(self._actions)
-        over, infos = terminated | truncated, []
+        over, each = terminated | truncated, []
         for slot in range(self.num_envs):
             info = _of(infos["final_info"] if over[slot] else infos, slot)
             if over[slot]:
                 info["terminal_observation"] = as_space(self._space, infos["final_obs"][slot])
                 info["TimeLimit.truncated"] = bool(truncated[slot])
-            infos.append(info)
+            each.append(info)
         seen = as_space(self._space, seen, self.num_envs)
-        return seen, reward.astype(np.float32), over, infos
+        return seen, reward.astype(np.float32), over, each
 
     def close(self) -> None:
         """Do nothing: there is no other process."""

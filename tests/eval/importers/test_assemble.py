@@ -11,7 +11,7 @@ from eval.importers.findings import usable_for
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
-from eval.logs.faults.finding import Finding, said
+from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support.imported import flight, write
 from tests.support.vehicles import PLAIN
@@ -107,7 +107,7 @@ def test_the_serious_come_first_and_the_rest_in_order():
         Finding("note", "motors", "put in order"),
         Finding("corrected", "attitude", "is xyzw"),
     )
-    assert said(findings) == [
+    assert finding_lines(findings) == [
         "corrected attitude: is xyzw",
         "doubt     velocity: is off",
         "note      rows: at 100 Hz",
