@@ -1,10 +1,10 @@
-"""Flight logs of other programs as flight logs of ours: one file a format, and the table of them.
+"""Import flight logs of other programs: one file for each format.
 
     imported = import_log("log.ulg")
     write_flight("flight.parquet", imported.log)
 
-A format is a module with `SUMMARY`, `detect` and `read` (`eval.importers.formats.Format`).
-docs/import.md says what each reads.
+A format is a module with `SUMMARY`, `detect` and `read` (`eval.importers.formats.Format`);
+docs/import.md describes each.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 class ImportedLog(NamedTuple):
-    """A flight of another program."""
+    """The result of an import."""
 
     log: FlightLog
-    """In our columns, units and frames."""
+    """With the columns, units and frames of a flight log."""
     findings: tuple[Finding, ...]
-    """What was checked, corrected and doubted."""
+    """Results of all checks and corrections."""
 
 
 def import_log(
@@ -34,12 +34,11 @@ def import_log(
     format: str | None = None,
     options: ImportOptions | None = None,
 ) -> ImportedLog:
-    """Read a log of another program, check it, and bring it to our columns, units and frames.
+    """Read a log of another program, check it and convert it to a flight log.
 
     Args:
         path: the file.
-        format: a name of `eval.importers.formats.FORMATS`; by default told by the file's first
-            bytes.
+        format: a name of `eval.importers.formats.FORMATS`; None: detected by the first bytes.
         options: see `eval.importers.options`.
 
     Raises:
@@ -50,20 +49,20 @@ def import_log(
     from eval.importers.formats import FORMATS, detect
     from eval.importers.options import ImportOptions
 
-    told = options or ImportOptions()
+    options = options or ImportOptions()
     file = Path(path)
-    name = format or detect(file, told)
+    name = format or detect(file, options)
     reader = FORMATS.find(name)
-    if told.map is not None and not getattr(reader, "TAKES_MAP", True):
+    if options.map is not None and not getattr(reader, "TAKES_MAP", True):
         raise ValueError(
-            f"{file} is read as {name!r}, whose names are known: leave --map out, or say "
+            f"{file} is read as {name!r}, whose names are known: leave --map out, or give "
             "--format table if it is a table that --map describes"
         )
-    # Where the pose is another file's, the source is that one's.
-    own = told if told.pose is None else replace(told, source="")
+    # `source` selects the pose within the file that holds it.
+    own = options if options.pose is None else replace(options, source="")
     if own.source and not getattr(reader, "TAKES_SOURCE", True):
         raise ValueError(
             f"{file} is read as {name!r}, whose pose is of one source: leave --source "
             f"{own.source} out"
         )
-    return ImportedLog(*assemble(reader.read(file, own), name, told))
+    return ImportedLog(*assemble(reader.read(file, own), name, options))

@@ -1,4 +1,4 @@
-"""From a recording to a checked flight log: the part that all formats share."""
+"""Convert a recording to a checked flight log: the steps that all formats share."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
-"""The pose is checked on at most so many rows a second."""
+"""Largest row rate for the checks of the pose."""
 SLOW_HZ = 40.0
-"""Signals that come more rarely than this are worth a word."""
+"""A signal below this rate gets a note."""
 TEXTS = {
     "pos": "position",
     "quat": "attitude",
@@ -29,16 +29,16 @@ TEXTS = {
     "cmd_rate": "rate command",
     "motor": "motors",
 }
-"""Signals whose rate counts, in words."""
+"""Signals that need a high rate, and their names in messages."""
 
 
 def assemble(
     recording: Recording, format: str, options: ImportOptions
 ) -> tuple[FlightLog, tuple[Finding, ...]]:
-    """Return `recording` as a flight log, and what its checks found.
+    """Return `recording` as a flight log, and the findings of all checks.
 
     Raises:
-        FlightLogError: where something a log needs is missing or breaks a rule.
+        FlightLogError: where a required signal is missing or breaks a rule.
     """
     findings = list(recording.findings)
     if options.pose is not None:
@@ -53,7 +53,7 @@ def assemble(
         {"time": recording.signals[slowest(recording)].time_s}, CLOCK, against, options.fix
     )
     findings += more
-    recording = with_readings(recording, readings)  # without seconds there are no rows
+    recording = with_readings(recording, readings)  # rows need the time in seconds
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
     more, readings, _ = run_checks(rows_at(recording, coarse), POSE, against, options.fix)
     findings += more
@@ -116,12 +116,12 @@ def _need(recording: Recording, partial: bool, findings: list[Finding]) -> None:
 def _flight(
     recording: Recording, options: ImportOptions
 ) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in the air [s]; all of it where the ground is kept."""
+    """Return the first and the last time in the air [s]; infinite where nothing is trimmed."""
     return airborne(recording) if options.trim else ((-np.inf, np.inf), [])
 
 
 def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
-    """Say what sets the rows, which signals are slow, and where holes are."""
+    """Return notes on the row rate, slow signals and gaps."""
     name = slowest(recording)
     every = f"at {1.0 / median_step(time_s):.3g} Hz, by the {TEXTS[name]}"
     findings = [Finding("note", "rows", every)]
@@ -142,7 +142,7 @@ def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
 
 
 def _pair(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
-    """Leave out half a command, in place: a thrust without rates or torques, or these without it.
+    """Remove half a command in place: a thrust without rates or torques, or these without it.
 
     A partial log keeps a thrust alone.
     """
@@ -159,7 +159,7 @@ def _pair(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
 
 
 def _lacks(rows: dict[str, np.ndarray]) -> list[str]:
-    """Return the groups that a flight needs and `rows` lack; `command` for all of these."""
+    """Return the required groups that `rows` lack; `command` stands for any of `COMMANDS`."""
     lacks = [name for name in NEEDED if name not in rows]
     driven = any(all(group in rows for group in groups) for groups in COMMANDS)
     return lacks if driven else [*lacks, "command"]

@@ -1,10 +1,10 @@
-"""A log's commands as the flight log has them.
+"""Convert a log's commands to those of a flight log.
 
-Motors are put in the vehicle file's order by where they are. Attitude set points become rates by
-the vehicle file's attitude loop. Normalised thrust (0 to 1) becomes thrust per mass: what full
-throttle gives is told by the user, or follows from the vehicle file (by its `[motors]` with the
-battery's voltage, where it has them), or is fitted to the accelerometer. The last takes what a
-diagnosis would look for in the thrust's scale into the command, and says so.
+Motors are sorted into the vehicle file's order by their positions. Attitude set points become rates
+by the vehicle file's attitude loop. Normalised thrust (0 to 1) becomes thrust per mass. Its value
+at full throttle is an option, or comes from the vehicle file (from its `[motors]` with the battery
+voltage, if present), or is fitted to the accelerometer. Such a fit hides a wrong thrust scale from
+a diagnosis, and a finding reports that.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from eval.logs.faults.finding import Finding
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""
+"""Front right, rear right, rear left, front left: the order of the shipped vehicles."""
 FULL = (8.0, 200.0)
-"""What full throttle of a multirotor that flies gives [m/s^2]."""
+"""Possible thrust per mass of a multirotor at full throttle [m/s^2]."""
 SIDES = ("front right", "rear right", "rear left", "front left")
 
 
@@ -31,13 +31,12 @@ def order_motors(
     motor_side: Sequence[tuple[float, float]] | None,
     vehicle: Vehicle | None,
 ) -> list[Finding]:
-    """Put `motor`, `motor_cmd` and `pwm` of `rows` in the vehicle's order, in place.
+    """Sort `motor`, `motor_cmd` and `pwm` of `rows` into the vehicle's order, in place.
 
     Args:
         rows: see `eval.importers.rows`.
-        motor_side: (x forward, y left) of the file's motors 1 to 4; None: the order is the
-            vehicle's already.
-        vehicle: whose order is wanted; None: that of the shipped vehicles.
+        motor_side: (x forward, y left) of the file's motors 1 to 4; None: already in order.
+        vehicle: with the wanted order; None: that of the shipped vehicles.
     """
     if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
@@ -60,12 +59,12 @@ def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
 def thrust_command(
     rows: dict[str, np.ndarray], options: ImportOptions, by_acc: bool = True
 ) -> list[Finding]:
-    """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2], in place, where that can be done.
+    """Replace `throttle` of `rows` by `cmd_thrust` [m/s^2] in place, where possible.
 
     Args:
         rows: see `eval.importers.rows`.
-        options: the vehicle, and what full throttle gives.
-        by_acc: fit it to the accelerometer where nothing else says it; not where that looks wrong.
+        options: the vehicle, and thrust per mass at full throttle.
+        by_acc: otherwise fit it to the accelerometer; False for a suspicious accelerometer.
     """
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
@@ -80,7 +79,7 @@ def thrust_command(
 
 
 def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> list[Finding]:
-    """Return findings of a throttle that the vehicle's `[motors]` turn into thrust, in place."""
+    """Convert a throttle to thrust by the vehicle's `[motors]`, in place; return the findings."""
     voltage = rows["voltage"][:, 0] if "voltage" in rows else None
     thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
     rows["cmd_thrust"] = thrust[:, None]
@@ -94,7 +93,7 @@ def _full_thrust(
 ) -> tuple[float | None, list[Finding]]:
     linear = "taking thrust as proportional to it"
     if options.full_thrust is not None:
-        text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as told, {linear}"
+        text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as given, {linear}"
         return options.full_thrust, [Finding("note", "thrust", text)]
     if options.vehicle is not None:
         full = options.vehicle.full_thrust
@@ -125,9 +124,9 @@ def _full_thrust(
 
 
 def _fitted_full(throttle: np.ndarray, acc: np.ndarray) -> tuple[float, float]:
-    """Return what full throttle gives by an accelerometer's z, and what is left [m/s^2]; or NaN.
+    """Return thrust per mass at full throttle from an accelerometer's z, and the residual [m/s^2].
 
-    By the median of their ratios, which garbage in a part of the log does not move.
+    Uses the median of their ratios, which is robust against outliers. NaN for too few samples.
     """
     good = np.isfinite(acc) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
     if np.sum(good) <= 100:
@@ -138,7 +137,7 @@ def _fitted_full(throttle: np.ndarray, acc: np.ndarray) -> tuple[float, float]:
 
 
 def _hover(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
-    """Say where the mean commanded thrust is far from what the flight needed."""
+    """Return a doubt where the mean commanded thrust differs from the measured one."""
     if "acc" not in rows:
         return []
     good = np.isfinite(thrust) & np.isfinite(rows["acc"][:, 2])
@@ -154,7 +153,7 @@ def _hover(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
 
 
 def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:
-    """Replace `cmd_quat` of `rows` by `cmd_rate`, in place, where nothing commanded rates.
+    """Replace `cmd_quat` of `rows` by `cmd_rate` in place, where the log has no rate command.
 
     The rate is the attitude gain times the rotation vector from the attitude to the set point,
     within the vehicle's `rate_max`.

@@ -1,4 +1,4 @@
-"""What can be asked of a log that lacks something."""
+"""Which quantities a partial log allows to estimate."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ QUESTIONS = (
     ("the rate loop (gains, delay)", ("rate", "cmd_rate"), ("rate",)),
     ("the rotors' lag", ("motor",), ("pwm", "motor_cmd")),
 )
-"""What can be asked, what it needs, and of which one of these it is driven."""
+"""Quantity, required signals, and alternative signals of which one is required."""
 UNSEEN = {
     "pos": ("the path", "wind", "faults of position and velocity"),
     "quat": ("faults of the attitude", "the gyro's scale and axes against it"),
     "acc": ("thrust over mass", "drag"),
 }
-"""Signal -> what a log without it, and without a pose, does not show."""
+"""Signal -> quantities that are not identifiable without it and without a pose."""
 
 
 def usable_for(rows: dict[str, np.ndarray], lacks: list[str]) -> Finding:
-    """Return what a log without the groups `lacks` can be asked."""
+    """Return the finding that lists what a log without the groups `lacks` is usable for."""
     no_pose = "pos" in lacks and "quat" in lacks
     can = [
         question

@@ -1,4 +1,4 @@
-"""Columns of a file as signals in our units, frames and axes, as a mapping says."""
+"""Convert a file's columns to signals in the flight log's units and frames, by a mapping."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from eval.logs.faults.finding import Finding
 
 Part = tuple[np.ndarray, np.ndarray]
 Find = Callable[[tuple[str, ...]], Part | None]
-"""Time [s] and values (N, C) of columns, or None where one of them is not there."""
+"""Returns time [s] and values (N, C) of columns, or None where one is missing."""
 KEPT = "kept:"
-"""Before the name of a column that is kept as it is."""
+"""Prefix of the name of a column that is kept unchanged."""
 ESTIMATED = ("pos", "quat", "vel")
-"""Signals of which an on-board estimate may stand next to motion capture."""
+"""Signals that may come as motion capture and as on-board estimate."""
 
 
 def recording_of(
     path: Path, mapping: LogMap, find: Find, missing: Callable[[str], str], options: ImportOptions
 ) -> Recording:
-    """Return the signals of the file at `path` that `find` finds, as `mapping` says.
+    """Return the signals of the file at `path` by `mapping`.
 
     Args:
         path: the file.
-        mapping: which columns are what.
-        find: gives columns.
-        missing: gives the reason to refuse a column that is not there.
+        mapping: the columns of each signal.
+        find: returns the values of columns.
+        missing: returns the error text for a missing column.
         options: `source` and the mass are used.
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.
-        ValueError: for an asked source where the mapping knows of none.
+        ValueError: for `options.source` where the mapping has no sources.
     """
     name, parts, taken = str(path), {}, {}
     if options.source and not any(c.source for each in mapping.columns.values() for c in each):
         raise ValueError(
-            f"--source {options.source}: the mapping of {name} says of no signal where it is from; "
-            'leave it out, or let the mapping say source = "mocap" and "estimate"'
+            f"--source {options.source}: the mapping of {name} names no source of any signal; "
+            'leave it out, or add source = "mocap" and "estimate" to the mapping'
         )
     for signal, alternatives in mapping.columns.items():
         column, part = _first(signal, alternatives, find, options.source, name)
@@ -63,7 +63,7 @@ def recording_of(
             first = next(c for c in alternatives[0].names if find((c,)) is None)
             raise FlightLogError(name, first, None, missing(first))
         taken[signal], parts[signal] = column, _values(part, column, name)
-    about, findings = _beside(path, mapping)
+    about, findings = _text_file(path, mapping)
     parts.pop("time", None)
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
         if angles in parts:
@@ -88,9 +88,9 @@ def recording_of(
 def _first(
     signal: str, alternatives: tuple[Column, ...], find: Find, source: str, name: str
 ) -> tuple[Column, Part | None]:
-    """Return the first alternative that is there, those of the asked source before the others."""
-    told = [c for c in alternatives if source and c.source == source]
-    for column in (*told, *(c for c in alternatives if c not in told)):
+    """Return the first alternative in the file; those from `source` come before the others."""
+    preferred = [c for c in alternatives if source and c.source == source]
+    for column in (*preferred, *(c for c in alternatives if c not in preferred)):
         part = find(column.names)
         if part is not None:
             if source and signal == "pos" and column.source and column.source != source:
@@ -103,7 +103,7 @@ def _first(
 def _estimates(
     mapping: LogMap, taken: Mapping[str, Column], find: Find, name: str
 ) -> dict[str, Part]:
-    """Return the estimate of each signal that is taken from motion capture, as columns to keep."""
+    """Return the on-board estimates of signals taken from motion capture, as columns to keep."""
     kept = {}
     for signal in ESTIMATED:
         if signal not in taken or taken[signal].source != "mocap":
@@ -134,18 +134,18 @@ def _values(part: Part, column: Column, name: str) -> Part:
 
 
 def _turned(
-    signal: str, time_s: np.ndarray, value: np.ndarray, taken: Mapping[str, Column], told: LogMap
+    signal: str, time_s: np.ndarray, value: np.ndarray, taken: Mapping[str, Column], by: LogMap
 ) -> Part:
-    """Return a signal in z-up and forward-left-up; what is in other axes stays in them."""
+    """Return a signal with z up and y left; a world or body vector remains one."""
     column = taken[signal]
     in_world = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
     if signal in ("quat", "cmd_quat"):
         quat = conjugate(value) if column.inverse else value
-        return time_s, attitude(quat, told.world, told.body)
+        return time_s, attitude(quat, by.world, by.body)
     if in_world:
-        return time_s, world_vector(value, told.world)
+        return time_s, world_vector(value, by.world)
     if signal in ("vel", "rate", "acc", "cmd_rate", "cmd_torque"):
-        return time_s, body_vector(value, told.body)
+        return time_s, body_vector(value, by.body)
     return time_s, value
 
 
@@ -154,7 +154,7 @@ def _is_world(signal: str, column: Column) -> bool:
 
 
 def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> None:
-    """Turn a signal into our axes by the attitude, in place; without one it is left out.
+    """Rotate a signal into the flight log's axes by the attitude, in place; without one, drop it.
 
     An acceleration in world axes is kept as `acc_w_x`, ... where there is no attitude.
     """
@@ -176,30 +176,30 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
     signals[signal] = Signal(samples.time_s[known], turned)
 
 
-def _per_mass(signals: dict[str, Signal], told: Any, options: ImportOptions) -> list[Finding]:
-    """Divide a thrust in N by the nominal mass, in place; it is kept as `cmd_force` besides."""
+def _per_mass(signals: dict[str, Signal], given: Any, options: ImportOptions) -> list[Finding]:
+    """Divide a thrust in N by the nominal mass in place, and keep it as `cmd_force` too."""
     thrust = signals.pop("cmd_thrust")
     signals[KEPT + "cmd_force"] = thrust
-    mass, whose = options.mass, "as told"
+    mass, whose = options.mass, "by --mass"
     if mass is None and options.vehicle is not None:
         mass, whose = options.vehicle.mass, f"by the vehicle {options.vehicle.name!r}"
-    if mass is None and isinstance(told, float):
-        mass, whose = told, "by the file beside it"
+    if mass is None and isinstance(given, float):
+        mass, whose = given, "by its text file"
     if mass is None:
-        text = "is in N, and nothing says the mass: kept as cmd_force; give --mass or --vehicle"
+        text = "is in N, and the mass is unknown: kept as cmd_force; give --mass or --vehicle"
         return [Finding("doubt", "thrust", text)]
     signals["cmd_thrust"] = Signal(thrust.time_s, thrust.value / mass)
     return [Finding("note", "thrust", f"in N; divided by a mass of {mass:g} kg, {whose}")]
 
 
-def _beside(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
-    """Return what the text file beside the log says: numbers and texts by key."""
-    if not mapping.beside:
+def _text_file(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
+    """Return the numbers and texts of the log's text file by key, and a note."""
+    if not mapping.text_file:
         return {}, []
     number = "".join(c for c in path.stem if c.isdigit())
-    file = path.parent / mapping.beside.format(stem=path.stem, number=number)
+    file = path.parent / mapping.text_file.format(stem=path.stem, number=number)
     if not file.is_file():
-        return {}, [Finding("note", "file", f"no {file.name} beside it")]
+        return {}, [Finding("note", "file", f"no {file.name} in its folder")]
     about: dict[str, Any] = {}
     for line in file.read_text(encoding="utf-8", errors="replace").splitlines()[:1000]:
         key, colon, value = line.partition(":")
@@ -209,7 +209,7 @@ def _beside(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]
     mass = about.get(mapping.mass_key) if mapping.mass_key else None
     if isinstance(mass, float) and mass > 0.0:
         found["mass"] = mass
-    return found, [Finding("note", "file", f"{file.name} is beside it; read with it")]
+    return found, [Finding("note", "file", f"{file.name} of its folder is read as well")]
 
 
 def _number_or_text(text: str) -> float | str:

@@ -1,8 +1,8 @@
-"""Mapping files (TOML): which columns of a file are which signal, in which unit and frame.
+"""Mapping files (TOML): the columns, units and frames of each signal in a file.
 
-A table of the file is a signal; several of the same name, `[[pos]]`, are alternatives of which the
-first that is there counts. docs/import.md shows one with every key. Some come with the suite and
-are taken by name.
+Each table describes a signal. Several tables of one name, such as `[[pos]]`, are alternatives; the
+first one found in the file is used. docs/import.md shows a mapping with every key. Shipped mappings
+are selected by name.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FORCE = {"m/s^2": 1.0, "g": GRAVITY}
 _SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
 _SHARE = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
 PER_MASS = "N"
-"""A unit of `cmd_thrust` that has to be divided by the mass."""
+"""Unit of a `cmd_thrust` that is divided by the mass."""
 UNITS: dict[str, dict[str, float]] = {
     "time": TIMES,
     "pos": _LENGTH,
@@ -51,7 +51,7 @@ UNITS: dict[str, dict[str, float]] = {
     "pwm": _SHARE,
     "voltage": {"V": 1.0, "mV": 1e-3},
 }
-"""Signal -> the units it may be in, and their factors; the first is the default."""
+"""Signal -> unit -> factor to the flight log's unit; the first unit is the default."""
 WIDTHS = {name: len(GROUPS[name]) if name in GROUPS else 3 for name in UNITS} | {
     "throttle": 1,
     "cmd_quat": 4,
@@ -61,7 +61,7 @@ AXES = {
     "rate": ("body", "world"),
     "acc": ("body", "world"),
 }
-"""Signals that may be in other axes than ours; ours first."""
+"""Signals with a choice of axes; the flight log's axes come first."""
 MIXERS: dict[str, np.ndarray] = {
     "crazyflie": np.array(
         [
@@ -75,19 +75,19 @@ MIXERS: dict[str, np.ndarray] = {
 """Motor command of each motor from thrust, roll, pitch and yaw (4, 4). Crazyflie: the firmware's
 legacy power distribution, in which roll and pitch count half."""
 SOURCES = ("mocap", "estimate")
-"""Where a pose may come from when a file holds both: raw motion capture, or a state estimator."""
+"""Sources of a pose in a file that holds both: raw motion capture, or a state estimator."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """Where one signal of a file is."""
+    """The columns of one signal, and their conversion."""
 
     names: tuple[str, ...]
-    """Columns, in our order (quaternions: wxyz); one where its cells hold lists."""
+    """Columns in the flight log's order (quaternions: wxyz); one column if its cells hold lists."""
     factor: tuple[float, ...]
-    """From the column's unit and sign to ours."""
+    """Factors from each column's unit and sign to the flight log's."""
     other_axes: bool = False
-    """In the second of `AXES`."""
+    """Whether the signal has the second choice of `AXES`."""
     gravity: bool = True
     """An acceleration in world axes is a specific force; False: the velocity's derivative."""
     inverse: bool = False
@@ -97,12 +97,12 @@ class Column:
     mixer: str = ""
     """One of `MIXERS`: the columns are thrust, roll, pitch and yaw."""
     source: str = ""
-    """One of `SOURCES`, where it is said."""
+    """One of `SOURCES`, or empty."""
 
 
 @dataclass(frozen=True)
 class LogMap:
-    """What a mapping file says."""
+    """The contents of a mapping file."""
 
     columns: Mapping[str, tuple[Column, ...]] = field(default_factory=dict)
     """Alternatives by signal."""
@@ -113,13 +113,13 @@ class LogMap:
     motor_side: tuple[tuple[float, float], ...] | None = None
     """Where the file's motors 1 to 4 are (x forward, y left), in any unit."""
     optional: bool = False
-    """A signal of which no alternative is there is left out; otherwise that is an error."""
+    """Whether missing signals are left out; otherwise they are an error."""
     keep: tuple[str, ...] = ()
-    """Columns that are kept as they are, where they are there."""
-    beside: str = ""
-    """A text file of `key: value` beside the log; {stem} and {number} are the log's."""
+    """Columns that are kept unchanged, if present."""
+    text_file: str = ""
+    """A text file of `key: value` in the log's folder; {stem} and {number} are the log's."""
     mass_key: str = ""
-    """The key of that file that is the mass [kg]."""
+    """Key of the mass [kg] in that file."""
 
 
 def shipped_maps() -> list[str]:
@@ -158,11 +158,11 @@ def read_map(path: Path) -> LogMap:
     for signal in UNITS:
         if top.has(signal):
             columns[signal] = _alternatives(signal, top)
-    beside = mass_key = ""
+    text_file = mass_key = ""
     if top.has("about"):
         about = top.table("about")
-        beside = about.text("file")
-        _check_placeholders(about, beside)
+        text_file = about.text("file")
+        _check_placeholders(about, text_file)
         mass_key = about.text("mass") if about.has("mass") else ""
         about.close()
     optional = top.has("optional") and top.choice("optional", ("no", "yes")) == "yes"
@@ -173,11 +173,11 @@ def read_map(path: Path) -> LogMap:
         raise top.error("keep", list(keep), allowed)
     top.has("topics")  # of MCAP files; see mcap.py
     top.close()
-    return LogMap(columns, world, body, side, optional, keep, beside, mass_key)
+    return LogMap(columns, world, body, side, optional, keep, text_file, mass_key)
 
 
 def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
-    """Return where the table `[frames]` has the file's motors 1 to 4; None where it does not say.
+    """Return the positions of the file's motors 1 to 4 in the table `[frames]`; None if absent.
 
     Raises:
         ValueError: where that is no four points.

@@ -1,4 +1,4 @@
-"""What a person may tell an import."""
+"""Options of an import."""
 
 from __future__ import annotations
 
@@ -23,25 +23,24 @@ class ImportOptions:
     vehicle: Vehicle | None = None
     """Sets the order of the motors, and scales normalised thrust to its full thrust."""
     full_thrust: float | None = None
-    """Thrust per mass at full throttle [m/s^2]; goes before the vehicle's."""
+    """Thrust per mass at full throttle [m/s^2]; overrides the vehicle's."""
     motor_poles: int = 14
     """Magnets on a motor's bell, to turn Betaflight's eRPM into revolutions."""
     rate_hz: float = 250.0
     """At most this many rows a second; faster signals are smoothed over a row's period."""
     start_s: float = 0.0
-    """Leave out what is earlier than this after the file's first sample, ground or not [s]."""
+    """Leave out rows before this time after the file's first sample, on the ground or not [s]."""
     end_s: float | None = None
-    """Leave out what is later than this after the file's first sample, ground or not [s]."""
+    """Leave out rows after this time after the file's first sample, on the ground or not [s]."""
     source: str = ""
-    """Take the pose from `mocap` or `estimate` where a file holds both; empty: as the mapping has
-    them in order."""
+    """`mocap` or `estimate` where a file holds both poses; empty: the mapping's order."""
     mass: float | None = None
-    """Nominal mass [kg], to divide a thrust in N by; goes before the vehicle's."""
+    """Nominal mass [kg], to divide a thrust in N by; overrides the vehicle's."""
     trim: bool = True
     """Leave out the time on the ground before take-off and after landing."""
     partial: bool = False
-    """Take a log without position, attitude, rates or commands, and keep what is there."""
+    """Accept a log without position, attitude, rates or commands."""
     read: Readings = ()
-    """Other readings of signals, before anything is checked: see `eval.logs.faults.reading`."""
+    """Readings to apply before any check: see `eval.logs.faults.reading`."""
     fix: bool = True
-    """Correct what the evidence shows overwhelmingly; otherwise only say it."""
+    """Correct faults with overwhelming evidence; False: only report them."""

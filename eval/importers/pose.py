@@ -1,10 +1,10 @@
 """Position and attitude from another device, brought onto the log's clock.
 
-Motion capture and flight controller have clocks of their own, which start apart and run at rates
-that differ by some tens of millionths. Both see the body turn: the rates that follow from the pose
-are laid over the gyro's. First the whole flights by their magnitudes, which no choice of frames
-changes; then offset, drift, gyro bias and the turn between the two body frames together, by least
-squares (Gauss-Newton; the turn by Kabsch 1976).
+The clocks of motion capture and flight controller have an unknown offset, and their rates differ by
+some 10 ppm. The body rates from the pose are aligned with the gyro's. The first step compares their
+magnitudes over the whole flight, which do not depend on frames. The second step estimates offset,
+drift, gyro bias and the rotation between the two body frames together, by least squares
+(Gauss-Newton; the rotation by Kabsch 1976).
 """
 
 from __future__ import annotations
@@ -27,43 +27,43 @@ from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
-"""The fit begins with this much on both sides of the middle [s]."""
+"""Time on both sides of the middle with which the fit begins [s]."""
 COARSE_HZ = 100.0
-"""The path is looked at on at most so many rows a second."""
+"""Largest row rate for the checks of the path."""
 GRID_S = 0.005
 """Step of the cross-correlation [s]."""
 SPAN_S = 0.025
-"""The pose is differenced over about this time, and the gyro averaged over the same [s]."""
+"""Time over which the pose is differenced and the gyro averaged [s]."""
 OVERLAP_S = 3.0
-"""Recordings must share at least this [s]."""
+"""Least common duration of the two recordings [s]."""
 ALIKE = 0.6
 """Correlation of the rates below which the clocks count as not aligned."""
 SURE = 0.9
-"""Correlation above which a reading of the quaternion is taken without trying others."""
+"""Correlation above which no other reading of the quaternion is tried."""
 READINGS = {
     "xyzw": "xyzw",
     "inverse": "world to body",
     "xyzw+inverse": "xyzw and world to body",
 }
-"""What the attitude may be instead: the steps of `read_as`, and words."""
+"""Other readings of the attitude: steps of `read_as` -> description."""
 SIGNS = ("-roll", "-pitch", "-yaw")
-"""By these, and by a gyro that is mirrored, clocks are aligned too. Which of the two is wrong is
-for the checks that hold both against the path (`eval/logs/faults/pose.py`, `vectors.py`)."""
+"""Readings with one wrong sign. Clocks are aligned with them and a mirrored gyro; later checks
+decide which signal is wrong (`eval/logs/faults/pose.py`, `vectors.py`)."""
 USUAL_STEP_S = 1.0 / 150.0
-"""Cameras and trackers give 30 to 1000 poses a second."""
+"""Usual time between poses of cameras and trackers, 30 to 1000 a second."""
 LONG_S = 7200.0
-"""Longer recordings are not aligned (a clock that jumps, or a wrong unit of time) [s]."""
+"""Longest recording that is aligned; longer ones have a wrong unit of time or a jump [s]."""
 DRIFT_MAX = 2e-3
-"""Clocks that differ by more than this are not believed."""
+"""Largest plausible relative drift of two clocks."""
 DRIFT = 2e-4
-"""Clocks of crystals differ by less than this."""
+"""Largest relative drift of two crystals."""
 TURN_DEG = 15.0
-"""A turn between the body frames above this is corrected (below, it may be a real tilt)."""
+"""Rotation between the body frames above which it is corrected; a smaller one may be a tilt."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the pose's clock and body frame lie to the log's."""
+    """Relation of the pose's clock and body frame to the log's."""
 
     offset_s: float
     """Log time of the pose's time 0 [s]."""
@@ -72,7 +72,7 @@ class Alignment:
     turn: np.ndarray
     """(3, 3) rotation from the pose's body axes to the gyro's."""
     correlation: float
-    """Of the rates, after all is aligned."""
+    """Of the rates after the alignment."""
     offset_sd_s: float
     """Standard error of the offset in the middle of the flight [s]."""
     drift_sd: float
@@ -143,7 +143,7 @@ def _moved(recording: Recording, pose: Recording, quat: Signal, alignment: Align
 
 
 def _has_a_sign(recording: Recording) -> bool:
-    """Return whether the path shows that an angle's sign, no turned body, parts pose and gyro."""
+    """Return whether the path shows that an angle has the wrong sign."""
     times = row_times(recording, COARSE_HZ, 0.0, None)
     fits = fit_pose_readings({k: v for k, v in rows_at(recording, times).items() if k != "rate"})
     if fits is None or fits.given.force is None or fits.best.force is None:
@@ -153,7 +153,7 @@ def _has_a_sign(recording: Recording) -> bool:
 
 
 def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
-    """Return the pose with its time in seconds: only one unit gives a rate that cameras have."""
+    """Return the pose with its time in seconds, in the unit that gives a usual camera rate."""
     step = median_step(pose.signals["quat"].time_s)
     unit = min(TIMES, key=lambda name: abs(np.log(step * TIMES[name] / USUAL_STEP_S)))
     if unit == "s":
@@ -166,7 +166,7 @@ def _in_seconds(pose: Recording) -> tuple[Recording, list[Finding]]:
 def _best_reading(
     pose: Recording, recording: Recording, fix: bool
 ) -> tuple[Signal, Alignment, list[Finding]]:
-    """Return the attitude in the order and sense in which it turns as the gyro does."""
+    """Return the attitude in the reading whose body rates agree with the gyro."""
     quat, rate = pose.signals["quat"], recording.signals["rate"]
     given = align(quat, rate, pose.name)
     enough = max(SURE, 0.5 + 0.5 * given.correlation)
@@ -176,7 +176,7 @@ def _best_reading(
         steps: align(Signal(quat.time_s, read_as("quat", quat.value, steps)), rate, pose.name)
         for steps in (*READINGS, *SIGNS)
     }
-    # Of readings that turn alike, the one whose body is the gyro's.
+    # Among readings with equal correlation, prefer a body frame close to the gyro's.
     best = max(found, key=lambda steps: found[steps].correlation + 0.1 * found[steps].turn.trace())
     if fix and best in READINGS and found[best].correlation > enough:
         fault = "quaternion_order" if "xyzw" in best else "quaternion_direction"
@@ -199,16 +199,16 @@ def _best_reading(
 
 
 def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alignment:
-    """Return how the clock and body of the attitude `quat` lie to those of the gyro `rate`.
+    """Return the alignment of the attitude `quat` with the gyro `rate`.
 
     Args:
         quat: body to world, on the pose's clock.
         rate: of the gyro, on the log's clock.
         name: of the pose's file, for messages.
-        mirrored: take one axis of the gyro, whichever fits, as inverted.
+        mirrored: allow one inverted axis of the gyro.
 
     Raises:
-        FlightLogError: where either is too short or too coarse to be aligned.
+        FlightLogError: where either is too short or too coarse.
     """
     centre_s, by_pose = _pose_rates(quat)
     if len(centre_s) < 50:
@@ -222,7 +222,7 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     middle = float(np.mean(centre_s[shared]))
     result = _Fit(offset, 0.0, np.eye(3), 0.0, np.inf, np.inf)
     reach, whole = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
-    # From the middle outwards: over a long flight the drift alone is more than can be followed.
+    # From the middle outwards, because over a long flight the drift is too large for one step.
     while True:
         near = np.abs(centre_s - middle) <= reach
         for _ in range(20):
@@ -256,7 +256,7 @@ def _refine(
     fit: _Fit,
     mirrored: bool,
 ) -> tuple[_Fit, np.ndarray]:
-    """Return one Gauss-Newton step from `fit`, and by how much offset and drift changed."""
+    """Return the result of one Gauss-Newton step from `fit`, and the change of offset and drift."""
     at = centre_s + fit.offset + fit.drift * (centre_s - middle)
     inside = (at > rate.time_s[0] + SPAN_S) & (at < rate.time_s[-1] - SPAN_S)
     if np.sum(inside) < 50:
@@ -269,7 +269,7 @@ def _refine(
     slope = (later - sooner) / (2.0 * step)
     turn = _kabsch(seen - seen.mean(0), gyro - gyro.mean(0), mirrored)
     turned = seen @ turn.T
-    # The size is left open: a gyro in other units is for `faults/vectors.py` to find.
+    # The scale is free: `faults/vectors.py` finds a gyro in other units.
     centred = turned - turned.mean(0)
     size = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
     rest = gyro - size * turned
@@ -282,7 +282,7 @@ def _refine(
     solution = np.linalg.lstsq(normal, design.T @ (weight * rest.ravel()), rcond=None)[0]
     change = np.clip(solution[:2], [-0.05, -1e-3], [0.05, 1e-3])
     noise = float(np.mean(weight * (rest.ravel() - design @ solution) ** 2))
-    # Neighbouring differences share poses and gyro samples: that many fewer are independent.
+    # Neighbouring differences share samples, which reduces the number of independent ones.
     shared = max(1.0, SPAN_S / median_step(centre_s))
     sd, drift_sd = np.sqrt(shared * noise / np.maximum(np.diag(normal)[:2], 1e-12)).tolist()
     alike = _alike(gyro, seen @ turn.T)
@@ -346,10 +346,10 @@ def _coarse(centre_s: np.ndarray, by_pose: np.ndarray, rate: Signal, name: str) 
 
 
 def _kabsch(source: np.ndarray, target: np.ndarray, mirrored: bool) -> np.ndarray:
-    """Return the rotation (3, 3), or mirrored one, that takes `source` (K, 3) to `target`."""
+    """Return the rotation (3, 3), or reflection, from `source` (K, 3) to `target`."""
     u, s, vt = np.linalg.svd(target.T @ source)
     if s[1] < 1e-3 * s[0]:
-        return np.eye(3)  # turning about one axis only does not tell the frames apart
+        return np.eye(3)  # rotation about one axis only does not determine the frames
     sign = np.sign(np.linalg.det(u @ vt)) * (-1.0 if mirrored else 1.0)
     return u @ np.diag([1.0, 1.0, sign]) @ vt
 

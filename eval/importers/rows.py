@@ -1,9 +1,9 @@
 """Signals of different rates brought onto the rows of one flight log.
 
-Rows stand at the samples of the slowest of position, attitude and gyro (every n-th where it is
-faster than asked), so that each measurement is in one row and its noise in none of the others:
-what a diagnosis takes for noise must not be copied from row to row. What is faster is smoothed
-over a row's period, so that vibration does not alias. A command is its mean until the next row.
+Row times are the samples of the slowest of position, attitude and gyro (every n-th where it exceeds
+the wanted rate). So each measurement is in one row only, and rows have independent noise, as a
+diagnosis assumes. Faster signals are smoothed over a row's period, so that vibration does not
+alias. A command is its mean until the next row.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from eval.logs.columns import FlightLogError
 from eval.logs.files import MOST_ROWS
 
 LEAST_HZ = 20.0
-"""Where that is slower than this, further rows stand between its samples."""
+"""Least row rate; for slower signals rows are added between the samples."""
 SMOOTH = ("pos", "quat", "vel")
-"""Interpolated by a cubic spline, as they follow from accelerations; the others linearly."""
+"""Signals that are interpolated by a cubic spline; the others linearly."""
 SPARSE = ("pos", "quat", "vel", "rate", "acc")
-"""Left empty between their samples where they are slower than the rows."""
+"""Signals that stay empty between their samples where they are slower than the rows."""
 HELD = (
     *("cmd_thrust", "cmd_rate", "cmd_torque", "cmd_quat", "throttle", "motor_cmd", "pwm"),
     "kept:cmd_force",
 )
-"""Hold their value until the next sample."""
+"""Signals that hold their value until the next sample."""
 HOLE_S = 0.1
 HOLE_STEPS = 5.0
-"""Samples further apart than both are a hole."""
+"""A gap exceeds both: in seconds, and in median steps."""
 HOLD_S = 0.5
 """A command is not held for longer than this (and ten of its own steps) [s]."""
 FAR_FASTER = 0.6
 """Signals whose step is below this share of a row's are smoothed."""
 LOST = 0.8
-"""A row further than this many steps from any sample of the velocity has none: it was left out."""
+"""A row further than this many steps from any velocity sample gets none."""
 SLOWER = 1.5
-"""Signals whose step is above this many rows' are slower than the rows."""
+"""Signals whose step exceeds this many rows' are slower than the rows."""
 
 
 def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Return the rows: `time` (T,) from 0 [s] and every signal as (T, C), NaN where unknown.
 
-    Signals slower than the rows are interpolated here; `own_rows` tells where.
+    Signals slower than the rows are interpolated here; `own_rows` returns their measured rows.
 
     Args:
         recording: holds at least one of pos, quat and rate.
@@ -64,7 +64,7 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def slowest(recording: Recording) -> str:
-    """Return which of the needed signals that are there is the slowest: it sets the rows."""
+    """Return the slowest available signal of `NEEDED`; its samples define the rows."""
     there = [name for name in NEEDED if name in recording.signals]
     return max(there, key=lambda name: median_step(recording.signals[name].time_s))
 
@@ -106,7 +106,7 @@ def row_times(
             raise FlightLogError(recording.name, "time", None, reason)
         share = np.arange(parts) / parts
         between = base[:-1, None] + share * np.diff(base)[:, None]
-        # A hole stays one: rows across it would hold nothing.
+        # A gap stays empty.
         near = np.diff(base)[:, None] < HOLE_STEPS * step
         base = np.append(between[near | (share == 0.0)], base[-1])
         step /= parts
@@ -130,7 +130,7 @@ def row_times(
 
 
 def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Return which rows a sample is for, (T,) bool, by signal that is slower than the rows.
+    """Return the measured rows (T,) bool of each signal that is slower than the rows.
 
     A sample is for the row nearest to it, and for that of the slowest signal where one is within
     half of its own step, so that there are rows in which nothing is missing.

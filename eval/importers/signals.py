@@ -1,4 +1,4 @@
-"""What an importer hands over: signals in the flight log's units and frames, each at its own rate.
+"""Signals of an imported file, in the flight log's units and frames, each at its own rate.
 
 Signals are named as the groups of columns in `eval/logs/columns.py` (pos, quat, vel, rate,
 cmd_thrust, cmd_rate, motor, motor_cmd, acc, voltage), and besides `throttle`: normalised

@@ -1,4 +1,4 @@
-"""The flight log's columns and the rules that a log must keep to be used.
+"""The columns of a flight log, and the rules that decide whether a log is accepted.
 
 | columns | unit | needed |
 |---|---|---|
@@ -14,10 +14,10 @@
 | `motor_cmd_1` to `motor_cmd_4` | rad/s, commanded | no |
 | `acc_x acc_y acc_z` | m/s^2, specific force, body | no |
 | `voltage` | V | no |
-| `est_pos_x` ..., `est_quat_w` ..., `est_vel_x` ... | of an on-board estimate | no |
+| `est_pos_x` ..., `est_quat_w` ..., `est_vel_x` ... | the on-board estimate | no |
 
-Missing values are null or NaN. Rows are counted from 1; a CSV's header is not a row. A partial log
-(its metadata say so) may lack all but the time and one more group.
+Missing values are null or NaN. Rows are counted from 1, without a CSV's header. A partial log
+(marked in its metadata) needs only the time and one more group.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "acc": _xyz("acc"),
     "voltage": ("voltage",),
 }
-"""Columns that come together, by the name of the group."""
+"""Columns of each group; a group is complete or absent."""
 NEEDED = ("time", "pos", "quat", "rate")
-"""Groups without which a whole log is refused; so is one without any of `COMMANDS`."""
+"""Groups that a whole log must have, together with one of `COMMANDS`."""
 COMMANDS = (("cmd_thrust", "cmd_rate"), ("cmd_thrust", "cmd_torque"), ("motor",), ("pwm",))
-"""What may drive a model: one of these must be there."""
+"""Sets of groups that can drive a model; a whole log has at least one."""
 ESTIMATE = "est_"
-"""Before a column of position, attitude or velocity: what the drone itself estimated."""
+"""Prefix of the drone's own estimates of position, attitude and velocity."""
 KNOWN = frozenset(column for group in GROUPS.values() for column in group)
-"""Every column that the rules know."""
+"""All columns that this file defines."""
 
 POSITION_MAX = 100e3
 """Positions beyond this are refused [m]."""
@@ -68,7 +68,7 @@ RATE_MAX = 200.0
 QUATERNION_TOLERANCE = 0.05
 """Quaternions further than this from unit norm are refused."""
 PWM_MAX = 1.05
-"""Motor commands beyond this, or below 1 less it, are refused."""
+"""Motor commands above this, or below 1 minus this, are refused."""
 DURATION_MIN = 1.0
 """Shorter flights are refused [s]."""
 
@@ -86,7 +86,7 @@ _OTHER_NAMES = {
 
 
 class FlightLogError(ValueError):
-    """A flight log that cannot be used: which file, which column, which row and why."""
+    """A flight log is refused; names the file, the column, the row and the reason."""
 
     def __init__(self, name: str, column: str | None, row: int | None, reason: str) -> None:
         """Keep the parts and join them to one line; `row` is counted from 1."""
@@ -95,7 +95,7 @@ class FlightLogError(ValueError):
         super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))
 
     def __reduce__(self) -> tuple[type[FlightLogError], tuple[object, ...]]:
-        """Let it travel between processes whole."""
+        """Return the parts for pickling."""
         return type(self), (self.name, self.column, self.row, self.reason)
 
 
@@ -107,7 +107,7 @@ def check_columns(
     Args:
         columns: by name.
         name: the file, for messages.
-        partial: take a log that lacks position, attitude, rates or commands.
+        partial: accept a log without position, attitude, rates or commands.
 
     Returns:
         The known columns as float64 without the rows that have no time, NaN where a value is

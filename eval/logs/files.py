@@ -1,4 +1,4 @@
-"""Columns of numbers in Parquet and CSV files, with one JSON text beside them.
+"""Parquet and CSV files with columns of numbers and one JSON text.
 
 Parquet keeps the text in the metadata key `flight`. CSV keeps it in the first row of a column
 `flight`, so that every CSV reader still finds the header in the first line.
@@ -24,12 +24,12 @@ from tracks.input.reading import LOG_BYTES, InputError, check_file
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
 MOST_ROWS = 4_000_000
-"""Of a flight log: more than an hour at 1 kHz, some gigabyte in memory."""
+"""Most rows of a flight log: more than an hour at 1 kHz, about a gigabyte in memory."""
 MOST_CELLS = 100_000_000
-"""Of a flight log, rows times columns: all the columns that we know at `MOST_ROWS`."""
+"""Most cells of a flight log, rows times columns: all defined columns at `MOST_ROWS`."""
 PARQUET_MAGIC = b"PAR1"
 MOST_BEFORE = 500
-"""Lines in which a CSV's header is looked for."""
+"""Most lines before a CSV's header."""
 OTHERS = {
     "FMT": "an ArduPilot text log, whose messages have columns of their own; export the messages "
     "that you need (ATT, IMU, RATE, RCOU, XKF1) as one table with a time, and describe it by --map",
@@ -37,12 +37,12 @@ OTHERS = {
     "above the first row of numbers, name the columns in one line (time, x, y, z, qx, qy, qz, qw), "
     "and describe it by --pose-map",
 }
-"""First cell of tables of other programs that cannot be read as they are, and what to do."""
+"""First cell of other programs' tables that cannot be read directly -> what to do."""
 NOT_CSV = "neither a Parquet file nor CSV in UTF-8"
 
 
 def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
-    """Read the file at `path`, which is told to be Parquet or CSV by its first bytes.
+    """Read the Parquet or CSV file at `path`; its first bytes decide the format.
 
     Returns:
         Every column by name with NaN where a number is missing; the JSON text, if any; warnings.
@@ -65,7 +65,7 @@ def read_columns(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[st
 
 
 def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> Path:
-    """Write `columns` and the JSON `text`: beside `path` first, then renamed.
+    """Write `columns` and the JSON `text` to a temporary file, then rename it to `path`.
 
     Raises:
         FlightLogError: where the ending of `path` is neither `.parquet` nor `.csv`.
@@ -90,12 +90,12 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> P
 
 def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]:
     try:
-        # A single handle on the file: `read_table` would take a folder's name for a column.
+        # `ParquetFile` instead of `read_table`, which takes a folder's name for a column.
         with pyarrow.parquet.ParquetFile(path) as file:
             wanted, warnings = _wanted(path, file)
             texts = [n for n in wanted if _is_text(file.schema_arrow.field(n).type)]
             metadata = file.schema_arrow.metadata or {}
-        # A text stays coded as in the file: a long one of every row fits there, not in memory.
+        # Texts stay dictionary-encoded: a long text in every row would not fit in memory.
         with pyarrow.parquet.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read(wanted)
     except MemoryError:  # Arrow's own is one as well
@@ -110,7 +110,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
 
 
 def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
-    """Return the columns to read, and a warning about those that are left out."""
+    """Return the columns to read, and a warning about the others."""
     rows, names, schema = file.metadata.num_rows, file.schema_arrow.names, file.schema_arrow
     for name in names:
         if names.count(name) > 1:
@@ -122,7 +122,7 @@ def _wanted(path: Path, file: Any) -> tuple[list[str], list[str]]:
     if rows * len(wanted) > MOST_CELLS:
         wanted = [name for name in wanted if name in KNOWN]
     if not wanted:
-        wanted = names  # refused by their number
+        wanted = names  # `_check_size` refuses this many
     _check_size(path, rows, len(wanted))
     left = len(names) - len(wanted)
     text = f"{path}: {left} of {len(names)} columns are left out: they hold lists, or are too many"
@@ -154,7 +154,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
         bad_rows.clear()
         return pyarrow.csv.read_csv(
             path,
-            # One thread, because only then are bad rows told with their numbers.
+            # One thread: only then does pyarrow report the numbers of bad rows.
             read_options=pyarrow.csv.ReadOptions(
                 column_names=names, skip_rows=before + 1, use_threads=False
             ),
@@ -168,7 +168,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
         try:
             table = parse(pa.float64())
         except pa.ArrowInvalid:
-            table = parse(pa.string())  # so that the rules can name the first bad value
+            table = parse(pa.string())  # so that `check_columns` can name the first bad value
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         if "Empty CSV" in str(error):
             raise FlightLogError(str(path), None, None, "a header, but no rows") from None
@@ -192,7 +192,7 @@ def _read_csv(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[str]]
 
 
 def _check_size(path: Path, rows: int, columns: int) -> None:
-    """Refuse more numbers than fit, before they are read."""
+    """Refuse tables that are too large, before they are read."""
     reason = "cut it into flights, or log less often"
     if rows > MOST_ROWS:
         reason = f"{rows:,} rows; at most {MOST_ROWS:,}: {reason}"
@@ -205,7 +205,7 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
 
 
 def _check_text(path: Path, columns: int) -> None:
-    """Refuse other bytes than UTF-8, which pyarrow trips over in a row that it tells of."""
+    """Refuse a file that is not UTF-8, which pyarrow reports at the wrong row."""
     lines = 0
     decode = codecs.getincrementaldecoder("utf-8")().decode
     try:
@@ -220,7 +220,7 @@ def _check_text(path: Path, columns: int) -> None:
 
 
 def _csv_header(path: Path) -> tuple[list[str], int]:
-    """Return the names of the columns, and how many lines of something else stand before them."""
+    """Return the names of the columns, and the number of lines before them."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [row for row, _ in zip(csv.reader(file), range(MOST_BEFORE), strict=False)]
@@ -238,9 +238,9 @@ def _csv_header(path: Path) -> tuple[list[str], int]:
 
 
 def _lines_before(lines: list[list[str]]) -> int:
-    """Return the place of the header: names above two rows of as many cells, most of them numbers.
+    """Return the header's line: names above two rows of equal width, most of them numbers.
 
-    0 where the first line may be it, so that its mistakes are reported of it.
+    0 where the first line may be the header, so that errors refer to it.
     """
     if len(lines) < 4 or len(lines[0]) == len(lines[1]) == len(lines[-2]):
         return 0
@@ -261,7 +261,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _numbers(row: list[str]) -> float:
-    """Return the share of a row's cells that are numbers or empty."""
+    """Return the share of numeric or empty cells of a row."""
     return sum(not cell.strip() or _is_number(cell) for cell in row) / max(len(row), 1)
 
 

@@ -1,4 +1,4 @@
-"""One recorded flight as plain arrays: what the judge hands to the flight log and to the viewer."""
+"""One recorded flight as plain arrays, for the flight log and the viewer."""
 
 from __future__ import annotations
 

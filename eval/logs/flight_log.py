@@ -1,8 +1,8 @@
 """Flight logs: one flight as arrays, read from and written to Parquet or CSV.
 
-The columns, their units and the rules that refuse a file are in `eval/logs/columns.py`. What the
-suite records besides (the policy's action, when it decided, the gate it flew to) are columns that
-other readers see as unknown ones; unknown columns of any origin are kept.
+The columns, their units and the rules for a valid file are in `eval/logs/columns.py`. The suite
+also records the policy's action, the rows of its decisions and the next gate, as extra columns.
+Unknown columns of any origin are kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCHEMA = 1
 """Version of the flight log's layout, in the metadata of every file we write."""
 ACTION = ("action_x", "action_y", "action_z")
 QUATERNION_ROUNDING = 1e-12
-"""Quaternions nearer to unit norm than this are taken as they are, so that logs come back equal."""
+"""Quaternions closer to unit norm than this are not normalised, so that a log reads back equal."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FlightLog:
     """
 
     name: str
-    """The file, or another name for messages."""
+    """The file's path, or another name for messages."""
     time_s: np.ndarray
     """(T,) increasing; sampling may jitter and rows may be missing [s]."""
     pos_w: np.ndarray
@@ -53,28 +53,28 @@ class FlightLog:
     thrust_cmd: np.ndarray | None = None
     """(T,) commanded collective thrust per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray | None = None
-    """(T, 3) commanded body rates [rad/s]; there with `thrust_cmd`, unless `torque_cmd_b` is."""
+    """(T, 3) commanded body rates [rad/s]; comes with `thrust_cmd`, unless `torque_cmd_b` does."""
     rotor_speed: np.ndarray | None = None
     """(T, 4) measured, in the vehicle file's order [rad/s]."""
     rotor_speed_cmd: np.ndarray | None = None
     """(T, 4) commanded [rad/s]."""
     acc_b: np.ndarray | None = None
-    """(T, 3) specific force, as an accelerometer has it [m/s^2]."""
+    """(T, 3) specific force measured by an accelerometer [m/s^2]."""
     voltage: np.ndarray | None = None
     """(T,) battery [V]."""
     torque_cmd_b: np.ndarray | None = None
-    """(T, 3) commanded body torques [N m]; there with `thrust_cmd`."""
+    """(T, 3) commanded body torques [N m]; comes with `thrust_cmd`."""
     pwm: np.ndarray | None = None
     """(T, 4) motor commands from 0 to 1, in the vehicle file's order; its `[motors]` and the
-    voltage say what thrust they give."""
+    voltage determine their thrust."""
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Unknown columns by name, (T,) each, as they were in the file."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """The JSON of metadata key `flight`: vehicle, source, notes, track, seed, integrator, ..."""
     velocity_derived: bool = False
-    """True where `vel_w` was not in the file but comes from `pos_w`."""
+    """True where `vel_w` was computed from `pos_w`."""
     warnings: tuple[str, ...] = ()
-    """What was odd about the file but not refused."""
+    """Oddities of the file that did not prevent its use."""
 
     @property
     def duration_s(self) -> float:
@@ -93,7 +93,7 @@ class FlightLog:
 
     @property
     def partial(self) -> tuple[str, ...]:
-        """Groups of columns that a partial log lacks of those that flights need; () for others.
+        """Required groups of columns that a partial log lacks; () for a whole log.
 
         Where `pos`, `quat` or `rate` is among them, that array is NaN in every row.
         """
@@ -102,7 +102,7 @@ class FlightLog:
 
     @property
     def whole(self) -> np.ndarray:
-        """(T,) bool: rows in which nothing of the state and of the flown command is missing."""
+        """(T,) bool: rows with a complete state and a complete command."""
         parts = [self.pos_w, self.quat_wxyz, self.vel_w, self.rate_b]
         if self.thrust_cmd is not None and self.rate_cmd_b is not None:
             parts += [self.thrust_cmd[:, None], self.rate_cmd_b]
@@ -116,16 +116,16 @@ class FlightLog:
 
     @property
     def integrator(self) -> str | None:
-        """How a simulator stepped the flight: `euler` (semi-implicit), or None if it is not said.
+        """The simulator's integrator, `euler` (semi-implicit); None where the log has none.
 
-        A flight without it is taken as continuous in time.
+        A flight without it counts as continuous in time.
         """
         named = self.about.get("integrator")
         return named if isinstance(named, str) else None
 
     @property
     def step_s(self) -> float | None:
-        """Length of the steps of `integrator` [s], or None where it is not said."""
+        """Length of the steps of `integrator` [s], or None where the log has none."""
         step = self.about.get("step_s")
         if isinstance(step, bool) or not isinstance(step, (int, float)):
             return None
@@ -133,18 +133,18 @@ class FlightLog:
 
     @property
     def action_b(self) -> np.ndarray | None:
-        """(T, 3) the policy's action in use [m/s^2], or None in logs that are not ours."""
+        """(T, 3) the policy's action in use [m/s^2]; None where the log has none."""
         return self._numbers(ACTION)
 
     @property
     def policy_step(self) -> np.ndarray | None:
-        """(T,) bool: rows that start to fly a new action, or None in logs that are not ours."""
+        """(T,) bool: rows at which a new action starts; None where the log has none."""
         values = self._numbers(("policy_step",))
         return None if values is None else values[:, 0] > 0
 
     @property
     def gate(self) -> np.ndarray | None:
-        """(T,) int32: the next gate's number from 0 (-1: missing), or None in others' logs."""
+        """(T,) int32: the next gate's number from 0 (-1: missing); None where the log has none."""
         values = self._numbers(("gate",))
         return None if values is None else np.nan_to_num(values[:, 0], nan=-1).astype(np.int32)
 
@@ -194,11 +194,10 @@ def log_from_flight(flight: Flight, name: str = "flight") -> FlightLog:
 def log_from_columns(
     columns: Mapping[str, np.ndarray], about: Mapping[str, Any], name: str
 ) -> FlightLog:
-    """Return the log that `columns` (column name to (T,) values) hold, or refuse them.
+    """Return `columns` (column name to (T,) values) as a log.
 
-    Rows without a time are left out, as nothing can be known of when they were. Quaternions are
-    made unit. A missing velocity is derived (`eval/logs/velocity.py`). Where `about` says
-    `partial`, what flights need and this one lacks is NaN.
+    Rows without a time are left out. Quaternions are normalised. A missing velocity is computed
+    (`eval/logs/velocity.py`). Where `about` has `partial`, missing required groups are NaN.
 
     Raises:
         FlightLogError: where the columns break a rule; it names column, row and reason.
@@ -234,7 +233,7 @@ def log_from_columns(
 
 
 def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
-    """Return the columns of `log` by name; a derived velocity is left out, as it was not measured.
+    """Return the columns of `log` by name; a computed velocity is left out.
 
     Raises:
         FlightLogError: where an array's length is not that of `time_s`.
@@ -256,7 +255,7 @@ def columns_from_log(log: FlightLog) -> dict[str, np.ndarray]:
 
 
 def flight_metadata(text: str | None, name: str) -> tuple[dict[str, Any], list[str]]:
-    """Return what the metadata's JSON text says of a flight, and warnings; {} without a text."""
+    """Return the metadata in a JSON text, {} without a text, and warnings."""
     if text is None:
         return {}, []
     try:
@@ -269,7 +268,7 @@ def flight_metadata(text: str | None, name: str) -> tuple[dict[str, Any], list[s
 
 
 def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
-    """Read a flight from a Parquet or CSV file; a partial one only where `partial` says so.
+    """Read a flight from a Parquet or CSV file; `partial` allows a partial log.
 
     Raises:
         FlightLogError: where the file cannot be read or breaks a rule; the message has the file,
@@ -288,17 +287,17 @@ def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
 def read_flights(
     paths: Iterable[str | Path], partial: bool = False
 ) -> tuple[list[FlightLog], list[str]]:
-    """Read many flights; a bad one is named in the warnings and the rest are used.
+    """Read many flights; the warnings name files that cannot be used.
 
     Args:
         paths: of the files.
-        partial: take partial logs too.
+        partial: accept partial logs as well.
 
     Returns:
         The flights in the order of `paths`, and the warnings of all files.
 
     Raises:
-        FlightLogError: where no flight is left, with the reason of every file.
+        FlightLogError: where no file can be used, with the reason of each.
     """
     flights: list[FlightLog] = []
     warnings: list[str] = []
@@ -318,7 +317,7 @@ def read_flights(
 
 
 def write_flight(path: str | Path, log: FlightLog) -> Path:
-    """Write `log` as Parquet (`.parquet`) or CSV (`.csv`), at once and under its name when whole.
+    """Write `log` as Parquet (`.parquet`) or CSV (`.csv`); the file appears only when complete.
 
     Parquet holds `log.about` with the keys of `provenance.stamp` as JSON in the metadata key
     `flight`; CSV holds the same JSON in the first row of a column `flight`.

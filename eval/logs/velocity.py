@@ -1,4 +1,4 @@
-"""Velocity from positions that were sampled unevenly and have holes.
+"""Velocity from positions with uneven sampling and gaps.
 
 A cubic in time is fitted by least squares to the positions within 50 ms of each row (a
 Savitzky-Golay derivative on uneven samples; Savitzky and Golay 1964), and its slope at the row is
@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 HALF_WINDOW_S = 0.05
-"""Positions this near to a row take part [s]; slower logs use the five nearest rows."""
+"""Positions within this time of a row are used [s]; slower logs use the five nearest rows."""
 GAP_STEPS = 6.0
-"""Rows further away than this many median steps (and the half window) take no part."""
+"""Rows further away than this many median steps (and the half window) are not used."""
 
 
 def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
@@ -22,7 +22,7 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
 
     Args:
         time_s: (T,) increasing [s].
-        pos_w: (T, 3) [m]; a row with a NaN takes no part and gets the fit of its neighbours.
+        pos_w: (T, 3) [m]; a row with a NaN gets the fit of its neighbours.
 
     Returns:
         (T, 3); where fewer than four positions are near, the fit has a lower degree, and where
@@ -36,7 +36,7 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
     step = float(np.median(np.diff(time)))
     reach = max(HALF_WINDOW_S, GAP_STEPS * step)
     count = int(np.clip(2 * np.floor(HALF_WINDOW_S / step) + 1, 5, 101))
-    # Neighbours are found among good rows by index; those beyond `reach` get no weight.
+    # Neighbours are found among good rows by index; rows beyond `reach` have zero weight.
     nearest = np.searchsorted(time, time_s)
     first = np.clip(nearest - count // 2, 0, max(len(time) - count, 0))
     moment = np.zeros((7, len(time_s)))

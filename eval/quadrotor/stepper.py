@@ -379,7 +379,7 @@ def _seen(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | N
         return flow
     if not carried or name not in carried:
         raise ValueError(
-            f"effects.{name} has a state of its own, which is not simulated here; leave it out of "
+            f"effects.{name} has a motion of its own, which is not simulated here; leave it out of "
             "the vehicle, or fly it with eval.quadrotor.stepper from hover_state on"
         )
     return flow._replace(memory=carried[name], dt=plant.dt)

@@ -1,4 +1,4 @@
-"""Where the flight is: between take-off and landing, told by the motors and the height."""
+"""Find take-off and landing from the motors and the height."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from eval.importers.signals import Recording, Signal
 from eval.logs.faults.finding import Finding
 
 RUNNING = 0.5
-"""Motors that get this share of what they usually get in flight carry the vehicle."""
+"""Share of the usual effort in flight above which the motors carry the vehicle."""
 HOLD_S = 0.3
-"""They must do so for this long without a break [s]."""
+"""Least time above it without a break [s]."""
 RISE_M = 0.05
-"""The vehicle flies from where it is this far above the ground [m]."""
+"""Height above the ground from which the vehicle counts as flying [m]."""
 POWER = {
     **{"throttle": 1, "cmd_thrust": 1, "kept:cmd_force": 1},
     **{"pwm": 1, "motor": 2, "motor_cmd": 2},
 }
-"""Signals that say how hard the motors work, and the power of theirs that goes with thrust."""
+"""Signals that measure the motors' effort, and their exponent in the thrust."""
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in flight [s], infinite where the log flies already.
+    """Return the first and the last time in flight [s]; infinite for a start or end in flight.
 
     Args:
         recording: with the time in s.
@@ -55,7 +55,7 @@ def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
 
 
 def _effort(recording: Recording) -> Signal | None:
-    """Return how hard the motors work, about 1 in flight."""
+    """Return the motors' effort, about 1 in flight."""
     for name, power in POWER.items():
         samples = recording.signals.get(name)
         if samples is None or len(samples.time_s) < 10:
@@ -80,7 +80,7 @@ def _lasting(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
 
 
 def _risen(pos: Signal, start: float, stop: float) -> tuple[float, float]:
-    """Return the times inside `start` and `stop` when the height is first and last off ground."""
+    """Return the first and last time within `start` and `stop` above the ground."""
     height = pos.value[:, 2]
     inside = (pos.time_s >= start) & (pos.time_s <= stop)
     if np.isfinite(start):

@@ -1,7 +1,7 @@
-"""Samples that no flight makes: jumps of position and speed, repeated and filled-in samples.
+"""Remove impossible samples: jumps of position and speed, repeated and interpolated samples.
 
-A sample that was held or drawn between its neighbours is no measurement: it would look like less
-noise than there is. A jump would look like a blow.
+A repeated or interpolated sample is no measurement and makes the noise look too small. A jump looks
+like a collision.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from eval.logs.faults.finding import Finding
 from eval.logs.velocity import velocity_from_position
 
 ACC_MAX = 60.0
-"""No flight changes its speed faster [m/s^2]."""
+"""Largest possible acceleration [m/s^2]."""
 POS_LEAST, VEL_LEAST = 0.02, 0.1
-"""Jumps below these are left alone [m, m/s]."""
+"""Smaller jumps are kept [m, m/s]."""
 TIMES_USUAL = 8.0
 """A velocity further from the path's slope than this many standard deviations is a glitch."""
 EDGE_S = 0.1
-"""So near to a hole or an end of the positions [s] no velocity is judged."""
+"""Time around a gap or an end of the positions in which velocities are not checked [s]."""
 AROUND = 7
-"""Samples whose median a position is held against."""
+"""Number of samples of the running median with which a position is compared."""
 REPEATED = 0.02
-"""A larger share of repeated or filled-in samples is worth a word and is left out."""
+"""Share of repeated or interpolated samples above which they are removed."""
 COARSE = 4.0
-"""A scale is coarse where the usual change is less than so many of its steps."""
+"""A scale is coarse where the usual change is below this many of its steps."""
 TEXTS = {"pos": "position", "quat": "attitude"}
 TURNING = 0.05
-"""Slower turns do not tell a filled-in attitude [rad/s]."""
+"""Least body rate at which an interpolated attitude is identifiable [rad/s]."""
 EXACT = 1e-3
-"""An attitude that turns on by exactly the same, to this share, was drawn between others."""
+"""An attitude whose rate is constant within this share was interpolated."""
 
 
 def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Return the recording without glitches, and what was found; the time is in s."""
+    """Return the recording (time in s) without impossible samples, and the findings."""
     signals, findings = dict(recording.signals), []
     findings += _leave_repeats(signals)
     if "quat" in signals and len(signals["quat"].time_s) > AROUND:
@@ -58,7 +58,7 @@ def _kept(samples: Signal, good: np.ndarray) -> Signal:
 
 
 def _leave_repeats(signals: dict[str, Signal]) -> list[Finding]:
-    """Leave out poses that repeat the one before, in place; what is logged with them goes too."""
+    """Remove repeated poses in place, with the signals logged at the same times."""
     for name in ("quat", "pos"):
         samples = signals.get(name)
         if samples is None or len(samples.time_s) <= AROUND:
@@ -83,13 +83,13 @@ def _is_coarse(samples: Signal) -> bool:
     change = change[change > 0.0]
     if not len(change):
         return True
-    # Rounding makes the least of all changes smaller than a step of the scale.
+    # Rounding makes the smallest change smaller than a step of the scale.
     least = float(np.quantile(change, 0.02))
     return float(np.median(change)) < COARSE * least
 
 
 def _moves(samples: Signal) -> bool:
-    """Return whether nearly every sample differs from that a second later: it does not rest."""
+    """Return whether nearly every sample differs from that a second later."""
     later = max(1, int(1.0 / max(median_step(samples.time_s), 1e-6)))
     if later >= len(samples.value):
         return False
@@ -127,7 +127,7 @@ def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
 
 
 def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
-    """Leave out velocities that the path does not bear out; a velocity in other frames stays."""
+    """Remove velocities that contradict the path; a velocity in another frame is kept."""
     path = velocity_from_position(pos.time_s, pos.value)
     slope = np.stack([np.interp(vel.time_s, pos.time_s, column) for column in path.T], axis=1)
     off = vel.value - slope
@@ -137,7 +137,7 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
         return vel, []
     far = np.abs(off - np.median(off, axis=0))
     bad = np.any(far > np.maximum(TIMES_USUAL * usual, VEL_LEAST), axis=1)
-    # At the ends and beside holes the slope is drawn from one side only.
+    # At the ends and next to gaps the slope uses one side only.
     steps = np.diff(pos.time_s)
     holes = pos.time_s[:-1][steps > 4.0 * median_step(pos.time_s)]
     for edge in (

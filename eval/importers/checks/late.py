@@ -1,4 +1,4 @@
-"""Is the pose late against the gyro? Motion capture is, and so is a state estimate."""
+"""Estimate and remove the delay of the pose (motion capture or state estimate) against the gyro."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
 
 LATE = ("pos", "quat", "vel")
-"""Signals that come of one device and are late together."""
+"""Signals of one device, which share a delay."""
 
 
 def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
-    """Return the recording with the pose moved to when the gyro felt it, and what was found.
+    """Return the recording with the pose shifted to the gyro's clock, and the findings.
 
     Args:
-        recording: time in s, rates in rad/s, frames as ours; holds quat and rate.
-        fix: move it; otherwise only say so.
+        recording: with time in s, rates in rad/s and a flight log's frames; holds quat and rate.
+        fix: shift the pose; otherwise only report the delay.
     """
     quat, rate = recording.signals["quat"], recording.signals["rate"]
     found = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)

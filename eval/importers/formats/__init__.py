@@ -1,4 +1,4 @@
-"""One file a format: what it reads, how it is told from others, and how it is read.
+"""Log formats, one file each: a summary, the detection and the reader.
 
 Another package adds one with an entry point of the group `diffracing_suite.formats`, a program for
 its own process with `FORMATS.register(name, module)`.
@@ -17,26 +17,26 @@ from tracks.common.names import Registry
 
 
 class Format(Protocol):
-    """A module (or an object) that reads one format.
+    """A module or object that reads one format.
 
-    One that takes whatever has columns says `ASKED_LAST = True`: the others are asked before it.
-    One to which a mapping file says nothing says `TAKES_MAP = False`, one whose pose is of one
-    source `TAKES_SOURCE = False`.
+    Optional attributes: `ASKED_LAST = True` for a format that accepts any table, so that the others
+    are tried before it; `TAKES_MAP = False` where a mapping file has no use; `TAKES_SOURCE = False`
+    where the pose has a single source.
     """
 
     SUMMARY: str
-    """What it reads, for people."""
+    """Description for users."""
 
     def detect(self, head: bytes, options: ImportOptions) -> bool:
-        """Return whether a file with these first bytes is of the format.
+        """Return whether a file with these first bytes has this format.
 
         Raises:
-            ValueError: for a file that could be read after something has been done to it.
+            ValueError: for a file that needs a conversion first.
         """
         ...
 
     def read(self, path: Path, options: ImportOptions) -> Recording:
-        """Return what the file holds."""
+        """Return the file's signals."""
         ...
 
 
@@ -59,7 +59,7 @@ FORMATS: Registry[Format] = Registry(
 def detect(path: Path, options: ImportOptions) -> str:
     """Return the name of the format of the file at `path`.
 
-    Formats that take whatever has columns, such as tables, are asked after all others.
+    Formats that accept any table are tried last.
 
     Raises:
         FlightLogError: where the file cannot be read, or is of no known format.

@@ -1,4 +1,4 @@
-"""The faults that a check can name, and the manoeuvre that shows each where a flight does not."""
+"""The faults that checks can name, each with a manoeuvre that makes it identifiable."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "gyro_axes": ("axes of the gyro are inverted or swapped", ROTATE),
     "gyro_frame": ("rates are in world axes", ROTATE),
     "gyro_scale": ("the gyro's unit or scale", ROTATE),
-    "accelerometer_unit": (
-        "the accelerometer's unit or counts",
-        REST,
-    ),
+    "accelerometer_unit": ("the accelerometer's unit or counts", REST),
     "accelerometer_axes": ("axes of the accelerometer are inverted", ROTATE),
     "accelerometer_gravity": ("gravity was taken out of the accelerometer", ROTATE),
     "accelerometer_throttle_bias": ("vibration biases the accelerometer", PULSE),
@@ -46,10 +43,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "rate_command_sign": ("a commanded rate has the other sign", STICKS),
     "rate_curve": ("the firmware maps sticks by another curve", STICKS),
     "command_delay": ("commands act too late", STICKS),
-    "controller_rate": (
-        "the controller runs at another rate",
-        FASTER,
-    ),
+    "controller_rate": ("the controller runs at another rate", FASTER),
     "throttle_range": ("the throttle is not from 0 to 1", "hover for two seconds"),
     "thrust_scale": ("thrust is not what the vehicle file says", "hover for two seconds"),
     "voltage": ("the battery's voltage is impossible", "log the battery that drives the motors"),
@@ -60,9 +54,9 @@ FAULTS: dict[str, tuple[str, str]] = {
     "camera_fov": ("the policy saw with another camera", ""),
     "file": ("the file is damaged, or of another kind", "log again"),
 }
-"""Name -> what it is, and the manoeuvre that shows it."""
+"""Name -> description, and the manoeuvre that makes it identifiable."""
 
 
 def manoeuvre(fault: str) -> str:
-    """Return what to fly or do so that a log shows `fault`."""
+    """Return the manoeuvre that makes `fault` identifiable."""
     return FAULTS[fault][1]

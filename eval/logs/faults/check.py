@@ -1,4 +1,4 @@
-"""All checks of a log, in the order in which one builds on the other; each is a pure function."""
+"""All checks of a log, as pure functions; later checks rely on earlier ones."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from eval.vehicles.vehicle import Vehicle
 from tracks.common.names import unknown_name
 
 LEAST_ROWS = 50
-"""Fewer rows show nothing."""
+"""Least rows for any check."""
 
 
 @dataclass(frozen=True)
 class CheckContext:
-    """What a log is held against."""
+    """References for the checks of a log."""
 
     vehicle: Vehicle | None = None
     policy_hz: float | None = None
@@ -38,14 +38,14 @@ class CheckContext:
 
 Check = Callable[[Rows, CheckContext], list[Finding]]
 CLOCK: tuple[Check, ...] = (lambda rows, _: check_time(rows),)
-"""In which unit the time is: before there can be rows."""
+"""The unit of the time, which all other checks need."""
 POSE: tuple[Check, ...] = (
     lambda rows, _: check_pose(rows, fit_pose_readings(rows)),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
     lambda rows, _: check_accelerometer(rows),
 )
-"""Where and how the vehicle was; each trusts those before it."""
+"""Position, attitude, rates, velocity and acceleration; each check relies on those before it."""
 DRIVE: tuple[Check, ...] = (
     lambda rows, _: check_voltage(rows),
     lambda rows, against: check_motors(rows, against.vehicle),
@@ -55,19 +55,19 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, _: check_accelerometer_bias(rows),
     lambda rows, _: check_barometer(rows),
 )
-"""What drove it, and what else was measured."""
+"""Motors, commands and other sensors."""
 
 
 def run_checks(
     rows: Rows, checks: Sequence[Check], against: CheckContext, fix: bool
 ) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
-    """Return the findings, the readings that put right what is overwhelming, and the rows by them.
+    """Return the findings, the readings that correct certain faults, and the corrected rows.
 
     Args:
         rows: signal to (T, C), `time` to (T,); NaN where unknown.
-        checks: in order; each sees the rows as those before it put them right.
-        against: what the log is held against.
-        fix: report corrections as made; otherwise as doubts. Later checks see them made either way.
+        checks: in order; each gets the rows that those before it corrected.
+        against: the references.
+        fix: report corrections as made; otherwise as doubts. Later checks get corrected rows.
     """
     findings, readings, rows = [], (), dict(rows)
     if len(rows["time"]) < LEAST_ROWS:
@@ -86,9 +86,9 @@ def run_checks(
 def check_log(
     log: FlightLog, against: CheckContext = CheckContext(), fix: bool = False
 ) -> tuple[list[Finding], Readings]:
-    """Return what is wrong with a log in our columns, and the readings that put it right.
+    """Return the faults of a flight log, and the readings that correct them.
 
-    What an import found and left open is repeated, where the same check does not come out again.
+    Stored findings of an import are repeated, unless a check finds the same fault again.
     """
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(rows_of(log), checks, against, fix)
@@ -100,7 +100,7 @@ def check_log(
 
 
 def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
-    """Return a log with signals read in another way; what is missing in it stays missing."""
+    """Return a log with its signals read in another way; missing values are kept."""
     columns = columns_from_log(log)
     rows = {"time": log.time_s}
     for group, names in GROUPS.items():
@@ -122,15 +122,15 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
 def check_before_diagnosis(
     logs: Sequence[FlightLog], against: CheckContext, accept: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
-    """Return the records of what the logs and the files show, before anything is concluded of it.
+    """Return the findings of logs and files as records, before a diagnosis or identification.
 
     Args:
         logs: flights.
-        against: what they are held against.
-        accept: faults that are known and go on all the same.
+        against: the references.
+        accept: names of known faults to ignore.
 
     Raises:
-        ValueError: for a fault that a diagnosis would name as something else.
+        ValueError: for a fault that a diagnosis would attribute to a wrong effect.
     """
     unknown = [fault for fault in accept if fault not in FAULTS]
     if unknown:
@@ -144,13 +144,13 @@ def check_before_diagnosis(
         faults = " ".join(sorted({f.fault for f, _ in stops}))
         raise ValueError(
             "\n".join(["an effect named from these flights would be wrong:", *lines])
-            + f"\nput it right, or go on all the same with --accept {faults}"
+            + f"\ncorrect it, or continue anyway with --accept {faults}"
         )
     return [{**f._asdict(), "flight": name} for f, name in found if f.status != "ok"]
 
 
 def not_examined(logs: Sequence[FlightLog]) -> list[str]:
-    """Return what of the motion no log allows to examine, in words: force, torque."""
+    """Return the parts of the dynamics that no log can test: `force`, `torque`."""
     drives = ("rotor_speed", "pwm")
     force = any(
         (not {"pos", "quat"} & set(log.partial) or (log.acc_b is not None and "pos" in log.partial))
@@ -166,7 +166,7 @@ def not_examined(logs: Sequence[FlightLog]) -> list[str]:
 
 
 def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the records of doubts and notes with a name as warnings of a report."""
+    """Return the records with a fault and status doubt or note, as warnings of a report."""
     return [
         f"{record['flight'] or 'vehicle file'}: {record['fault']}: {record['evidence']}"
         for record in records
@@ -175,13 +175,13 @@ def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def check_files(against: CheckContext) -> list[Finding]:
-    """Return what is wrong with the vehicle file and the policy's camera."""
+    """Return the findings for the vehicle file and the policy's camera."""
     found = [] if against.vehicle is None else check_vehicle_numbers(against.vehicle)
     return found + check_camera(against.policy_fov, against.vehicle)
 
 
 def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """Return which faults the flights do not show, and a manoeuvre that does."""
+    """Return the faults that are not identifiable from the flights, each with a manoeuvre."""
     faults = {f.fault: f.evidence for f in findings if f.status == "not identifiable"}
     return [
         {"fault": fault, "why": why, "manoeuvre": manoeuvre(fault)} for fault, why in faults.items()
@@ -189,7 +189,7 @@ def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
 
 
 def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
-    """Return a log's signals on its rows, holes of slower signals filled by lines."""
+    """Return a log's signals on its rows; gaps of slower signals are interpolated linearly."""
     columns = columns_from_log(log)
     rows = {"time": log.time_s}
     for group, names in GROUPS.items():
@@ -204,7 +204,7 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
 
 
 def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return `value` (T, C) with lines through what is missing, holes of 0.5 s and more left."""
+    """Return `value` (T, C) with gaps below 0.5 s interpolated linearly."""
     known = np.isfinite(value).all(axis=1)
     if known.all() or known.sum() < 2:
         return value

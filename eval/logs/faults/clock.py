@@ -1,8 +1,8 @@
-"""Clocks: the unit of time, and a pose that is late against the gyro or drifts away from it.
+"""Checks of clocks: the unit of time, and the delay and drift of the pose against the gyro.
 
-The attitude's turn over 60 ms is held against the gyro's mean over the same time, moved by a trial
-delay; where they differ least is the delay. Its error comes from blocks of the flight that are
-left out in turn (jackknife).
+The attitude's rate over 60 ms is compared with the gyro's mean over the same time, shifted by trial
+delays; the least difference gives the delay. Its error comes from leaving out blocks of the flight
+in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -17,48 +17,48 @@ from eval.logs.faults.pose import SPAN_S, Rows
 from eval.logs.faults.reading import TIMES, option
 
 STEPS_S = (5e-5, 0.25)
-"""Rows of any log are so far apart [s]."""
+"""Possible time between rows of a log [s]."""
 REACH_S, STEP_S = 0.1, 0.002
-"""Delays that are tried, to both sides, and their distance [s]."""
+"""Largest delay that is tried, in both directions, and the step between trials [s]."""
 BLOCKS = 8
 CALM = 0.2
-"""Turns slower than this tell nothing (root mean square) [rad/s]."""
+"""Smallest usable body rate, root mean square [rad/s]."""
 LEAST_S, SURE = 0.002, 4.0
-"""A delay below the first [s], or within so many standard errors of none, is left alone."""
+"""Least delay that is corrected: in seconds, and in standard errors."""
 GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
-"""Clocks drift that part by more than the first over a flight [s], by more than the second (two
-crystals part by less than 200 ppm), and by more than so many standard errors."""
+"""Least drift that is reported: over a flight [s], relative (two crystals differ by less than
+200 ppm), and in standard errors."""
 LIKELY = 2.5
-"""A drift of so many standard errors is taken off before its own error is judged."""
+"""A drift of this many standard errors is removed before its error is estimated."""
 SEEN = 0.005
-"""A flight that does not bound the drift by this does not show it."""
+"""The drift is not identifiable where its error exceeds this."""
 LATE_S = 0.025
 """A diagnosis estimates smaller offsets itself (the effect clock_offset) [s]."""
 
 
 class Late(NamedTuple):
-    """By how much an attitude is late against a gyro."""
+    """Delay of an attitude against a gyro."""
 
     delay_s: float
     error_s: float
     """Standard error [s]."""
     drift: float
-    """By how much that grows in a second of the flight."""
+    """Growth of the delay per second of flight."""
     drift_error: float
     """Standard error of the drift."""
     middle_s: float
-    """When it is `delay_s` late [s]."""
+    """Time at which the delay is `delay_s` [s]."""
     duration_s: float
     """Of the flight [s]."""
 
     @property
     def drifts(self) -> bool:
-        """Whether the clocks part by more than their crystals do, and than is known anyway."""
+        """Whether the drift exceeds that of crystals and its own error."""
         grown = abs(self.drift) * self.duration_s
         return grown > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
 
     def drift_figures(self) -> str:
-        """Return the drift in words."""
+        """Return the drift as text."""
         return (
             f"it gets later by {1e6 * self.drift:+.0f} ppm (± {1e6 * self.drift_error:.0f}), "
             f"{1e3 * self.drift * self.duration_s:+.1f} ms over the flight"
@@ -66,7 +66,7 @@ class Late(NamedTuple):
 
 
 def check_time(rows: Rows) -> list[Finding]:
-    """Return in which unit the time is, where rows would else be impossibly far apart."""
+    """Return the unit of the time, where the rows are impossibly far apart in seconds."""
     step = float(np.median(np.diff(rows["time"])))
     low, high = STEPS_S
     if low <= step <= high:
@@ -81,7 +81,7 @@ def check_time(rows: Rows) -> list[Finding]:
 
 
 def check_clock(rows: Rows) -> list[Finding]:
-    """Return whether a log's pose is late against its gyro by more than a diagnosis estimates."""
+    """Return whether the pose's delay exceeds what a diagnosis can estimate."""
     if not {"quat", "rate"} <= rows.keys():
         return []
     known = [np.isfinite(rows[name]).all(axis=1) for name in ("quat", "rate")]
@@ -111,9 +111,9 @@ def check_clock(rows: Rows) -> list[Finding]:
 def delay_of(
     quat_time: np.ndarray, quat: np.ndarray, rate_time: np.ndarray, rate: np.ndarray
 ) -> Late | None:
-    """Return by how much the attitude `quat` (N, 4) is late against the gyro `rate` (M, 3).
+    """Return the delay of the attitude `quat` (N, 4) against the gyro `rate` (M, 3).
 
-    None where the flight turns too little, or where the best delay is at the end of the reach.
+    None where body rates are too small, or where the best delay is the largest that is tried.
     """
     step = float(np.median(np.diff(quat_time))) if len(quat_time) > 1 else np.inf
     count = max(1, round(SPAN_S / step)) if np.isfinite(step) else 0
@@ -155,7 +155,7 @@ def delay_of(
         for k, late_s in enumerate(trials):
             off = turns - gyro(late_s, drift)
             size = np.linalg.norm(off - np.median(off, axis=0), axis=1)
-            # The noise of one turn is that of two attitudes: wild ones must not decide.
+            # Huber's loss limits the influence of outliers.
             limit = 3.0 * np.median(size)
             loss = np.where(size < limit, 0.5 * size**2, limit * (size - 0.5 * limit))
             cost[:, k] = np.bincount(block, weights=loss, minlength=BLOCKS)
@@ -163,7 +163,7 @@ def delay_of(
 
     cost = costs(0.0)
     first_drift, (more, drift_error) = 0.0, _drift(trials, cost, duration)
-    if abs(more) > LIKELY * drift_error:  # within a block, too, a drift would pass for scatter
+    if abs(more) > LIKELY * drift_error:  # inside a block a drift would count as scatter
         first_drift, cost = more, costs(more)
         more, drift_error = _drift(trials, cost, duration)
     whole = _lowest(trials, cost.sum(axis=0))
@@ -175,7 +175,7 @@ def delay_of(
 
 
 def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[float, float]:
-    """Return by how much the delay grows in a second, from half to half, and its error."""
+    """Return the growth of the delay per second between the two halves, and its error."""
     half = BLOCKS // 2
     halves = [
         [_lowest(trials, part.sum(axis=0) - gone) for gone in (0.0, *part)]
@@ -189,13 +189,13 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
 
 
 def _jackknife(left_out: np.ndarray) -> float:
-    """Return the standard error of an estimate by those with one block left out each."""
+    """Return the standard error from estimates with one block left out each."""
     count = len(left_out)
     return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
 
 
 def _lowest(trials: np.ndarray, cost: np.ndarray) -> float | None:
-    """Return where a parabola through the least cost and its neighbours is lowest."""
+    """Return the minimum of the parabola through the least cost and its neighbours."""
     k = int(np.argmin(cost))
     if k in (0, len(trials) - 1):
         return None

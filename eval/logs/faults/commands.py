@@ -1,4 +1,4 @@
-"""Commands: units, signs and curve of the rates, range of the throttle, delay, and how often."""
+"""Checks of commands: unit, signs and curve of rates, throttle range, delay, update rate."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from eval.logs.faults.vectors import DEG
 from eval.vehicles.vehicle import Vehicle
 
 REACH_S, STEP_S = 0.3, 0.01
-"""Delays that are tried, and their distance [s]."""
+"""Largest delay that is tried, and the step between trials [s]."""
 LATE_S = 0.06
-"""A response later than the loop, the rotors and the usual link make it by more than this [s]."""
+"""Allowed delay beyond that of rate loop, rotors and usual link [s]."""
 STEADY_S = 0.1
-"""Within so long before and after, a steady command changes little [s]."""
+"""Time before and after within which a steady command changes little [s]."""
 USUAL_S = 0.08
-"""What these make together where no vehicle file says it [s]."""
+"""Usual delay of loop, rotors and link without a vehicle file [s]."""
 GAIN = (0.8, 1.25)
-"""What the body does of a steady rate command, where nothing is wrong."""
+"""Correct range of body rate over steady rate command."""
 UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
 OPPOSITE, FOLLOWED, BENT = -0.5, 0.92, 0.4
-"""Correlations of commands and gyro: of another sign, and of commands whose gain says something for
-sure; and how much bend is a curve."""
+"""Correlations of commands and gyro: with a wrong sign below the first, with a reliable gain above
+the second. The third is the least bend of a rates curve."""
 RANGES = (
     ("0 to 1", 1.0, (0.03, 0.97), ""),
     ("percent", 100.0, (8.0, 90.0), "0.01"),
@@ -32,13 +32,13 @@ RANGES = (
     ("1000 to 2000 us", 1000.0, (1080.0, 1920.0), "1000-2000"),
     ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
-"""Range of a throttle, its span, where its median lies in flight, and what makes 0 to 1 of it."""
+"""Range of a throttle, its span, its usual median in flight, and the step to 0 to 1."""
 RATE_OFF = 0.1
-"""A controller whose rate is off by a larger share runs at another one."""
+"""Largest relative error of a controller's rate."""
 
 
 def check_throttle(rows: Rows) -> list[Finding]:
-    """Return in which range throttle and motor commands are, where it is not 0 to 1."""
+    """Return the range of throttle and motor commands where it is not 0 to 1."""
     found = []
     for name, subject in (("throttle", "throttle"), ("pwm", "motor commands")):
         value = rows.get(name)
@@ -62,7 +62,7 @@ def check_throttle(rows: Rows) -> list[Finding]:
 
 
 def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return what is wrong with the commanded rates, by how the gyro follows them."""
+    """Return the faults of the commanded rates, compared with the gyro."""
     if not {"cmd_rate", "rate"} <= rows.keys():
         return []
     time_s, subject = rows["time"], "rate command"
@@ -114,7 +114,7 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
 
 
 def _response(vehicle: Vehicle) -> float:
-    """Return how late the body follows a rate command by the vehicle file [s]."""
+    """Return the expected delay from rate command to body rate by the vehicle file [s]."""
     known = vehicle.effects.get("command_delay")
     loop = 0.0 if vehicle.controller.settings is not None else vehicle.controller.rate_gain[0]
     late = 0.03 if known is None else float(known.delay)
@@ -122,7 +122,7 @@ def _response(vehicle: Vehicle) -> float:
 
 
 def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay [s] at which the smoothed rates follow the command best, and it then."""
+    """Return the delay [s] with the best correlation of command and rates, and that command."""
     step = float(np.median(np.diff(time_s)))
     value = smooth(time_s, command, WIDTH_S)
     best, delay, kept = -1.0, 0.0, value
@@ -144,11 +144,11 @@ def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple
 
 
 def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
-    """Return how much more of large commands the body does than of small ones, as a share.
+    """Return by what share the gain of large commands exceeds that of small ones.
 
-    Of commands that hardly change within the loop's response: the body never reaches a short large
-    one. Of the axes that turn and both halves of the flight the least; 0 where one of them has too
-    few commands, or follows large ones less: that is no curve, motors reach their limits.
+    Only commands that hardly change within the loop's response count, since the body never reaches
+    short large ones. The result is the least over moving axes and both halves of the flight. It is
+    0 where one of them has too few commands, or less gain for large ones (motors at their limits).
     """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
     time_s, command, rate = time_s[both], command[both], rate[both]
@@ -172,7 +172,7 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
-    """Return whether commands change as often as a policy or a file says."""
+    """Return whether commands change at the rate of a policy or a file."""
     name = next((n for n in ("action", "cmd_rate", "cmd_thrust", "motor_cmd", "pwm")
                  if n in rows), None)  # fmt: skip
     if wanted_hz is None or name is None:

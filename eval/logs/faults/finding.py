@@ -1,4 +1,4 @@
-"""What a check says about a log: its status, the figures it rests on, the fault's name, its fix."""
+"""Results of the checks of a log: status, evidence, fault and fix."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from typing import Any, NamedTuple
 STATUSES = ("corrected", "doubt", "not identifiable", "note", "ok")
 """Most serious first."""
 SURE = 0.9
-"""A doubt at least as sure as this is open: nothing is concluded from its log."""
+"""A doubt with at least this confidence is open: a diagnosis refuses its log."""
 
 
 class Finding(NamedTuple):
-    """One statement about a log."""
+    """One result of a check."""
 
     status: str
-    """`ok` (checked and right), `note` (worth knowing), `corrected` (found wrong, put right),
-    `doubt` (looks wrong, left as it is), `not identifiable` (this flight does not show it)."""
+    """`ok` (checked, correct), `note` (information), `corrected` (wrong, was corrected), `doubt`
+    (probably wrong, unchanged), `not identifiable` (this flight contains no evidence)."""
     signal: str
-    """What it is about: `time`, `attitude`, `velocity`, `thrust`, ..."""
+    """Subject: `time`, `attitude`, `velocity`, `thrust`, ..."""
     evidence: str
-    """One sentence with the figures that it rests on."""
+    """One sentence with the measured figures."""
     fault: str = ""
-    """A name of `catalogue.FAULTS`; empty where nothing has a name."""
+    """A name of `catalogue.FAULTS`; empty for none."""
     size: float | None = None
-    """How large the fault is, in the unit that the catalogue says."""
+    """Size of the fault, such as the factor of a wrong unit or a delay [s]."""
     confidence: float | None = None
-    """From 0 to 1 that it is this fault."""
+    """Probability of this fault, 0 to 1."""
     fix: str = ""
-    """Options of `suite import`, or keys of the vehicle file, that put it right."""
+    """Options of `suite import`, or keys of the vehicle file, that correct it."""
 
     @property
     def is_open(self) -> bool:
-        """Whether a diagnosis of the log would name this fault as something else."""
+        """Whether a diagnosis of the log would attribute this fault to a wrong effect."""
         return self.status == "doubt" and (self.confidence or 0.0) >= SURE and bool(self.fault)
 
 
 def unseen(signal: str, evidence: str, *faults: str) -> list[Finding]:
-    """Return that a flight shows none of `faults`, for the reason in `evidence`."""
+    """Return findings that `faults` are not identifiable, for the reason in `evidence`."""
     return [Finding("not identifiable", signal, evidence, fault) for fault in faults]
 
 
 def finding_lines(findings: Iterable[Finding]) -> list[str]:
-    """Return the findings as lines for people, the serious ones first."""
+    """Return the findings as lines of text, the most serious first."""
     ranked = sorted(findings, key=lambda finding: STATUSES.index(finding.status))
     together: dict[tuple[str, str, str], list[Finding]] = {}
     for finding in ranked:
@@ -54,14 +54,14 @@ def finding_lines(findings: Iterable[Finding]) -> list[str]:
 
 
 def line(finding: Finding) -> str:
-    """Return a finding as one line for people."""
+    """Return a finding as one line of text."""
     name = f" [{finding.fault}]" if finding.fault and finding.status != "ok" else ""
     fix = f"; fix: {finding.fix}" if finding.fix and finding.status == "doubt" else ""
     return f"{finding.status:9} {finding.signal}{name}: {finding.evidence}{fix}"
 
 
 def findings_of(about: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings in a log's metadata; what is none is left out."""
+    """Return the findings in a log's metadata; invalid records are left out."""
     old = {"level": "status", "subject": "signal", "text": "evidence"}
     found = []
     records = about.get("findings")

@@ -1,4 +1,4 @@
-"""Motors: how many there are, their order and spin, the unit of their speeds, what they lift."""
+"""Checks of the motors: number, order, spin, the unit of their speeds, and their lift."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
 SPAN_S = 0.08
-"""Turns are differenced, and torques averaged, over this time [s]."""
+"""Body rates are differenced, and torques averaged, over this time [s]."""
 LAGS_S = (0.0, 0.02, 0.04, 0.06)
-"""By how much commands may lead the torques [s]."""
+"""Possible delays from commands to torques [s]."""
 CALM_TURN = 0.3
-"""Angular accelerations below this say nothing (root mean square) [rad/s^2]."""
+"""Smallest usable angular acceleration, root mean square [rad/s^2]."""
 RIGHT, SURELY, WRONG, CLEAR = 0.3, 0.5, -0.3, 0.4
-"""An order whose torques correlate with the turns by more than the first about roll and pitch may
-be right, by more than the second it is; it must win by the fourth, in both halves of a flight."""
+"""Correlations of torque and angular acceleration about roll and pitch: an order is possible above
+the first, certain above the second, wrong below the third. It must exceed the given order's by the
+fourth, in both halves of a flight."""
 AS_GIVEN = (0, 1, 2, 3)
 TURNING = 0.05
-"""A motor that never reaches this share of the fastest one does not turn."""
+"""A motor that never reaches this share of the fastest one counts as stopped."""
 FITS = 1.35
-"""Lift within this factor of the weight may be an effect, which a diagnosis names."""
+"""Lift within this factor of the weight may be a physical effect, which a diagnosis names."""
 UNITS = {
     "rpm in place of rad/s": 60.0 / (2.0 * np.pi),
     "revolutions a second in place of rad/s": 1.0 / (2.0 * np.pi),
@@ -39,12 +40,12 @@ UNITS = {
         for pairs in (6, 7, 11)
     },
 }
-"""What rotor speeds may be too large by, in words."""
+"""Mistake of unit -> factor by which rotor speeds are then too large."""
 NEAR, ALONE = 1.2, 1.1
-"""A factor within the first of the measured one may explain it; where just one is within the
-second, it does."""
+"""A factor within the first ratio of the measured one is possible; a single one within the second
+ratio is certain."""
 SAME = 1.07
-"""Lift within this factor of the weight is what the vehicle file says."""
+"""Lift within this factor of the weight agrees with the vehicle file."""
 MAGNETS = (12, 14, 16, 22, 24, 28)
 POLES = {
     f"{mine} poles were declared of {true}": true / mine
@@ -52,14 +53,14 @@ POLES = {
     for true in MAGNETS
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
-"""What speeds are too large by where eRPM was divided by the wrong number of pole pairs."""
+"""Wrong number of poles -> factor by which speeds from eRPM are then too large."""
 X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Front right, rear right, rear left, front left: the order of the vehicles that are shipped."""
+"""Front right, rear right, rear left, front left: the order of the shipped vehicles."""
 X_SPIN = (1, -1, 1, -1)
 
 
 def check_count(turning: int, whose: str) -> list[Finding]:
-    """Return a finding where not four motors ever turn: the models here are quadrotors."""
+    """Return a finding where the number of turning motors is not four."""
     if turning == 4 or turning == 0:
         return []
     text = f"{turning} motors {whose} turn; four are read, and the models here have four"
@@ -68,7 +69,7 @@ def check_count(turning: int, whose: str) -> list[Finding]:
 
 
 def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
-    """Return which motors do not turn, and whether their order and spin fit how the body turns."""
+    """Return stopped motors, and whether order and spin agree with the angular accelerations."""
     name = next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
     if name is None:
         return []
@@ -85,7 +86,7 @@ def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
 
 
 def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
-    """Return whether torques by the motors turn the body as they should, in every order."""
+    """Return whether the motors' torques agree with the angular accelerations, in any order."""
     hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
@@ -142,7 +143,7 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
 
 
 Scores = dict[tuple[int, ...], np.ndarray]
-"""By order of the motors: correlation of their torques with the turns about x, y and z."""
+"""Order of the motors -> correlation of torque and angular acceleration about x, y and z."""
 
 
 def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
@@ -161,7 +162,7 @@ def _best(scores: Scores) -> tuple[int, ...]:
 def _thrust(
     value: np.ndarray, name: str, vehicle: Vehicle | None, voltage: np.ndarray | None
 ) -> np.ndarray:
-    """Return what rises with each motor's thrust (T, 4)."""
+    """Return a quantity proportional to each motor's thrust (T, 4)."""
     if name == "pwm" and vehicle is not None and vehicle.motors is not None:
         return np.asarray(motor_thrust(vehicle.motors, value))
     return value**2
@@ -180,7 +181,7 @@ def _alike(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
-    """Hold the rotors' thrust by the vehicle file against the force that bends the path."""
+    """Compare the rotors' thrust by the vehicle file with the path's acceleration."""
     if "motor" not in rows:
         return []
     if vehicle is None:
@@ -201,7 +202,7 @@ def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
 
 
 def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
-    """Return what speeds that lift `factor`^2 times the weight mean."""
+    """Return the finding for rotor speeds whose lift is `factor`^2 times the weight."""
     near = _within(UNITS, NEAR, factor)
     clear = _within(UNITS, ALONE, factor)
     names = [n for n in ("motor", "motor_cmd") if n in rows]
@@ -234,7 +235,7 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
 
 
 def _lift(rows: Rows, thrust: np.ndarray) -> float:
-    """Return the thrust over what the path needs of it [kg], drag along body z left out."""
+    """Return thrust divided by the path's specific force along body z [kg], drag removed."""
     time_s = rows["time"]
     drag = np.zeros((len(time_s), 0))
     need = np.full(len(time_s), GRAVITY)
@@ -255,5 +256,5 @@ def _lift(rows: Rows, thrust: np.ndarray) -> float:
 
 
 def _within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
-    """Return which entries of `table` are within the ratio `limit` of the measured `factor`."""
+    """Return the entries of `table` within the ratio `limit` of the measured `factor`."""
     return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]

@@ -1,8 +1,8 @@
-"""How the attitude and the position are written: order, direction, frames, signs, unit of length.
+"""Checks of attitude and position: order, direction, frames, signs and the unit of length.
 
-All readings are tried at once, by what no reading of one signal alone can satisfy: the force that
-bends the path (acceleration less gravity) is thrust, so it points along body z and upwards, but for
-drag; and the attitude turns as the gyro says, in whichever axes and unit the gyro is.
+All readings (ways to interpret the columns) are compared by two conditions. First, acceleration
+minus gravity is thrust, so it points along body z and upwards, except for drag. Second, the
+attitude turns at the gyro's rates, in any axes and unit of the gyro.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from eval.logs.velocity import velocity_from_position
 
 Rows = Mapping[str, np.ndarray]
 WIDTH_S, SPAN_S = 0.2, 0.06
-"""Everything is averaged over the first; the attitude is differenced over the second [s]."""
+"""Averaging time of all signals; time over which the attitude is differenced [s]."""
 POINTS = 400
-"""At most so many rows take part."""
+"""Most rows that are used."""
 CALM_RATE, CALM_ACC = 0.15, 0.5
-"""Below these, root mean square, turns [rad/s] and accelerations [m/s^2] say nothing."""
+"""Smallest usable body rates [rad/s] and accelerations [m/s^2], root mean square."""
 GOOD, BAD, TIMES_BETTER = 0.45, 0.6, 2.0
-"""A reading is good below the first misfit and bad above the second; one that is good and better
-than a bad one by the third is overwhelming evidence."""
+"""A reading is good below the first misfit and bad above the second. The evidence is overwhelming
+where a good reading's misfit is lower by the third factor."""
 RIGHT = 0.25
-"""Below this misfit nothing else is tried."""
+"""Misfit below which no other reading is tried."""
 EACH = 0.06
-"""A reading must win by this for each step that it takes: the simplest that fits is right."""
+"""Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
 DRAG, BIAS = 1.2, 1.0
-"""Most drag [1/s] and constant side force [m/s^2] that are left out before a force is judged."""
+"""Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
 _ORDERS = ("", "xyzw")
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
@@ -43,7 +43,7 @@ SHOWN = (
     *("attitude", "attitude_sign", "quaternion_order", "quaternion_direction", "world_frame"),
     *("body_frame", "position_axes", "position_unit"),
 )
-"""Faults that only the attitude shows."""
+"""Faults that need an attitude to be identifiable."""
 POSITIONS = (
     ("", "x,y,z"),
     ("x,-y,-z", "x,-y,-z"),
@@ -57,40 +57,40 @@ POSITIONS = (
 )
 """Readings of a position, and their axes."""
 LENGTHS = (1.0, 0.01, 0.001)
-"""Metres in what a position may be in."""
+"""Possible units of a position [m]."""
 
 
 class Reading(NamedTuple):
-    """One way to read the attitude and the position."""
+    """One way to interpret the attitude and the position."""
 
     quat: str
-    """Steps of `reading.read_as`, "" for as it is."""
+    """Steps of `reading.read_as`, "" for unchanged."""
     pos: str
     length: float
     steps: int
-    """How many things it changes."""
+    """Number of changes."""
     misfit: float
-    """By force and turns together; 0 fits, 1 and more does not."""
+    """Of force and body rates together; 0 is a perfect fit, 1 and more is none."""
     force: float | None
     turns: float | None
     gyro: Match | None
 
 
 class PoseFits(NamedTuple):
-    """What a log shows of its pose."""
+    """Result of the comparison of all readings of a pose."""
 
     given: Reading
     best: Reading
     second: float
-    """Misfit of the best reading that says another thing."""
+    """Misfit of the second best reading."""
     level: float
     """Horizontal acceleration or tilt times gravity, root mean square [m/s^2]."""
     rate: float
-    """Turns by the gyro [its unit]."""
+    """Body rates of the gyro, root mean square [its unit]."""
 
 
 def fit_pose_readings(rows: Rows) -> PoseFits | None:
-    """Return how well every reading fits; None where the rows hold no attitude."""
+    """Return the fits of all readings; None where the rows have no attitude."""
     if "quat" not in rows:
         return None
     time_s, quat = rows["time"], _unit(rows["quat"])
@@ -107,7 +107,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
         seen = None if gyro is None else _gyro_match(turned[base], gyro, "frd" in frames)
         turns = None if seen is None else _misfit_of(seen)
         axes = _axes_of(time_s, _as(quat, steps), every) if path is not None else None
-        # A frame is one mistake, of the attitude alone or of the gyro with it.
+        # A wrong frame is one mistake, of the attitude alone or of attitude and gyro.
         count = sum(step not in ("", "ned", "frd") for step in steps.split("+")) + bool(frames)
         apart = 0 if seen is None else int(seen.axes != "x,y,z")
         apart = 0 if "frd" in frames and seen is not None and seen.axes == "x,-y,-z" else apart
@@ -121,7 +121,7 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
                     level = max(level, size) if not steps and not pos and length == 1.0 else level
                 taken = count + apart + (pos != "") + (length != 1.0)
                 if frames == {"ned", "frd"} and pos == "x,-y,-z":
-                    taken -= 1  # one mistake: all of it is north-east-down
+                    taken -= 1  # one mistake: the whole log is north-east-down
                 parts = [part for part in (force, turns) if part is not None]
                 misfit = float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
                 found.append(Reading(steps, pos, length, taken, misfit, force, turns, seen))
@@ -133,13 +133,13 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
 
 
 def _is_right(one: Reading) -> bool:
-    """Return whether the log fits as it is given, so that no other reading need be tried."""
+    """Return whether the given reading fits, so that no other need be tried."""
     turned = one.gyro is not None and one.gyro.is_turned
     return one.force is not None and one.misfit < RIGHT and not turned
 
 
 def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
-    """Return what is wrong with how attitude and position are written."""
+    """Return the faults of attitude and position."""
     if fits is None:
         return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
     given, best = fits.given, fits.best
@@ -177,7 +177,7 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
 
 
 def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield (fault, signal, signals that its fix is of) of a reading that differs."""
+    """Yield (fault, signal, signals to correct) of a reading that differs from the given one."""
     steps = set(best.quat.split("+")) - {""}
     pose, world = ("quat", "cmd_quat"), ("pos", "vel")
     if steps:
@@ -253,7 +253,7 @@ def _unit(quat: np.ndarray) -> np.ndarray:
 
 
 def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) by the attitude, over `SPAN_S` around each row [rad/s]."""
+    """Return the body rates (T, 3) from the attitude, over `SPAN_S` around each row [rad/s]."""
     count = max(1, round(0.5 * SPAN_S / float(np.median(np.diff(time_s)))))
     out = np.full((len(time_s), 3), np.nan)
     if len(time_s) > 2 * count:
@@ -273,7 +273,7 @@ def _gyro_match(turns: np.ndarray, gyro: np.ndarray, frd: bool) -> Match:
 
 
 def _misfit_of(seen: Match) -> float:
-    """Return what the gyro leaves of the turns in its best axes, as a share of them."""
+    """Return the share of the attitude's body rates that the gyro's best axes do not explain."""
     weight = seen.level**2
     left = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
     return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))
@@ -295,15 +295,15 @@ def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, 
 def _force_misfit(
     axes: np.ndarray, path: tuple[np.ndarray, np.ndarray], change: np.ndarray
 ) -> tuple[float, float]:
-    """Return what of the force is not along body z, but for drag, over what there is of it.
+    """Return the share of the force that is not along body z, drag removed.
 
     Args:
         axes: (N, 3, 3) of the body in the world.
-        path: velocity and acceleration (N, 3) as they are written.
-        change: (3, 3) that takes them to the reading's.
+        path: velocity and acceleration (N, 3) in the given reading.
+        change: (3, 3) from these to the reading's axes and unit.
 
     Returns:
-        The share, and the level that it is a share of [m/s^2].
+        The share, and the level to which it refers [m/s^2].
     """
     vel, acc = path[0] @ change.T, path[1] @ change.T
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(acc).all(axis=1)

@@ -1,21 +1,21 @@
-"""Other readings of a signal, written as on the command line: `--read rate=x,-y,-z+0.0610352`.
+"""Readings: ways to interpret a signal, as in `--read rate=x,-y,-z+0.0610352`.
 
 | step | what it does | signals |
 |---|---|---|
-| `0.01` | times that | all |
-| `x,-y,-z` | these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
+| `0.01` | multiply by this | all |
+| `x,-y,-z` | take these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
 | `2,1,4,3` | motors in this order | motor motor_cmd pwm |
-| `xyzw` | columns were in this order | quat cmd_quat |
-| `inverse` | it maps world to body | quat cmd_quat |
-| `ned`, `frd` | its world points down; its body is forward-right-down | quat cmd_quat |
-| `-roll`, `-pitch`, `-yaw` | the angle's sign | quat cmd_quat |
-| `from-body`, `from-world` | turned by the attitude into our axes | vel rate acc |
-| `plus-gravity` | gravity had been taken out of it | acc |
-| `1000-2000` | pulse widths in us to a share from 0 to 1 | throttle pwm |
-| `ms`, `us`, `ns` | the unit of all times | time |
-| `drop` | left out | all but time |
+| `xyzw` | the file's columns have this order | quat cmd_quat |
+| `inverse` | the file's quaternion maps world to body | quat cmd_quat |
+| `ned`, `frd` | the file's world points down; its body is forward-right-down | quat cmd_quat |
+| `-roll`, `-pitch`, `-yaw` | change the angle's sign | quat cmd_quat |
+| `from-body`, `from-world` | rotate by the attitude into the log's axes | vel rate acc |
+| `plus-gravity` | add gravity, which the file has removed | acc |
+| `1000-2000` | map pulse widths in us to 0 to 1 | throttle pwm |
+| `ms`, `us`, `ns` | unit of all times | time |
+| `drop` | leave the signal out | all but time |
 
-Steps are joined by `+` and act from left to right.
+Steps are joined by `+` and applied from left to right.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, from_euler, multiply, turn
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds in each unit that clocks count in."""
+"""Unit of time -> seconds."""
 QUATS = ("quat", "cmd_quat")
 VECTORS = ("pos", "vel", "rate", "acc", "cmd_rate", "cmd_torque")
 MOTORS = ("motor", "motor_cmd", "pwm")
@@ -41,11 +41,11 @@ _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
 _ANGLES = ("-roll", "-pitch", "-yaw")
 _QUAT_STEPS = ("xyzw", "inverse", "ned", "frd", *_ANGLES)
 Readings = tuple[tuple[str, str], ...]
-"""(signal, steps) in the order in which they act."""
+"""(signal, steps) in the order of application."""
 
 
 def parse_readings(texts: Sequence[str]) -> Readings:
-    """Return what options as `rate=x,-y,-z` say.
+    """Return the readings of options such as `rate=x,-y,-z`.
 
     Raises:
         ValueError: naming the option, and what is allowed.
@@ -72,7 +72,7 @@ def option(*readings: tuple[str, str]) -> str:
 
 
 def readings_in(fix: str) -> Readings:
-    """Return the readings in a finding's fix; () where it is no option `--read`."""
+    """Return the readings in a finding's fix; () where it has no option `--read`."""
     words = fix.split()
     return parse_readings([words[k + 1] for k, w in enumerate(words[:-1]) if w == "--read"])
 
@@ -80,12 +80,12 @@ def readings_in(fix: str) -> Readings:
 def read_as(
     signal: str, value: np.ndarray, steps: str, quat: Callable[[], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Return samples (N, C) of a signal as another reading has them.
+    """Return samples (N, C) of a signal in another reading.
 
     Args:
         signal: its name.
         value: (N, C).
-        steps: see the head of this file.
+        steps: see the table in this module's docstring.
         quat: gives the attitude (N, 4) wxyz at the same times; needed by `from-body` and others
             that turn.
     """
@@ -107,7 +107,7 @@ def read_as(
 
 
 def read_rows(rows: Mapping[str, np.ndarray], readings: Readings) -> dict[str, np.ndarray]:
-    """Return rows (signal to (T, C), `time` to (T,)) with `readings` in place."""
+    """Return rows (signal to (T, C), `time` to (T,)) with `readings` applied."""
     found = dict(rows)
     for signal, steps in readings:
         if signal == "time":
@@ -120,7 +120,7 @@ def read_rows(rows: Mapping[str, np.ndarray], readings: Readings) -> dict[str, n
 
 
 def axes_matrix(step: str) -> np.ndarray:
-    """Return the matrix (3, 3) that takes columns to `x,-y,-z` of them."""
+    """Return the matrix (3, 3) of a step such as `x,-y,-z`."""
     matrix = np.zeros((3, 3))
     for row, part in enumerate(step.split(",")):
         matrix[row, "xyz".index(part[-1])] = -1.0 if part[0] == "-" else 1.0

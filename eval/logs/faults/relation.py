@@ -1,4 +1,4 @@
-"""How two measurements of the same vector differ: axes, signs and scale, whatever the noise."""
+"""Compare two noisy measurements of one vector: their axes, signs and scale."""
 
 from __future__ import annotations
 
@@ -8,55 +8,55 @@ from typing import NamedTuple
 import numpy as np
 
 ALIKE = 0.8
-"""Axes whose correlation is above this are the same."""
+"""Axes with a higher correlation are the same."""
 UNLIKE = 0.5
-"""An axis correlates with its own by less than the best other by this: it is another one."""
+"""An axis is another one if the best correlation exceeds that with its own axis by this."""
 LEAST = 20
-"""Fewer rows say nothing."""
+"""Least rows for a comparison."""
 SEEN = 0.5
-"""An axis that correlates with none by more than this cannot be identified."""
+"""Least correlation at which an axis is identifiable."""
 
 
 class Match(NamedTuple):
-    """How `wanted` (N, 3) and `given` (N, 3) belong together."""
+    """Relation between `wanted` (N, 3) and `given` (N, 3)."""
 
     axes: str
-    """Which columns of `given`, with which signs, are x, y and z of `wanted`: `x,-y,-z`."""
+    """Columns and signs of `given` that equal x, y and z of `wanted`, such as `x,-y,-z`."""
     seen: np.ndarray
-    """(3,) bool: axes of `wanted` of which that can be said."""
+    """(3,) bool: identifiable axes of `wanted`."""
     alike: np.ndarray
-    """(3,) correlation in these axes."""
+    """(3,) correlation in the axes `axes`."""
     as_given: np.ndarray
-    """(3,) correlation with the axes as they are."""
+    """(3,) correlation in the given axes."""
     scale: np.ndarray
-    """(3,) given over wanted, in these axes."""
+    """(3,) given divided by wanted, in the axes `axes`."""
     low: np.ndarray
     """(3,) smallest and ..."""
     high: np.ndarray
-    """... largest scale that noise in either of them allows (Frisch 1934)."""
+    """... largest scale consistent with noise in either of them (Frisch 1934)."""
     level: np.ndarray
     """(3,) standard deviation of `wanted`."""
 
     @property
     def is_turned(self) -> bool:
-        """Whether other axes than the given ones are overwhelmingly right."""
+        """Whether the evidence for other axes than the given ones is overwhelming."""
         worse = self.seen & (self.alike - self.as_given > UNLIKE)
         return bool(worse.any() and (self.alike[self.seen] > ALIKE).all())
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether an axis surely has the other sign, though others are too small to confirm it."""
+        """Whether an axis has the wrong sign, while other axes are too small to confirm it."""
         worse = self.seen & (self.alike - self.as_given > UNLIKE) & (self.alike > ALIKE)
         return bool(worse.any() and "".join(self.axes.split(",")).replace("-", "") == "xyz")
 
     @property
     def fits(self) -> bool:
-        """Whether every axis that can be judged fits as it is given."""
+        """Whether all identifiable axes fit as given."""
         return bool(self.seen.any() and (self.as_given[self.seen] > SEEN).all())
 
 
 def match(wanted: np.ndarray, given: np.ndarray) -> Match:
-    """Return how (N, 3) `given` belongs to (N, 3) `wanted`; rows with a NaN take no part."""
+    """Return the relation of `given` (N, 3) to `wanted` (N, 3); rows with a NaN are not used."""
     wanted, given = _clear(wanted, given)
     if len(wanted) < LEAST:
         wanted = given = np.zeros((LEAST, 3))
@@ -82,7 +82,7 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
 
 
 def pooled_scale(found: Match) -> tuple[float, float, float]:
-    """Return the common scale of the axes that are seen, and the least and largest of it."""
+    """Return the common scale of the identifiable axes, and its least and largest value."""
     weight = np.where(found.seen, found.level**2 * found.alike**4, 0.0)
     if weight.sum() == 0.0:
         return np.nan, np.nan, np.nan
@@ -94,7 +94,7 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
 
 
 def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
-    """Return the mean (T, C) of `value` over `width_s` around each time; NaN over holes."""
+    """Return the mean (T, C) of `value` over `width_s` around each time; NaN in gaps."""
     first = np.searchsorted(time_s, time_s - 0.5 * width_s)
     stop = np.searchsorted(time_s, time_s + 0.5 * width_s, side="right")
     known = np.asarray(np.isfinite(value).all(axis=1))
@@ -108,7 +108,7 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
 
 
 def rms(value: np.ndarray) -> float:
-    """Return the root mean square of the lesser nineteen twentieths: glitches must not decide."""
+    """Return the root mean square of the smallest 95 %, so that glitches have no influence."""
     squared = np.sum(np.atleast_2d(value.T).T ** 2, axis=1)
     squared = np.sort(squared[np.isfinite(squared)])
     squared = squared[: max(1, int(0.95 * len(squared)))]
@@ -116,7 +116,7 @@ def rms(value: np.ndarray) -> float:
 
 
 def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows in which both are known and neither jumps."""
+    """Return the rows in which both are finite and neither is an outlier."""
     good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
     for value in (wanted, given):
         size = np.linalg.norm(value, axis=1)

@@ -1,4 +1,4 @@
-"""Battery, barometer and the accelerometer under vibration: what a flight contradicts."""
+"""Checks of battery voltage, barometer and the accelerometer under vibration."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from eval.logs.faults.reading import option
 from eval.logs.velocity import velocity_from_position
 
 LEAST_V, MOST_V = 2.5, 70.0
-"""Batteries of multirotors, from one cell at its end to sixteen full ones [V]."""
+"""Possible battery voltages, from one empty cell to sixteen full cells [V]."""
 SUNK_M, SUNK_SHARE = 0.5, 0.6
-"""A height that falls by the first as the motors start, and by that share of it stays there."""
+"""Least fall of the height as the motors start [m]."""
 SPAN_S = 0.6
 BIAS, ALIKE = 0.15, 0.6
-"""An accelerometer that owes the first to the throttle half of the flight [m/s^2], and whose error
-correlates with it by the second."""
+"""Least median error of the accelerometer due to the throttle [m/s^2], and least correlation of its
+error with the squared throttle."""
 
 
 def check_voltage_fails(value: np.ndarray) -> bool:
-    """Return whether the middle of a voltage is none that a battery has [V]."""
+    """Return whether the median of a voltage [V] is impossible for a battery."""
     known = value[np.isfinite(value)]
     return not len(known) or not LEAST_V <= float(np.median(known)) <= MOST_V
 
 
 def check_voltage(rows: Rows) -> list[Finding]:
-    """Return whether the battery's voltage is one that a battery has."""
+    """Return whether the battery's voltage is possible, and its unit."""
     value = rows.get("voltage")
     if value is None or not np.isfinite(value).any():
         return []
@@ -49,7 +49,7 @@ def check_voltage(rows: Rows) -> list[Finding]:
 def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     """Return whether the accelerometer's error along body z grows with the throttle squared.
 
-    Changes of the vertical speed over `SPAN_S` are held against the integrated accelerometer.
+    Changes of the vertical speed over `SPAN_S` are compared with the integrated accelerometer.
     """
     drive = next((n for n in ("throttle", "pwm", "motor", "cmd_thrust") if n in rows), None)
     if not {"acc", "pos", "quat"} <= rows.keys() or drive is None:

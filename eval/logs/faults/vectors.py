@@ -1,4 +1,4 @@
-"""Gyro, velocity and accelerometer: axes, signs, frames and units, against a pose that is right."""
+"""Checks of gyro, velocity and accelerometer against the pose: axes, signs, frames and units."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eval.logs.velocity import velocity_from_position
 
 DEG = float(np.pi / 180.0)
 COUNTS = 16.384
-"""Counts per deg/s of a gyro of 2000 deg/s and 16 bits."""
+"""Counts per deg/s of a 16-bit gyro with a range of 2000 deg/s."""
 RATES = {
     "deg/s": 1.0 / DEG,
     "raw counts of a gyro, read as deg/s": COUNTS,
@@ -25,7 +25,7 @@ RATES = {
     "rad/s, read as deg/s": DEG,
     "mrad/s": 1000.0,
 }
-"""Unit -> what it is too large by."""
+"""Unit -> factor by which its numbers are too large."""
 SPEEDS = {"cm/s": 100.0, "mm/s": 1000.0, "km/h": 3.6, "knots": 1.0 / 0.514444}
 FORCES = {
     "g": 1.0 / GRAVITY,
@@ -35,24 +35,24 @@ FORCES = {
     "g, taken for raw counts of 2048 per g": 1.0 / 2048.0,
 } | {f"raw counts of {per_g} per g": per_g / GRAVITY for per_g in (512, 2048, 4096, 8192, 16384)}
 NEAR = 1.06
-"""A scale within this factor of a unit's is of that unit."""
+"""Factor around a unit's scale within which a scale counts as that unit."""
 SAME = 1.1
-"""A scale within this factor of 1 is no fault."""
+"""Factor around 1 within which a scale is correct."""
 FAR = 1.15
-"""A scale within this factor is worth a word: filters of an attitude make as much."""
+"""Factor around 1 within which a scale is only a note: attitude filters cause as much."""
 SLOW = 1.25
-"""The same of a velocity, which filters make smaller or larger."""
+"""The same for a velocity, whose filters change it more."""
 CALM_SPEED = 0.3
-"""Speeds below this say nothing (root mean square) [m/s]."""
+"""Smallest usable speed, root mean square [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
 OK = 0.3
-"""A signal that is off by more than this share of itself is not called right."""
+"""Largest relative error of a correct signal."""
 APART = 0.5
-"""Axes that differ by a smaller share of a signal cannot be told apart by it."""
+"""Least relative difference of two frames at which they are distinguishable."""
 
 
 def check_gyro(rows: Rows) -> list[Finding]:
-    """Return what is wrong with the gyro's axes, frame and unit, by how the attitude turns."""
+    """Return the faults of the gyro's axes, frame and unit, compared with the attitude's rates."""
     if "rate" not in rows:
         return []
     if "quat" not in rows:
@@ -103,7 +103,7 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
 
 
 def _unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
-    """Return that the axes along which nothing happens cannot be checked."""
+    """Return findings for axes without motion, which cannot be checked."""
     axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
     text = f"along {axes} there is too little to check its sign by"
     return unseen(subject, text, *faults) if axes else []
@@ -118,7 +118,7 @@ def _unit(
     of: str,
     same: float = SAME,
 ) -> list[Finding]:
-    """Return what a scale means: a unit, another factor, or nothing."""
+    """Return the finding for a scale: a wrong unit, another factor, or correct."""
     scale, low, high = pooled_scale(found)
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
     if not np.isfinite(scale) or low / same < 1.0 < high * same:
@@ -139,7 +139,7 @@ def _unit(
 
 
 def check_velocity(rows: Rows) -> list[Finding]:
-    """Return what is wrong with the velocity's frame and unit, by the path's derivative."""
+    """Return the faults of the velocity's frame and unit, compared with the path's derivative."""
     if "vel" not in rows or "pos" not in rows:
         return []
     time_s = rows["time"]
@@ -186,9 +186,9 @@ def check_velocity(rows: Rows) -> list[Finding]:
 
 
 def check_accelerometer(rows: Rows) -> list[Finding]:
-    """Return what is wrong with the accelerometer, by the force that bends the path.
+    """Return the faults of the accelerometer, compared with the path's acceleration.
 
-    Without a path its unit shows all the same: in flight it reads about one g.
+    Without a path only its unit is checked: in flight it reads about one g.
     """
     if "acc" in rows and not {"pos", "quat"} <= rows.keys():
         return _unit_alone(rows)
@@ -249,7 +249,7 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
 
 
 def _unit_of(ratio: float, within: float) -> tuple[str, float]:
-    """Return the unit of an accelerometer that reads `ratio` times the force, and its factor."""
+    """Return unit and factor of an accelerometer that reads `ratio` times the force."""
     units = {"m/s^2": 1.0, **FORCES}
     unit = min(units, key=lambda name: abs(np.log(max(ratio, 1e-9) / units[name])))
     near = abs(np.log(max(ratio, 1e-9) / units[unit])) < np.log(within)
@@ -276,7 +276,7 @@ def _sideways(acc: np.ndarray, force: np.ndarray) -> str:
 
 
 def _left(found: Match) -> float:
-    """Return what axes as they are given leave, as a share, whatever the scale."""
+    """Return the relative residual in the given axes, for the best scale."""
     weight = found.level**2
     left = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
     return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))

@@ -1,4 +1,4 @@
-"""Numbers of a vehicle file that no quadrotor has, and of a policy that another camera flew."""
+"""Checks of a vehicle file for implausible numbers, and of a policy's camera."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from eval.logs.faults.finding import Finding
 from eval.vehicles.vehicle import Vehicle
 
 ARM_M = (0.012, 1.5)
-"""From the middle to a rotor [m]."""
+"""Usual distance from the centre to a rotor [m]."""
 LIFT = (1.15, 20.0)
-"""Full thrust over the weight."""
+"""Usual full thrust over weight."""
 ROUND = (0.015, 2.5)
-"""Inertia about x and y over mass times arm squared: all mass in the middle, or at the rotors."""
+"""Usual inertia about x and y over mass times arm squared (mass at the centre or at the rotors)."""
 FOV_DEG = 2.0
-"""Fields of view that differ by more are of another camera [deg]."""
+"""Largest difference of fields of view of one camera [deg]."""
 
 
 def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
-    """Return which numbers of the vehicle file do not belong together."""
+    """Return implausible combinations of numbers in the vehicle file."""
     found = []
     hubs = np.asarray(vehicle.rotors.position)
     arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
@@ -47,7 +47,7 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
 
 
 def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None) -> list[Finding]:
-    """Return whether a policy's camera is the vehicle's."""
+    """Return whether a policy's camera agrees with the vehicle's."""
     if policy_fov is None or vehicle is None:
         return []
     here = vehicle.camera.fov_deg

@@ -23,7 +23,7 @@ def thrust_rows(felt=None, count=200):
 @pytest.mark.parametrize(
     ("felt", "options", "full", "by"),
     [
-        (25.0, ImportOptions(full_thrust=20.0, vehicle=PLAIN), 20.0, "as told"),
+        (25.0, ImportOptions(full_thrust=20.0, vehicle=PLAIN), 20.0, "as given"),
         # Four rotors of 1.6e-6 N s^2 at 2100 rad/s on 0.75 kg.
         (37.632, ImportOptions(vehicle=PLAIN), 37.632, "by the vehicle file"),
         (25.0, ImportOptions(), 25.0, "by the accelerometer"),

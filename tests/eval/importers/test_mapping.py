@@ -108,7 +108,7 @@ file = "info{number}.yaml"
 mass = "mass"
 """
     )
-    with pytest.raises(FlightLogError, match="nothing says the mass"):
+    with pytest.raises(FlightLogError, match="the mass is unknown"):
         imported(tmp_path, mapping, columns)
     (tmp_path / "info7.yaml").write_text("motors: standard\nmass: 0.5\n")
     log, _ = imported(tmp_path, mapping, columns)
@@ -116,7 +116,7 @@ mass = "mass"
     near(log.torque_cmd_b, truth.rate * 1e-3, 1e-12)
     assert log.about["beside"] == {"motors": "standard", "mass": 0.5} and log.about["mass"] == 0.5
     (tmp_path / "info7.yaml").write_text("integrator: euler\npartial: no\nmass: 0\n")
-    with pytest.raises(FlightLogError, match="nothing says the mass"):
+    with pytest.raises(FlightLogError, match="the mass is unknown"):
         imported(tmp_path, mapping, columns)
     other, _ = imported(tmp_path, mapping, columns, mass=0.5)
     assert other.integrator is None and not other.partial

@@ -118,9 +118,10 @@ def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
     onnx.save(PLAIN, path)
     # Below what the engine has already and may have besides.
     script = (
-        "import resource, sys; from policies.formats.model_process import Apart, MEMORY_BYTES\n"
+        "import resource, sys\n"
+        "from policies.formats.model_process import ModelProcess, MEMORY_BYTES\n"
         "resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))\n"
-        "print(Apart(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
+        "print(ModelProcess(open(sys.argv[1], 'rb').read(), 'here', 'onnx').inputs[0].name)"
     )
     done = subprocess.run(
         [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False

@@ -28,7 +28,7 @@ SAMPLES = "data/sample_inputs/model.pt"
 @pytest.fixture
 def here(monkeypatch):
     """Torch loads the file in this process, where it is imported already."""
-    monkeypatch.setattr(torch_file, "Apart", InProcess)
+    monkeypatch.setattr(torch_file, "ModelProcess", InProcess)
 
 
 def rewrite(source, target, change):

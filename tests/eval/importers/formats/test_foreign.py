@@ -129,7 +129,7 @@ def test_betaflight_alone_asks_for_a_pose(tmp_path):
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2))
     with pytest.raises(FlightLogError, match="no position and no attitude; --pose"):
         import_log(path)
-    with pytest.raises(ValueError, match="read as 'betaflight', .* leave --map out, or say --form"):
+    with pytest.raises(ValueError, match="read as 'betaflight', .* leave --map out, or give"):
         import_log(path, None, ImportOptions(map=tmp_path / "mine.toml", partial=True))
 
 
