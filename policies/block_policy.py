@@ -1,9 +1,8 @@
-"""A model of any kind as a `Policy`: rows go through it in blocks of one size.
+"""A model of any kind as a `Policy`: it always runs on blocks of one size.
 
-A trial's outcome may depend on its row alone, not on the rows beside it nor on how many there are.
-Matrix products of another size add up in another order, so the model only ever sees full blocks,
-padded with zeros. Where that is not enough (some kernels treat the last rows of a block
-otherwise), rows are sent through one by one.
+A trial's outcome must depend on its own row alone. Matrix products of different sizes sum in
+different orders, so the model always gets full blocks, padded with zeros. If that is not enough
+(some kernels treat the last rows of a block differently), each row runs in a block of its own.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndar
 """(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
 
 BLOCK = 64
-"""Rows that go through a model at a time, unless the model itself is of a fixed batch."""
+"""Rows of a block, unless the model has a fixed batch."""
 ROUNDING = 1e-4
-"""A row's answers, alone and in a block, differ by less than this times their size."""
+"""Largest relative difference of a row's outputs, alone and in a block."""
 
 
 @final
@@ -32,22 +31,22 @@ class BlockPolicy:
     """A `Policy` around a model that takes a fixed number of rows."""
 
     name: str
-    """What tables call it."""
+    """Name in tables."""
     spec: PolicySpec
-    """The rate, camera and scaling it expects of the world."""
+    """The rate, camera and scaling that it expects."""
     model: Model
     """The network."""
     hidden_shape: tuple[int, ...]
     """Shape of one row's recurrent state; (0,) for a policy without memory."""
     block: int = BLOCK
-    """Rows the model is called with."""
+    """Rows of each call of the model."""
     rows: int = BLOCK
-    """Rows of a block that are used, the first ones: `block`, or 1."""
+    """Number of rows of a block that are used, from the first: `block`, or 1."""
     notes: tuple[Note, ...] = ()
-    """What is assumed of it."""
+    """Assumptions about its file."""
 
     def start(self, n: int) -> np.ndarray:
-        """Return the recurrent state at the start of n trials: zeros."""
+        """Return the recurrent state at the start of n trials, zeros."""
         return np.zeros((n, *self.hidden_shape), np.float32)
 
     def act(
@@ -55,7 +54,7 @@ class BlockPolicy:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (action (n, spec.action.size), hidden'); see `policies.policy.Policy.act`.
 
-        Where the memory overflows the answer is NaN, which the judge counts and does not fly.
+        Where the recurrent state overflows, the action is NaN; the judge counts it as a bad action.
         """
         hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
@@ -79,19 +78,19 @@ class BlockPolicy:
 
 
 def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
-    """Try a model that was just loaded, and return the policy in a form whose rows stand alone.
+    """Test a loaded model, and return a policy whose rows do not influence each other.
 
-    The trial is of a block of random rows, twice, then of some of these rows each filling a whole
-    block, and each among zeros. Where a row's answer depends on its place or on its neighbours by
-    rounding, the policy that comes back sends rows one by one.
+    The test runs a block of random rows twice; then some of its rows, each repeated to fill a
+    block, and each among zeros. If a row's output changes by rounding, the returned policy runs one
+    row at a time.
 
     Args:
-        policy: as it was loaded.
-        where: the file it came from, for the message.
+        policy: as loaded.
+        where: the file, for messages.
 
     Raises:
-        PolicyError: where the outputs have wrong shapes, the same inputs give another answer, or
-            an answer depends on the other rows by more than rounding.
+        PolicyError: where the outputs have wrong shapes, the same inputs give different outputs, or
+            an output depends on the other rows by more than rounding.
     """
     rng = np.random.default_rng(0)
     n = policy.block
@@ -106,7 +105,7 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
             )
     if not _same(first, policy.model(state, image, hidden)):
         raise PolicyError(
-            f"{where}: the same inputs gave two answers; export the policy in evaluation mode, "
+            f"{where}: the same inputs gave two outputs; export the policy in evaluation mode, "
             "without dropout and sampling"
         )
     one_by_one = False
@@ -125,23 +124,23 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
 def _refuse_leaning(
     wanted: tuple[np.ndarray, ...], found: tuple[np.ndarray, ...], where: str
 ) -> None:
-    """Refuse answers that depend on the other rows by more than rounding, as by BatchNorm."""
+    """Refuse outputs that depend on the other rows by more than rounding, as with BatchNorm."""
     for expected, value in zip(wanted, found, strict=True):
         size = max(1.0, float(np.abs(expected).max(initial=0.0)))
         apart = float(np.abs(value - expected).max(initial=0.0))
         if apart > ROUNDING * size:
             raise PolicyError(
-                f"{where}: a row's answer changes by {apart:.2g} with the other rows of its batch; "
+                f"{where}: a row's output changes by {apart:.2g} with the other rows of its batch; "
                 "a layer takes statistics over the batch (BatchNorm in training mode): call "
                 "module.eval() before the export"
             )
 
 
 def for_one_row(policy: BlockPolicy) -> BlockPolicy:
-    """Return a policy for one vehicle, without a block's other rows, which cost time.
+    """Return a faster policy for one vehicle, whose blocks have one row.
 
-    It comes back as it is where its model does not take one row, or answers it otherwise. The sums
-    round otherwise than in a block, so this is not for the judge.
+    The policy is returned unchanged where its model refuses one row or gives different outputs.
+    Rounding differs from that in a block, so the judge does not use this.
     """
     inputs = _drawn(policy, np.random.default_rng(0))
     wanted = policy.model(*inputs)
@@ -169,7 +168,7 @@ def _drawn(
 
 
 def _refuse_lost_memory(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Answer NaN where the memory is no number any more: such a row does not fly, it is counted."""
+    """Return the outputs, with NaN actions in rows whose recurrent state is not finite."""
     lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
     if lost.any():
         action = np.where(lost[:, None], np.float32(np.nan), action)

@@ -1,7 +1,7 @@
-"""The contract of a policy: what its numbers mean, as one JSON with a digest that travels with it.
+"""The contract of a policy: names, units, frames and scales of inputs and outputs, and a digest.
 
-It is made from a `PolicySpec`, stands in policy files, checkpoints and environments, and is read
-back by the judge, which refuses whatever it does not provide exactly so.
+The contract is one JSON object. It is made from a `PolicySpec` and stored in policy files,
+checkpoints and environments. The judge reads it and refuses anything that it cannot provide.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Entry:
     unit: str
     frame: str
     scale: float = 1.0
-    """What the policy is given times this is in `unit`."""
+    """Factor from the policy's input to `unit`."""
 
 
 @dataclass(frozen=True)
@@ -78,23 +78,23 @@ class Action:
     scale: tuple[float, ...]
     offset: tuple[float, ...]
     clip: float
-    """Outputs are cut off at plus and minus this before they are scaled; 0: they are not."""
+    """Outputs are clipped to plus and minus this before scaling; 0: no clipping."""
     limit: str
-    """What is done to larger ones in SI units."""
+    """Limits in SI units, as text."""
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What a policy is given and what it answers."""
+    """Inputs and outputs of a policy."""
 
     rate_hz: float
     state: tuple[Entry, ...]
     image: Image
     action: Action
     memory: tuple[int, ...] | None = None
-    """Shape of a row's hidden state; None where nothing is said of it."""
+    """Shape of a row's hidden state; None where unknown."""
     speed: float = 1.0
-    """Of the state's entry `speed`, where nobody says otherwise."""
+    """Default of the state's entry `speed`."""
     version: int = VERSION
 
     @functools.cached_property
@@ -130,7 +130,7 @@ _EXTRAS = {
 
 
 def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Contract:
-    """Return the contract that a policy of `spec` has, with `memory`, the shape of its state."""
+    """Return the contract of a policy with `spec`; `memory` is the shape of its hidden state."""
     state = [
         Entry("velocity", 3, "m/s", BODY),
         Entry("world_z", 3, "1", BODY),
@@ -154,10 +154,10 @@ def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Cont
 
 
 def spec_of(contract: Contract, where: str) -> PolicySpec:
-    """Return the spec by which the suite provides what a contract says.
+    """Return the spec with which the suite fulfils a contract.
 
     Raises:
-        PolicyError: naming the first part that the suite does not provide, and what it does.
+        PolicyError: naming the first part that the suite cannot provide, and the alternatives.
     """
     image, action = contract.image, contract.action
     if action.kind not in ACTIONS:

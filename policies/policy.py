@@ -1,4 +1,4 @@
-"""The `Policy` that the judge flies, and `load_policy`, which makes one from a name or a file."""
+"""The `Policy` protocol of the judge, and `load_policy`, which loads one by name or file."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import closest, unknown_name
 
 Hidden = Any
-"""What a policy remembers of n trials; only the policy itself looks inside."""
+"""Hidden state of n trials, opaque to the caller."""
 
 SUFFIXES = {
     ".onnx": "ONNX",
     ".pt2": "torch exported program, needs trust",
     ".pt": "TorchScript, needs trust",
-    ".c": "C with policy.h beside it, needs trust and a C compiler",
+    ".c": "C with policy.h in its folder, needs trust and a C compiler",
 }
-"""Kinds of policy file by suffix; a folder is a checkpoint of ours, or holds policy.c."""
+"""Kinds of policy file by suffix; a folder is one of the suite's checkpoints, or holds policy.c."""
 
 
 class Policy(Protocol):
-    """Flies n trials at once; a row's answer depends on nothing but that row, to the bit."""
+    """Computes actions of n trials at once; a row's result depends only on that row, to the bit."""
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         ...
 
     @property
     def spec(self) -> PolicySpec:
-        """The rate, camera and scaling it expects of the world."""
+        """The rate, camera and scaling that it expects."""
         ...
 
     def start(self, n: int) -> Hidden:
-        """Return what it remembers at the start of n trials: nothing."""
+        """Return the hidden state at the start of n trials."""
         ...
 
     def act(
@@ -49,11 +49,11 @@ class Policy(Protocol):
             hidden: from `start` or the last `act`.
             state: (n, spec.state_size) float32, the state of `observation.observe`.
             image: (n, height, width) float32, its image.
-            fresh: (n,) bool, rows whose memory is cleared first since a new trial starts there.
+            fresh: (n,) bool, rows in which a new trial starts: their hidden state is reset first.
 
         Returns:
             action_b (n, 3) float32, the wanted net acceleration in current body axes [m/s^2],
-            unchecked, and the new memory.
+            unchecked, and the new hidden state.
         """
         ...
 
@@ -64,8 +64,8 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     Args:
         name_or_path: the name of a shipped policy, a checkpoint's folder, or a file: .onnx, .pt2
             (torch exported program), .pt (TorchScript), policy.c or its folder.
-        trust: also load what can run code on this machine: .pt2, .pt and .c. Checkpoints of ours
-            and ONNX of standard operators need none.
+        trust: also load .pt2, .pt and .c, which can run any code on this machine. The suite's
+            checkpoints and ONNX files with standard operators need no trust.
 
     Raises:
         PolicyError: for an unknown name, or a file that cannot be used or is not safe; the message
@@ -112,11 +112,11 @@ def _holds_c(path: Path) -> bool:
 
 
 def _missing(text: str, path: Path) -> PolicyError:
-    """Return the error for something that is neither a shipped name nor there."""
+    """Return the error for a name or path that does not exist."""
     looks_like_path = len(path.parts) > 1 or path.suffix in SUFFIXES
     if not looks_like_path:
         error = unknown_name("policy", text, shipped.names())
-        return PolicyError(f"{error} A checkpoint's folder or a policy file will do, too.")
+        return PolicyError(f"{error} A checkpoint's folder or a policy file is allowed as well.")
     siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = closest(path.name, siblings)
     meant = f" Did you mean {path.parent / guess}?" if guess else ""

@@ -1,8 +1,8 @@
-"""What a policy expects of the world: its rate, its camera and how its inputs are scaled.
+"""The specification of a policy: its rate, its camera and the scaling of its inputs and outputs.
 
-The observation is the paper's (Su et al. 2026, Eq. 1), 12 numbers and a depth image, unless a
-policy asks for the gate after the next one, for the flight direction of either or for how fast it
-is to fly as well. The errors of policies are here, too: a person's mistake, or a model's failure.
+The observation is the paper's (Su et al. 2026, Eq. 1): 12 numbers and a depth image. A policy may
+add the gate after the next one, the flight direction of either gate, and the wanted speed. This
+file also defines the errors of policies.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from tracks.geometry.camera import Camera
 from tracks.input.ranges import Range, check_ranges
 
 STATE_SIZE = 12
-"""Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3). With
-another kind of action, as many more as it has than three."""
+"""Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3). Another
+kind of action changes the last part to its own size."""
 EXTRAS = {"second_gate": 3, "gate_axis": 3, "second_axis": 3, "speed_input": 1}
-"""Key of a spec -> how many numbers it adds to the state, in this order."""
+"""Optional parts of the state: key of a spec -> size, in this order."""
 ACTION_SIZE = 3
 """Numbers in an action of kind `acceleration`."""
 ACTIONS = {"acceleration": ACTION_SIZE, "ctbr": 4, "motors": 4}
-"""Kinds of action and how many numbers each has; `ActionSpec.kind` says what they mean."""
+"""Kind of action -> size; `ActionSpec.kind` explains them."""
 
 CHANNEL_BLOCK = 32
-"""Channels come in such blocks from the second convolution on, as the C export lays weights out."""
+"""Channels of the second and third convolution are multiples of this, for the C export's layout."""
 RAYS_MOST = 640 * 480
-"""Rays of an image: the pixels of the usual depth cameras at full size. 64 trials' images of this
-size and what they are made with fit into 2 GB."""
+"""Largest number of rays of an image: the pixels of usual depth cameras. 64 trials' images of this
+size, with all intermediate arrays, fit into 2 GB."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class DepthEncoding:
     scale: Annotated[float, Range(1e-6, 1e6)] = 3.0
     """Numerator [m]."""
     near: Annotated[float, Range(1e-3, 100.0)] = 0.3
-    """Depths below this read as this [m]."""
+    """Smaller depths are set to this [m]."""
     offset: Annotated[float, Range(-1e6, 1e6)] = 0.6
-    """Subtracted, so that far pixels are near zero [1]."""
+    """Subtracted, so that distant pixels are near zero [1]."""
     channel_axis: bool = False
     """Whether images are (1, height, width) and not (height, width)."""
     uint8: bool = False
@@ -57,19 +57,19 @@ class DepthEncoding:
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """What a policy's output means: kind, and the affine map from the output to SI units."""
+    """A policy's output: its kind, and the affine map to SI units."""
 
     kind: str = "acceleration"
     """acceleration: wanted net acceleration, body axes [m/s^2]; ctbr: collective thrust per mass
     [m/s^2] and body rates [rad/s]; motors: four rotors' shares, 0 to 1, of `motors`."""
     scale: Annotated[tuple[float, ...], Range(-1e6, 1e6)] = (1.0,)
-    """SI units a unit of output: one number for all, or one for each."""
+    """Factor from output to SI units: one number for all, or one for each."""
     offset: Annotated[tuple[float, ...], Range(-1e6, 1e6)] = (0.0,)
     """SI value of an output of zero: one number for all, or one for each."""
     motors: str = "thrust"
-    """Of kind motors: a rotor's share of its largest `thrust` or `speed`."""
+    """For kind motors: the output is a share of the largest `thrust` or `speed`."""
     clip: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Outputs are cut off at plus and minus this before they are scaled; 0: they are not."""
+    """Outputs are clipped to plus and minus this before scaling; 0: no clipping."""
 
     @property
     def size(self) -> int:
@@ -78,11 +78,11 @@ class ActionSpec:
 
     @property
     def is_plain(self) -> bool:
-        """Whether outputs are in SI units as they are."""
+        """Whether outputs are in SI units already."""
         return set(self.scale) == {1.0} and set(self.offset) == {0.0} and not self.clip
 
     def to_si(self, output: Any) -> Any:
-        """Return outputs (..., size) in SI units; plain ones are returned as they are."""
+        """Return outputs (..., size) in SI units; plain ones are returned unchanged."""
         if self.is_plain:
             return output
         output = np.clip(output, -self.clip, self.clip) if self.clip else output
@@ -91,30 +91,30 @@ class ActionSpec:
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """What trainer and judge must agree on for a policy to fly; stored in its checkpoint."""
+    """Settings that trainer and judge share for a policy; stored in its checkpoint."""
 
     rate_hz: Annotated[float, Range(1.0, 500.0)] = 30.0
     """Actions per second [Hz]."""
     camera: Camera = field(default_factory=Camera)
     """The camera that the images come from; depths are clipped to its range."""
     depth: DepthEncoding = field(default_factory=DepthEncoding)
-    """How a depth becomes an input."""
+    """Conversion of depth to the image input."""
     hidden_size: Annotated[int, Range(1, 4096)] = 192
     """Width of the embeddings and of the recurrent state."""
     channels: Annotated[tuple[int, int, int], Range(2, 1024)] = (32, 64, 128)
     """Output channels of the three convolutions: an even number, then multiples of 32 twice."""
     second_gate: bool = False
-    """Whether the state goes on with the centre of the gate after the next one, in body axes."""
+    """Whether the state contains the centre of the gate after the next one, body axes."""
     gate_axis: bool = False
-    """Whether the state goes on with the next gate's flight direction, in body axes."""
+    """Whether the state contains the next gate's flight direction, body axes."""
     second_axis: bool = False
-    """Whether the state goes on with that of the gate after it, in body axes."""
+    """Whether the state contains the flight direction of the gate after it, body axes."""
     speed_input: bool = False
-    """Whether the state ends with how fast to fly, from 0 (careful) to 1 (a race)."""
+    """Whether the state contains the wanted speed, 0 (careful) to 1 (race)."""
     speed: Annotated[float, Range(0.0, 1.0)] = 1.0
-    """How fast that is where nobody says otherwise [1]."""
+    """Default of the wanted speed [1]."""
     action: ActionSpec = field(default_factory=ActionSpec)
-    """What the policy's output means."""
+    """The policy's output."""
 
     @property
     def state_size(self) -> int:
@@ -128,17 +128,17 @@ class PolicySpec:
 
     @property
     def image_shape(self) -> tuple[int, ...]:
-        """Shape of one image as the policy is given it."""
+        """Shape of one image input."""
         shape = (self.camera.height, self.camera.width)
         return (1, *shape) if self.depth.channel_axis else shape
 
 
 def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
-    """Refuse a spec that no policy can have.
+    """Refuse an impossible spec.
 
     Args:
         spec: what to check.
-        where: what stands before a key in the message.
+        where: prefix of a key in the message.
 
     Raises:
         ValueError: naming the key, its value and what is allowed.
@@ -172,7 +172,7 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
 
 
 def check_network(spec: PolicySpec) -> None:
-    """Refuse an image that our network cannot take, and channels that it cannot have.
+    """Refuse an image size or channels that the suite's network does not support.
 
     Raises:
         ValueError: naming the side and its pixels, or the channels, and what is allowed.
@@ -197,14 +197,14 @@ def check_network(spec: PolicySpec) -> None:
 
 
 class Note(NamedTuple):
-    """Something about a policy's interface that looks wrong, or has to be assumed."""
+    """A probable fault of a policy's interface, or an assumption about it."""
 
     fault: str
     """Its name."""
     evidence: str
-    """What was seen, and where."""
+    """The evidence, with the file or the figures."""
     fix: str
-    """What to do."""
+    """What to do next."""
 
     def __str__(self) -> str:
         return f"{self.evidence}; {self.fix}"
@@ -215,8 +215,8 @@ class PolicyError(ValueError):
 
 
 class NeedsTrust(PolicyError):
-    """A file is refused since loading it can run its maker's code, and nobody said to trust it."""
+    """A file is refused because loading it can run its author's code, and `trust` was not given."""
 
 
 class NoAnswer(PolicyError):
-    """A policy that was loaded gave no answer: it failed, or did not come to an end in time."""
+    """A loaded policy gave no output: it failed, or exceeded the time limit."""

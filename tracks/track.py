@@ -1,4 +1,4 @@
-"""A track: a scene to race through, where it came from and where the drone starts."""
+"""A track: a scene to race through, its origin (family, level, seed) and the start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tracks.geometry.scene import Boxes, Gates, Scene
 
 @dataclass(frozen=True)
 class Track:
-    """A race track with its start; its gates are in flight order, the first to pass being 0."""
+    """A race track with its start; its gates are in flight order, from gate 0."""
 
     family: str
     """Name of the family that made it, or of the file it was read from."""
@@ -24,21 +24,21 @@ class Track:
     scene: Scene
     """Gates and solids in the world frame, numpy arrays, float64, not batched."""
     start_pos_w: np.ndarray
-    """(3,) where the drone's centre rests at time 0 [m]."""
+    """(3,) the drone's centre at time 0 [m]."""
     start_yaw: float
     """Heading at the start, about world z, 0 along world x [rad]."""
     names: tuple[str, ...]
-    """One name a solid, in the order boxes, cylinders, capsules, spheres, meshes. The bars of a
+    """Names of the solids, in the order boxes, cylinders, capsules, spheres, meshes. The bars of a
     gate's frame share a name ("gate 3 frame"); every other name is unique."""
     mesh_sizes: tuple[int, ...] = ()
     """Triangles of each convex mesh; `scene.triangles` holds them one mesh after another."""
 
 
 def first_gates(track: Track, count: int) -> Track:
-    """Return `track` with its first `count` gates; the obstacles stay, the later frames go.
+    """Return `track` with its first `count` gates and all obstacles.
 
     Raises:
-        ValueError: unless the track has that many gates and one is left.
+        ValueError: unless `count` is from 1 to the number of gates.
     """
     gates = track.scene.gates
     whole, bars = gates.opening_g.shape[:2]

@@ -1,6 +1,6 @@
-"""A checkpoint is a folder: weights.safetensors holds arrays, config.json says what they are.
+"""Checkpoints: a folder with arrays in weights.safetensors and their description in config.json.
 
-Neither file can run code when it is read. The config carries the weights' SHA-256, so a file that
+Neither file can run code when it is read. The config has the weights' SHA-256, so a file that
 was cut short, mixed up with another or changed is refused.
 """
 
@@ -35,12 +35,12 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Stored:
-    """What a checkpoint holds."""
+    """Contents of a checkpoint."""
 
     arrays: dict[str, np.ndarray]
-    """Arrays by name, of the shapes and types they were saved with."""
+    """Arrays by name, with their saved shapes and types."""
     config: dict[str, Any]
-    """The whole of config.json: kind, the provenance stamp, weights and the caller's."""
+    """All of config.json: kind, provenance, weights and the caller's keys."""
 
 
 def save_arrays(
@@ -51,16 +51,16 @@ def save_arrays(
     seed: int | None,
     extra: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write arrays and what they are as a checkpoint, replacing the one that was there.
+    """Write arrays and their description as a checkpoint, replacing an existing one.
 
     A kill at any moment leaves the old checkpoint or the new one, whole.
 
     Args:
         folder: the checkpoint's folder.
         arrays: numpy or JAX arrays by name, of any shape.
-        kind: what this is ("policy", "delta", "training"); loading asks for it again.
-        seed: the seed that made it, if one did.
-        extra: more for config.json (see `tracks.common.files.to_json`).
+        kind: "policy", "delta" or "training"; loading requires the same kind.
+        seed: the seed of its training or fit; None for none.
+        extra: further keys of config.json (see `tracks.common.files.to_json`).
 
     Returns:
         `folder`.
@@ -91,12 +91,12 @@ def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
 
     Args:
         folder: the checkpoint's folder.
-        kind: what it has to be.
+        kind: the required kind.
         finite: refuse NaN and infinity in the arrays.
 
     Raises:
         PolicyError: where a file is missing, cut short, changed, of another kind or a newer
-            schema, or an array is not finite; the message names the file and what to do.
+            schema, or an array is not finite; the message names the file and the next step.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load

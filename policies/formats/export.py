@@ -1,4 +1,4 @@
-"""Policies as files: ours as torch program (.pt2), ONNX and C, anybody's torch module as ONNX."""
+"""Export policies: the suite's as torch program (.pt2), ONNX and C; any torch module as ONNX."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from policies.formats.c.forward import Observed
 
 MODULE_OPSET = 17
-"""Of a module's graph; old enough for the runtimes of companion computers."""
+"""Opset of a module's graph; old enough for the runtimes of companion computers."""
 
 
 def export_policy(
@@ -32,15 +32,15 @@ def export_policy(
     dtype: str = "float32",
     observed: Observed | None = None,
 ) -> list[Path]:
-    """Write a policy of ours for other programs; `load_policy` reads all (with trust .pt2 and C).
+    """Export one of the suite's policies; `load_policy` reads all formats (.pt2 and C with trust).
 
     Args:
         name_or_folder: a shipped policy's name or a checkpoint's folder.
         out: the folder that the files go to: NAME.pt2, NAME.onnx; for C policy.h, policy.c and what
             checks them.
         formats: which of `FORMATS`.
-        dtype: of the weights of C, "float32" or "int8".
-        observed: what the policy was given in flights, by which int8 scales its activations.
+        dtype: type of the weights in C, "float32" or "int8".
+        observed: observations of flights, which set the scales of int8 activations.
 
     Returns:
         The files' paths.
@@ -77,7 +77,7 @@ def export_module(
     trained_under: PolicySpec | contract.Contract,
     memory: tuple[int, ...] | None = None,
 ) -> Path:
-    """Write a torch module as ONNX with its contract, and load it once as the judge does.
+    """Export a torch module as ONNX with its contract, and load the file once as the judge does.
 
     The module is exported in evaluation mode, with a free batch, by torch's exporter over
     TorchScript, which needs no further package.
@@ -110,11 +110,11 @@ def export_module(
     names = INPUTS[: len(sizes)]
     example = tuple(torch.zeros(2, *size) for size in sizes)
     outputs = ["action", "hidden_next"][: 1 + bool(memory)]
-    buffer: Any = io.BytesIO()  # which torch takes, its annotation forgets it
+    buffer: Any = io.BytesIO()  # torch accepts it, but its annotation omits it
     training = module.training
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that this exporter will go one day
+            warnings.simplefilter("ignore")  # the deprecation of this exporter
             torch.onnx.export(
                 module.eval(), example, buffer, input_names=list(names), output_names=outputs,
                 dynamic_axes={name: {0: "batch"} for name in (*names, *outputs)},
@@ -137,12 +137,12 @@ def export_module(
 
 
 def main_file(name: str, wanted: str) -> str:
-    """Return what the file is called that holds a policy called `name` in one of `FORMATS`."""
+    """Return the file name of the policy `name` in one of `FORMATS`."""
     return "policy.c" if wanted == "c" else f"{name}{_WRITERS[wanted][0]}"
 
 
 def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:
-    """Refuse what cannot be written.
+    """Refuse formats and types that cannot be written.
 
     Raises:
         ValueError: for an unknown format or type, or a type that the format has not.
@@ -155,10 +155,10 @@ def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:
 
 
 def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoint]:
-    """Return the name and the checkpoint of a policy of ours.
+    """Return the name and the checkpoint of one of the suite's policies.
 
     Raises:
-        PolicyError: where it is none, or cannot be used.
+        PolicyError: where it is not one of them, or cannot be used.
     """
     folder = shipped.locate(name_or_folder)
     if not folder.is_dir():
@@ -170,14 +170,14 @@ def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoi
 
 
 def torch_program(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
-    """Return a policy as the bytes of a .pt2 file that carries `texts` by their keys."""
+    """Return a policy as the bytes of a .pt2 file with `texts` by their keys."""
     import torch
 
     from policies.formats.torch_twin import torch_twin
 
     spec = checkpoint.spec
     twin = torch_twin(checkpoint.params, spec)
-    # Two rows, since torch takes sizes 0 and 1 in an example for fixed.
+    # Two rows, because torch treats sizes 0 and 1 in an example as fixed.
     example = (
         torch.zeros(2, spec.state_size),
         torch.zeros(2, spec.camera.height, spec.camera.width),
@@ -193,7 +193,7 @@ def torch_program(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
 
 
 def onnx_file(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
-    """Return a policy as the bytes of an .onnx file that carries `texts` by their keys."""
+    """Return a policy as the bytes of an .onnx file with `texts` by their keys."""
     from policies.formats.onnx_graph import onnx_model
 
     return onnx_model(checkpoint.params, checkpoint.spec, texts).SerializeToString()

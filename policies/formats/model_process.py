@@ -1,10 +1,9 @@
-"""A model that runs in a process of its own: it may loop for ever or abort, and we do not.
+"""Run a model in its own process, so that an endless loop or a crash does not affect the suite.
 
-A model from elsewhere is a program: a `Loop` of 2^62 rounds is one node of ONNX, also one that is
-worked out while the file is loaded; TorchScript has `while`, and C anything. So onnxruntime, torch
-and a compiled policy.c have a process with limits of time and memory (`model_server.py`), and who
-does not answer in time is killed. That is for what goes wrong: torch files and C are code and may
-do more.
+A model from elsewhere is a program: one ONNX node can loop 2^62 times, even while the file loads,
+TorchScript has `while`, and C has everything. So onnxruntime, torch and a compiled policy.c run in
+a process with limits of time and memory (`model_server.py`), which is killed when it exceeds them.
+This protects against errors only: torch files and C are code and can do more.
 """
 
 from __future__ import annotations
@@ -30,17 +29,17 @@ from policies.formats.model_server import KINDS, data_bytes
 from policies.spec import NoAnswer, PolicyError
 
 LOAD_S = 60.0
-"""To start, load the model and optimise it [s]."""
+"""Time limit to start, load and optimise the model [s]."""
 ANSWER_S = 60.0
-"""To answer for one block of rows [s]; the deadline of a judgement is shorter, and counts."""
+"""Time limit for one block of rows [s]; the judge's own deadline is shorter."""
 MEMORY_BYTES = 4 * 2**30
-"""Addresses that the process may use beside those of the engine itself."""
+"""Address space of the process, in addition to that of the engine."""
 ANSWER_BYTES = 2**28
-"""Of one answer."""
+"""Largest answer."""
 PIPE_BYTES = 2**20
-"""Of a pipe between the two; the most that Linux gives to everybody."""
+"""Size of the pipes; the largest that Linux allows every user."""
 GRACE_S = 5.0
-"""Later than we give up, the process ends itself [s]; it may have lost us."""
+"""Time after the limit at which the process ends itself, in case its parent is gone [s]."""
 SERVER = Path(__file__).with_name("model_server.py")
 
 
@@ -49,9 +48,9 @@ REMEDIES = {
     "torch": "export it again with this version of torch",
     "ctypes": "it must define policy_reset and policy_step as its policy.h declares them",
 }
-"""What to do where an engine refuses a model."""
+"""Engine -> advice where it refuses a model."""
 CALLED = {"ctypes": "compiled C"}
-"""Engines whose module has another name than people know them by."""
+"""Module -> usual name of the engine."""
 
 
 class Port(NamedTuple):
@@ -59,15 +58,15 @@ class Port(NamedTuple):
 
     name: str
     kind: str
-    """As onnxruntime calls it, such as tensor(float); torch does not say."""
+    """Type as named by onnxruntime, such as tensor(float); empty for torch."""
     shape: tuple[int | None, ...]
-    """None where a size is free; of TorchScript not known."""
+    """None for a free size; empty for TorchScript, where it is unknown."""
 
 
 class ModelProcess:
-    """A loaded model in its process, which ends with this object.
+    """A loaded model in its own process, which ends with this object.
 
-    A process that gave no answer is killed; the next question goes to a fresh one.
+    A process without an answer is killed; the next call starts a new one.
     """
 
     def __init__(self, model: bytes, where: str, kind: str, labels: Sequence[str] = ()) -> None:
@@ -77,26 +76,26 @@ class ModelProcess:
             model: a serialised model, or a library's path.
             where: the file it came from, for messages.
             kind: one of `model_server.KINDS`.
-            labels: names of texts that a torch file may carry; of a C library one, of its JSON.
+            labels: names of the texts in a torch file; for a C library one name, for its JSON.
 
         Raises:
-            PolicyError: where the engine refuses it, or does not come to an end with it.
+            PolicyError: where the engine refuses it, or exceeds its limits.
         """
         self._where, self._model = where, model
         self._module, self._kind, self._wanted = KINDS[kind][0], kind, list(labels)
         self._engine = CALLED.get(self._module, self._module)
         about = self._start()
         self.labels: dict[str, str | bytes] = about.get("labels", {})
-        """The texts that were asked for; empty where there is none."""
+        """Texts by name; empty where there is none."""
         self.sizes: list[int] = about.get("sizes", [])
-        """Of a C library: bytes of its memory, then the sizes of its observation."""
+        """For a C library: bytes of its state, then the sizes of its observation."""
         self.inputs, self.outputs = (
             [Port(name, number, tuple(shape)) for name, number, shape in about[side]]
             for side in ("inputs", "outputs")
         )
 
     def _start(self) -> dict[str, Any]:
-        """Start the process, load the model there and return what it says of it."""
+        """Start the process, load the model there and return its description."""
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(SERVER)],
             stdin=subprocess.PIPE,
@@ -126,10 +125,10 @@ class ModelProcess:
         return about
 
     def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """Return the model's outputs, float32, for its inputs, which are in its order.
+        """Return the model's outputs, float32, for its inputs in order.
 
         Raises:
-            NoAnswer: where it fails, or does not come to an end.
+            NoAnswer: where it fails, or exceeds its limits.
         """
         if not self._end.alive:
             self._start()
@@ -201,7 +200,7 @@ class ModelProcess:
 
 
 def _widen(handle: int) -> None:
-    """Let a pipe hold a block of rows, where the system can: in small pieces it takes turns."""
+    """Enlarge a pipe for a whole block of rows, where possible; small pieces are slow."""
     if hasattr(fcntl, "F_SETPIPE_SZ"):
         with contextlib.suppress(OSError):
             fcntl.fcntl(handle, fcntl.F_SETPIPE_SZ, PIPE_BYTES)

@@ -1,12 +1,12 @@
-"""The program that runs one model from elsewhere: ONNX, torch's two kinds, a C library.
+"""The program that runs one foreign model: ONNX, TorchScript, a torch program or a C library.
 
-It imports nothing of ours and is run by its path. Frames come on standard input, answers go to the
+It imports nothing of the suite and is run by its path. Frames come on standard input, answers go to
 output. A frame is four bytes of length, a JSON object of that length, and the bytes of the float32
 arrays whose names and shapes it lists under "arrays" (bytes as they are under "bytes"). The first
 frame holds the model, its kind and the limits; each other one, the inputs of one call, in the
 model's order. An answer has "error" instead of arrays where the model cannot be loaded or fails.
 
-The alarm clock ends it where a call lasts too long, whether or not its parent still lives.
+An alarm signal ends the process where a call exceeds its limit, even without a parent.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import IO, Any
 Run = Callable[[dict[str, Any]], list[Any]]
 """Inputs by name to the outputs, float32 arrays all."""
 Loaded = tuple[dict[str, Any], Run]
-"""What there is to say of a model, and the model."""
+"""Description of a model, and its function."""
 
 
 def write_frame(file: IO[bytes], head: dict[str, Any], *data: Any) -> None:
@@ -42,7 +42,7 @@ def read_frame(file: IO[bytes]) -> tuple[dict[str, Any], bytearray]:
     """Return one frame's head and its data.
 
     Raises:
-        EOFError: where the other side has gone.
+        EOFError: where the other side has closed the pipe.
     """
     (length,) = struct.unpack("<I", _exactly(file, 4))
     head = json.loads(_exactly(file, length))
@@ -66,7 +66,7 @@ def _exactly(file: IO[bytes], count: int) -> bytearray:
 
 
 def load_onnx(onnxruntime: Any, model: bytes, labels: list[str]) -> Loaded:
-    """Load an ONNX model; its labels are read by who sent it."""
+    """Load an ONNX model; the parent process reads its labels."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
@@ -81,7 +81,7 @@ def load_onnx(onnxruntime: Any, model: bytes, labels: list[str]) -> Loaded:
 
 
 def load_program(torch: Any, model: bytes, labels: list[str]) -> Loaded:
-    """Load a torch exported program and the texts that it carries under `labels`."""
+    """Load a torch exported program and its texts under `labels`."""
     extra = dict.fromkeys(labels, "")
     program = torch.export.load(io.BytesIO(model), extra_files=extra)
     values = {node.name: node.meta.get("val") for node in program.graph.nodes}
@@ -94,7 +94,7 @@ def load_program(torch: Any, model: bytes, labels: list[str]) -> Loaded:
 
 
 def load_script(torch: Any, model: bytes, labels: list[str]) -> Loaded:
-    """Load TorchScript and the texts that it carries under `labels`; shapes are not known."""
+    """Load TorchScript and its texts under `labels`; shapes are unknown."""
     extra = dict.fromkeys(labels, "")
     module = torch.jit.load(io.BytesIO(model), map_location="cpu", _extra_files=extra).eval()
     inputs = [[argument.name, "", []] for argument in module.forward.schema.arguments[1:]]
@@ -106,11 +106,11 @@ def load_script(torch: Any, model: bytes, labels: list[str]) -> Loaded:
 
 
 def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
-    # Sums are split by threads, so a fixed number of them keeps a policy's answers the same.
+    # Threads split sums, so a fixed number of them makes outputs reproducible.
     torch.set_num_threads(1)
 
     def run(feed: dict[str, Any]) -> list[Any]:
-        # A tensor of torch's own lies as its kernels like it, whatever stood before it in a frame.
+        # A clone has torch's own memory alignment, independent of its place in the frame.
         inputs = [torch.from_numpy(value).clone() for value in feed.values()]
         with torch.inference_mode():
             try:

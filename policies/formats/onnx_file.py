@@ -24,7 +24,7 @@ from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 _STANDARD = ("", "ai.onnx")
 NODES_MOST = 100_000
-"""Operators of a graph whose functions stand where they are called."""
+"""Largest number of operators of a graph with inlined functions."""
 
 
 def load_onnx(path: Path) -> BlockPolicy:
@@ -98,10 +98,10 @@ def read_checked(path: Path) -> onnx.ModelProto:
 
 
 def _inlined(path: Path, proto: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a graph whose local functions, as torch's exporter writes them, stand where called.
+    """Return the model with its local functions (as torch's exporter writes them) inlined.
 
     Raises:
-        PolicyError: where functions call themselves, or come to more than `NODES_MOST` operators.
+        PolicyError: where functions are recursive, or expand to more than `NODES_MOST` operators.
     """
     if not proto.functions:
         return proto
@@ -132,7 +132,7 @@ def _inlined(path: Path, proto: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return an ONNX file and the files that its tensors' data lie in, by name.
+    """Return an ONNX file and the files with its external data, by name.
 
     Raises:
         PolicyError: where it is damaged or points outside its folder.
@@ -155,18 +155,18 @@ def _graph_of(path: Path) -> onnx.ModelProto:
 
 
 def _external_bytes(path: Path, tensors: list[Any]) -> int:
-    """Return how many bytes lie outside: in the files, or, if more, in all tensors together."""
+    """Return the bytes of external data: the files', or all tensors' where they are more."""
     sizes, held = {}, 0
     for tensor in tensors:
         file = _data_file(path, tensor)
         sizes[file] = file.stat().st_size
-        # Tensors may share a file's bytes, and each is read into memory by itself.
+        # Tensors may share a file's bytes, but each is read into memory separately.
         held += _held_bytes(_external(tensor), sizes[file])
     return max(sum(sizes.values()), held)
 
 
 def _held_bytes(entries: dict[str, Any], size: int) -> int:
-    """Return how many bytes a tensor takes of a file of `size`; all where it does not say."""
+    """Return the bytes of a tensor in a file of `size`; all of it where unspecified."""
     try:
         rest = size - int(entries.get("offset", 0))
         return max(0, min(int(entries.get("length", rest)), rest))
@@ -175,12 +175,12 @@ def _held_bytes(entries: dict[str, Any], size: int) -> int:
 
 
 def _external(tensor: onnx.TensorProto) -> dict[str, Any]:
-    """Return where a tensor's data lie; of a key that stands twice onnx takes the last, too."""
+    """Return the location of a tensor's data; for a repeated key the last counts, as in onnx."""
     return {entry.key: entry.value for entry in tensor.external_data}
 
 
 def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
-    """Return the file that a tensor's data lie in, which is in the same folder."""
+    """Return the file with a tensor's data, which must be in the same folder."""
     location = _external(tensor).get("location", "")
     _check_text(path, location)
     folder = path.resolve().parent
@@ -196,7 +196,7 @@ def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
 
 
 def _check_text(path: Path, *texts: object) -> None:
-    """Refuse what should be text and is none; protobuf hands such a field over as bytes."""
+    """Refuse fields that are not text, which protobuf returns as bytes."""
     if not all(isinstance(text, str) and "\0" not in text for text in texts):
         raise PolicyError(f"{path}: names in it are not UTF-8 ({texts}); export it again")
 

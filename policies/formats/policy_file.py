@@ -1,4 +1,4 @@
-"""Our networks as checkpoints: a policy with its `PolicySpec`, and a Delta Action Model."""
+"""Checkpoints of the suite's networks: a policy with its `PolicySpec`, and a Delta Action Model."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PolicyCheckpoint:
 
     @property
     def seed(self) -> int | None:
-        """The seed of its training; None where its maker does not say."""
+        """The seed of its training; None where unknown."""
         return self.config.get("seed")
 
 
@@ -72,7 +72,7 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
 
     Raises:
         PolicyError: where it is damaged, of another kind, not finite, or its arrays do not have
-            the shapes that its spec asks for.
+            the shapes of its spec.
     """
     stored = load_arrays(folder, kind=POLICY)
     if "spec" not in stored.config:
@@ -82,7 +82,7 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
     if contract.KEY in stored.config:
         where, own = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
         stored_contract = contract.read_contract(stored.config[contract.KEY], where)
-        contract.refuse_other(stored_contract, own, where, "the spec beside it")
+        contract.refuse_other(stored_contract, own, where, "the spec in the same file")
     return PolicyCheckpoint(stored.arrays, spec, stored.config)
 
 
@@ -90,7 +90,7 @@ def expected_shapes(spec: PolicySpec, where: str) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the network's parameters for a spec.
 
     Raises:
-        PolicyError: where no network of ours has such an image or such channels.
+        PolicyError: where the suite's network does not support such an image or such channels.
     """
     import jax
 

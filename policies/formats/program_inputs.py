@@ -1,4 +1,4 @@
-"""The inputs that a policy from elsewhere must have, whatever its format."""
+"""Checks of the inputs of a foreign policy, for all formats."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ INPUTS = ("state", "image", "hidden")
 
 
 BLOCK_MOST = 4096
-"""Rows of a model with a fixed batch."""
+"""Largest batch of a model with a fixed batch."""
 HIDDEN_MOST = 2**16
-"""Numbers in one row's recurrent state."""
+"""Largest recurrent state of one row."""
 
 
 def check_inputs(
@@ -27,7 +27,7 @@ def check_inputs(
 
     Args:
         shapes: by input name, in order; sizes that are not ints are free.
-        spec: what the file says of its camera.
+        spec: the file's spec.
         where: the file, for the message.
 
     Raises:
@@ -80,14 +80,13 @@ def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where:
 
 
 def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
-    """Return what to say where an exporter has left out an input that nothing uses."""
+    """Return notes on inputs that an exporter has dropped because nothing uses them."""
     missing = [name for name in INPUTS[:2] if name not in names]
     return tuple(
         Note(
             "dropped_input",
-            f"{where}: has no input {name!r}: exporters drop what no operator uses, and it flies "
-            "without",
-            f"where it should see it, use {name} in forward() and export again",
+            f"{where}: has no input {name!r}: exporters drop unused inputs, and it flies without",
+            f"if it should use it, use {name} in forward() and export again",
         )
         for name in missing
     )

@@ -1,6 +1,6 @@
-"""A `PolicySpec` as JSON, checked key by key when it is read; and what policy files say of theirs.
+"""A `PolicySpec` as JSON, and the metadata of policy files.
 
-A torch, ONNX or C file holds an object under the key `policy.json`, a contract, both or nothing.
+A torch, ONNX or C file has an object under the key `policy.json`, a contract, both or neither.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ KEY = "policy.json"
 """Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
 SCHEMA = 1
 KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec", contract.KEY)
-"""Of the object; what a policy says of itself stands under `spec` and `contract`."""
+"""Keys of the object; `spec` and `contract` describe the policy."""
 
 
 class PolicyMetadata(NamedTuple):
-    """What a file says of its policy."""
+    """The metadata of a policy file."""
 
     spec: PolicySpec
-    """The default one where it says nothing."""
+    """The default spec where the file has none."""
     contract: contract.Contract | None
-    """As the file has it."""
+    """The file's own contract; None for none."""
     notes: tuple[Note, ...]
-    """What is assumed."""
+    """Assumptions."""
 
 
 def labels(spec: PolicySpec, name: str, seed: int | None) -> dict[str, str]:
@@ -75,10 +75,10 @@ def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
 
 
 def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetadata:
-    """Return what a file says of its policy.
+    """Return the metadata of a policy file.
 
     Args:
-        texts: what stands under `KEY` and under `contract.KEY`, where it does.
+        texts: the file's texts under `KEY` and `contract.KEY`, if present.
         where: the file, for the message.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, run in a process of their own.
+"""Torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, run in their own process.
 
 Neither is loaded without trust: `torch.jit.load` runs what a file says by design, and
 `torch.export.load` unpickles sample inputs and some weights, resolves operators by dotted paths and
@@ -86,7 +86,7 @@ def _check_names(path: Path, names: tuple[str, ...]) -> None:
 
 
 def _is_weights(data: bytes) -> bool:
-    """Return whether an archive of torch's is what torch.save writes, which has no code."""
+    """Return whether a torch archive is from torch.save, which stores no code."""
     try:
         names = zipfile.ZipFile(io.BytesIO(data)).namelist()
     except zipfile.BadZipFile:

@@ -1,4 +1,4 @@
-"""The policies that come with the suite: one folder each, a checkpoint with a card.md beside."""
+"""The shipped policies: one folder each, with a checkpoint and a card.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def names() -> list[str]:
 
 
 def locate(name_or_path: str | Path) -> Path:
-    """Return a shipped policy's folder by its name, and anything else as the path it is."""
+    """Return a shipped policy's folder for its name; any other text is returned as a path."""
     return folder(str(name_or_path)) if str(name_or_path) in names() else Path(name_or_path)
 
 

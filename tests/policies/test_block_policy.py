@@ -117,7 +117,7 @@ def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
     base = BlockPolicy("x", PolicySpec(), lambda s, i, h: (s[:, :3], h), (0,))
     assert proven(base, "here") == base
     for model, said in [
-        (lambda s, i, h: (rng.random((64, 3), np.float32), h), "two answers"),
+        (lambda s, i, h: (rng.random((64, 3), np.float32), h), "two outputs"),
         (lambda s, i, h: (s[:, :4], h), r"here: output 'action' is float32 \(64, 4\)"),
         (lambda s, i, h: (s[:, :3].astype(float), h), "is float64"),
         (lambda s, i, h: (s[:, :3], s), "output 'hidden'"),

@@ -1,7 +1,7 @@
-"""Files and folders written whole or not at all: beside their final name, then renamed.
+"""Write files and folders completely or not at all: under a temporary name first, then renamed.
 
-A reader, a kill or a full disk never leaves half a file under its final name. What a killed
-process leaves beside it starts with a dot and ends in ``.part``.
+A kill or a full disk never leaves a partial file under its final name. The temporary names start
+with a dot and end in ``.part``; a killed process may leave one in the same folder.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ from pathlib import Path
 from typing import Any
 
 PART = ".part"
-"""Ending of what is being written, or what a killed process left of it."""
+"""Ending of a temporary folder, in use or left by a killed process."""
 PART_NAME = re.compile(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part")
-"""Of it: what it becomes, and the process that makes it."""
+"""Pattern of its name: the final name, and the number of the writing process."""
 LONGEST_STEM = 200
-"""Bytes of a file's name in that of what is written beside it: systems allow 255."""
+"""Most bytes of the final name in the temporary one: systems allow 255."""
 SWEPT_DEPTH = 4
-"""Folders within each other that are looked through for it."""
+"""Depth of folders that `sweep_parts` searches."""
 
 
 def user_cache(environment: Mapping[str, str] | None = None) -> Path:
     """Return the suite's own folder in the user's cache, made if missing.
 
-    Where there is no home (a container's user may have none), or it cannot be written, it is a
-    folder for temporary files that is the user's alone.
+    Without a writable home (as in some containers) it is a private folder for temporary files.
 
     Args:
-        environment: variables; those of this process if not given.
+        environment: variables; None: those of this process.
     """
     values = os.environ if environment is None else environment
     try:
@@ -48,13 +47,13 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.access(folder, os.W_OK):
             return folder
-    except (OSError, RuntimeError):  # RuntimeError: nobody knows where home is
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
         pass
     folder = Path(tempfile.gettempdir()) / f"diffracing-suite-{os.getuid()}"
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     found = folder.lstat()
-    # What lies there is loaded as code: it must be nobody else's.
+    # Files in it are loaded as code, so nobody else may own or write it.
     if found.st_uid != os.getuid() or found.st_mode & 0o022 or not folder.is_dir():
         folder = Path(tempfile.mkdtemp(prefix="diffracing-suite-"))
     return folder
@@ -62,7 +61,7 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
 
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Let errors of the system that name no file, as those of a full disk, name `path`."""
+    """Add `path` to operating system errors without a file name, such as for a full disk."""
     try:
         yield
     except OSError as error:
@@ -73,9 +72,9 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path to write to; on a clean exit it becomes `path`, on an error it is removed.
+    """Yield a temporary path to write to; it becomes `path` on success, and is removed on an error.
 
-    The yielded path keeps the suffix of `path`, so that writers that go by it still do. Missing
+    The temporary path has the suffix of `path`, which some writers depend on. Missing
     parent folders are made.
 
     Raises:
@@ -97,10 +96,10 @@ def replacing_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield an empty folder to fill; on a clean exit it becomes `path`, else it is removed.
+    """Yield an empty folder to fill; it becomes `path` on success, and is removed on an error.
 
-    A folder that already stands at `path` is replaced by two renames; after a kill exactly
-    between them `recover_folder` brings the new one in.
+    An existing folder at `path` is replaced by two renames. After a kill exactly between them
+    `recover_folder` completes the replacement.
 
     Raises:
         OSError: where the disk is full or `path` cannot be written.
@@ -121,17 +120,17 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, final)
         _sync(final.parent)
     finally:
-        # Also for an interrupt that comes between the two renames.
+        # Also after an interrupt between the two renames.
         if retired.exists() and not final.exists():
             os.replace(retired, final)
         shutil.rmtree(parent, ignore_errors=True)
 
 
 def recover_folder(path: str | os.PathLike[str]) -> None:
-    """Put `path` in place where a kill between the two renames of `replacing_folder` left it out.
+    """Complete a replacement by `replacing_folder` that was killed between its two renames.
 
-    The new folder was complete and on the disk by then, so it is the one taken. Readers of
-    folders that are replaced call this first.
+    The new folder was complete on the disk by then, so it is used. Readers of replaced folders call
+    this first.
     """
     final = Path(path)
     if final.exists():
@@ -147,7 +146,7 @@ def recover_folder(path: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def folder_while_used(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Make a folder and what it lies in; what nothing came into is taken away again at the end.
+    """Make a folder and its parents; remove those that are still empty at the end.
 
     Raises:
         OSError: where it cannot be made.
@@ -164,7 +163,7 @@ def folder_while_used(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
-    """Find out whether a file can be written at `path` before the work that makes it; writes none.
+    """Check that a file can be written at `path`, without writing it.
 
     Raises:
         OSError: where it cannot.
@@ -179,12 +178,12 @@ def check_place(path: str | os.PathLike[str]) -> None:
 def check_no_input(
     path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str] | None], option: str
 ) -> None:
-    """Refuse to write a file that is read as well.
+    """Refuse to overwrite an input file.
 
     Args:
-        path: what is to be written.
-        inputs: what is read; names that are no files are passed over.
-        option: what says where `path` is.
+        path: of the output.
+        inputs: of the inputs; names that are not files are ignored.
+        option: the option that sets `path`.
 
     Raises:
         ValueError: naming the file, and the option to change.
@@ -193,16 +192,16 @@ def check_no_input(
         if given and os.path.exists(given) and os.path.exists(path):
             if os.path.samefile(given, path):
                 raise ValueError(
-                    f"{option}: {os.fspath(path)} is read, too, and would be written over; give "
+                    f"{option}: {os.fspath(path)} is also an input and would be overwritten; give "
                     f"another {option}"
                 )
 
 
 def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
-    """Remove what killed processes left half-written in a folder and below, and return it.
+    """Remove the temporary folders of killed processes in a folder and below, and return them.
 
-    What a process that lives is writing stays, and a whole folder that a kill between the two
-    renames of `replacing_folder` left aside is put in place. Only for who alone writes there.
+    Those of running processes are kept, and replacements killed between their two renames are
+    completed. Call it only where no other process writes.
     """
     swept = []
     start = os.fspath(folder)
@@ -212,7 +211,7 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
             names.remove(name)
             match = PART_NAME.fullmatch(name)
             if match and not _is_being_written(name):
-                for whole in os.listdir(Path(place, name)):  # of a long name the start stands there
+                for whole in os.listdir(Path(place, name)):  # `name` may have a shortened name
                     recover_folder(Path(place, whole))
                 shutil.rmtree(Path(place, name), ignore_errors=True)
                 swept.append(Path(place, name))
@@ -222,17 +221,17 @@ def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def _prefix(final: Path) -> str:
-    # Who writes it stands in the name, so that another process can tell whether it still does.
+    # With the process number, so that others can check whether the writer is still running.
     return f".{_stem(final)}-{os.getpid()}-"
 
 
 def _stem(final: Path) -> str:
-    """Return the start of a name that leaves room for what is added to it beside the file."""
+    """Return the start of a name, short enough for the additions of the temporary name."""
     return os.fsencode(final.name)[:LONGEST_STEM].decode(errors="ignore")
 
 
 def _is_being_written(part: str) -> bool:
-    """Return whether the process that made a part, by its name, may still be writing it."""
+    """Return whether the writer of a temporary folder may still be running, by its name."""
     match = PART_NAME.fullmatch(part)
     return bool(match and match[2] and _is_alive(int(match[2])))
 
@@ -257,14 +256,14 @@ def _sync(path: Path) -> None:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` to `path` as UTF-8, whole or not at all."""
+    """Write `text` to `path` as UTF-8, completely or not at all."""
     with replacing_file(path) as temporary:
-        # A name that is not UTF-8, as a folder's above may be, is written as an escape.
+        # Characters that are not UTF-8, as in some folders' names, are written as escapes.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write `value` to `path` as indented JSON (see `to_json`), whole or not at all."""
+    """Write `value` to `path` as indented JSON (see `to_json`), completely or not at all."""
     write_text(path, to_json(value, indent=2) + "\n")
 
 
@@ -278,7 +277,7 @@ def to_json(value: Any, indent: int | None = None) -> str:
 
 
 def digest_of(value: Any) -> str:
-    """Return the SHA-256, 64 hex digits, of `value`, which JSON must be able to hold."""
+    """Return the SHA-256 of the JSON text of `value`, 64 hex digits."""
     return hashlib.sha256(to_json(value).encode()).hexdigest()
 
 

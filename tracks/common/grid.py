@@ -1,4 +1,4 @@
-"""A table as a value, and what it looks like in Markdown, in a terminal and in HTML."""
+"""Tables of text, and their output as Markdown, HTML and in a terminal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Cell(NamedTuple):
 
     text: str
     tone: str = ""
-    """good, bad, or nothing: whether the number speaks for or against what is judged."""
+    """`good` or `bad` colours the cell; empty for neither."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Grid:
     """A table."""
 
     title: str
-    """Above it."""
+    """Text above the table."""
     headers: Sequence[str]
-    """One a column."""
+    """One for each column."""
     rows: Sequence[Sequence[Cell]]
-    """Cells, as many as headers in each."""
+    """Each with as many cells as there are headers."""
     strong_last: bool = False
-    """Whether the last row sums up the others."""
+    """Whether the last row is a sum, printed in bold."""
     note: str = ""
-    """Below it."""
+    """Text below the table."""
 
 
 def table(
@@ -58,7 +58,7 @@ def markdown(grid: Grid) -> str:
 
 
 def markdown_cell(text: str) -> str:
-    """Return a text that may hold names from elsewhere: no control characters, no HTML."""
+    """Return a text from an untrusted source without control characters and HTML."""
     return _TAG.sub("&lt;", printable(text, keep="")).replace("|", "\\|")
 
 
@@ -88,7 +88,7 @@ def rich_table(grid: Grid) -> Table:
 
 
 def html_table(grid: Grid) -> str:
-    """Return a table as HTML; its rows of class sum and cells of a tone are for a style sheet."""
+    """Return a table as HTML; classes for the style sheet are `sum`, `good` and `bad`."""
     head = "".join(f'<th scope="col">{escape(header)}</th>' for header in grid.headers)
     rows = []
     for number, row in enumerate(grid.rows):

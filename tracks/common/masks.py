@@ -1,7 +1,7 @@
-"""Rows of nested arrays chosen by a mask, and laid out; what a mask makes needless is left out.
+"""Select rows of nested arrays by a mask, for numpy and JAX.
 
-It is left out of numpy's steps, and of no program that JAX compiles:
-A traced mask holds nothing yet, and a compiled program is the same whatever it holds.
+With numpy, work is skipped where a mask is true or false everywhere. JAX traces masks without
+values, so a compiled program always does all the work.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from tracks.geometry.scene import Array
 
 
 def everywhere(mask: Array) -> bool:
-    """Return whether a numpy `mask` is known to hold in all rows; False of one of JAX."""
+    """Return whether a numpy `mask` is true in all rows; always False for JAX."""
     return isinstance(mask, np.ndarray) and bool(mask.all())
 
 
 def nowhere(mask: Array) -> bool:
-    """Return whether a numpy `mask` is known to hold in no row; False of one of JAX."""
+    """Return whether a numpy `mask` is false in all rows; always False for JAX."""
     return isinstance(mask, np.ndarray) and not mask.any()
 
 
 def select(mask: Array, new: Any, old: Any) -> Any:
     """Return `new` in the rows where `mask` (N,) and `old` elsewhere.
 
-    Both are arrays (N, ...), or alike nested tuples and dicts of such; None stays None.
+    Both are arrays (N, ...), or equally nested tuples and dicts of arrays; None is kept.
     """
     if everywhere(mask):
         return new
@@ -47,17 +47,17 @@ def _selected(mask: Array, new: Any, old: Any) -> Any:
 
 
 def packed(tree: Any) -> Any:
-    """Return nested tuples and dicts of numpy arrays with every array laid out row by row.
+    """Return nested tuples and dicts of numpy arrays with all arrays C-contiguous.
 
-    numpy adds up in an order that depends on how an array lies in memory, and a concatenation
-    lies as its parts do; without this a row's last bit could depend on the rows beside it.
-    Arrays of JAX have one layout and are passed on.
+    numpy's order of summation depends on the memory layout, and a concatenation inherits its parts'
+    layout. Without this, a row's last bit could depend on the other rows. JAX arrays have one
+    layout and are returned unchanged.
     """
     return _mapped(lambda x: np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x, tree)
 
 
 def take(tree: Any, rows: Any) -> Any:
-    """Return an array, or nested tuples and dicts of such, indexed with `rows`."""
+    """Return an array, or nested tuples and dicts of arrays, indexed with `rows`."""
     return _mapped(lambda x: x[rows], tree)
 
 

@@ -1,6 +1,6 @@
-"""Tables of names that other packages may add to, and the error for a name that is in none.
+"""Registries of named objects, which other packages can extend, and errors for unknown names.
 
-Effects, track families, log formats and worlds are such tables.
+There are registries of effects, sensors, track families, log formats and simulators.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from typing import Any, TypeVar
 from unicodedata import category
 
 LONGEST = 80
-"""Characters of a name that are looked at, and shown; a file's key may be of megabytes."""
+"""Most characters of a name that are compared and printed; a file's key may have megabytes."""
 
 
 def closest(name: str, allowed: Iterable[str]) -> str | None:
-    """Return the entry of `allowed` that `name` was probably meant to be, or None."""
+    """Return the entry of `allowed` closest to `name`, or None."""
     lowered = {entry.lower(): entry for entry in allowed}
     match = difflib.get_close_matches(name[:LONGEST].lower(), lowered, n=1, cutoff=0.6)
     return lowered[match[0]] if match else None
 
 
 def printable(text: str, keep: str = "\n\t") -> str:
-    """Return a text from elsewhere as it may be printed: control characters as escapes.
+    """Return a text from an untrusted source for printing, with control characters as escapes.
 
-    A name or a path may hold what a terminal takes for an order, such as to change its title or to
-    type; also what turns the direction of writing, and half characters.
+    Control characters could change a terminal's title or type text. Characters that reverse the
+    writing direction and lone surrogates are escaped too.
     """
     if text.isprintable():
         return text
@@ -40,9 +40,9 @@ def printable(text: str, keep: str = "\n\t") -> str:
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
-    """Return (not raise) the error for `name` where only `allowed` names of `kind` exist.
+    """Return (not raise) the error for an unknown `name` of `kind`.
 
-    The message gives the name, the nearest one or those that hold it, and the whole list.
+    The message has the name, the closest one or those that contain it, and all allowed names.
     """
     allowed = list(allowed)
     near = [guess] if (guess := closest(name, allowed)) else _holding(name, allowed)
@@ -51,7 +51,7 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
 
 
 def _holding(name: str, allowed: list[str]) -> list[str]:
-    """Return those of `allowed` that hold `name` as a part, where they are few."""
+    """Return the entries of `allowed` that contain `name`, if they are few."""
     found = [entry for entry in allowed if len(name) > 2 and name.lower() in entry.lower()]
     return found if len(found) < 5 else []
 
@@ -59,15 +59,15 @@ def _holding(name: str, allowed: list[str]) -> list[str]:
 T = TypeVar("T")
 
 PREFIX = "diffracing_suite."
-"""Of the entry points' groups of all tables."""
+"""Prefix of the entry point groups of all registries."""
 
 
 class Registry(Mapping[str, T]):
-    """What stands under each name: our own first, then what was added.
+    """A mapping from names to objects: the suite's own first, then added ones.
 
-    A package adds to it with an entry point of the table's group; a program, for its own process,
-    with `register`. Modules are imported, and installed packages asked, when a name is looked up
-    that is not there yet or when all are listed, not before.
+    A package adds entries with an entry point of the registry's group. A program adds them for its
+    own process with `register`. Modules and entry points are loaded only when a name is looked up
+    or all names are listed.
     """
 
     def __init__(
@@ -77,14 +77,14 @@ class Registry(Mapping[str, T]):
         own: Mapping[str, Any],
         check: Callable[[str, Any], str | None] = lambda name, value: None,
     ) -> None:
-        """Prepare the table.
+        """Make the registry.
 
         Args:
-            kind: what an entry is, for people.
-            group: of the entry points, such as `diffracing_suite.effects`.
-            own: our entries in their order: a value, or where it is as `module` or
-                `module:attribute` in a string.
-            check: (name, value) -> what is wrong with an added one, None where nothing is.
+            kind: name of the kind of entry, for messages.
+            group: entry point group, such as `diffracing_suite.effects`.
+            own: the suite's entries in order: a value, or its place as `module` or
+                `module:attribute`.
+            check: (name, value) -> the fault of an added entry, None for none.
         """
         self._kind, self._group, self._check = kind, group, check
         self._entries: dict[str, Any] = {
@@ -98,18 +98,18 @@ class Registry(Mapping[str, T]):
         """Add `value` under `name`, for this process.
 
         Raises:
-            ValueError: for a name that is taken, or a value that is no such thing.
+            ValueError: for a name that exists, or a value of the wrong kind.
         """
         if name in self:
-            raise ValueError(f"{self._kind} {name!r} is there already; register another name")
+            raise ValueError(f"{self._kind} {name!r} exists already; register another name")
         self._values[name] = self._checked(name, value, "register")
         self._entries[name] = value
 
     def find(self, name: str) -> T:
-        """Return what stands under `name`.
+        """Return the entry `name`.
 
         Raises:
-            ValueError: for an unknown name, with the nearest one.
+            ValueError: for an unknown name, with the closest one.
         """
         if name not in self:
             raise unknown_name(self._kind, str(name), self)
@@ -139,7 +139,7 @@ class Registry(Mapping[str, T]):
                     raise
                 raise ValueError(
                     f"{self._kind} {name!r} of {_origin(entry)} cannot be loaded "
-                    f"({type(error).__name__}: {error}); mend the package or uninstall it"
+                    f"({type(error).__name__}: {error}); repair the package or uninstall it"
                 ) from error
             if entry.dist is not None:
                 self._checked(name, value, _origin(entry))
@@ -169,7 +169,7 @@ class Registry(Mapping[str, T]):
 
 
 def added_entries() -> list[EntryPoint]:
-    """Return what installed packages add to any of our tables, in one order."""
+    """Return the entry points of installed packages for all registries, sorted."""
     groups = sorted(group for group in _installed().groups if group.startswith(PREFIX))
     return [
         entry

@@ -1,4 +1,4 @@
-"""Where a file came from: the suite's version, and the four keys that every file we write carries.
+"""Provenance of files: the suite's version, and four keys in every file that the suite writes.
 
 The build reads the version here.
 """
@@ -16,12 +16,12 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 @functools.cache
 def git_commit() -> str | None:
-    """Return the commit this code comes from, and what became of it since.
+    """Return the commit of this code, and a digest of later changes.
 
     Where tracked files differ from the commit, "-dirty-" and 8 digits of their differences follow,
-    so that two states of the code never share a name. A checkout is asked through git; a wheel
-    carries the commit it was built from. None where neither knows (a copy without history). A
-    repository that merely surrounds the installed package is not asked.
+    so that two states of the code never share a name. In a checkout git reports the commit; a wheel
+    contains the commit of its build. None where neither exists (a copy without history). A
+    repository that merely contains the installed package is ignored.
     """
     baked = Path(__file__).with_name("built_from.txt")
     if baked.is_file():

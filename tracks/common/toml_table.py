@@ -1,6 +1,6 @@
-"""Tables of a person's file, read key by key or as a typed dataclass; and TOML as text.
+"""Read TOML tables key by key or as a typed dataclass, and write tables as TOML.
 
-What is wrong is refused by file and key, with the value, what is allowed and the nearest name.
+An error names the file, the key, its value, what is allowed and the closest name.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tracks.input.ranges import is_number, shown
 T = TypeVar("T")
 
 REQUIRED: Any = object()
-"""In place of a default: the key must be there."""
+"""Default of a key that must be present."""
 
 
 def read_toml(path: Path) -> Table:
     """Return the whole file as a table.
 
     Raises:
-        ValueError: where there is no such file or it is no TOML, naming the file.
+        ValueError: where the file does not exist or is not TOML, naming the file.
     """
     try:
         return Table(str(path), "", reading.read_toml(path))
@@ -39,7 +39,7 @@ def read_toml(path: Path) -> Table:
 
 
 def shipped_names(folder: Path) -> list[str]:
-    """Return the names of the TOML files in a folder of what comes with the suite."""
+    """Return the names of the shipped TOML files in a folder."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
@@ -50,14 +50,14 @@ def load_shipped(
     parse: Callable[[dict[str, Any]], T],
     refused: type[ValueError],
 ) -> T:
-    """Return what a TOML file describes, or one that comes with the suite by its name.
+    """Return the object described by a TOML file, given by its path or a shipped name.
 
     Args:
         source: a path (it ends in .toml, has a folder or exists) or a shipped name.
-        folder: of the shipped files.
-        kind: what a message calls one.
-        parse: makes it of the file's table; a ValueError says what is wrong.
-        refused: the error for what the file says or lacks.
+        folder: with the shipped files.
+        kind: name of the kind of file, for messages.
+        parse: makes the object from the file's table; raises a ValueError for a fault.
+        refused: class of the error for a faulty file.
 
     Raises:
         refused: naming the file.
@@ -84,10 +84,10 @@ def load_shipped(
 
 
 class Table:
-    """One table of a file; every key that is asked for counts as known."""
+    """One table of a file; every key that is read counts as known."""
 
     def __init__(self, source: str, place: str, values: Mapping[str, Any]) -> None:
-        """Prepare to read `values`; messages begin with `source`, unless it is empty."""
+        """Make a reader of `values`; messages begin with `source`, unless it is empty."""
         self._source, self._place, self.values = source, place, values
         self._known: list[str] = []
 
@@ -101,12 +101,12 @@ class Table:
         return self._refused(f"{self._at(key)} is {shown(value)}, allowed is {allowed}")
 
     def read(self, cls: type[T], also: Iterable[str] = (), **held: Any) -> T:
-        """Return a dataclass from this table's keys; fields that are left out take their defaults.
+        """Return a dataclass from this table's keys; missing fields take their defaults.
 
         Args:
             cls: its fields are numbers, texts, truth values, tuples of these, or dataclasses.
-            also: further keys that the table may have.
-            held: fields that the table does not say.
+            also: further allowed keys.
+            held: values of fields that are not in the table.
         """
         named = {field.name: field for field in dataclasses.fields(cls) if field.name not in held}  # pyright: ignore[reportArgumentType]
         self.expect([*named, *also])
@@ -118,12 +118,12 @@ class Table:
         return cls(**held)
 
     def value(self, key: str, kind: Any, default: Any = REQUIRED) -> Any:
-        """Return what stands under `key` as `kind`, a type that a field of `read` may have."""
+        """Return the value of `key` as `kind`, one of the field types of `read`."""
         found = self._get(key, default, _words(kind))
         return found if key not in self.values else self._typed(key, found, kind)
 
     def choice(self, key: str, allowed: Iterable[str]) -> str:
-        """Return one of the texts `allowed`; the first where the key is not there."""
+        """Return one of the texts `allowed`; the first where the key is absent."""
         allowed = list(allowed)
         value = self._get(key, allowed[0], "a text")
         if not isinstance(value, str) or value not in allowed:
@@ -146,7 +146,7 @@ class Table:
             if not isinstance(value, list | tuple) or len(value) != len(parts):
                 raise self.error(key, value, _words(kind))
             both = enumerate(zip(value, parts, strict=True))
-            # A list in a list has a place of its own in the message.
+            # A nested list is named with its index in the message.
             inner = get_origin(parts[0]) is tuple
             return tuple(self._typed(f"{key}[{i}]" if inner else key, v, k) for i, (v, k) in both)
         plain: Any = kind
@@ -156,7 +156,7 @@ class Table:
         return plain(value)
 
     def has(self, key: str) -> bool:
-        """Return whether the key is there; asking makes it known."""
+        """Return whether the key is present; it then counts as known."""
         if key not in self._known:
             self._known.append(key)
         return key in self.values
@@ -246,11 +246,11 @@ class Table:
         return [Table(self._source, f"{key}[{i}]", entry) for i, entry in enumerate(value)]
 
     def close(self) -> None:
-        """Refuse every key that nothing asked for."""
+        """Refuse every key that was not read."""
         self.expect(self._known)
 
     def expect(self, allowed: Iterable[str]) -> None:
-        """Refuse every key that is not `allowed`."""
+        """Refuse every key outside `allowed`."""
         allowed = list(allowed)
         for key in self.values:
             if key not in allowed:
@@ -277,7 +277,7 @@ class Table:
 
 
 def _words(kind: Any) -> str:
-    """Return what values of `kind` are called."""
+    """Return a description of the values of `kind`."""
     if get_origin(kind) is not tuple:
         names = {bool: "true or false", int: "a whole number", float: "a finite number"}
         return names.get(kind, "a text that is not empty" if kind is str else "a table")
@@ -293,7 +293,7 @@ def _limits(above: float, least: float, most: float) -> str:
 
 
 def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
-    """Return `table` as TOML that reads back equal; its own keys come before its subtables."""
+    """Return `table` as TOML that reads back equal; plain keys come before subtables."""
     lines = [
         f"{key} = {_value(entry)}\n"
         for key, entry in table.items()
@@ -311,7 +311,7 @@ def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
 
 
 def _is_array(entry: Any) -> bool:
-    """Say whether this is an array of tables."""
+    """Return whether this is an array of tables."""
     return isinstance(entry, list) and bool(entry) and all(isinstance(o, Mapping) for o in entry)
 
 
@@ -321,9 +321,9 @@ def _value(value: Any) -> str:
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        return repr(float(value))  # numpy's own floats say their type besides
+        return repr(float(value))  # the repr of numpy's floats contains their type
     if isinstance(value, str):
-        # TOML's basic strings take JSON's escapes, except that DEL must be escaped as well.
+        # TOML's basic strings use JSON's escapes, and DEL must be escaped as well.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"

@@ -1,4 +1,4 @@
-"""Track families by name. A new one is a file with `make(d, rng) -> Layout` and an entry here.
+"""Track families by name; each is a file with `make(d, rng) -> Layout` and an entry here.
 
 Another package adds one with an entry point of the group `diffracing_suite.tracks`, a program for
 its own process with `FAMILIES.register(name, make)`.
@@ -42,7 +42,7 @@ most 3 plates, 3 small solids, 1 pillar and 4 ground objects, whose kinds are de
 
 
 def make_track(family: str, level: int, seed: int) -> Track:
-    """Return the track that (family, level, seed) alone determine.
+    """Return the track of (family, level, seed), which determine it completely.
 
     Args:
         family: a name in `FAMILIES`.
@@ -51,7 +51,7 @@ def make_track(family: str, level: int, seed: int) -> Track:
 
     Raises:
         ValueError: where the family is unknown, the level out of range or the seed negative, or
-            where the family makes more than fits the worlds' scenes.
+            where the track has more solids than the simulators' scenes hold.
     """
     check_family(family)
     if level not in LEVELS:
@@ -73,8 +73,8 @@ def random_track(
 
     Args:
         difficulty: d in [0, 1].
-        rng: source of randomness, advanced by the call.
-        mix: how many tracks have sharp turns and how many obstacles.
+        rng: source of randomness.
+        mix: shares of tracks with sharp turns and with obstacles.
 
     Raises:
         ValueError: where the difficulty is outside [0, 1].
@@ -86,7 +86,7 @@ def random_track(
 
 
 def check_family(family: str) -> None:
-    """Raise a ValueError that names the nearest family where `family` is unknown."""
+    """Raise a ValueError with the closest name where `family` is unknown."""
     FAMILIES.find(family)
 
 

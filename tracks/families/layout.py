@@ -1,4 +1,4 @@
-"""What the families share: difficulty, gate sizes, starts and putting a track together."""
+"""Shared functions of the track families: difficulty, gate sizes, starts, assembly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_YAW_NOISE = np.deg2rad(30.0)
 
 
 class Layout(NamedTuple):
-    """What a family makes: a track without its provenance."""
+    """The result of a family: a track without its origin."""
 
     scene: Scene
     start_pos_w: np.ndarray
@@ -31,7 +31,7 @@ class Layout(NamedTuple):
 
 
 def ramp(easy: float, hard: float, d: float) -> float:
-    """Return the value on the way from `easy` (d = 0) to `hard` (d = 1)."""
+    """Return the linear interpolation from `easy` (d = 0) to `hard` (d = 1)."""
     return easy + (hard - easy) * d
 
 
@@ -61,14 +61,14 @@ def noisy_gates(
 
 
 def flight_order(gates: Gates, first: int) -> Gates:
-    """Return the gates of a closed track so that gate `first` becomes gate 0."""
+    """Return the gates of a closed track, rotated so that gate `first` becomes gate 0."""
     return Gates(*(np.roll(field, -first, axis=0) for field in gates))
 
 
 def pick_stretch(rng: np.random.Generator, center_w: np.ndarray, min_length_m: float) -> int:
-    """Return a random gate whose stretch before it is long enough for a start.
+    """Return a random gate with a long enough stretch before it for a start.
 
-    The longest stretch is taken where none is.
+    If there is none, return the gate with the longest stretch.
     """
     length = np.linalg.norm(center_w - np.roll(center_w, 1, axis=0), axis=-1)
     fits = np.flatnonzero(length >= min_length_m)
@@ -83,8 +83,8 @@ def counts_per_stretch(
     Args:
         rng: source of randomness.
         d: difficulty in [0, 1).
-        stretches: how many stretches hold obstacles.
-        scale: multiplies the counts before they are cut to integers (radius / 8 on the circle).
+        stretches: number of stretches with obstacles.
+        scale: factor on the counts before truncation (radius / 8 on the circle).
     """
 
     def same(easy: float, hard: float) -> np.ndarray:
@@ -95,7 +95,7 @@ def counts_per_stretch(
 
 
 def build(gates: Gates, start_pos_w: np.ndarray, obstacles: Obstacles) -> Layout:
-    """Put gates, start and obstacles together; the start faces gate 0."""
+    """Return the layout of gates, start and obstacles; the start faces gate 0."""
     frames = frame_boxes(gates)
     boxes = Boxes(*(np.concatenate(pair) for pair in zip(frames, obstacles.boxes, strict=True)))
     scene = Scene(
@@ -121,6 +121,6 @@ def furnish(
     per_stretch: PerStretch,
     site: Site,
 ) -> Layout:
-    """Scatter obstacles, clear of gates and start, and put the layout together."""
+    """Place obstacles clear of gates and start, and return the layout."""
     obstacles = scatter(rng, per_stretch, site, keep_clear(gates, start_pos_w))
     return build(gates, start_pos_w, obstacles)

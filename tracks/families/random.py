@@ -1,8 +1,8 @@
-"""Random: the training distribution, which covers the three judged families and is none of them.
+"""Random: the training distribution, which covers the three judged families.
 
-A track is a walk of 8 gates. Its drift (a bend of either sign or none, with up to two sharp
-turns) gives circles, U-turns and lines; stray headings and spacings around the drift give
-zigzags. Every parameter is drawn a track, obstacles of each kind have their own density.
+A track is a random walk of 8 gates. Its mean turn (a bend of either sign or none, with up to two
+sharp turns) produces circles, U-turns and lines; random deviations of heading and spacing produce
+zigzags. Every parameter is drawn for each track; each kind of obstacle has its own density.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from tracks.geometry.scene import Gates
 
 MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
 PASSING_M = 1.6
-"""Least level distance of a straight stretch from the centre of a gate that it does not join."""
+"""Least horizontal distance of a stretch from the centre of a gate that it does not join."""
 MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
-"""The same on tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
+"""The same for tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8
 _DRAWS = 12
 
 BESIDE_M = (2.0, 4.0)
-"""Range of how far beside the straight lines between gates a track's obstacles stand at most; near
-lines more of them stand in the way [m]."""
+"""Range of the largest distance of a track's obstacles from the lines between gates; smaller values
+put more of them in the way [m]."""
 
 
 class Walks(NamedTuple):
@@ -45,7 +45,7 @@ class Walks(NamedTuple):
 
 
 class Mix(NamedTuple):
-    """What share of tracks is hard, besides their difficulty."""
+    """Shares of hard tracks, in addition to the difficulty."""
 
     sharp_share: float = 0.55
     """Probability that a track has one or two sharp turns."""
@@ -56,7 +56,7 @@ class Mix(NamedTuple):
     hairpin_share: float = 0.0
     """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
     height_spread: float = 1.0
-    """How far the gates' heights lie apart, as a share of what is usual."""
+    """Spread of the gates' heights, relative to the usual one."""
 
 
 MIX = Mix()
@@ -91,7 +91,7 @@ def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> Pe
     numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (level > 0)
     for row, most in zip(numbers, MAX_TOTALS, strict=True):
         if row.sum() > most:
-            # Any of them go, not those at the end: there a policy would learn to meet fewer.
+            # Removed at random: otherwise the last stretches would always have fewer obstacles.
             row[:] = rng.multivariate_hypergeometric(row, int(most))
     return PerStretch(*numbers)
 
@@ -99,8 +99,8 @@ def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> Pe
 def _walk(
     d: float, rng: np.random.Generator, mix: Mix
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first walk that is free."""
-    # No draw where there is nothing to decide, so that seeds without hairpins keep their tracks.
+    """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first free walk."""
+    # No draw without hairpins, so that such mixes keep their tracks for each seed.
     hairpins = mix.hairpin_share > 0 and rng.random() < mix.hairpin_share
     for _ in range(_DRAWS):
         turn = _drift_turns(d, rng, mix.sharp_share)
@@ -113,7 +113,7 @@ def _walk(
 
 
 def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.ndarray:
-    """Return how far the drift turns at each gate, (G,) [rad]."""
+    """Return the mean turn at each gate, (G,) [rad]."""
     sign = rng.choice([-1.0, 1.0])
     bend = np.deg2rad(rng.uniform(0, 52)) if rng.random() < 0.6 else 0.0
     turn = sign * bend + rng.normal(size=GATE_COUNT) * np.deg2rad(rng.uniform(0, 12))
@@ -125,7 +125,7 @@ def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.n
 
 
 def _with_hairpins(turn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the turns (G,) with one or two of them so sharp that the track comes back [rad]."""
+    """Return the turns (G,) with one or two hairpins [rad]."""
     turn = 0.3 * turn
     first = rng.integers(0, GATE_COUNT - 1)
     second = first + rng.integers(3, 5)
@@ -149,7 +149,7 @@ def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
 
 
 def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
-    """Return which walks keep clear of their own gates and meet each gate from its side, (W,)."""
+    """Return which walks avoid their own gates and approach each gate from its front, (W,)."""
     point = np.concatenate([walks.start[:, None], walks.center], axis=1)
     way = np.diff(point, axis=1)
     normal = np.stack([np.cos(walks.yaw), np.sin(walks.yaw)], axis=-1)
@@ -166,7 +166,7 @@ def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
 
 
 def is_free(gates: Gates, start_pos_w: np.ndarray) -> bool:
-    """Return whether straight flight from gate to gate keeps clear of the other gates' frames."""
+    """Return whether straight flight from gate to gate avoids the other gates' frames."""
     normal = gates.rot_w[:, :2, 0]
     yaw = np.arctan2(normal[:, 1], normal[:, 0])
     return bool(_is_free(Walks(gates.center_w[None, :, :2], yaw[None], start_pos_w[None, :2]))[0])

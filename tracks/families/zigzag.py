@@ -1,4 +1,4 @@
-"""Zigzag: a 35 m line of 8 gates, 5 m apart, that strays more and more (Yu et al. 2025)."""
+"""Zigzag: a 35 m line of 8 gates, 5 m apart, with growing deviations (Yu et al. 2025)."""
 
 from __future__ import annotations
 

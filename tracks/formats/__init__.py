@@ -1,1 +1,1 @@
-"""A scene in other forms: track files, meshes, MuJoCo."""
+"""Scenes in other formats: track files, meshes, MuJoCo."""

@@ -1,7 +1,7 @@
-"""Convex closed parts of a mesh file: what MuJoCo collides and the depth image shows alike.
+"""Convex closed parts of a mesh file, for MuJoCo's collisions and for depth images.
 
-Run by `mesh_reader.py` in a process of its own: trimesh follows what a file refers to and takes the
-memory that it asks for. Materials are left out; the buffers of a glTF are read as plain files.
+`mesh_reader.py` runs this in a separate process, because trimesh loads files to which a mesh refers
+and may use any amount of memory. Materials are skipped; a glTF's buffers are read as plain files.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     import trimesh
 
 _VOLUME_TOLERANCE = 1e-3
-"""A part may miss this share of its convex hull's volume (rounding of stored corners)."""
+"""Largest share of the convex hull's volume that a part may lack (rounding of stored corners)."""
 
 _FLAT = 1e-9
-"""Volume over that of a cube of the largest extent at which a part counts as flat."""
+"""A part whose volume over its cubed largest extent is below this counts as flat."""
 
 _SLIVER = 1e-12
-"""A triangle's area over that of a square of its part's largest extent at which it is none."""
+"""A triangle whose area over its part's squared largest extent is below this is dropped."""
 
 
 class _Resolver:
-    """The files beside a mesh, for its loader: buffers of a glTF, with the limits of the mesh."""
+    """Loader of the files to which a mesh refers (a glTF's buffers), within its size limit."""
 
     def __init__(self, folder: Path, left: int) -> None:
         self._folder, self._left = folder.resolve(), left
@@ -47,12 +47,12 @@ class _Resolver:
 def convex_parts(path: Path) -> list[np.ndarray]:
     """Return the connected parts of a mesh file, each as triangles (M, 3, 3) in file units.
 
-    Objects of an OBJ file or a scene are looked at one by one, so that they may touch. Triangles
-    without an area are left out: they have no side, and a distance to them means nothing.
+    Objects of an OBJ file or a scene are treated one by one, so they may touch. Triangles
+    without an area are left out, since they have no normal.
 
     Raises:
         ValueError: where the file cannot be read, or a part is open or not convex, naming both.
-        MemoryError: where it takes more than this process may have.
+        MemoryError: where it needs more memory than this process may use.
     """
     import trimesh
 
@@ -71,7 +71,7 @@ def convex_parts(path: Path) -> list[np.ndarray]:
         raise ValueError(f"{path}: cannot be read as a mesh ({reason(error)})") from None
     except MemoryError:
         raise
-    except Exception as error:  # the loaders raise whatever they like on a damaged file
+    except Exception as error:  # the loaders may raise anything for a damaged file
         reason_text = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError(f"{path}: cannot be read as a mesh ({reason_text})") from None
     meshes = [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
@@ -92,7 +92,7 @@ def _with_area(part: trimesh.Trimesh) -> np.ndarray:
 
 
 def thickness(triangles: np.ndarray) -> float:
-    """Return how far triangles (M, 3, 3) reach along the axis that they spread least along."""
+    """Return the least extent of triangles (M, 3, 3) along their principal axes."""
     corners = triangles.reshape(-1, 3) - triangles.mean(axis=(0, 1))
     axes = np.linalg.eigh(corners.T @ corners)[1]
     return float(np.ptp(corners @ axes, axis=0).min())

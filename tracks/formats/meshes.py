@@ -1,4 +1,4 @@
-"""A track's solids as triangle meshes, to look at or to check geometry against."""
+"""A track's solids as triangle meshes, for pictures and for checks of the geometry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
     """Return (name, mesh) of every solid in the order of `Track.names`, in the world frame.
 
     Parked bars (of openings with fewer corners than the track's most) are left out; the ground,
-    the plane z = 0, is no mesh. Round solids are polyhedra inscribed in them.
+    the plane z = 0, has no mesh. Round solids are approximated by inscribed polyhedra.
     """
     scene = track.scene
     first = np.cumsum((0, *track.mesh_sizes))
@@ -37,7 +37,7 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def named_meshes(track: Track) -> dict[str, trimesh.Trimesh]:
-    """Return one mesh a name in the world frame: the bars of a gate's frame are one mesh."""
+    """Return one mesh for each name in the world frame; the bars of a gate's frame are one."""
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for name, mesh in solid_meshes(track):
         parts.setdefault(name, []).append(mesh)
@@ -72,7 +72,7 @@ def _cylinder(radius: float, half_length: float) -> trimesh.Trimesh:
 
 def _capsule(radius: float, half_length: float) -> trimesh.Trimesh:
     mesh = trimesh.creation.capsule(radius=radius, height=2 * half_length, count=[_SECTIONS] * 2)
-    # Centred whatever the library's own origin is.
+    # Centred, independent of the library's origin.
     return mesh.apply_translation(-mesh.bounds.mean(axis=0))
 
 

@@ -17,7 +17,7 @@ from tracks.geometry.scene import Counts, Scene, pad
 GROUND = "ground"
 PARKED = "parked"
 MESH_GROUP = 1
-"""Geom group of meshes, for rays that shall meet nothing else."""
+"""Geom group of meshes, for rays that should hit meshes only."""
 _BAR = "/"
 
 
@@ -41,7 +41,7 @@ def add_scene(
     `mujoco.batch.Batch.set_models` asks for).
 
     Args:
-        spec: to be added to.
+        spec: is changed in place.
         scene: not batched.
         names: as `Track.names`; solids are named by kind and number where it is empty.
         mesh_sizes: as `Track.mesh_sizes`.
@@ -91,7 +91,7 @@ def add_scene(
 
 
 class _Names:
-    """Deals out unique geom names, solid by solid."""
+    """Returns unique geom names, solid by solid."""
 
     def __init__(self, names: tuple[str, ...], real: list[int]) -> None:
         self._names = names
@@ -133,7 +133,7 @@ def _quats(rot: np.ndarray) -> np.ndarray:
 
 
 def _axis_quats(axis: np.ndarray) -> np.ndarray:
-    """Return quaternions (N, 4) wxyz that turn z into the given unit axes (N, 3)."""
+    """Return quaternions (N, 4) wxyz that rotate z to the given unit axes (N, 3)."""
     x, y, z = np.asarray(axis, float).T
     quat = np.stack([1 + z, -y, x, 0 * z], axis=-1)
     quat[z < -1 + 1e-12] = [0.0, 1.0, 0.0, 0.0]

@@ -20,13 +20,13 @@ class Camera:
     fov_deg: Annotated[tuple[float, float], Range(1.0, 179.0)] = (78.4, 63.8)
     """Horizontal and vertical field of view, edge to edge [deg]."""
     range_m: Annotated[float, Range(0.1, 1000.0)] = 10.0
-    """Depths beyond this read as this [m]."""
+    """Larger depths are set to this [m]."""
     width: Annotated[int, Range(1, 1024)] = 32
     """Pixels across."""
     height: Annotated[int, Range(1, 1024)] = 24
     """Pixels down."""
     rays: Annotated[int, Range(1, 8)] = 1
-    """Rays across and down a pixel, which reads as the nearest: fewer thin things slip through."""
+    """Rays across and down a pixel, whose value is the nearest; more rays find thinner objects."""
 
 
 def pixel_rays_b(camera: Camera) -> np.ndarray:
@@ -47,7 +47,7 @@ def pixel_rays_b(camera: Camera) -> np.ndarray:
 
 
 def cast_rays_b(camera: Camera) -> np.ndarray:
-    """Return all rays that an image is made of, (rays^2 * height * width, 3), for `nearest`.
+    """Return all rays of an image, (rays^2 * height * width, 3), for `nearest`.
 
     Each pixel is split evenly into rays x rays parts, and a ray goes through the centre of each.
     All pixels' first parts come first, so that the nearest is taken over a leading axis.

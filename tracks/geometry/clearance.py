@@ -54,7 +54,7 @@ def _capsule(rods: Rods, point_w: Array) -> tuple[Array, Array]:
 
 
 def to_cylinders(rods: Rods, point_w: Array) -> tuple[Array, Array]:
-    """Return the signed distances to flat-ended rods and the directions away; see `distances`."""
+    """Return signed distances to flat-ended rods and directions away from them (`distances`)."""
     away = point_w[..., None, :] - rods.center_w
     along = (away * rods.axis_w).sum(-1)
     radial = away - along[..., None] * rods.axis_w

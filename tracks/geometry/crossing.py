@@ -1,4 +1,4 @@
-"""When a gate counts as passed: the plane crossed inside the opening, in flight direction."""
+"""Gate crossing: the gate's plane is crossed inside the opening, in flight direction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_inside(opening_g: Array, point_g: Array) -> Array:
 
 
 def sides(opening_g: Array, point_g: Array) -> tuple[Array, Array]:
-    """Return the sides of an opening, and on which side of each a point lies.
+    """Return the sides of an opening, and the signed distance of a point to each.
 
     Args:
         opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
@@ -53,7 +53,7 @@ def crossing(
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
     if nowhere(crosses):
-        return crosses, crosses  # as in most steps of a flight
+        return crosses, crosses  # most steps cross no plane
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)
     point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]

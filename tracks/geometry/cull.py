@@ -1,7 +1,7 @@
-"""The solids of a scene that matter at a place: what cannot be seen or is far is left out.
+"""Select the relevant solids of a scene: the nearest, or the visible ones.
 
-Scenes are batched here, (B, ...), and stay static in shape: the K best solids of each kind are
-gathered, where K is the caller's `Counts`. A kind with no more than K solids is passed on whole.
+Scenes are batched, (B, ...), with static shapes: the K best solids of each kind are gathered, where
+K is the caller's `Counts`. A kind with at most K solids is returned whole.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def visible_solids(
         pos_w: (B, 3) camera positions [m].
         rot_w: (B, 3, 3) body to world.
         rays_b: (R, 3) rays in body axes; the cone around their mean holds them all.
-        range_m: planar depth beyond which nothing is seen [m].
+        range_m: largest planar depth [m].
         limits: how many of each kind to keep.
     """
     unit = rays_b / jnp.linalg.norm(rays_b, axis=-1, keepdims=True)

@@ -1,6 +1,6 @@
 """Planar depth images by analytic ray casting, batched over worlds (JAX).
 
-Every solid is convex or a union of convex parts; a ray's stay inside a convex part is an interval
+Every solid is convex or a union of convex parts. A ray is inside a convex part on an interval
 [enter, leave] of the ray parameter, and intervals of intersected sets are intersected. With rays
 whose component along the optical axis is 1 the parameter is the planar depth.
 """
@@ -25,7 +25,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _entry(enter: Array, leave: Array) -> Array:
-    """Return where an interval is entered: 0 from inside, far where it is empty or behind."""
+    """Return the start of an interval: 0 from inside, far if it is empty or behind the camera."""
     return jnp.where((enter <= leave) & (leave > 0), jnp.maximum(enter, 0.0), _FAR)
 
 
@@ -144,7 +144,7 @@ def depth_image(
         pos_w: (B, 3) camera positions [m].
         rot_w: (B, 3, 3) body to world.
         rays_b: (R, 3) from `camera.pixel_rays_b`.
-        range_m: the largest depth seen [m].
+        range_m: largest depth [m].
         limits: keep only this many solids of each kind, the nearest visible ones; None keeps all,
             which is exact.
     """

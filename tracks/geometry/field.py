@@ -17,7 +17,7 @@ _TINY = 1e-9
 def _norm(vector: Array) -> Array:
     xp = vector.__array_namespace__()
     square = (vector * vector).sum(-1)
-    # At zero the root's slope is infinite, times nothing: no number. At rest it counts as none.
+    # At zero the root's slope is infinite, and its gradient would be NaN.
     some = square > 0.0
     return xp.where(some, xp.sqrt(xp.where(some, square, 1.0)), 0.0)
 
@@ -25,7 +25,7 @@ def _norm(vector: Array) -> Array:
 def magnetic_field(
     center_w: Array, rot_w: Array, opening_g: Array, point_w: Array, current: float = CURRENT
 ) -> Array:
-    """Return the field B (..., 3) at point_w, in the world frame (Eq. mag_segment, mag_total).
+    """Return the field B (..., 3) at point_w in the world frame (Eq. mag_segment, mag_total).
 
     The paper's "shortest vector to the wire segment" is taken as the perpendicular to the line
     through it: only then does the sum satisfy Biot and Savart and have no divergence.
@@ -48,7 +48,7 @@ def magnetic_field(
     unit = edge / xp.maximum(length, _TINY)[..., None]
     ends = start / (_norm(start) + _TINY)[..., None] - end / (_norm(end) + _TINY)[..., None]
     perpendicular = start - (start * unit).sum(-1)[..., None] * unit
-    # On the wire itself the field has no value; a micrometre keeps it finite there.
+    # On the wire itself the field is undefined; a distance of a micrometre keeps it finite.
     square = xp.maximum((perpendicular * perpendicular).sum(-1), 1e-12)
     strength = current * (unit * ends).sum(-1) / square
     field_g = (strength[..., None] * xp.linalg.cross(unit, perpendicular)).sum(-2)

@@ -1,4 +1,4 @@
-"""Gates: openings as convex polygons and their frames as one box a side."""
+"""Gates: openings as convex polygons, and their frames with one box for each side."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def square_gates(
 
 
 def frame_boxes(gates: Gates) -> Boxes:
-    """Return the frames' bars, one box a side of the opening, gate by gate, (G * V) boxes.
+    """Return the frames' bars, one box for each side of an opening, gate by gate, (G * V) boxes.
 
     A bar lies outside its side of the opening and is lengthened so that neighbours close the
     corner between them. Where corners repeat (openings padded to V corners), the bar is parked.
@@ -93,7 +93,7 @@ def frame_boxes(gates: Gates) -> Boxes:
 def _corner_extensions(
     along: np.ndarray, real: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much each bar is lengthened at its end and at its start, (G, V) each.
+    """Return the extensions of each bar at its end and at its start, (G, V) each [m].
 
     `width * tan(turn / 2)` brings the outer edges of neighbours together; sharper corners than a
     right angle are capped at one width, so that no spike sticks out.

@@ -1,7 +1,7 @@
-"""Obstacles scattered off the flight line: plates, small solids, pillars, objects on the ground.
+"""Random obstacles: plates, small solids, pillars and objects on the ground.
 
-Sizes are the baseline's (Yu et al. 2025). The kinds of solids are dealt out evenly over a track
-(a shuffled deck, not independent draws), which bounds how many of a kind a track can hold.
+Sizes are the baseline's (Yu et al. 2025). Kinds of solids are distributed evenly over a track (by
+permutation instead of independent draws), which bounds the number of each kind.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ KIND_NAMES = ("box", "cylinder", "capsule", "sphere")
 GATE_DISTANCE_M = 1.5
 """Least level distance of an obstacle's centre from a gate's centre [m]."""
 CORRIDOR_HALF_LENGTH_M = 1.5
-"""The axis of a gate is kept free this far before and behind it [m]."""
+"""Distance before and behind a gate over which its axis is kept free [m]."""
 CORRIDOR_CLEARANCE_M = 0.4
 """Least level distance between an obstacle and a gate's axis [m]."""
 START_CLEARANCE_M = 0.6
@@ -32,7 +32,7 @@ Site = Callable[[np.random.Generator, np.ndarray], np.ndarray]
 
 
 class PerStretch(NamedTuple):
-    """How many obstacles each stretch holds, (S,) integers each."""
+    """Numbers of obstacles on each stretch, (S,) integers each."""
 
     plates: np.ndarray
     """Square plates in the air at any orientation."""
@@ -45,7 +45,7 @@ class PerStretch(NamedTuple):
 
 
 class KeepClear(NamedTuple):
-    """Level lines that obstacles keep away from, and the gates' centres."""
+    """Horizontal lines that obstacles must avoid, and the gates' centres."""
 
     begin: np.ndarray
     """(K, 2) [m]."""
@@ -69,7 +69,7 @@ class Obstacles(NamedTuple):
 
 
 def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
-    """Return what obstacles must leave free: each gate's axis and the way to the first gate."""
+    """Return the lines to keep free: each gate's axis, and the line from the start to gate 0."""
     center = gates.center_w[:, :2]
     reach = CORRIDOR_HALF_LENGTH_M * gates.rot_w[:, :2, 0]
     clearance = np.full(len(center) + 1, CORRIDOR_CLEARANCE_M)
@@ -97,7 +97,7 @@ def segment_distance(point: np.ndarray, begin: np.ndarray, end: np.ndarray) -> n
 
 
 def straight_sites(gates: Gates, first: np.ndarray, offset_m: float) -> Site:
-    """Return a site that lies up to `offset_m` beside the line from gate `first[s]` to the next.
+    """Return a site within `offset_m` of the line from gate `first[s]` to the next.
 
     Args:
         gates: the gates in flight order; the last is followed by gate 0.
@@ -119,9 +119,9 @@ def straight_sites(gates: Gates, first: np.ndarray, offset_m: float) -> Site:
 def scatter(
     rng: np.random.Generator, per_stretch: PerStretch, site: Site, clear: KeepClear
 ) -> Obstacles:
-    """Return obstacles drawn from `rng`, none of them in a gate's way or the start's.
+    """Return random obstacles that keep the lines of `clear` free.
 
-    An obstacle that finds no free place in 24 tries is left out.
+    An obstacle without a free place after 24 draws is left out.
     """
     numbers = [int(n.sum()) for n in per_stretch]
     plates, small, pillars, ground = numbers
@@ -186,7 +186,7 @@ def _labels(numbers: list[int], kind: np.ndarray) -> list[str]:
 
 
 def _level_radius(kind: np.ndarray, size: np.ndarray, is_pillar: np.ndarray) -> np.ndarray:
-    """Return how far each obstacle can reach from its centre in the level plane, (n,) [m]."""
+    """Return the largest horizontal reach of each obstacle from its centre, (n,) [m]."""
     across = np.where(kind == BOX, np.hypot(size[:, 0], size[:, 1]), size[:, 0])
     bounding = np.hypot(across, size[:, 2])
     bounding = np.where(kind == CAPSULE, size[:, 0] + size[:, 2], bounding)

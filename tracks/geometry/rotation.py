@@ -1,7 +1,7 @@
-"""Rotations: vectors turned, quaternions, matrices and the exponential map (numpy and JAX).
+"""Rotations: vectors, quaternions, matrices and the exponential map (numpy and JAX).
 
-Products are written out and summed over the last axes: a matrix product may round a row differently
-at another batch size, and a trial's outcome must not depend on the trials beside it.
+Products are written out and summed over the last axes. A matrix product may round a row differently
+for another batch size, and a trial's outcome must not depend on other trials.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from tracks.geometry.scene import Array
 
 
 def to_world(rot_w: Array, vector: Array) -> Array:
-    """Return vectors (..., 3) in the axes of a body or gate turned to world axes.
+    """Return vectors (..., 3) of a body or gate frame in world axes.
 
     Args:
         rot_w: (..., 3, 3) body or gate to world.

@@ -1,6 +1,6 @@
-"""A scene as plain arrays: the gates in flight order and every solid, the ground being z = 0.
+"""A scene as plain arrays: the gates in flight order, and all solids; the ground is z = 0.
 
-The classes are named tuples, so they are immutable and are pytrees for JAX without importing it.
+The classes are named tuples, so they are immutable, and pytrees for JAX without importing it.
 All positions are in the world frame (z up) in metres; rotation matrices map local to world.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 Array = Any  # numpy.ndarray or jax.Array: the geometry functions take both
 
 PARKED_Z = -1000.0
-"""Height at which padding solids are parked [m]: out of reach of every ray and distance."""
+"""Height of padding solids [m], out of reach of every ray and distance."""
 
 
 class Gates(NamedTuple):
@@ -49,7 +49,7 @@ class Boxes(NamedTuple):
 
 
 class Rods(NamedTuple):
-    """Cylinders (flat ends) or capsules (round ends), told apart by the field that holds them."""
+    """Cylinders (flat ends) or capsules (round ends); the field of the scene decides."""
 
     center_w: Array
     """(N, 3) [m]."""
@@ -71,7 +71,7 @@ class Spheres(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Everything that can be flown through, seen or hit; the ground plane z = 0 is implied."""
+    """All gates and solids; the ground plane z = 0 is implied."""
 
     gates: Gates
     boxes: Boxes
@@ -84,7 +84,7 @@ class Scene(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How many of each solid a padded scene holds."""
+    """Numbers of solids of each kind in a padded scene."""
 
     boxes: int
     cylinders: int
@@ -99,7 +99,7 @@ def no_rods() -> Rods:
 
 
 def counts(scene: Scene) -> Counts:
-    """Return how many solids of each kind `scene` (not batched) holds."""
+    """Return the numbers of solids of each kind in `scene` (not batched)."""
     return Counts(
         len(scene.boxes.center_w),
         len(scene.cylinders.radius),
@@ -124,10 +124,10 @@ def _pad_rods(rods: Rods, n: int) -> Rods:
 
 
 def pad(scene: Scene, to: Counts) -> Scene:
-    """Return `scene` with parked solids added until it holds `to` of each kind.
+    """Return `scene` padded with parked solids to the numbers `to`.
 
     Raises:
-        ValueError: where the scene already holds more than `to` of a kind, naming both numbers.
+        ValueError: where the scene has more than `to` of a kind, naming both numbers.
     """
     have = counts(scene)
     for kind, n, limit in zip(Counts._fields, have, to, strict=True):

@@ -1,11 +1,10 @@
-"""Planar depth images of many cameras at once (numpy): what MuJoCo's rays see, but faster.
+"""Planar depth images of many cameras at once (numpy): equal to MuJoCo's rays, but faster.
 
-The image is cut into tiles of a few rays. A ray is only held against solids that reach into its
-tile, which are few; the planes between tiles go through the eye, so a solid's support in the
-direction of their normals says on which sides of them it is. Depths agree with MuJoCo's rays to
-rounding (1e-9 m), but for rays that graze an edge. Everything is a chain of single operations on
-double-precision numbers, so that an image depends on its own camera and scene and on nothing else
-in the batch.
+The image is divided into tiles of a few rays, and rays are tested only against the few solids that
+reach into their tile. The planes between tiles pass through the camera, so a solid's support along
+their normals determines on which sides it lies. Depths agree with MuJoCo's rays to rounding
+(1e-9 m), except for rays that graze an edge. All operations are elementwise in double precision, so
+an image depends only on its own camera and scene.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Boxes, Rods, Scene
 
 TILE = 6
-"""Rays across and down a tile, or as many as a pixel has."""
+"""Least rays across and down a tile; a pixel with more rays is one tile."""
 PAIRS_AT_ONCE = 1024
-"""Solids in tiles that are cast together: what is worked on stays in the processor's cache."""
+"""Pairs of solid and tile that are processed together, so that they fit the processor's cache."""
 RAYS_AT_ONCE = 1 << 20
-"""Of several images, to bound the memory."""
+"""Rays of the images that are processed together, to bound the memory."""
 _TINY, _FAR = 1e-200, 1e290
-"""What keeps divisors from zero, and a depth beyond every other."""
+"""Offset that avoids division by zero, and a depth larger than any other."""
 
 
 class Tiles(NamedTuple):
@@ -49,7 +48,7 @@ class Tiles(NamedTuple):
 
 
 class _Shape(NamedTuple):
-    """Convex solids of one kind in the axes of the camera that sees them, one a column."""
+    """Convex solids of one kind in the axes of their camera, one in each column."""
 
     center: np.ndarray
     """(3, V)."""
@@ -67,11 +66,11 @@ class _Shape(NamedTuple):
 Linear = Callable[[np.ndarray], np.ndarray]
 """Vectors (3, P) to their products (T, T, P) with the rays of P tiles."""
 Cast = Callable[[_Shape, Linear, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(solids, products, squares of the rays) to where (T, T, P) rays enter and leave."""
+"""(solids, products, squares of the rays) to the depths (T, T, P) of entry and exit."""
 
 
 def make_tiles(camera: Camera) -> Tiles:
-    """Return the rays of `camera.cast_rays_b` in tiles; those at the far edges may look past it."""
+    """Return the rays of `camera.cast_rays_b` in tiles; the last tiles may exceed the image."""
     pixels = max(1, TILE // camera.rays)
     side = pixels * camera.rays
     pitch = np.deg2rad(camera.pitch_deg)
@@ -87,11 +86,11 @@ def make_tiles(camera: Camera) -> Tiles:
 
 
 def depth_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
-    """Return the planar depth images (N, H, W) [m]; what is beyond the range reads as the range.
+    """Return the planar depth images (N, H, W) [m]; larger depths are set to the camera's range.
 
     Args:
         tiles: of the camera.
-        scene: batched, (N, ...); its triangles are not seen.
+        scene: batched, (N, ...); its triangles are ignored.
         pos_w: (N, 3) camera positions [m].
         rot_w: (N, 3, 3) body to world.
     """
@@ -117,7 +116,7 @@ def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
         across, down = _tiles_met(tiles, shape, flat=name == "cylinders")
         which, row, column = np.nonzero(down[:, :, None] & across[:, None, :])
         tile = (frame[which] * rows + row) * columns + column
-        # Solids of one rank are in images of their own, so no tile comes twice in a stretch.
+        # Solids of one rank belong to different images, so no tile occurs twice in a stretch.
         stops = np.flatnonzero(np.diff(rank[which], append=-1)) + 1
         for low in range(0, len(which), PAIRS_AT_ONCE):
             high = min(low + PAIRS_AT_ONCE, len(which))
@@ -185,7 +184,7 @@ def _shape(solids: Any, pos_w: np.ndarray, axes_w: np.ndarray) -> _Shape:
 
 
 def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return which columns (V, columns) and rows (V, rows) of tiles each solid reaches into."""
+    """Return the columns (V, columns) and rows (V, rows) of tiles that each solid reaches."""
     met = []
     for side, edges in ((1, tiles.left_edges), (2, tiles.up_edges)):
 
@@ -206,7 +205,7 @@ def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.
 
 
 def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear, np.ndarray]:
-    """Return what multiplies vectors with the rays of P tiles, and the rays' own squares."""
+    """Return a function that multiplies vectors with the rays of P tiles, and the squared rays."""
     left, up = tiles.left[:, column], tiles.up[:, row]
 
     def linear(vector: np.ndarray) -> np.ndarray:
@@ -217,7 +216,7 @@ def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear
 
 
 def _first(enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
-    """Return where solids are first met, 0 from inside."""
+    """Return the depth of the first hit, 0 from inside."""
     missed = enter > leave
     missed |= leave <= 0
     return np.maximum(enter, missed * _FAR, out=enter)  # many times faster than `numpy.where`
@@ -240,7 +239,7 @@ def _slab(center: np.ndarray, half: np.ndarray, rate: np.ndarray) -> tuple[np.nd
 def _ball(
     square: np.ndarray, half: np.ndarray, excess: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval in which square t^2 - 2 half t + excess <= 0; far to near if in none."""
+    """Return the interval in which square t^2 - 2 half t + excess <= 0; reversed if empty."""
     discriminant = half * half
     discriminant -= square * excess
     missed = (discriminant < 0) * _FAR
@@ -274,7 +273,7 @@ def _cylinder(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.nda
 
 
 def _capsule(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The parts overlap, so the stay in the whole is from the first entry to the last exit."""
+    """The parts overlap, so the interval is from the first entry to the last exit."""
     (axis,), (half,) = shape.axes, shape.halves
     parts = [_cylinder(shape, linear, square)]
     parts += [

@@ -1,1 +1,1 @@
-"""What comes from people and from elsewhere: ranges of settings, and files read with care."""
+"""Ranges of settings, and safe readers of untrusted files."""

@@ -1,11 +1,11 @@
-"""Ranges of settings, declared beside each field and checked in one call before work begins.
+"""Ranges of settings, declared in each field's annotation and checked in one call.
 
-A field of a configuration says what it may be in its annotation:
+A field of a configuration has its range in its annotation:
 
     rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
 
-`check_ranges` goes through a dataclass and all dataclasses within. Where an annotation has a name
-of its own (as an option of the command line may have), the message calls the field by it.
+`check_ranges` checks a dataclass and all nested dataclasses. If an annotation has its own name (as
+an option of the command line may have), messages use that name.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers that are allowed; of a tuple, each of its numbers."""
+    """Allowed numbers; for a tuple, of each of its numbers."""
 
     low: float
-    """The least, allowed itself unless `above`."""
+    """Lower bound, itself allowed unless `above`."""
     high: float
-    """The most, allowed itself unless `below`; infinity is allowed only where this is infinite."""
+    """Upper bound, itself allowed unless `below`; infinity is allowed only if this is infinite."""
     above: bool = False
     """Whether `low` itself is refused."""
     below: bool = False
     """Whether `high` itself is refused."""
     ordered: bool = False
-    """Whether a tuple's numbers may not fall: a span from its lower to its upper end."""
+    """Whether a tuple's numbers must not decrease, as in a range from low to high."""
 
     def holds(self, value: float) -> bool:
-        """Say whether `value` is allowed; NaN never is."""
+        """Return whether `value` is allowed; NaN never is."""
         over = self.low < value if self.above else self.low <= value
         return over and (value < self.high if self.below else value <= self.high)
 
@@ -49,19 +49,19 @@ SEED_MOST = 2**32 - 1
 Seed = Annotated[int, Range(0, SEED_MOST)]
 """A seed."""
 Share = Annotated[float, Range(0.0, 1.0)]
-"""A share of a whole."""
+"""A fraction from 0 to 1."""
 Iterations = Annotated[int, Range(1, 10**9)]
-"""How often something is repeated."""
+"""A number of iterations."""
 Trials = Annotated[int, Range(1, 100_000)]
-"""Trials, or flights, of one kind."""
+"""A number of trials or flights."""
 
 
 def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
-    """Refuse numbers outside of their fields' ranges.
+    """Refuse numbers outside their fields' ranges.
 
     Args:
-        config: a dataclass; dataclasses within are checked as well.
-        where: what stands before a field's path in the message.
+        config: a dataclass; nested dataclasses are checked as well.
+        where: prefix of a field's path in the message.
         options: fields are options of the command line, `deadline_s` being `--deadline-s`.
 
     Raises:
@@ -77,7 +77,7 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
 
 
 def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:
-    """Yield (path, value, range) of every number with a range in `config` and within."""
+    """Yield (path, value, range) of every number with a range, also in nested dataclasses."""
     for name, called, allowed in _fields(type(config)):
         value = getattr(config, name)
         if dataclasses.is_dataclass(value):
@@ -87,7 +87,7 @@ def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def is_finite(value: float) -> bool:
-    """Say whether a number is finite as a float; an int of hundreds of digits is not."""
+    """Return whether a number is finite as a float; an int of hundreds of digits is not."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -95,22 +95,22 @@ def is_finite(value: float) -> bool:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Say whether a value of a file is a finite number; true and false are none."""
+    """Return whether a value of a file is a finite number; true and false are not."""
     return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def shown(value: object) -> str:
-    """Return a value for a message, a number of hundreds of digits by its first ones."""
+    """Return a value for a message; a long one is shortened."""
     try:
         text = repr(value)
-    except ValueError:  # Python writes no number of more than 4300 digits
+    except ValueError:  # Python prints no number of more than 4300 digits
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:40]}… ({len(text)} characters)"
 
 
 @functools.cache
 def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
-    """Return (name, what it is called, range) of the fields of a dataclass."""
+    """Return (name, name in messages, range) of the fields of a dataclass."""
     hints = get_type_hints(cls, include_extras=True)
     found = []
     for field in dataclasses.fields(cls):
@@ -123,7 +123,7 @@ def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
 
 
 def _notes(hint: Any) -> Iterator[Any]:
-    """Yield all that annotates a type, and the types that it is made of."""
+    """Yield all annotations of a type and of its parts."""
     yield from getattr(hint, "__metadata__", ())
     for part in get_args(hint):
         yield from _notes(part)

@@ -1,8 +1,8 @@
-"""Files from elsewhere, read with care: their kind and size first, then JSON and TOML of any sort.
+"""Safe readers of untrusted files: check kind and size first, then parse JSON or TOML.
 
-A pipe, a device or a link to one would never end, a file of gigabytes fills the memory before it
-can be refused, and numbers of thousands of digits or tables within tables within tables end the
-parsers in ways of their own. What cannot be used is an `InputError` that names the file.
+A pipe or a device may never end, a file of gigabytes would fill the memory, and numbers of
+thousands of digits or deeply nested tables make the parsers fail in other ways. All these raise an
+`InputError` that names the file.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import tomllib
 from typing import Any
 
 TEXT_BYTES = 64 * 2**20
-"""Of a JSON or TOML file."""
+"""Largest JSON or TOML file."""
 MODEL_BYTES = 512 * 2**20
-"""Of a policy's file from elsewhere, external data included."""
+"""Largest foreign policy file, with its external data."""
 WEIGHTS_BYTES = 2 * 2**30
-"""Of a checkpoint's arrays: those of the widest network with its optimiser's state."""
+"""Largest arrays of a checkpoint: the widest network with its optimiser's state."""
 LOG_BYTES = 2 * 2**30
-"""Of a flight log, ours or another program's."""
+"""Largest flight log of any format."""
 MESH_BYTES = 256 * 2**20
-"""Of a mesh file."""
+"""Largest mesh file."""
 DEPTH = 64
-"""Of tables and lists within each other in a JSON or TOML file."""
+"""Deepest nesting of tables and lists in a JSON or TOML file."""
 
 _KINDS = {
     stat.S_IFIFO: "a named pipe",
@@ -40,7 +40,7 @@ class InputError(ValueError):
 
 
 def check_file(path: str | os.PathLike[str], most_bytes: int) -> None:
-    """Refuse what is no plain file (links are followed) or is too large, before it is opened.
+    """Refuse anything but a plain file (links are followed) of allowed size, before it is opened.
 
     Raises:
         InputError: naming the file, what it is and what is allowed.
@@ -50,13 +50,13 @@ def check_file(path: str | os.PathLike[str], most_bytes: int) -> None:
 
 
 def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> bytes:
-    """Return what a plain file holds.
+    """Return the contents of a plain file.
 
     Raises:
         InputError: where it is no plain file or too large.
         OSError: where it cannot be read.
     """
-    # Without waiting: a pipe that nobody writes to would be waited for.
+    # Non-blocking, because opening a pipe without a writer would wait.
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         _check(os.fspath(path), os.fstat(handle), most_bytes)
@@ -64,7 +64,7 @@ def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> by
             data = file.read(most_bytes + 1)
     finally:
         os.close(handle)
-    if len(data) > most_bytes:  # files of /proc say that they are empty
+    if len(data) > most_bytes:  # files of /proc have size 0
         raise _too_large(os.fspath(path), "more", most_bytes)
     return data
 
@@ -74,10 +74,10 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
 
     Args:
         path: of the file.
-        keys: that it must hold, with the type of what stands there.
+        keys: required keys, with the types of their values.
 
     Raises:
-        InputError: where it is no plain file, too large or no JSON, or holds something else.
+        InputError: where it is no plain file, too large, no JSON, or not as required.
         OSError: where it cannot be read.
     """
     value = parse_json(read_bytes(path), os.fspath(path))
@@ -93,7 +93,7 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Return the value of a JSON text; `where` it is from stands in the message.
+    """Return the value of a JSON text; `where` names its source in messages.
 
     Raises:
         InputError: where it is no JSON, or nested too deeply.
@@ -133,7 +133,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def reason(error: OSError) -> str:
-    """Return why a file cannot be read, in the system's words."""
+    """Return the operating system's reason why a file cannot be read."""
     return error.strerror or str(error)
 
 

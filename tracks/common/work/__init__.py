@@ -1,7 +1,8 @@
-"""Independent pieces of work: here, in processes of this machine, or on a cluster.
+"""Run independent pieces of work in this process, in several processes or on a cluster.
 
-`work(piece)` is a function of its piece alone, and a piece is small and travels by content: where
-it is worked on touches no result. Who asks says only how many, or where.
+`work(piece)` is a function of its piece alone, and pieces are small and are sent by value. So the
+place of execution does not change a result. The caller gives only the number of processes or the
+address of a cluster.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 Workers = int | str
-"""So many processes of this machine, or the address of a cluster's scheduler."""
+"""Number of processes of this machine, or the address of a cluster's scheduler."""
 MOST = 256
-"""Processes of this machine."""
+"""Most processes of this machine."""
 _PROTOCOLS = ("tcp", "tls", "ws", "wss")
 
 
 def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
-    """Return what `option` says, None where it was not given.
+    """Return the value of `option`, None where it was not given.
 
     Raises:
         ValueError: where it is neither a number of processes nor an address.
@@ -49,10 +50,10 @@ def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
 
 
 def crew(workers: Workers) -> int:
-    """Return how many processes that is.
+    """Return the number of processes.
 
     Raises:
-        ValueError: where there is no cluster at that address, or none that can work for us.
+        ValueError: where there is no usable cluster at that address.
     """
     if isinstance(workers, int):
         return workers
@@ -68,25 +69,24 @@ def work_off(
     keep: Callable[[int, Result], None],
     pinned: bool = False,
 ) -> None:
-    """Call `keep(number, result)` with every result of work(piece number `number`), as they come.
+    """Call `keep(number, result)` with every result of piece `number`, in order of completion.
 
-    One worker is this process. More are processes of their own, which end with this call, however
-    it ends, and with this process; each takes the next piece when it is through with its last, and
-    hands over results while it is at it. Those of a cluster hand them over at the end of a piece.
-    What a worker had under way when it died is done again, once on this machine and three times on
-    a cluster; of what it had handed over, `keep` then hears twice.
+    One worker means this process. More workers are separate processes, which end with this call and
+    with this process. Each takes the next piece when it has finished one, and returns results while
+    it works; on a cluster results return at the end of a piece. The piece of a worker that died is
+    repeated, once on this machine and three times on a cluster; `keep` may then get a result twice.
 
     Args:
-        work: a function at the top of a module, or a `functools.partial` of one.
-        pieces: what to work on, taken as workers come free.
-        workers: how many processes of this machine, or where the cluster is.
-        keep: called in this process; what it raises ends the work.
-        pinned: give each process of this machine as many cores, and none of another's.
+        work: a module-level function, or a `functools.partial` of one.
+        pieces: taken whenever a worker is free.
+        workers: number of processes of this machine, or the cluster's address.
+        keep: called in this process; an exception of it ends the work.
+        pinned: give each process of this machine an equal number of cores of its own.
 
     Raises:
-        ValueError: where `work` or a piece cannot travel, or there is no cluster that can work.
-        WorkerDied: where a process died again over the same piece, with what to do.
-        Exception: what `work` raises, as it was raised.
+        ValueError: where `work` or a piece cannot be pickled, or there is no usable cluster.
+        WorkerDied: where a process died twice with the same piece.
+        Exception: any exception of `work`.
     """
     if workers == 1:
         for number, piece in enumerate(pieces):

@@ -1,11 +1,11 @@
-"""Pieces of work on the machines of a Dask cluster, whose scheduler deals them out.
+"""Run pieces of work on a Dask cluster, whose scheduler distributes them.
 
-Work and pieces travel as bytes, so a machine needs the same suite and no file of ours. The work
-itself is the result of a task: every machine fetches it once, and where the machine that held it
-dies the scheduler makes it anew, as it does the pieces that were under way there.
+Work and pieces are sent as bytes, so a machine needs the same version of the suite but no files.
+The work itself is the result of a task, which every machine fetches once. If a machine dies, the
+scheduler repeats its tasks.
 
-Dask's own messages hold pickles, which its client unpacks: who runs the scheduler or a worker can
-run code in this process. Results are no safer than that, so they travel as pickles as well.
+Dask's own messages contain pickles, which its client unpacks: the scheduler and the workers can run
+any code in this process. Results are therefore sent as pickles as well.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 ANSWER_S = 10.0
-"""A scheduler has this long to answer [s]."""
+"""Time limit for an answer of the scheduler [s]."""
 GRACE_S = 1.0
-"""Later than that we stop waiting ourselves [s]."""
+"""Extra time before this process stops waiting itself [s]."""
 ALONE_S = 60.0
-"""A scheduler may be without workers for this long [s]."""
+"""Longest time without workers [s]."""
 AHEAD = 4
-"""Pieces given to the scheduler for each worker: one is worked on, the others wait there."""
+"""Pieces at the scheduler for each worker: one runs, the others wait."""
 LEAST = 64
-"""Pieces given to the scheduler at least; tiny ones would wait for the way otherwise."""
+"""Least pieces at the scheduler, so that workers need not wait for small pieces."""
 COUNT_S = 5.0
-"""Workers come and go; they are counted this often [s]."""
+"""Time between counts of the workers [s]."""
 ADVICE = (
     "on a machine with the suite and its extra `cluster`, `dask scheduler` starts one and "
     "`dask worker ADDRESS --nworkers N --nthreads 1` gives it N processes"
@@ -62,11 +62,11 @@ TLS_ADVICE = (
 
 
 class UnusableCluster(ValueError):
-    """A cluster that is not there, or cannot work for us; the message says what to do."""
+    """A cluster that does not exist or is not usable; the message has the next step."""
 
 
 def size(address: str) -> int:
-    """Return how many processes work in the cluster.
+    """Return the number of worker processes of the cluster.
 
     Raises:
         UnusableCluster: where none answers at `address`, or it has no workers.
@@ -81,11 +81,11 @@ def share_out(
     address: str,
     keep: Callable[[int, Result], None],
 ) -> None:
-    """Do what `tracks.common.work.work_off` says on the cluster at `address`."""
+    """Run `tracks.common.work.work_off` on the cluster at `address`."""
     with _connected(address) as client:
         run, waiting = uuid.uuid4().hex, iter(enumerate(pieces))
         body = client.submit(_body, pack((software(), work)), key=f"suite-{run}-work")
-        # Where one machine alone held it, the scheduler would give that one most of the pieces.
+        # With one copy, the scheduler would give most pieces to the machine that has it.
         client.replicate([body])
         in_air: dict[Any, int] = {}
         ended: SimpleQueue[Any] = SimpleQueue()
@@ -93,16 +93,16 @@ def share_out(
 
         def fill() -> None:
             window = max(AHEAD * workers(), LEAST)
-            # Many at once cost the scheduler little more than one.
+            # Submitting many at once costs little more than one.
             room = window - len(in_air) if len(in_air) <= window // 2 else 0
             batch = list(islice(waiting, room))
             if not batch:
                 return
             numbers, packed = zip(*((n, pack(piece)) for n, piece in batch), strict=True)
             keys = [f"suite-{run}-{n}" for n in numbers]
-            # Of one priority: the piece that was given first is worked on first.
+            # With equal priority, pieces run in the order of submission.
             with warnings.catch_warnings():
-                # That a training's start is large to send is known: it travels once.
+                # Dask warns about large pieces, such as a training's start, which is sent once.
                 warnings.simplefilter("ignore")
                 futures = client.map(_work_on, packed, work=body, key=keys)
             for number, future in zip(numbers, futures, strict=True):
@@ -126,7 +126,7 @@ def share_out(
 
 
 class _Count:
-    """How many workers there are, asked now and then."""
+    """The number of workers, updated from time to time."""
 
     def __init__(self, client: Any) -> None:
         self._client, self._until, self._count = client, 0.0, 0
@@ -140,7 +140,7 @@ class _Count:
 
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """Be a client of the scheduler at `address`."""
+    """Connect to the scheduler at `address`."""
     try:
         import distributed
     except ModuleNotFoundError as error:
@@ -148,7 +148,7 @@ def _connected(address: str) -> Iterator[Any]:
             f"--workers {address}: a cluster needs the package {error.name!r}: "
             "pip install 'diffracing-suite[cluster]'"
         ) from error
-    # What goes wrong is raised; its log of what is mended without us is not for people.
+    # Errors are raised; the log of problems that Dask repairs itself is suppressed.
     logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
     logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
     met: SimpleQueue[Any] = SimpleQueue()
@@ -157,12 +157,12 @@ def _connected(address: str) -> Iterator[Any]:
         try:
             client: Any = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
             met.put((client, client.nthreads()))
-        except Exception as error:  # of whatever kind, by what the other side sends
+        except Exception as error:  # any kind, depending on the other side
             met.put(error)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # Beside this thread: it waits on a port that is silent for longer than it was told.
+        # In a separate thread, because it may exceed its timeout on a silent port.
         threading.Thread(target=connect, daemon=True).start()
         try:
             found = met.get(timeout=ANSWER_S + GRACE_S)
@@ -188,7 +188,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _next(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]:
-    """Return what has ended, after waiting for it."""
+    """Wait for ended pieces, and return them."""
     while True:
         try:
             futures = [ended.get(timeout=ALONE_S)]
@@ -205,7 +205,7 @@ def _next(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]:
 
 
 def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
-    """Raise what the cluster itself could not do."""
+    """Raise an error for pieces that the cluster gave up."""
     for future in futures:
         if future.status == "finished":
             continue
@@ -223,7 +223,7 @@ def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
 
 
 def _body(packed: bytes) -> bytes:
-    """Be the task whose result is the work."""
+    """Return the work; the task that all others depend on."""
     return packed
 
 
@@ -231,7 +231,7 @@ _one_at_a_time = threading.Lock()
 
 
 def _work_on(piece: bytes, work: bytes) -> bytes:
-    """Work a piece off in a worker of the cluster; return its results, or how it failed."""
+    """Run a piece in a worker of the cluster; return its results or its failure."""
     try:
         with _one_at_a_time:
             return pack(list(_unpacked(work)(unpack(piece))))
@@ -244,14 +244,14 @@ def _unpacked(packed: bytes) -> Callable[[Any], Iterable[Any]]:
     """Return the work, the same object for all of its pieces.
 
     Raises:
-        UnusableCluster: where this machine would come to other numbers.
+        UnusableCluster: where this machine's software differs.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     set_threads()
     wanted, work = unpack(packed)
     if why := differences(software(), wanted):
         raise UnusableCluster(
-            f"a worker on {os.uname().nodename} would come to other numbers ({why}); install the "
+            f"a worker on {os.uname().nodename} would compute other numbers ({why}); install the "
             "same versions there"
         )
     return work

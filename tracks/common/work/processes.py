@@ -1,7 +1,7 @@
-"""Pieces of work shared by processes of this machine; results come as they end.
+"""Run pieces of work in several processes of this machine.
 
-It stands on `concurrent.futures`, one pool of one process each: a pool can be given its cores,
-ended at once, and begun anew where its process died.
+It uses `concurrent.futures` with one pool for each process: a pool can be pinned to cores, ended at
+once, and restarted when its process has died.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 REPORT_S = 0.2
-"""A process hands over what has come up this often; a round trip costs it a millisecond [s]."""
+"""Time between reports of results [s]; a round trip costs a millisecond."""
 TRIES = 2
-"""A piece whose process died is begun so often in all."""
+"""Number of attempts for a piece whose process died."""
 
 
 @dataclass
 class _Asked:
-    """A piece that a process is at."""
+    """A piece that is being processed."""
 
     number: int
     packed: bytes
-    """The work and the piece, for another process where this one dies."""
+    """The work and the piece, for another attempt."""
     tries: int = 1
 
 
@@ -47,7 +47,7 @@ class _Process:
         self.begin()
 
     def begin(self) -> None:
-        """Start the process, anew where it died."""
+        """Start or restart the process."""
         before = set(multiprocessing.active_children())
         # Spawned, as threads of JAX and MuJoCo do not survive a fork.
         context = multiprocessing.get_context("spawn")
@@ -56,7 +56,7 @@ class _Process:
         self._processes = set(multiprocessing.active_children()) - before
 
     def end(self) -> str:
-        """End the process, and return what it ended with."""
+        """End the process, and return its exit code."""
         for process in self._processes:
             process.terminate()
         self.pool.shutdown(cancel_futures=True)
@@ -71,7 +71,7 @@ def share_out(
     keep: Callable[[int, Result], None],
     pinned: bool,
 ) -> None:
-    """Do what `tracks.common.work.work_off` says, in `count` processes of this machine."""
+    """Run `tracks.common.work.work_off` in `count` processes of this machine."""
     processes: list[_Process] = []
     try:
         for cores in core_shares(count) if pinned else [[]] * count:
@@ -88,7 +88,7 @@ def _collect(
     processes: list[_Process],
     keep: Callable[[int, Result], None],
 ) -> None:
-    """Ask every process for results until there is no more."""
+    """Collect results from every process until all pieces are done."""
     waiting = iter(enumerate(pieces))
     asked: dict[Future[tuple[bytes, bool]], tuple[_Process, _Asked]] = {}
 
@@ -138,13 +138,13 @@ def _collect(
 
 
 _results: Iterator[Any] = iter(())
-"""In a process that works for another one: what is left of its piece."""
+"""In a worker process: the remaining results of its piece."""
 
 
 def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
-    """Return the next results of the piece, of a new one where it is given; more to come?
+    """Return the next results of the current or a given new piece, and whether more follow.
 
-    What goes wrong is returned: an error that does not travel would end this process.
+    Errors are returned: one that cannot be pickled would end this process.
     """
     global _results
     try:
@@ -163,10 +163,10 @@ def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
 
 def _start(cores: list[int]) -> None:
     """Make this process a worker."""
-    # An interrupt from the keyboard goes to every process of the group; the first one decides.
+    # A keyboard interrupt reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:
-        # Before JAX makes its threads: there will be as many as cores.
+        # Before JAX starts as many threads as there are cores.
         os.sched_setaffinity(0, cores)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

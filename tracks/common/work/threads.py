@@ -1,12 +1,11 @@
-"""How many cores there are, and how many threads XLA's CPU and numpy's products take.
+"""The number of cores, and of threads in XLA and in numpy's matrix products.
 
-XLA's are as many as cores, and at least two. Its matrix products (Eigen's) are cut into other
-blocks where there is one thread than where there are several, and so add up in another order. With
-two threads on a single core too, a training comes to the same bits on any number of cores; there it
-costs about a tenth of the speed. Products that several threads would cut along their sums are cut
-by us (`policies/networks/layers.py`).
+XLA gets a thread for each core, and at least two. With one thread its matrix products (Eigen's) use
+other blocks than with several, and sum in another order. With at least two threads, a training
+gives the same bits on any number of cores; on a single core it is about a tenth slower. Products
+that threads would split along their sums are split by `policies/networks/layers.py`.
 
-The cores that this process may run on are counted here, too, and shared out among processes.
+This file also counts the cores that this process may use, and divides them among processes.
 """
 
 from __future__ import annotations
@@ -15,22 +14,22 @@ import os
 from collections.abc import MutableMapping
 
 VARIABLE = "NPROC"
-"""Of the environment; XLA reads it when JAX first looks for devices."""
+"""Environment variable that XLA reads when JAX first lists its devices."""
 LEAST, MOST = 2, 4096
 
 
 def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
-    """Have XLA take a thread a core, and at least two, where nothing else was asked for.
+    """Set XLA's threads to the number of cores, and at least two, unless the variable is set.
 
     Args:
         environment: changed in place; that of this process if not given.
 
     Raises:
-        ValueError: where another number was asked for that is none.
+        ValueError: where the variable is set to an invalid value.
     """
     values = os.environ if environment is None else environment
     asked = values.setdefault(VARIABLE, str(_wanted()))
-    # XLA would end the process without a word to a person.
+    # XLA would end the process without a useful message.
     if not (asked.isascii() and asked.isdigit() and 1 <= int(asked[:5]) <= MOST):
         raise ValueError(
             f"{VARIABLE} is {asked[:40]!r} in the environment; allowed is 1 to {MOST}, threads of "
@@ -39,23 +38,23 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
 
 
 def share_threads(environment: MutableMapping[str, str] | None = None) -> None:
-    """Take no more threads than this process's share of the cores, after `set_threads`."""
+    """Limit the threads to this process's share of the cores, after `set_threads`."""
     values = os.environ if environment is None else environment
     values[VARIABLE] = str(min(threads(values), _wanted()))
 
 
 def threads(environment: MutableMapping[str, str] | None = None) -> int:
-    """Return how many threads XLA has, or will have."""
+    """Return the number of XLA's threads."""
     values = os.environ if environment is None else environment
     return int(values.get(VARIABLE) or usable_cores())
 
 
 def one_thread_a_product(environment: MutableMapping[str, str] | None = None) -> None:
-    """Have numpy and scipy multiply matrices on one thread, where nothing else was asked for.
+    """Set numpy's and scipy's matrix products to one thread, unless a variable is set.
 
-    Ours are many and small: threads gain nothing on free cores, and where a core is busy they wait
-    for each other, ten to a hundred times as long as the product takes. numpy reads the setting
-    when it is imported: call this before.
+    The suite's products are many and small. Threads gain nothing on free cores, and on a busy core
+    they wait for each other ten to a hundred times as long as the product takes. Call this before
+    importing numpy, which reads the setting then.
 
     Args:
         environment: changed in place; that of this process if not given.
@@ -70,7 +69,7 @@ def _wanted() -> int:
 
 
 def usable_cores() -> int:
-    """Return how many processor cores this process may run on."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,6 +1,6 @@
-"""Work, pieces and results as bytes: what goes to another process or machine and comes back.
+"""Serialise work, pieces and results for other processes and machines.
 
-`software` says what must be the same on two machines for the same work to come to the same bits.
+`software` lists what must be equal on two machines for equal results to the bit.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from typing import Any, NamedTuple
 from tracks.common.provenance import VERSION
 
 ROOT = Path(__file__).resolve().parents[3]
-"""Of the code; another machine may have it elsewhere."""
+"""Folder of the code, which may differ on another machine."""
 
 
 class WorkerDied(RuntimeError):
-    """A process that worked for this one was killed, or ended where it should not."""
+    """A worker process was killed or ended unexpectedly."""
 
 
 class Failure(NamedTuple):
-    """An error that work elsewhere ended with."""
+    """An error in another process."""
 
     error: Exception
-    """Itself."""
+    """The exception."""
     lines: str
     """Its traceback."""
     root: str
-    """Of the code there."""
+    """Folder of the code there."""
 
 
 class _RemoteTraceback(Exception):
-    """Where an error came up, in the words of the process in which it did."""
+    """The traceback of an error in another process."""
 
     def __init__(self, lines: str) -> None:
         super().__init__(lines)
@@ -67,17 +67,17 @@ def pack(value: Any) -> bytes:
 
 
 def let_views_travel() -> None:
-    """Let read-only views of dicts be pickled; a vehicle's effects are one."""
+    """Make read-only dict views picklable, such as a vehicle's effects."""
     copyreg.pickle(MappingProxyType, _reduce_view)
 
 
 unpack: Callable[[bytes], Any] = pickle.loads
-"""Of bytes that `pack` made. Who sends them can run code here: processes of ours, and whoever runs
-a cluster that `--workers` names."""
+"""Return the value of bytes from `pack`. Their sender can run any code here: the suite's own
+processes, and the machines of a cluster given by `--workers`."""
 
 
 def failure(error: Exception) -> Failure:
-    """Return an error as it travels, one that cannot as its words."""
+    """Return an error for sending; one that cannot be pickled is replaced by its text."""
     lines = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
@@ -89,7 +89,7 @@ def failure(error: Exception) -> Failure:
 
 
 def raised(there: Failure) -> Exception:
-    """Return the error to raise here, with where it came up as its cause."""
+    """Return the error to raise here, with the remote traceback as its cause."""
     there.error.__cause__ = _RemoteTraceback(there.lines.replace(there.root, str(ROOT)))
     return there.error
 
@@ -108,7 +108,7 @@ PACKAGES = ("numpy", "scipy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "onnxrunt
 
 @functools.cache
 def software() -> dict[str, str]:
-    """Return versions of what computes by name, and 16 hex digits that stand for our own code."""
+    """Return the versions of all relevant packages, and 16 hex digits of the suite's own code."""
     sums = hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
         sums.update(f"{path.relative_to(ROOT).as_posix()}\0".encode() + path.read_bytes())
@@ -121,7 +121,7 @@ def software() -> dict[str, str]:
 
 
 def differences(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
-    """Return what differs, in words; "" where nothing does."""
+    """Return the differences as text; "" for none."""
     names = [name for name in ours if theirs.get(name) != ours[name]]
     return ", ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in names)
 
