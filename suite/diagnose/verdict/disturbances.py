@@ -21,8 +21,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from eval.effects import EFFECTS, constant_wind, gusts
+from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY
+from eval.effects.wind import CONSTANT_WIND, GUSTS, VERTICAL, ConstantWind, Gusts
 from eval.quadrotor.plant import Motion, assemble
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from suite.diagnose.data.view import SmoothedFlight
@@ -242,12 +243,12 @@ class Turbulence(NamedTuple):
     @property
     def effect(self) -> str:
         """Name of the wind in the catalogue."""
-        return gusts.EFFECT.name
+        return GUSTS.name
 
     @property
-    def values(self) -> gusts.Gusts:
+    def values(self) -> Gusts:
         """What a vehicle file holds of it."""
-        return gusts.Gusts(self.intensity, self.length)
+        return Gusts(self.intensity, self.length)
 
 
 def find_turbulence(
@@ -284,7 +285,7 @@ def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarra
     """Return (W, 6 KNOTS, 3 KNOTS): the push per m/s of wind in the world at each knot."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
-    steady_wind = constant_wind.EFFECT.name
+    steady_wind = CONSTANT_WIND.name
     plain = np.asarray(values[steady_wind].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))
     count = len(motion.pos_w)
@@ -293,7 +294,7 @@ def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarra
     inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=still)
 
     def wrench(wind_w: np.ndarray) -> np.ndarray:
-        values[steady_wind] = constant_wind.ConstantWind(plain + wind_w)
+        values[steady_wind] = ConstantWind(plain + wind_w)
         plant = assemble(given.nominal, given.constants, values, model.dt, 0.0)
         _, out = plant_step(plant, state, motion, inputs, still)
         mass, inertia = plant.constants.mass, plant.constants.inertia
@@ -313,7 +314,7 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
     passed = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
     colour = np.exp(-np.abs(passed[:, :, None] - passed[:, None, :]))
     root = np.linalg.cholesky(colour + 1e-9 * np.eye(KNOTS))
-    axes = np.diag([1.0, 1.0, gusts.VERTICAL])
+    axes = np.diag([1.0, 1.0, VERTICAL])
     count = len(root)
     whole = np.einsum("wkl,ab->wkalb", root, axes)
     return whole.reshape(count, KNOTS * 3, KNOTS * 3)

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS, constant_wind
+from eval.effects import EFFECTS
 from eval.effects.interface import Effect, at, neutral
+from eval.effects.wind import CONSTANT_WIND
 from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
 from eval.vehicles.vehicle import Vehicle
 
@@ -180,7 +181,7 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
         Sweep("mass", "mass above nominal [%]", more(heavier, 10, 20, 40, 60), _heavier),
         _drag_sweep(vehicle),
         Sweep("wind", "constant wind [m/s]", more(wind, 2, 4, 6, 8),
-              _effect("constant_wind", "velocity", constant_wind.EFFECT.parameters[0].direction)),
+              _effect("constant_wind", "velocity", CONSTANT_WIND.parameters[0].direction)),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
               _sensing("stereo", 1, "noise", focal=1.0, baseline=1.0)),
         Sweep("gate-pose error", "standard deviation per axis [m]", (0, 0.05, 0.1, 0.2, 0.3),

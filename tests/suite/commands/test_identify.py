@@ -38,7 +38,7 @@ def test_the_file_that_is_started_from_is_not_written_over(flights, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     before = (tmp_path / "start.toml").rename("vehicle.toml").read_text()
     assert cli.main(["identify", str(flights), "--vehicle", "./vehicle.toml"]) == 2
-    assert "vehicle.toml is read, too, and would be written over" in capsys.readouterr().err
+    assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
     assert (tmp_path / "vehicle.toml").read_text() == before
 
 

@@ -59,7 +59,7 @@ def test_a_log_that_is_read_is_not_written_over(tmp_path, capsys):
         [str(table), "--pose", str(pose), "--out", str(pose)],
     ):
         assert cli.main(["import", *args]) == 2
-        assert f"{args[-1]} is read, too" in capsys.readouterr().err
+        assert f"{args[-1]} is also an input" in capsys.readouterr().err
     assert pose.read_text() == "t\n"
 
 

@@ -32,7 +32,7 @@ def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch
     monkeypatch.setattr(run, "train", None)
     own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
     assert cli.main(["train", "--init-from", str(own), "--out", str(tmp_path)]) == 2
-    assert "config.json is read, too, and would be written over" in capsys.readouterr().err
+    assert "config.json is also an input and would be overwritten" in capsys.readouterr().err
 
 
 def test_the_command_line_asks_for_model_and_vehicle_together():

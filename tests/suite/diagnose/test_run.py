@@ -103,4 +103,4 @@ def test_what_is_read_is_not_written_over(tmp_path, capsys):
                  ["--vehicle", "reference", "--fly", "reference"]):  # fmt: skip
         assert main(["diagnose", str(flown), *args, *out]) == 2
         said = "plan_1_circle.parquet" if own not in args else "vehicle.toml"
-        assert f"{said} is read, too, and would be written over" in capsys.readouterr().err
+        assert f"{said} is also an input and would be overwritten" in capsys.readouterr().err

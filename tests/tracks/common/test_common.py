@@ -193,7 +193,7 @@ def test_a_name_is_given_once(monkeypatch):
     installed(monkeypatch, a=("one", "math:e"))
     found = registry_of(z=1)
     for name in ("z", "a"):
-        with pytest.raises(ValueError, match=f"thing '{name}' is there already"):
+        with pytest.raises(ValueError, match=f"thing '{name}' exists already"):
             found.register(name, 2)
     installed(monkeypatch, z=("one", "math:e"))
     with pytest.raises(ValueError, match="'z' of the package 'one'.*the suite too.*rename"):

@@ -134,5 +134,5 @@ def test_a_file_that_is_read_is_refused_as_one_to_write_by_whatever_name(tmp_pat
     files.check_no_input(given, [None, "", "reference", tmp_path / "none.toml"], "--out")
     files.check_no_input(tmp_path / "new.toml", [given], "--out")
     for path in (given, link, tmp_path / "." / "a.toml"):
-        with pytest.raises(ValueError, match="--out: .* is read, too, .* give another --out"):
+        with pytest.raises(ValueError, match="--out: .* is also an input .* give another --out"):
             files.check_no_input(path, [given], "--out")

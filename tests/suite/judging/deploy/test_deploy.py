@@ -119,7 +119,7 @@ def test_the_card_of_a_policy_is_not_written_over(tmp_path, folder, capsys):
     own = shutil.copytree(folder, tmp_path / "own")
     (own / exporting.CARD).write_text("mine")
     assert cli.main(["export", str(own), "--format", "c", "--out", str(own)]) == 2
-    assert "card.md is read, too, and would be written over" in capsys.readouterr().err
+    assert "card.md is also an input and would be overwritten" in capsys.readouterr().err
     assert {path.name for path in own.iterdir()} == {
         *(p.name for p in folder.iterdir()),
         exporting.CARD,
