@@ -46,7 +46,7 @@ def test_start_and_end_cut_the_flight(tmp_path):
 def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
     asked = replace(FULL, source="mocap")
     ours = write_flight(tmp_path / "ours.csv", import_log(made.write_usd(tmp_path / "log00"))[0])
-    with pytest.raises(ValueError, match="--source mocap: the mapping of .* says of no signal"):
+    with pytest.raises(ValueError, match="--source mocap: the mapping of .* names no source"):
         import_log(ours, None, asked)
     with pytest.raises(ValueError, match="'px4', whose pose is of one source: leave --source"):
         import_log(made.write_ulog(tmp_path / "log.ulg"), None, asked)
