@@ -33,7 +33,7 @@ from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.plans.follow import FlightFailed
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
-from suite.diagnose.verdict.gap import gap_of
+from suite.diagnose.verdict.rollout_gap import gap_of
 from tracks.common.work import usable_cores, work_off
 from tracks.common.work.threads import one_thread_a_product
 

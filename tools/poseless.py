@@ -26,7 +26,7 @@ from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.console import Console
 from suite.common.startup import keep_compiled
-from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.experiments.injected.flights import as_log, flight_parts
 from suite.judging.collect import collect
@@ -87,7 +87,7 @@ def run(out: Path, cases: int, seed: int, first: int = 0) -> Iterator[dict[str, 
         files = sorted((folder / "flights").glob("*.parquet"))
         logs = [without_pose(read_flight(f), nominal, rng) for f in files]
         logs = [log for log in logs if log.duration_s > 3.0]
-        found = diagnosis_json(diagnose_by_views(logs, nominal, seed=number))
+        found = diagnosis_json(diagnose(logs, nominal, by="views", seed=number))
         yield {"case": number, "hidden": name, "truth": hidden.get(name), "flights": len(logs),
                "found": found}  # fmt: skip
 

@@ -8,25 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of, not_examined
-from eval.logs.flight_log import FlightLog, read_flights
+from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
-from suite.diagnose.by_views import diagnose_by_views
 from suite.diagnose.data.sampling import without_slow_rotors
-from suite.diagnose.data.windows import remembers
-from suite.diagnose.diagnose import BeyondRollouts, diagnose
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
+from suite.diagnose.sources.rollout_source import of_rollouts
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.black_box import BlackBoxConfig, compare_black_box
 from suite.diagnose.verdict.checks import run_checks
-from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -57,15 +55,15 @@ def diagnose_files(
         paths: flight logs, or folders of them.
         vehicle_name: a vehicle file or a shipped name.
         out: folder for the files.
-        console: told of the work as it goes.
+        console: for progress and warnings.
         drive: what the model's input is: "auto", "commands" or "motors".
         integrator: how the bodies were moved: "auto", "continuous" or "euler".
-        compare_delta: fit a Delta Action Model to the same flights and show it beside the names.
+        compare_delta: fit a Delta Action Model to the same flights and compare it.
         plan: write flights that tell apart what these could not.
         fly: fly the plan in simulation with this vehicle.
         recording: write a recording for rerun.
         seed: of all draws.
-        reference: flights of the same vehicle before what changed: say what has changed since.
+        reference: flights of the same vehicle before what changed: find what has changed since.
         relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of a finding.
         accept: faults of the interface that are known, and go on all the same.
 
@@ -77,75 +75,62 @@ def diagnose_files(
     refuse_own_motion(vehicle)
     truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths), partial=True)
-    before, told = read_flights(flight_files(reference), partial=True) if reference else ([], [])
+    before, more = read_flights(flight_files(reference), partial=True) if reference else ([], [])
     findings = check_before_diagnosis([*logs, *before], CheckContext(vehicle), accept)
-    warnings = [*warnings, *told, *lines_of(findings)]
+    warnings = [*warnings, *more, *lines_of(findings)]
     logs, slow = without_slow_rotors(logs)
     before, slow_before = without_slow_rotors(before)
     warnings += [*slow, *slow_before]
     for warning in warnings:
         console.note(f"warning: {warning}")
-    said = len(warnings)
-    asked = {
-        "--compare-delta": compare_delta,
-        "--plan": plan,
-        "--fly": fly is not None,
-        "--drive": drive != "auto",
-        "--integrator": integrator != "auto",
-    }
-    unused = [f"{flag} is of rollouts: left out" for flag, given in asked.items() if given]
-
-    result, checks = None, None
-    if not before and not only_views(logs, vehicle):
-        try:
-            result = diagnose(logs, vehicle, drive, console.note, seed, limits, integrator, True)
-        except BeyondRollouts:
-            console.note("rollouts of a second leave these flights, whatever is fitted: by views")
-    if result is None:
-        result = diagnose_by_views(logs, vehicle, before, console.note, seed, limits)
-        warnings = [*warnings, *unused]
+    shown = len(warnings)
+    result = diagnose(
+        logs, vehicle, before, drive=drive, integrator=integrator, say=console.note, seed=seed,
+        limits=limits,
+    )  # fmt: skip
     found: dict[str, Any] = diagnosis_json(result)
+    flown, checks, files = result.main.source.rollouts, None, {"vehicle.toml", "diagnosis.json"}
+    if flown is None:
+        wanted = {
+            "--compare-delta": compare_delta,
+            "--plan": plan,
+            "--fly": fly is not None,
+            "--drive": drive != "auto",
+            "--integrator": integrator != "auto",
+        }
+        unused = [flag for flag, given in wanted.items() if given]
+        warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
     found["warnings"] = [*warnings, *found["warnings"]]
-    files = {"vehicle.toml", "diagnosis.json"}
-    if isinstance(result, Diagnosis):
-        checks = run_checks(result)
+    if flown is not None:
+        checks = run_checks(flown)
         if compare_delta:
+            config = BlackBoxConfig(seed=seed)
             with console.progress("fitting the Delta Action Model", 1.0) as show:
-                compared = compare_black_box(result, BlackBoxConfig(seed=seed), show)
+                compared = compare_black_box(flown, result.main, config, show)
             checks = replace(checks, black_box=compared)
         found |= checks_json(checks, seed)
         if plan or truth is not None:
             folder = out / "plan"
             found["plan"] = write_plan_of(found, folder)
             if truth is not None:
-                found["plan"] = fly_plan(found["plan"], result.sigma, vehicle, truth, folder, seed)
+                sigma = of_rollouts(result.main.search.last).noise.sigma
+                found["plan"] = fly_plan(found["plan"], sigma, vehicle, truth, folder, seed)
             found["warnings"] += found["plan"].pop("warnings", [])
             files |= {"plan/plan.json"} if found["plan"].get("flights") else set()
         if recording:
-            write_rollouts(out / "recording.rrd", result)
+            fitted = result.main.theta if result.main.names else None
+            write_rollouts(out / "recording.rrd", flown, fitted)
             files.add("recording.rrd")
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
     write_report(out / "report.html", page(result, found, checks, toml, files))
-    for warning in found["warnings"][said:]:
+    for warning in found["warnings"][shown:]:
         console.note(f"warning: {warning}")
     found["findings"], found["not_examined"] = findings, not_examined(logs)
     if found["verdict"] == "no_gap" and found["not_examined"]:
         console.note(f"not examined: {', '.join(found['not_examined'])}")
     write_json(out / "diagnosis.json", found)
     return found
-
-
-def only_views(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
-    """Return whether rollouts cannot be flown.
-
-    Something is missing, or what drives is known by motor commands alone, or by those to a rate
-    loop that remembers.
-    """
-    return any(
-        log.partial or (log.rotor_speed is None and (log.rate_cmd_b is None or remembers(vehicle)))
-        for log in logs
-    )
 
 
 def _vehicle_file(named: Vehicle, given: Vehicle, found: Mapping[str, Any], out: Path) -> str:

@@ -199,7 +199,7 @@ class Thresholds:
     shown_chi2: float = 9.0
     """Fall of chi-square on held-out flights that is expected of a name at its fitted size, from
     which it is withdrawn where none comes (three sigma)."""
-    least_beside_rest: float = 0.5
+    least_next_to_rest: float = 0.5
     """Where the model stays off the noise floor: held-out squared error that a name takes away at
     least, as a share of what stays and is no noise [1]."""
     cells: int = 4

@@ -24,6 +24,8 @@ class Evidence(ABC):
 
     limits: Thresholds = THRESHOLDS
     """Of every step."""
+    off: bool = False
+    """Whether all that the model leaves is taken for noise."""
 
     @property
     @abstractmethod

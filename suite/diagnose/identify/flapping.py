@@ -23,7 +23,7 @@ from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.entries import inertia_of, of_force, put
 from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.numbers import Number, told
-from suite.diagnose.search.look import SearchResult
+from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.search.search import search
 
 EFFECT, KEY = "blade_flapping", "coefficient"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from eval.logs.flight_log import FlightLog
 from eval.view.comparison import Compared, Simulation, Track, write_comparison
 from suite.common.charts import png, titled
-from suite.diagnose.data.windows import LENGTH_S, SLICES, UNITS, FlightWindows, take
+from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.estimate.permutation import CandidateScore
-from suite.diagnose.search.look import rollouts_of
+from suite.diagnose.sources.source import Series
 from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap, true_starts
+from suite.diagnose.verdict.gap import Gap
+from suite.diagnose.verdict.rollout_gap import Rollouts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
@@ -56,18 +56,21 @@ def gains_chart(
     return png(figure)
 
 
-def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray, seed: int) -> bytes:
+def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, seed: int) -> bytes:
     """Return gaps with their intervals, and each rollout's error against its speed.
 
     Args:
         rows: label, gap and colour, from top to bottom.
-        speed: (W,) of the held-out rollouts at their starts [m/s].
+        speed: (W,) of the held-out rollouts at their starts [m/s]; None where none was flown.
         seed: of the intervals' draws.
     """
-    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(11.0, 3.4 if speed is not None else 2.0), layout="constrained")
+    left, *others = figure.subplots(1, 1 if speed is None else 2, squeeze=False)[0]
     _gap_bars(left, rows, seed)
-    titled(left, "Gap on held-out flights, 1 is the noise floor")
+    titled(left, "Gap on held-out flights; the dotted line is the noise floor")
+    if speed is None:
+        return png(figure)
+    (right,) = others
     for label, gap, colour in rows:
         if len(gap.score) == len(speed):
             right.plot(speed, np.sqrt(gap.score), "o", ms=3.5, color=colour, label=label)
@@ -109,9 +112,11 @@ def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> No
         axes.plot(gap.rms, place, "o", ms=7, color=colour)
     axes.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
     axes.set_ylim(-0.6, len(rows) - 0.4)
-    axes.axvline(1.0, color=FLOOR, lw=0.8, ls=":")
+    floor = rows[0][1].floor
+    axes.axvline(floor, color=FLOOR, lw=0.8, ls=":")
     axes.set_xscale("log")
-    axes.set_xlim(0.8, 1.25 * max(1.5, *(gap.ci95(seed)[1] for _, gap, _ in rows)))
+    most = max(gap.ci95(seed)[1] for _, gap, _ in rows)
+    axes.set_xlim(0.8 * floor, 1.25 * max(1.5 * floor, most))
     _few_ticks(axes, "x")
 
 
@@ -128,81 +133,27 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
         axis.set_major_locator(LogLocator())
 
 
-MOST = 4
-"""Held-out flights in a recording."""
-
-
-def held_out_rollouts(diagnosis: Diagnosis) -> tuple[FlightWindows, dict[str, np.ndarray]]:
-    """Return windows of 1 s over what was held out, and measured - simulated (W, N, 19) in them.
-
-    As given and, where something was named, with it, by what it is called.
-    """
-    model, held = diagnosis.model, diagnosis.held_windows
-    windows = diagnosis.cut(LENGTH_S, np.unique(held.flight)[:MOST].tolist())
-    windows = take(windows, np.asarray(windows.start_s) >= _first_s(diagnosis) - 1e-6)
-    series = {"simulated as given": diagnosis.start}
-    if diagnosis.fitted is not None:
-        series["simulated with what was named"] = diagnosis.fitted
-    return windows, {
-        label: model.residual(theta, true_starts(model, theta, windows), windows)
-        for label, theta in series.items()
-    }
-
-
-def _first_s(diagnosis: Diagnosis) -> float:
-    """Return from when on a flight was held out [s]."""
-    fitted, held = rollouts_of(diagnosis.search.last).windows, diagnosis.held_windows
-    lone = bool(np.isin(held.flight, fitted.flight).any())
-    return float(np.min(held.start_s)) if lone else 0.0
-
-
-def held_out_chart(
-    windows: FlightWindows, simulated: Mapping[str, np.ndarray], sigma: np.ndarray
-) -> bytes:
-    """Return a held-out flight as measured and as simulated, where the model misses most.
-
-    Args:
-        windows: from `held_out_rollouts`, and `simulated`.
-        simulated: measured - simulated by label.
-        sigma: (19,) noise of the channels.
-    """
-    measured = {
-        "position": windows.row_pos_w, "velocity": windows.row_vel_w, "rates": windows.row_rate_b
-    }  # fmt: skip
-    of = np.asarray(windows.flight) == windows.flight[0]
-    seen = np.asarray(windows.seen)[of]
-    first = next(iter(simulated.values()))[of]
-
-    def missed(group: str, axis: int) -> float:
-        at = SLICES[group].start + axis
-        there = seen[..., at] & np.isfinite(first[..., at])
-        return float(np.sqrt((first[..., at][there] ** 2).mean()) / sigma[at]) if there.any() else 0
-
-    group, axis = max(((g, k) for g in measured for k in range(3)), key=lambda one: missed(*one))
-    at = SLICES[group].start + axis
-    time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[of]
-    value = np.where(seen[..., at], np.asarray(measured[group])[of][..., axis], np.nan)
+def series_chart(series: Series) -> bytes:
+    """Return a held-out stretch as measured and as simulated."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     axes = figure.subplots()
-    axes.plot(time_s.ravel(), value.ravel(), color=FLOOR, lw=1.6, label="measured")
-    for (label, residual), colour in zip(simulated.items(), (BEFORE, AFTER), strict=False):
-        for row, line in enumerate(value - residual[of][..., at]):
-            axes.plot(time_s[row], line, color=colour, lw=1.4, label="" if row else label)
+    axes.plot(series.time_s, series.measured, color=FLOOR, lw=1.6, label="measured")
+    for (label, values), colour in zip(series.simulated.items(), (BEFORE, AFTER), strict=False):
+        axes.plot(series.time_s, values, color=colour, lw=1.4, label=label)
     axes.set_xlabel("time [s]", fontsize=8)
     axes.legend(fontsize=8, frameon=False, ncols=3)
-    frame = "body" if group == "rates" else "world"
-    titled(axes, f"{group.capitalize()} along {frame} {'xyz'[axis]} [{UNITS[group]}]")
+    titled(axes, series.label)
     return png(figure)
 
 
-def write_rollouts(path: Path, diagnosis: Diagnosis) -> Path:
-    """Write rollouts of 1 s over what was held out, as given and with what was named, as `.rrd`.
+def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Path:
+    """Write rollouts of 1 s over what was held out, as given and as `fitted` (P,), as `.rrd`.
 
     Raises:
         OSError: where the file cannot be written; nothing is left under its name.
     """
-    windows, simulated = held_out_rollouts(diagnosis)
-    first_s, flights = _first_s(diagnosis), []
+    windows, simulated = flown.simulated(fitted)
+    flights = []
     for number in np.unique(windows.flight):
         rows = np.flatnonzero(windows.flight == number)
         simulations = []
@@ -211,9 +162,9 @@ def write_rollouts(path: Path, diagnosis: Diagnosis) -> Path:
             whole = [one for one in found if one is not None]
             tracks, errors = [one[0] for one in whole], [one[1] for one in whole]
             simulations.append(Simulation(label, tracks, errors))
-        log = diagnosis.logs[int(number)]
-        flights.append(Compared(log.name, _measured(log, first_s), simulations))
-    return write_comparison(path, flights, diagnosis.nominal.body.half_size)
+        log = flown.logs[int(number)]
+        flights.append(Compared(log.name, _measured(log, flown.since_s), simulations))
+    return write_comparison(path, flights, flown.vehicle.body.half_size)
 
 
 def _measured(log: FlightLog, first_s: float) -> Track:

@@ -1,4 +1,4 @@
-"""The report's parts about the logs, their noise, the actuators, what is left and the evidence."""
+"""A report's sections: logs, noise, actuators, candidates, rivals, remaining error, evidence."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from suite.common.report import Part, Picture, Section
+from suite.common.report import Details, Part, Picture, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.report.charts import (
     AFTER,
     BEFORE,
     WRONG,
     black_box_chart,
+    gains_chart,
     gap_chart,
     labelled_gaps,
 )
-from suite.diagnose.report.parameters_json import grid, short_name
+from suite.diagnose.report.parameters_json import cells, grid, short_name
+from suite.diagnose.sources.rollout_source import of_rollouts
 from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.checks import Checks, Kinematics
 from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import MEASURE, Gap
-from tracks.common.grid import Grid
+from suite.diagnose.verdict.gap import Gap
+from tracks.common.grid import Cell, Grid
 
 SHOWN = 12
 """Logs in the table."""
@@ -77,7 +79,8 @@ def _kinematics(found: Kinematics, resolution_s: float) -> Grid:
 
 
 def _faults(diagnosis: Diagnosis) -> Grid:
-    named = {candidate.name for candidate in diagnosis.search.candidates}
+    search = diagnosis.main.search
+    named = {candidate.name for candidate in search.candidates}
     rows = [
         (
             s.candidate.label,
@@ -85,7 +88,7 @@ def _faults(diagnosis: Diagnosis) -> Grid:
             f"{s.p_value:.4f}",
             "named" if s.candidate.name in named else "not named",
         )
-        for s in diagnosis.search.first
+        for s in search.first
         if all(EFFECTS[name].of_log for name in s.candidate.effects)
     ]
     note = (
@@ -97,10 +100,11 @@ def _faults(diagnosis: Diagnosis) -> Grid:
 
 def noise_section(diagnosis: Diagnosis) -> Section:
     """Return the noise of every channel."""
+    sigma = of_rollouts(diagnosis.main.search.last).noise.sigma
     rows = [
         (f"{name} [{UNITS[name]}]", ", ".join(f"{v:.3g}" for v in values))
         for name, place in SLICES.items()
-        if np.isfinite(values := diagnosis.sigma[place]).any()
+        if np.isfinite(values := sigma[place]).any()
     ]
     words = (
         "Standard deviation by axis, from the data: what is left of measured minus simulated when "
@@ -140,60 +144,126 @@ def _mismatch(found: ActuatorMismatch) -> Grid:
     return grid(f"Against the {found.asked_by}", ["", ""], rows, note)
 
 
-SHAPES = 5
-"""Shapes of the residual in the table."""
-HORIZON_S = 0.5
-"""Of the rollouts in the comparison with the black box [s]."""
+HORIZON = "0.5 s"
+"""Of the rollouts in the comparison with the black box."""
 BLACK_BOX = (
-    "Beside it a Delta Action Model: a recurrent network that corrects the body's acceleration and "
-    "turning from velocity, attitude and command, fitted by gradients through the same rollouts of "
-    "the same flights. It has no name and no number to write into a vehicle file."
+    "Next to it a Delta Action Model: a recurrent network that corrects the body's acceleration "
+    "and turning from velocity, attitude and command, fitted by gradients through the same "
+    "rollouts of the same flights. It has no name and no number to write into a vehicle file."
 )
 
 
-def residual_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
-    """Return what the named effects leave over; `found` is the JSON."""
-    left, residual = found["unexplained"], diagnosis.residual
-    words = "No structure beyond the measurement noise is left."
+RIVALS = 6
+"""Other names in the table of what fits as well."""
+
+
+def candidates_section(diagnosis: Diagnosis) -> Section:
+    """Return what each candidate gains alone, by source."""
+    parts: list[Part] = []
+    for one in diagnosis.findings:
+        scores, limits = one.search.first, one.source.limits
+        if not scores:
+            continue
+        named, least = {candidate.label for candidate in one.search.candidates}, 0.0005
+        rows = [
+            f"{s.candidate.label:32}{s.gain:>12.1f}"
+            + (f"{s.p_value:>8.4f}  " if s.p_value > least else " " * 10)
+            + ("named" if s.candidate.label in named else "")
+            for s in scores
+        ]
+        head = f"{'effect':32}{'gain':>12}{'p':>8}"
+        parts += [
+            f"{one.source.name.capitalize()}: all {len(scores)} candidates, each fitted alone "
+            "before anything was named. The gain is the fall of the whitened squared error on "
+            "stretches that its fit did not see; p is how often the best of all candidates gains "
+            f"as much by chance, left out below {least:g}. One name follows another while p is at "
+            f"most {limits.name_p_value:g}; then all are refitted jointly.",
+            Picture(
+                gains_chart(scores, scores[0].chance, named), "The best fourteen; blue were named."
+            ),
+            Details("all candidates", "\n".join([head, *rows])),
+        ]
+    return Section("3. The candidates", parts)
+
+
+def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
+    """Return what was fitted in each name's place; `found` is the JSON."""
+    rows = []
+    for _, one in diagnosis.named:
+        ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
+        for label, worse_by in ordered[:RIVALS]:
+            same = label.rstrip(" 1234") in one.rivals
+            verdict = Cell("not separable", "bad") if same else Cell("ruled out")
+            rows.append([*cells(one.candidate.label, label, f"{worse_by:.1f}"), verdict])
+    headers = ["named", "in its place", "worse by", ""]
+    note = (
+        "Worse by: squared error in units of the noise, with one for each parameter that is "
+        "fitted; 9 is three standard errors. What was not fitted in a name's place was too far off."
+    )
+    parts: list[Part] = [Grid("", headers, rows, note=note)] if rows else []
+    if not diagnosis.named:
+        parts.append("Nothing was named, so that nothing has a rival.")
+    elif not found["separate_with"]:
+        parts.append("No other name explains the same flights as well.")
+    if found["separate_with"]:
+        parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
+    return Section("4. What could stand in its place", parts)
+
+
+def residual_section(found: Mapping[str, Any]) -> Section:
+    """Return what the named effects leave; `found` is the JSON."""
+    left = found["unexplained"]
+    words = "No structure beyond the measurement noise remains."
     if left["where"]:
-        words = f"{100 * left['share']:.0f} % of the gap is left: {left['where']}."
+        words = f"{100 * left['share']:.0f} % of the gap remains: {left['where']}."
     parts: list[Part] = [words]
-    if residual.shapes:
-        rows = [(s.label, f"{s.gain:.1f}", f"{s.p_value:.3f}") for s in residual.shapes[:SHAPES]]
+    if left.get("shapes"):
+        rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in left["shapes"]]
         note = (
             "A force or torque that no effect describes, with a plain shape over the state: its "
             "gain on stretches left out, and how often chance gains as much."
         )
-        parts.append(grid("Shapes without a name", ["the rest as a", "gain", "p"], rows, note))
-        rows = [(axis, f"{p:.2g}") for axis, p in residual.coloured.items()]
+        parts.append(
+            grid("Shapes without a name", ["remaining error as a", "gain", "p"], rows, note)
+        )
+        rows = [(axis, f"{p:.2g}") for axis, p in left["coloured"].items()]
         note = "How often noise alone has as much energy in a smooth push along the axis."
         parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
     return Section("5. Remaining error", parts)
 
 
-def held_out_section(diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks) -> Section:
+def evidence_section(
+    diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks | None
+) -> Section:
     """Return the gap on flights that took no part, with its rivals; `found` is the JSON."""
-    seed = diagnosis.seed
-    gaps = [("as given", diagnosis.before, BEFORE)]
-    if diagnosis.control is not None:
-        gaps.append((f"wrong: {diagnosis.control[0]}", diagnosis.control[1], WRONG))
-    if len(diagnosis.without) > 1:
-        gaps += [(f"without {label}", gap, BEFORE) for label, gap in diagnosis.without.items()]
-    if diagnosis.search.named:
-        gaps.append(("with what was named", diagnosis.after, AFTER))
-    rows = [(label, *_gap_cells(gap, diagnosis.before, seed, 3)) for label, gap, _ in gaps]
+    seed, main = diagnosis.seed, diagnosis.main
+    gaps = [("as given", main.before, BEFORE)]
+    if main.control is not None:
+        gaps.append((f"wrong: {main.control[0]}", main.control[1], WRONG))
+    if len(main.without) > 1:
+        gaps += [(f"without {label}", gap, BEFORE) for label, gap in main.without.items()]
+    if main.names:
+        gaps.append(("with what was named", main.after, AFTER))
+    rows = [(label, *_gap_cells(gap, main.before, seed, 3)) for label, gap, _ in gaps]
     held = ", ".join(found["gap"]["held_out"])
-    words = f"{MEASURE}. Held out: {held}; they took no part in finding or fitting anything."
-    note = (
-        "95 % by drawing neighbouring rollouts in blocks of a second. Wrong: the best effect that "
-        "is neither named nor a rival, fitted to the same flights in the same way."
+    words = (
+        f"{main.source.measure}. Held out: {held}; they took no part in finding or fitting "
+        "anything."
     )
-    speed = np.linalg.norm(np.asarray(diagnosis.held_windows.vel_w), axis=1)
+    note = (
+        "95 % by drawing neighbouring stretches in blocks. Wrong: the best effect that is neither "
+        "named nor a rival, fitted to the same flights in the same way."
+    )
+    flown, speed = main.source.rollouts, None
+    if flown is not None:
+        speed = np.linalg.norm(np.asarray(flown.held.vel_w), axis=1)
     parts: list[Part] = [
         words,
-        Picture(gap_chart(gaps, speed, seed), "Left: bars are 95 %. Right: dots are rollouts."),
+        Picture(gap_chart(gaps, speed, seed), "Bars are 95 %; dots are rollouts."),
         grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
     ]
+    if checks is None:
+        return Section("6. The evidence", parts)
     if checks.black_box is None:
         parts.append(
             "A black box on the same split, and outside the speeds of its fit: "
@@ -209,21 +279,42 @@ def held_out_section(diagnosis: Diagnosis, found: Mapping[str, Any], checks: Che
     return Section("6. The evidence", parts)
 
 
+AGREEMENT = (
+    "The fall of the squared error of each flight under what the others' fit gives, in units of "
+    "independent noise. A name needs all flights but one."
+)
+
+
+def agreement_section(diagnosis: Diagnosis) -> Section:
+    """Return what each source compares, and whether the flights agree on the names."""
+    parts: list[Part] = [
+        f"{one.source.name}: {one.source.about}, in means or stretches of "
+        f"{one.source.horizon_s:g} s; driven by {diagnosis.flights.driven_by}."
+        for one in diagnosis.findings
+    ]
+    for one, name in diagnosis.named:
+        if name.gains:
+            rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(name.gains)]
+            title = f"{one.source.name}: {name.candidate.label}"
+            parts.append(grid(title, ["fitted flight", "gain"], rows, AGREEMENT))
+    return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
+
+
 def _comparison(side: BlackBoxComparison, seed: int) -> Grid:
     rows = [
         (
             label,
             *_gap_cells(gap, side.before, seed, 2),
-            *(f"{values[0]:.3g}" for values in gap.table[HORIZON_S].values()),
+            *(f"{values.error:.3g}" for values in gap.channels[HORIZON].values()),
         )
         for label, gap in labelled_gaps(side)
         if gap is not None
     ]
-    names = [f"{group} [{UNITS[group]}]" for group in side.before.table[HORIZON_S]]
+    names = [f"{group} [{UNITS[group]}]" for group in side.before.channels[HORIZON]]
     headers = ["", "gap", "95 %", "removed", *names]
     note = (
         f"{side.fitted} stretches fitted, {side.judged} judged. The last columns: RMS errors of "
-        f"rollouts of {HORIZON_S:g} s."
+        f"rollouts of {HORIZON}."
     )
     return grid(f"On {side.judged_on}", headers, rows, note)
 
@@ -231,7 +322,7 @@ def _comparison(side: BlackBoxComparison, seed: int) -> Grid:
 def _gap_cells(gap: Gap, before: Gap, seed: int, digits: int) -> tuple[str, str, str]:
     """Return a gap, its interval, and the share of `before` that it removes."""
     low, high = gap.ci95(seed)
-    whole = before.rms - 1.0
+    whole = before.rms - before.floor
     removed = ""
     if gap is not before and whole > 0.0:
         removed = f"{100 * (before.rms - gap.rms) / whole:.0f} %"

@@ -36,7 +36,7 @@ from suite.diagnose.evidence.moments import (
 )
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, chance_of, rotor_gain
-from suite.diagnose.search.look import Look, NamedEffect, SearchResult
+from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 
 
@@ -281,7 +281,7 @@ def search_motion_change(
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
     at = evidence.at(theta)
     block = evidence.linearise(at, sorted(name.candidate.indices))
-    last = Look(evidence, at, block, block.equations())
+    last = Evaluation(evidence, at, block, block.equations())
     named = (replace(name, rivals=rivals),)
     return SearchResult(named, evidence.at(begun), last, last, [], 0.0)
 

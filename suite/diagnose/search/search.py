@@ -18,7 +18,14 @@ from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
-from suite.diagnose.search.look import Look, NamedEffect, SearchResult, chi2_of, fit_beside, look_at
+from suite.diagnose.search.evaluation import (
+    Evaluation,
+    NamedEffect,
+    SearchResult,
+    chi2_of,
+    evaluated_at,
+    fit_beside,
+)
 from suite.diagnose.thresholds import Thresholds
 
 T = TypeVar("T")
@@ -48,23 +55,23 @@ def search(
     """
     limits = evidence.limits
     task = SearchTask(among, say, seed, limits)
-    look = look_at(known or evidence.weighed(start), start, among)
-    first = _scores(task, look, [], among)
+    here = evaluated_at(known or evidence.weighed(start), start, among)
+    first = _scores(task, here, [], among)
     named: list[NamedEffect] = []
     for _ in range(2 * limits.most_names):  # a name that went may come again
         found = None
         if len(named) < limits.most_names:
-            scores = first if look.at is start else None
-            found = _next_name(task, look, named, among, scores)
+            scores = first if here.at is start else None
+            found = _next_name(task, here, named, among, scores)
         if found is None or (named and found[0].gain <= limits.least_name_share * first[0].gain):
             break
         one, at = found
         new = [replace(one, candidate=single) for single in one.candidate.singles]
-        known = look.evidence.weighed(at)
+        known = here.evidence.weighed(at)
         named, at = _without_idle_names(task, known[0], at, [*named, *new], len(new) == 1)
-        look = look_at(known if at is found[1] else known[0].again(at), at, among)
-    named, at = _settled(task, look.evidence, look.at, named)
-    last = judged = _last_fit(look.evidence, at, named)
+        here = evaluated_at(known if at is found[1] else known[0].again(at), at, among)
+    named, at = _settled(task, here.evidence, here.at, named)
+    last = judged = _last_fit(here.evidence, at, named)
     misfit = last.evidence.misfit(last.at, last.block)
     if misfit is not None:
         say("the model leaves more than noise: names are judged by what it leaves")
@@ -79,26 +86,26 @@ def search(
 
 
 def _scores(
-    task: SearchTask, look: Look, beside: Sequence[int], among: Sequence[Candidate]
+    task: SearchTask, here: Evaluation, beside: Sequence[int], among: Sequence[Candidate]
 ) -> list[CandidateScore]:
-    return look.evidence.scores(look.block, look.equations, look.at.theta, beside, among, task.seed)
+    return here.evidence.scores(here.block, here.equations, here.at.theta, beside, among, task.seed)
 
 
-def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Look:
+def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     block = evidence.linearise(at, indices_of([n.candidate for n in named]))
-    return Look(evidence, at, block, block.equations())
+    return Evaluation(evidence, at, block, block.equations())
 
 
-def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Look:
+def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     """Fit all names to the end, as some effects saturate; where there is none nothing is moved."""
     indices, limits = indices_of([n.candidate for n in named]), evidence.limits
     at, block = fit(evidence, at, indices, limits.last_rounds if indices else 0, None, limits)
-    return Look(evidence, at, block, block.equations())
+    return Evaluation(evidence, at, block, block.equations())
 
 
 def _next_name(
     task: SearchTask,
-    look: Look,
+    here: Evaluation,
     named: Sequence[NamedEffect],
     among: Sequence[Candidate],
     known: Sequence[CandidateScore] | None = None,
@@ -106,13 +113,13 @@ def _next_name(
 ) -> tuple[NamedEffect, Estimate] | None:
     """Return the best name beside `named`, and the fit with it; None where there is none.
 
-    `known` are the scores there, to save their calculation. With `now`, a name that `look` is taken
+    `known` are the scores there, to save their calculation. With `now`, a name that `here` is taken
     without, all that may stand in its place is tried.
     """
-    limits, evidence, space = task.limits, look.evidence, look.evidence.space
+    limits, evidence, space = task.limits, here.evidence, here.evidence.space
     beside = indices_of([n.candidate for n in named])
     left = [c for c in among if not set(c.indices) & set(beside)]
-    scores = {s.candidate: s for s in known or _scores(task, look, beside, left)}
+    scores = {s.candidate: s for s in known or _scores(task, here, beside, left)}
     near = list(scores)
     if now is None:
         most = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
@@ -121,15 +128,15 @@ def _next_name(
             for c, score in scores.items()
             if score.p_value <= evidence.name_p_value and score.gain >= most
         ]
-    columns, theta = look.equations.columns_of, look.at.theta
-    fallen = {c: chi2_fall(look.equations, theta, space, [*beside, *columns(c)]) for c in near}
+    columns, theta = here.equations.columns_of, here.at.theta
+    fallen = {c: chi2_fall(here.equations, theta, space, [*beside, *columns(c)]) for c in near}
     near = [c for c in near if c == now or could_be_best(fallen, c, limits)]
     if now is None:
         single = [c for c in near if not c.parts][: limits.short_list]
         near = [c for c in near if c.parts or c in single]
-    begin, judge = look, evidence.compared()
+    begin, judge = here, evidence.compared()
     if judge is not evidence and near:
-        begin = look_at(judge.again(look.at), look.at, among)
+        begin = evaluated_at(judge.again(here.at), here.at, among)
     before, tried = chi2_of(begin, begin.block, begin.at, beside), []
     for candidate in near:
         at, block = fit_beside(begin, beside, candidate)
@@ -178,8 +185,8 @@ def _judged(
     without = Estimate(theta, at.free)
     others = [*named[:place], *named[place + 1 :]]
     left = [c for c in (task.among if among is None else among) if one not in c.parts]
-    look = look_at(evidence.again(without), without, left)
-    found = _next_name(task, look, others, left, None, one)
+    here = evaluated_at(evidence.again(without), without, left)
+    found = _next_name(task, here, others, left, None, one)
     if found is None:
         return others, without
     new = [replace(found[0], candidate=single) for single in found[0].candidate.singles]

@@ -1,4 +1,4 @@
-"""The named effect beside a black box: on flights left out, and outside the speeds of the fit.
+"""The named effect next to a black box: on flights left out, and outside the speeds of the fit.
 
 The black box is the Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
 et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net acceleration that the
@@ -34,10 +34,18 @@ from suite.diagnose.evidence.rollouts import (
     start_estimate,
     weighed_by,
 )
-from suite.diagnose.search.look import rollouts_of
+from suite.diagnose.sources.rollout_source import of_rollouts
+from suite.diagnose.sources.source import Finding
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap, gap_of, measure, noise_floor, start_noise, true_starts
+from suite.diagnose.verdict.gap import Gap
+from suite.diagnose.verdict.rollout_gap import (
+    Rollouts,
+    gap_of,
+    measure,
+    noise_floor,
+    start_noise,
+    true_starts,
+)
 from tracks.geometry.rotation import to_local
 
 
@@ -71,34 +79,34 @@ class BlackBoxComparisons:
 
 
 def compare_black_box(
-    diagnosis: Diagnosis,
+    flown: Rollouts,
+    finding: Finding,
     config: BlackBoxConfig,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> BlackBoxComparisons:
-    """Fit the black box twice and hold it against what was named.
+    """Fit the black box twice and compare it with what was named.
 
-    `progress` is called with (share done, words).
+    `finding` is that of the rollouts `flown`; `progress` is called with (share done, words).
     """
     began = time.monotonic()
-    limits, search = diagnosis.limits, diagnosis.search
-    model, held = diagnosis.model, diagnosis.held_windows
-    noise = rollouts_of(search.last).noise
+    limits, search, model, held = flown.limits, finding.search, flown.model, flown.held
+    noise = of_rollouts(search.last).noise
 
     def show(part: int) -> Callable[[int, str], None]:
         return lambda step, words: progress(0.5 * (part + step / config.iterations), words)
 
-    known = _not_held_out(diagnosis.cut(limits.check_stride_s), held)
+    known = _not_held_out(flown.cut(limits.check_stride_s), held)
     params = fit_black_box(model, known, noise, config, show(0))
     held_out = BlackBoxComparison(
         judged_on="flights left out",
         fitted=len(known.flight),
         judged=len(held.flight),
-        before=diagnosis.before,
-        named=diagnosis.after if search.named else None,
+        before=finding.before,
+        named=finding.after if search.named else None,
         black_box=black_box_gap(model, params, held, noise, limits),
     )
-    every = diagnosis.cut(LENGTH_S)
-    top, mean = _speeds(diagnosis.logs, every)
+    every = flown.cut(LENGTH_S)
+    top, mean = _speeds(flown.logs, every)
     split = float(np.quantile(top, limits.slow_share))
     slow, fast = take(every, top <= split), take(every, mean > split)
     outside = None
@@ -115,7 +123,7 @@ def compare_black_box(
             judged_on=f"speeds above {split:.1f} m/s, fitted below",
             fitted=len(slow.flight),
             judged=len(fast.flight),
-            before=measure(model, diagnosis.start, fast, noise, limits),
+            before=measure(model, flown.start, fast, noise, limits),
             named=named,
             black_box=black_box_gap(model, params, fast, noise, limits),
         )

@@ -1,4 +1,4 @@
-"""What stands beside the names: logs and their consistency, the actuators, a black box.
+"""What a report shows besides the names: logs and their consistency, the actuators, a black box.
 
 The attitude must turn as the gyro says, but for a bias of the gyro, and not later; the velocity
 must be the path's slope. Left alone these faults imitate physics.
@@ -22,7 +22,7 @@ from suite.diagnose.evidence.moments import means_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import ActuatorMismatch, actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxComparisons
-from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.verdict.rollout_gap import Rollouts
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Checks:
     """Only where it was asked for: it takes minutes."""
 
 
-def run_checks(diagnosis: Diagnosis) -> Checks:
-    """Return what stands beside the names of `diagnosis`, but for the black box."""
-    limits, logs = diagnosis.limits, diagnosis.logs
+def run_checks(flown: Rollouts) -> Checks:
+    """Return what a report shows besides the names, but for the black box."""
+    limits, logs = flown.limits, flown.logs
     return Checks(
         facts=[facts_of(log) for log in logs],
         kinematics=check_kinematics(logs, limits),
-        actuators=actuator_mismatches(logs, diagnosis.nominal, limits),
+        actuators=actuator_mismatches(logs, flown.vehicle, limits),
     )
 
 

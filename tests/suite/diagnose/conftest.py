@@ -72,6 +72,18 @@ def drag(diagnosed):
 
 
 @pytest.fixture(scope="session")
+def found_drag(drag):
+    """Return what its rollouts show."""
+    return drag.main
+
+
+@pytest.fixture(scope="session")
+def flown(drag):
+    """Return its rollouts."""
+    return drag.main.source.rollouts
+
+
+@pytest.fixture(scope="session")
 def drag_checks(diagnosed):
-    """Return what stands beside its names."""
+    """Return what its report shows besides the names."""
     return diagnosed[2]

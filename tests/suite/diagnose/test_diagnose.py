@@ -52,7 +52,7 @@ def within(entry, truth):
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():
-    found = diagnosis_json(diagnose(flights(LAGGED, duration_s=5.0), LAGGED))
+    found = diagnosis_json(diagnose(flights(LAGGED, duration_s=5.0), LAGGED, by="rollouts"))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert 0.8 < found["gap"]["before"] < 1.2
 
@@ -74,7 +74,7 @@ def test_behind_a_loop_that_remembers_measured_rotors_drive():
 
 @pytest.mark.slow
 def test_behind_a_loop_that_remembers_there_is_no_gap_where_nothing_is_hidden():
-    found = diagnosis_json(diagnose(flights(REMEMBERED, motors=True), REMEMBERED))
+    found = diagnosis_json(diagnose(flights(REMEMBERED, motors=True), REMEMBERED, by="rollouts"))
     assert 0.8 < found["gap"]["before"] < 1.3
 
 
@@ -109,7 +109,7 @@ def test_a_drag_is_named_with_its_value(drag):
 def test_an_effect_is_named_with_its_value(name):
     parameter, truth = CASES[name]
     logs = flights(with_effects(LAGGED, **{name: (truth,)}))
-    named_with_value(diagnosis_json(diagnose(logs, LAGGED)), name, parameter, truth)
+    named_with_value(diagnosis_json(diagnose(logs, LAGGED, by="rollouts")), name, parameter, truth)
 
 
 def named_with_value(found, name, parameter, truth):
@@ -137,7 +137,7 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
     logs = flights(truth, duration_s=5.0, extras=[swing] * 3)
     limits = Thresholds(unexplained_share=0.0, most_names=1)
-    found = diagnosis_json(diagnose(logs, LAGGED, limits=limits))
+    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts", limits=limits))
     assert found["verdict"] == "unknown" and found["effects"] == []
     assert any(text.startswith("nearest in the catalogue") for text in found["warnings"])
     # What is left is what nothing that was withdrawn has taken away.
@@ -154,7 +154,7 @@ def blown(*headings):
     truth = with_effects(LAGGED, **SIDE)
     each = range(50, 50 + len(headings))
     logs = fly_all([truth] * len(each), each, 6.0, speed=0.2, noise=2.0, headings=headings)
-    found = diagnosis_json(diagnose(logs, LAGGED))
+    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts"))
     return {effect["name"]: set(effect["alternatives"]) for effect in found["effects"]}
 
 
@@ -177,7 +177,7 @@ def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
 def test_a_payload_is_its_mass_and_where_it_sits(ways):
     payload = {"mass_offset": (0.06,), "com_offset": ((0.005, -0.003, 0.0),)}
     truth = with_effects(GIVEN, **DRAG, **payload)
-    found = diagnosis_json(diagnose(logged(truth, ways, 9), GIVEN))
+    found = diagnosis_json(diagnose(logged(truth, ways, 9), GIVEN, by="rollouts"))
     effects = {effect["name"]: effect for effect in found["effects"]}
     heavy = effects.pop("mass_offset", None) or effects.pop("thrust_scale")
     assert {heavy["name"], *heavy["alternatives"]} <= {"mass_offset", "thrust_scale"}
@@ -193,7 +193,7 @@ def test_a_load_on_a_line_is_said_to_swing():
     loads = [Pendulum(0.08, 0.5, LAGGED.mass) for _ in range(3)]
     logs = fly_all([LAGGED] * 3, range(3), 8.0, speed=1.5, extras=loads)
     # Without names, for the search takes longer than what is asked here.
-    found = diagnosis_json(diagnose(logs, LAGGED, limits=Thresholds(most_names=0)))
+    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts", limits=Thresholds(most_names=0)))
     assert found["verdict"] == "unknown"
     assert found["unexplained"]["where"].startswith("swings with 1.")
 
@@ -208,14 +208,14 @@ def test_unusable_input_ends_with_2(tmp_path, capsys):
 
 def test_what_drives_the_model_must_be_in_every_log():
     with pytest.raises(ValueError, match="motors"):
-        diagnose([fly(LAGGED, 0, duration_s=2.0)], LAGGED, drive="motors")
+        diagnose([fly(LAGGED, 0, duration_s=2.0)], LAGGED, by="rollouts", drive="motors")
     log = replace(fly(LAGGED, 0, duration_s=2.0), thrust_cmd=None, rate_cmd_b=None)
     with pytest.raises(ValueError, match="sort"):
-        diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED)
+        diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED, by="rollouts")
 
 
 def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch):
-    monkeypatch.setattr("suite.diagnose.diagnose.another_controller", lambda *_: True)
+    monkeypatch.setattr("suite.diagnose.sources.rollouts.another_controller", lambda *_: True)
     logs = [fly(LAGGED, seed, duration_s=2.0, motors=seed > 0) for seed in range(2)]
     without = next(log.name for log in logs if log.rotor_speed is None)
     with pytest.raises(ValueError, match=f"{without} has none to drive by: diagnose the others"):
@@ -225,8 +225,8 @@ def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch)
 @pytest.mark.slow
 def test_thresholds_are_those_that_are_given():
     logs = flights(with_effects(LAGGED, linear_drag=((0.1, 0.1, 0.05),)), duration_s=4.0)
-    strict = diagnose(logs, LAGGED, limits=Thresholds(most_names=0))
-    assert not strict.search.named and strict.verdict.label == "unknown"
+    strict = diagnose(logs, LAGGED, by="rollouts", limits=Thresholds(most_names=0))
+    assert not strict.main.names and strict.verdict.label == "unknown"
     assert strict.limits.most_names == 0
 
 
@@ -242,11 +242,11 @@ def sound():
 def outcome(logs, drive="commands"):
     """The JSON of a diagnosis that went through all its steps, or the message of its refusal."""
     try:
-        result = diagnose(logs, LAGGED, drive)
+        result = diagnose(logs, LAGGED, by="rollouts", drive=drive)
     except ValueError as error:
         assert len(str(error)) > 20
         return str(error)
-    checks = run_checks(result)
+    checks = run_checks(result.main.source.rollouts)
     found = {**diagnosis_json(result), **checks_json(checks, 0)}
     text = to_json(plain(found))
     assert "NaN" not in text and "Infinity" not in text
@@ -364,7 +364,7 @@ def test_no_effect_is_forgotten():
 def test_an_effect_is_named_alone(name, ways):
     truth = with_effects(GIVEN, **{**DRAG, name: HIDDEN[name]})
     logs = logged(truth, ways, list(EFFECTS).index(name))
-    found = diagnosis_json(diagnose(logs, GIVEN))
+    found = diagnosis_json(diagnose(logs, GIVEN, by="rollouts"))
     assert found["verdict"] in ("named", "partly"), found["unexplained"]
     assert [effect["name"] for effect in found["effects"]] == [name]
     (effect,) = found["effects"]

@@ -8,7 +8,7 @@ import numpy as np
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from suite.cli import main
-from suite.diagnose.run import only_views
+from suite.diagnose.sources.rollouts import can_fly
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, REMEMBERING
@@ -16,16 +16,16 @@ from tests.support.vehicles import PLAIN, REMEMBERING
 
 def test_logs_without_what_a_rollout_needs_go_by_views():
     (log,) = flights(1, duration_s=2.0)
-    assert not only_views([log], VEHICLE)
-    assert only_views([replace(log, about={"partial": ["quat"]})], VEHICLE)
+    assert can_fly([log], VEHICLE)
+    assert not can_fly([replace(log, about={"partial": ["quat"]})], VEHICLE)
     driven = replace(log, rotor_speed=None, thrust_cmd=None, rate_cmd_b=None)
-    assert only_views([replace(driven, pwm=np.full((len(log.time_s), 4), 0.5))], VEHICLE)
+    assert not can_fly([replace(driven, pwm=np.full((len(log.time_s), 4), 0.5))], VEHICLE)
 
 
 def test_a_loop_that_remembers_goes_by_views_where_no_rotor_speeds_were_measured():
     commands = fly(PLAIN, 0, duration_s=2.0)
-    assert not only_views([commands], PLAIN) and only_views([commands], REMEMBERING)
-    assert not only_views([fly(PLAIN, 0, duration_s=2.0, motors=True)], REMEMBERING)
+    assert can_fly([commands], PLAIN) and not can_fly([commands], REMEMBERING)
+    assert can_fly([fly(PLAIN, 0, duration_s=2.0, motors=True)], REMEMBERING)
 
 
 def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
@@ -44,7 +44,7 @@ def test_a_change_is_written_as_every_diagnosis_is(tmp_path, capsys):
     assert "mass_offset" in names and told["views"] and len(told["reference"]) == 3
     for flag in ("--plan", "--drive"):
         assert any(flag in line for line in told["warnings"])
-        assert f"warning: {flag} is of rollouts: left out" in said.err
+        assert f"warning: {flag} needs rollouts" in said.err
     for axis in told["gap"]["channels"]["force"].values():
         assert {"before", "after", "noise_floor", "repeatability"} <= set(axis)
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == told["verdict"]

@@ -18,7 +18,7 @@ from suite.diagnose.estimate.composites import (
     usual_size,
 )
 from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
-from suite.diagnose.search.look import Look, asked_for
+from suite.diagnose.search.evaluation import Evaluation, asked_for
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
@@ -89,7 +89,7 @@ def test_lent_columns_come_last_and_are_a_composites_alone():
     evidence: Any = SimpleNamespace(space=SPACE)
     at: Any = SimpleNamespace(theta=SPACE.array("start"))
     block: Any = None
-    change, told = asked_for(Look(evidence, at, block, made), [], WIND)
+    change, told = asked_for(Evaluation(evidence, at, block, made), [], WIND)
     np.testing.assert_allclose(change[list(lent)], [1.0, -2.0, 0.5], atol=1e-3)
     assert (told[list(lent)] > 0.0).all() and told[places("frame_tilt")].max() == 0.0
 

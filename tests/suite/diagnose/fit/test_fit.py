@@ -23,7 +23,7 @@ from suite.diagnose.evidence.rollouts import (
     start_estimate,
     weighed_by,
 )
-from suite.diagnose.search.look import NamedEffect
+from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.search.search import search
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -33,12 +33,12 @@ NEEDED = ("acc_b", "command")
 
 
 @pytest.fixture(scope="module")
-def flown(drag):
+def linearised(flown):
     """Return a model, windows with a drag that it lacks, and their slopes along everything.
 
     They are those of the shared diagnosis, for which the model's programs are compiled already.
     """
-    model, windows = drag.model, drag.cut(1.0)
+    model, windows = flown.model, flown.cut(1.0)
     begin = start_estimate(model, windows)
     return model, windows, model.linearise(begin.theta, begin.free, windows, None)
 
@@ -64,8 +64,8 @@ def test_a_vehicle_that_no_stretch_can_begin_with_is_refused():
         make_space(with_effects(slung_load=(0.05, 0.5)))
 
 
-def test_slopes_are_those_of_small_changes(flown):
-    model, windows, linear = flown
+def test_slopes_are_those_of_small_changes(linearised):
+    model, windows, linear = linearised
     begin = start_estimate(model, windows)
     name = ("linear_drag", "coefficient", 0)
     index = SPACE.layout.index(name)
@@ -78,8 +78,8 @@ def test_slopes_are_those_of_small_changes(flown):
     np.testing.assert_allclose(few.slope[..., 0], linear.slope[..., index], atol=1e-9)
 
 
-def test_a_disturbance_pushes_the_windows(flown):
-    model, windows, _ = flown
+def test_a_disturbance_pushes_the_windows(linearised):
+    model, windows, _ = linearised
     begin = start_estimate(model, windows)
     response = model.respond(begin.theta, begin.free, windows)
     assert response.slope.shape[-1] == KNOTS * 6
@@ -90,16 +90,16 @@ def test_a_disturbance_pushes_the_windows(flown):
     np.testing.assert_allclose(up[np.arange(len(at)), at], 0.125, rtol=0.5)
 
 
-def test_batches_are_of_one_size_and_whole(flown):
-    model, windows, _ = flown
+def test_batches_are_of_one_size_and_whole(linearised):
+    model, windows, _ = linearised
     offset = start_estimate(model, windows).free
     parts = list(batches(offset, windows))
     assert all(len(x) == len(w.flight) == BATCH for x, w, _ in parts)
     assert sum(count for *_, count in parts) == len(windows.flight) and DIRECTIONS <= model.size
 
 
-def test_what_the_start_explains_is_projected_out(flown):
-    model, windows, linear = flown
+def test_what_the_start_explains_is_projected_out(linearised):
+    model, windows, linear = linearised
     sigma = np.where(windows.seen.any(axis=(0, 1)), 0.01, np.nan)
     whitening = make_whitening(linear, Noise(sigma, {}), windows)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
@@ -132,8 +132,8 @@ def test_columns_that_depend_on_each_other_are_made_orthonormal_too():
         )
 
 
-def test_windows_are_trusted_until_the_model_leaves_the_flight(flown):
-    _, windows, linear = flown
+def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
+    _, windows, linear = linearised
     residual = np.zeros_like(linear.residual)
     residual[0, np.asarray(windows.row_s)[0] > 0.4, 0] = 1.0
     view = trusted(windows, residual)
@@ -141,8 +141,8 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(flown):
     assert last == pytest.approx([0.25, 1.0], abs=0.011)
 
 
-def test_a_search_names_the_drag_and_leaves_its_result_alone(flown):
-    model, windows, linear = flown
+def test_a_search_names_the_drag_and_leaves_its_result_alone(linearised):
+    model, windows, linear = linearised
     among = [
         c for c in candidates(SPACE, False, NEEDED[1:]) if c.name in ("linear_drag", "gyro_bias")
     ]

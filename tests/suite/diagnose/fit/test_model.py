@@ -11,7 +11,7 @@ from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.plans.simulate import SENSORS, fly, log_of
 from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
-from suite.diagnose.verdict.gap import true_starts
+from suite.diagnose.verdict.rollout_gap import true_starts
 from tests.support.faults import ImuFault, with_imu_fault
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 

@@ -11,12 +11,11 @@ from suite.diagnose.report import charts
 from suite.diagnose.report.charts import (
     black_box_chart,
     gains_chart,
-    held_out_chart,
-    held_out_rollouts,
+    series_chart,
     write_rollouts,
 )
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.page import _held_out, page
+from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.report.parameters_json import (
     UNSEEN,
     cells,
@@ -28,7 +27,7 @@ from suite.diagnose.report.parameters_json import (
 )
 from suite.diagnose.report.sections import (
     actuators_section,
-    held_out_section,
+    evidence_section,
     logs_section,
     noise_section,
     residual_section,
@@ -51,7 +50,8 @@ def texts(table):
 
 
 def compared(drag):
-    side = BlackBoxComparison("flights left out", 9, 5, drag.before, drag.after, drag.before)
+    gaps = (drag.main.before, drag.main.after, drag.main.before)
+    side = BlackBoxComparison("flights left out", 9, 5, *gaps)
     return BlackBoxComparisons(side, None, 4.0, 1.0)
 
 
@@ -62,11 +62,11 @@ def test_rows_are_cells_without_a_tone():
 
 
 def test_the_json_says_what_was_found(drag, found):
-    assert found["verdict"] == drag.verdict.label and found["driven_by"] == "commands"
+    assert found["verdict"] == drag.label and found["driven_by"] == "commands"
     (effect,) = found["effects"]
     assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
     value = np.array(effect["parameters"]["coefficient"]["value"])
-    np.testing.assert_allclose(value, drag.fitted[drag.search.indices])
+    np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
     assert found["black_box"] is None and found["kinematics"]["velocity_over_path"]
 
@@ -74,7 +74,7 @@ def test_the_json_says_what_was_found(drag, found):
 def test_a_comparison_with_a_black_box_is_in_the_json(drag, drag_checks):
     box = checks_json(replace(drag_checks, black_box=compared(drag)), 0)["black_box"]
     assert box["outside"] is None and box["held_out"]["stretches"] == {"fitted": 9, "judged": 5}
-    assert box["held_out"]["named"]["gap"] == drag.after.rms
+    assert box["held_out"]["named"]["gap"] == drag.main.after.rms
 
 
 def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
@@ -113,33 +113,33 @@ def test_sections_show_the_numbers(drag, drag_checks, found):
     assert len(actuators_section(drag_checks, "commands")) == 1
     assert actuators_section(replace(drag_checks, actuators=[]), "commands") == []
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
-    assert residual_section(drag, rest).parts[0] == "25 % of the gap is left: a shape."
+    assert residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
     with_box = replace(drag_checks, black_box=compared(drag))
-    held = held_out_section(drag, found, with_box).parts
+    held = evidence_section(drag, found, with_box).parts
     assert "too few stretches" in str(held[-1])
     tables = [part for part in held if isinstance(part, Grid)]
     assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
 
 
-def test_what_no_log_measured_is_not_in_the_table(drag, found):
-    gap = {horizon: {**groups, "velocity": {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}}
-           for horizon, groups in found["gap"]["channels"].items()}  # fmt: skip
-    lacks = {**found, "gap": {**found["gap"], "channels": gap}}
-    (table,) = [part for part in _held_out(drag, lacks) if isinstance(part, Grid)]
+def test_what_no_log_measured_is_not_in_the_table(found):
+    none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
+    every = found["gap"]["channels"].items()
+    table = channels_grid({horizon: {**groups, "velocity": none} for horizon, groups in every})
     assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
 
 
 def test_charts_are_pictures(drag, monkeypatch):
-    scores = drag.search.first
+    main = drag.main
+    scores = main.search.first
     assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
     assert black_box_chart([compared(drag).held_out], 0).startswith(PNG)
-    windows, simulated = held_out_rollouts(drag)
-    assert held_out_chart(windows, simulated, drag.sigma).startswith(PNG)
+    series = main.source.series(main.search)
+    assert series_chart(series).startswith(PNG)
     drawn = lambda figure: figure.axes[0]  # noqa: E731
     monkeypatch.setattr(charts, "png", drawn)
-    axes = held_out_chart(windows, simulated, drag.sigma)
+    axes = series_chart(series)
     labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
-    assert labels == ["measured", *simulated] and len(simulated) == 2
+    assert labels == ["measured", *series.simulated] and len(series.simulated) == 2
 
 
 def test_the_page_stands_alone(drag, drag_checks, found):
@@ -148,6 +148,6 @@ def test_the_page_stands_alone(drag, drag_checks, found):
     assert "recording.rrd" not in text
 
 
-def test_the_recording_is_written(drag, tmp_path):
-    path = write_rollouts(tmp_path / "x.rrd", drag)
+def test_the_recording_is_written(drag, flown, tmp_path):
+    path = write_rollouts(tmp_path / "x.rrd", flown, drag.main.theta)
     assert path.stat().st_size > 10_000

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from suite.diagnose.search.look import NamedEffect, rollouts_of
-from suite.diagnose.verdict.diagnosis import confirmed
-from suite.diagnose.verdict.gap import measure, verdict_on
+from suite.diagnose.search.evaluation import NamedEffect
+from suite.diagnose.sources.examine import confirmed
+from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
+from suite.diagnose.verdict.residual_structure import ResidualStructure
 
 
-def spoilt(drag, steps):
-    """What was found, and a torque that is not there beside the drag that is."""
-    found, space = drag.search, drag.model.space
+def spoilt(found_drag, steps):
+    """What was found, and a torque that is not there next to the drag that is."""
+    found, space = found_drag.search, found_drag.source.space
     other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
     theta, at = found.estimate.theta.copy(), list(other.indices)
     theta[at] += steps * space.array("step")[at]
@@ -20,55 +21,48 @@ def spoilt(drag, steps):
     return replace(found, named=named, last=last, judged=last)
 
 
-def judged(drag, found):
-    held, limits = drag.held_windows, drag.limits
-    after = measure(drag.model, found.estimate.theta, held, rollouts_of(found.last).noise, limits)
-    return after, confirmed(drag.model, found, held, (drag.before, after), limits)
+def judged(found_drag, found):
+    after = found_drag.source.gap(found, found.estimate.theta)
+    return after, confirmed(found_drag.source, found, (found_drag.before, after))
 
 
-def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(drag):
-    found = spoilt(drag, 0.2)
-    after, (kept, gap, without, gone) = judged(drag, found)
+def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(found_drag):
+    found = spoilt(found_drag, 0.2)
+    after, (kept, gap, without, gone) = judged(found_drag, found)
     assert gone == ["torque_trim"] and gap.rms < after.rms
-    assert [one.label for one in kept.candidates] == [one.label for one in drag.search.candidates]
-    assert set(without) == {one.label for one in drag.search.candidates}
+    labels = [one.label for one in found_drag.search.candidates]
+    assert [one.label for one in kept.candidates] == labels and set(without) == set(labels)
     theta = found.estimate.theta
     np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
 
 
-def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_rest(drag):
-    found, held, limits = drag.search, drag.held_windows, drag.limits
+def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_rest(found_drag):
+    found, before, after = found_drag.search, found_drag.before, found_drag.after
     # As if the rest were so large that the gap without the drag is a fifth larger only.
-    raised = drag.without["linear_drag"].energy.sum() / 1.2 / drag.after.energy.sum()
-    after = drag.after._replace(score=raised * drag.after.score, energy=raised * drag.after.energy)
-    misfit = replace(rollouts_of(found.judged), off=True)
+    raised = found_drag.without["linear_drag"].energy.sum() / 1.2 / after.energy.sum()
+    after = after._replace(score=raised * after.score, energy=raised * after.energy)
+    misfit = replace(of_rollouts(found.judged), off=True)
     off = replace(found, judged=found.judged._replace(evidence=misfit))
     gone = {
-        rollouts_of(one.judged).off: confirmed(drag.model, one, held, (drag.before, after), limits)[
-            3
-        ]
+        one.judged.evidence.off: confirmed(found_drag.source, one, (before, after))[3]
         for one in (found, off)
     }
     assert gone == {False: [], True: ["linear_drag"]}
 
 
-def test_one_that_they_could_not_show_stays(drag):
-    _, (kept, _, _, gone) = judged(drag, spoilt(drag, 1e-4))
+def test_one_that_they_could_not_show_stays(found_drag):
+    _, (kept, _, _, gone) = judged(found_drag, spoilt(found_drag, 1e-4))
     assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
 
 
-def test_what_was_withdrawn_has_explained_nothing(drag):
+def test_what_was_withdrawn_has_explained_nothing(found_drag):
     """A gap that a withdrawn name had closed is there again: `unknown`, not `no_gap`."""
 
-    def loudness(found):
-        slow, expected = rollouts_of(found.last).slow_errors(found.last.block)
-        return slow.sum() / expected.sum()
+    def errors(found):
+        return of_rollouts(found.last).slow_errors(found.last.block)
 
-    bare = drag.search.refitted(())
+    bare = found_drag.search.refitted(())
     assert bare.named == () and bare.explained == 0.0
-    assert loudness(drag.search) < 1.5 and loudness(bare) > 3.0
-    quiet = drag.residual._replace(shapes=[], coloured={})
-    gaps = (drag.before, drag.before)
-    slow = rollouts_of(bare.last).slow_errors(bare.last.block)
-    verdict = verdict_on(False, slow, quiet, gaps, rotor_input=True, limits=drag.limits)
-    assert verdict.label == "unknown"
+    slow, expected = errors(found_drag.search)
+    assert slow.sum() / expected.sum() < 1.5
+    assert structure_where(errors(bare), ResidualStructure([], {}), True) is not None

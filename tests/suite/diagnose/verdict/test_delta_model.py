@@ -16,7 +16,7 @@ from suite.diagnose.verdict.black_box import (
     compare_black_box,
     fit_black_box,
 )
-from suite.diagnose.verdict.gap import measure, true_starts
+from suite.diagnose.verdict.rollout_gap import measure, true_starts
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -79,14 +79,16 @@ def test_its_output_pushes_the_body(few):
     at = np.abs(np.asarray(windows.row_s) - 1.0).argmin(axis=1)
     error = apart[np.arange(BATCH), at][:, :3]
     rms = np.sqrt((error**2).sum(axis=1).mean())
-    assert boxed.table[1.0]["position"][0] == pytest.approx(rms, rel=1e-6)
+    assert boxed.channels["1 s"]["position"].error == pytest.approx(rms, rel=1e-6)
 
 
 @pytest.mark.slow
 def test_it_learns_and_the_named_effect_holds_up_better_outside():
     logs = [fly(TRUTH, k, duration_s=8.0, speed=3.0 + k) for k in range(5)]
     result = diagnose(logs, LAGGED)
-    found = compare_black_box(result, BlackBoxConfig(iterations=200))
+    found = compare_black_box(
+        result.main.source.rollouts, result.main, BlackBoxConfig(iterations=200)
+    )
     inside, outside = found.held_out, found.outside
     assert outside is not None and inside.named is not None and outside.named is not None
     assert inside.black_box.rms < 0.5 * inside.before.rms

@@ -1,5 +1,6 @@
 """How large an effect is on these flights, in units of practice; what is too small to matter."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,16 +8,10 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import SLICES
+from suite.diagnose.sources.examine import relevant_part
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import (
-    EffectSize,
-    gap_matters,
-    relevant_part,
-    rollout_size,
-    sizes_of,
-    view_size,
-)
+from suite.diagnose.verdict.gap import Channel
+from suite.diagnose.verdict.relevance import EffectSize, rollout_size, upper_size, view_size
 
 LIMITS = Thresholds()
 
@@ -56,10 +51,13 @@ def test_a_bias_of_the_accelerometer_counts_as_a_force():
 
 def test_the_upper_end_of_a_size_holds_what_the_interval_allows():
     slope = pushed(1.0)[..., None]
-    size, upper = sizes_of(slope, np.array([0.03]), np.array([0.01]), windows())
-    assert size.force == pytest.approx(0.03) and upper.force == pytest.approx(0.04)
-    assert not upper.relevant(LIMITS)
-    _, unsure = sizes_of(slope, np.array([0.03]), np.array([0.03]), windows())
+
+    def size_of(moved):
+        return rollout_size(moved, windows())
+
+    upper = upper_size(slope, np.array([0.03]), np.array([0.01]), size_of)
+    assert upper.force == pytest.approx(0.04) and not upper.relevant(LIMITS)
+    unsure = upper_size(slope, np.array([0.03]), np.array([0.03]), size_of)
     assert unsure.relevant(LIMITS), "a small effect that may be large is no finding of none"
 
 
@@ -78,24 +76,29 @@ def test_a_views_size_is_in_its_own_unit():
     assert view_size(moved, False) == EffectSize(0.0, pytest.approx(0.5), None)
 
 
-def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds():
-    def gap(error, floor):
-        table = {h: dict.fromkeys(("position", "velocity", "rates"), (error, floor))
-                 for h in (0.1, 0.5, 1.0)}  # fmt: skip
-        return Gap(np.ones(4), np.ones(4), table)
+def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
+    def matters(error, floor, count=400, limits=LIMITS):
+        flown = replace(found_drag.source.flown, held=SimpleNamespace(flight=np.zeros(count)))
+        source = replace(found_drag.source, flown=flown, limits=limits)
+        groups = dict.fromkeys(("position", "velocity", "rates"), Channel(error, floor))
+        return source.matters(found_drag.before._replace(
+            channels=dict.fromkeys(("0.1 s", "0.5 s", "1 s"), groups)))  # fmt: skip
 
-    assert not gap_matters(gap(0.004, 0.001), 400, LIMITS)
-    assert gap_matters(gap(0.04, 0.001), 400, LIMITS)
-    assert not gap_matters(gap(0.04, 0.05), 400, LIMITS)
-    assert gap_matters(gap(0.04, 0.04), 4, LIMITS), "few rollouts cannot say that it is small"
-    assert gap_matters(gap(0.0, 0.0), 400, Thresholds(relevance=(0.0, 0.0, 0.0)))
+    assert not matters(0.004, 0.001) and matters(0.04, 0.001) and not matters(0.04, 0.05)
+    assert matters(0.04, 0.04, 4), "few rollouts cannot show that it is small"
+    assert matters(0.0, 0.0, limits=Thresholds(relevance=(0.0, 0.0, 0.0)))
 
 
-def test_where_rollouts_as_given_are_near_enough_no_name_matters(drag):
+def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
     """Noise-free flights: 0.5 % of inertia, by how rotor speeds run between rows, is no finding."""
-    none = {h: {g: (1e-3, 0.0) for g in groups} for h, groups in drag.before.table.items()}
-    near = drag.before._replace(table=none, score=np.ones(400))
-    held = drag.held_windows._replace(flight=np.zeros(400, int))
-    found, after, _, out = relevant_part(drag.model, drag.search, held, (near, drag.after), LIMITS)
+    none = {
+        horizon: dict.fromkeys(groups, Channel(1e-3, 0.0))
+        for horizon, groups in found_drag.before.channels.items()
+    }
+    near, source = found_drag.before._replace(channels=none), found_drag.source
+    held = source.flown.held._replace(flight=np.zeros(400, int))
+    source = replace(source, flown=replace(source.flown, held=held))
+    found, after, _, out = relevant_part(source, found_drag.search, (near, found_drag.after))
     assert found.named == () and after is near
-    assert [one.name for one in out] == ["linear_drag"] and out[0].size.force > 0.05
+    ((name, size),) = out
+    assert name == "linear_drag" and size.force > 0.05

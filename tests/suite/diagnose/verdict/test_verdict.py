@@ -6,20 +6,13 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import KNOTS, STATE
-from suite.diagnose.search.look import rollouts_of
+from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
+from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import black_box, checks, diagnosis
-from suite.diagnose.verdict.disturbances import _likelihood, find_turbulence
-from suite.diagnose.verdict.gap import (
-    Gap,
-    Verdict,
-    measure,
-    noise_floor,
-    share_left,
-    start_noise,
-    verdict_on,
-    worse,
-)
+from suite.diagnose.verdict.diagnosis import Verdict, verdict_on
+from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
+from suite.diagnose.verdict.gap import Gap, share_left
 from suite.diagnose.verdict.residual_structure import (
     AXES,
     DisturbanceEquations,
@@ -29,6 +22,7 @@ from suite.diagnose.verdict.residual_structure import (
     residual_structure,
     shape_library,
 )
+from suite.diagnose.verdict.rollout_gap import measure, noise_floor, start_noise
 
 
 def gap(energy):
@@ -51,35 +45,48 @@ def scores(before, after):
     return one, two
 
 
-SAME = scores(0.0, 0.0)
-
-
 def left(p_value=0.5, coloured=0.5, gain=1.0):
     shapes = [ShapeScore("force with the speed", gain, p_value)]
     return ResidualStructure(shapes, dict.fromkeys(AXES, coloured))
 
 
-def test_noise_alone_is_no_gap_and_a_name_without_structure_is_named():
-    assert verdict_on(False, QUIET, left(), SAME, False) == Verdict("no_gap")
-    assert verdict_on(True, QUIET, left(), SAME, False) == Verdict("named")
+def finding(drag, named=True, **remaining):
+    """What rollouts show, with another remaining error."""
+    left = Remaining(**{"structured": False, "share": 0.0, **remaining})
+    names = drag.main.names if named else ()
+    return replace(drag.main, names=names, remaining=left)
 
 
-def test_structure_is_told_by_what_it_goes_with():
-    shaped = verdict_on(False, QUIET, left(p_value=1e-4), SAME, False)
-    assert shaped == Verdict("unknown", 1.0, "force with the speed")
-    coloured = verdict_on(False, QUIET, left(coloured=1e-6), SAME, False)
-    assert coloured.where == "a changing " + ", ".join(AXES)
-    loud = verdict_on(False, slow_errors(10.0), left(), SAME, False)
-    assert loud.label == "unknown" and loud.where == "errors of velocity x"
+def test_one_place_decides_by_names_structure_and_share(drag):
+    def label(named, tested=False, **remaining):
+        one = finding(drag, named, **remaining)
+        return verdict_on([one], named or tested, THRESHOLDS).label
 
-
-def test_what_explains_most_is_named_in_part():
-    seen = left(p_value=1e-4)
-    verdict = verdict_on(True, QUIET, seen, scores(11.0, 1.0), False)
-    assert verdict.label == "partly" and verdict.share_left == pytest.approx(
-        (2**0.5 - 1.0) / (12**0.5 - 1.0)
+    some = {"structured": True, "where": "the speed"}
+    assert label(False) == "no_gap" and label(True) == "named"
+    assert label(False, tested=True) == "named", "a wind or a lag is a name as well"
+    assert (
+        label(True, share=0.3, **some) == "partly" and label(False, share=1.0, **some) == "unknown"
     )
-    assert verdict_on(True, QUIET, seen, scores(11.0, 9.0), False).label == "unknown"
+    assert label(True, share=0.9, **some) == "unknown"
+
+
+def test_sources_that_name_something_are_judged_and_a_swing_is_left_whatever_is_named(drag):
+    some = finding(drag, share=0.1)
+    bare = finding(drag, False, structured=True, share=0.8, where="torque x")
+    assert verdict_on([some, bare], True, THRESHOLDS) == Verdict("named", 0.1)
+    assert verdict_on([bare], False, THRESHOLDS) == Verdict("unknown", 0.8, "torque x")
+    swing = Swing(1.4, (1.3, 1.5), 0.5, 1e-6)
+    verdict = verdict_on([finding(drag, share=0.1, swing=swing)], True, THRESHOLDS)
+    assert verdict.label == "partly" and verdict.where == swing.words
+
+
+def test_structure_goes_with_a_shape_a_colour_or_the_loudest_channel():
+    assert structure_where(QUIET, left(), False) is None
+    assert structure_where(QUIET, left(p_value=1e-4), False) == "force with the speed"
+    coloured = structure_where(QUIET, left(coloured=1e-6), False)
+    assert coloured == "a changing " + ", ".join(AXES)
+    assert structure_where(slow_errors(10.0), left(), False) == "errors of velocity x"
 
 
 def test_the_share_that_is_left_is_that_of_the_gaps():
@@ -91,10 +98,9 @@ def test_the_share_that_is_left_is_that_of_the_gaps():
 
 def test_rotor_speeds_as_input_may_be_noisier():
     quiet = slow_errors(3.0)
-    assert verdict_on(False, quiet, left(coloured=1e-6), SAME, True) == Verdict("no_gap")
-    assert verdict_on(False, quiet, left(), SAME, False).label == "unknown"
-    strict = replace(THRESHOLDS, structure_rotor_input=1.1)
-    assert verdict_on(False, quiet, left(), SAME, True, strict).label == "unknown"
+    assert structure_where(quiet, left(coloured=1e-6), True) is None
+    assert structure_where(quiet, left(), False)
+    assert structure_where(quiet, left(), True, replace(THRESHOLDS, structure_rotor_input=1.1))
 
 
 def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
@@ -103,8 +109,10 @@ def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     low, high = before.ci95(0)
     assert low < before.rms < high and high - low < 0.3
     assert before.ci95(0) == before.ci95(0) != before.ci95(1)
-    assert worse(before, after) and not worse(after, before) and not worse(before, before)
-    assert not worse(before, after, limits=Thresholds(doubt_chi2=1e6))
+    assert after.above(before, 0.25, 0, THRESHOLDS)
+    assert not before.above(after, 0.25, 0, THRESHOLDS)
+    assert not before.above(before, 0.25, 0, THRESHOLDS)
+    assert not after.above(before, 0.25, 0, Thresholds(doubt_chi2=1e6))
 
 
 def test_the_noise_floor_is_what_start_and_row_make():
@@ -116,34 +124,34 @@ def test_the_noise_floor_is_what_start_and_row_make():
     assert floor[0, 0] == pytest.approx(0.5) and floor[0, 6] == pytest.approx(0.8)
 
 
-def test_a_diagnosis_is_measured_on_what_was_held_out(drag):
-    assert isinstance(drag, diagnosis.Diagnosis) and drag.verdict.label == "named"
-    assert drag.input_source == "commands" and drag.fitted is not None
-    sigma, held = drag.sigma, drag.held_windows
-    again = measure(drag.model, drag.fitted, held, rollouts_of(drag.search.last).noise)
-    np.testing.assert_array_equal(again.score, drag.after.score)
-    assert drag.after.rms < 1.3 < drag.before.rms
-    noise = start_noise(sigma, held, drag.model.free)
+def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
+    assert isinstance(drag, diagnosis.Diagnosis) and drag.label == "named"
+    assert drag.flights.driven_by == "commands"
+    own = of_rollouts(found_drag.search.last).noise
+    again = measure(flown.model, found_drag.theta, flown.held, own)
+    np.testing.assert_array_equal(again.score, found_drag.after.score)
+    assert found_drag.after.rms < 1.3 < found_drag.before.rms
+    noise, sigma = start_noise(own.sigma, flown.held, flown.model.free), own.sigma
     np.testing.assert_array_equal(noise[:STATE], np.where(np.isfinite(sigma), sigma, 0.0)[:STATE])
     # Rotors begin as the commands at the measured rates leave them, which gyro noise moves.
     assert (noise[STATE:] == noise[STATE]).all() and 0.05 < noise[STATE] < 50.0
 
 
-def test_without_the_name_its_shape_is_left(drag):
-    found = drag.search
-    evidence, bare = rollouts_of(found.last), found.estimate._replace(theta=drag.start)
+def test_without_the_name_its_shape_is_left(found_drag, flown):
+    found, details = found_drag.search, found_drag.remaining.details
+    evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start)
     windows = evidence.trusted
-    equations = disturbance_equations(drag.model, windows, evidence.whitening, bare)
+    equations = disturbance_equations(flown.model, windows, evidence.whitening, bare)
     fold = np.arange(len(windows.flight)) % 5
     with_gap = residual_structure(equations, fold)
-    assert with_gap.shapes[0].gain > 10.0 * max(drag.residual.shapes[0].gain, 1.0)
-    assert min(with_gap.coloured.values()) < 1e-6 <= min(drag.residual.coloured.values())
+    assert with_gap.shapes[0].gain > 10.0 * max(details["shapes"][0]["gain"], 1.0)
+    assert min(with_gap.coloured.values()) < 1e-6 <= min(details["coloured"].values())
 
 
-def test_shapes_are_columns_that_their_groups_share_out(drag):
-    found = drag.search
-    windows = rollouts_of(found.last).trusted
-    response = drag.model.respond(found.estimate.theta, found.estimate.free, windows)
+def test_shapes_are_columns_that_their_groups_share_out(found_drag, flown):
+    found = found_drag.search
+    windows = of_rollouts(found.last).trusted
+    response = flown.model.respond(found.estimate.theta, found.estimate.free, windows)
     library = shape_library(response.knot, np.asarray(windows.start_s))
     columns = [column for group in library.groups for column in group.columns]
     assert columns == list(range(library.unit.shape[-1]))
@@ -164,22 +172,22 @@ def test_the_likelihood_of_a_random_disturbance_peaks_at_its_size():
     assert sizes[found.argmax()] == size
 
 
-def test_a_drag_is_not_taken_for_wind(drag):
-    found = drag.search
-    evidence = rollouts_of(found.last)
+def test_a_drag_is_not_taken_for_wind(found_drag, flown):
+    found = found_drag.search
+    evidence = of_rollouts(found.last)
     with_it = (evidence.trusted, evidence.whitening, found.estimate)
-    equations = disturbance_equations(drag.model, *with_it)
-    assert find_turbulence(drag.model, found.estimate.theta, equations) is None
+    equations = disturbance_equations(flown.model, *with_it)
+    assert find_turbulence(flown.model, found.estimate.theta, equations) is None
 
 
-def test_what_was_held_out_is_not_fitted_by_the_black_box(drag):
-    known = black_box._not_held_out(drag.cut(0.5), drag.held_windows)
-    assert len(known.flight) and not set(known.flight) & set(drag.held_windows.flight)
-    top, mean = black_box._speeds(drag.logs, known)
+def test_what_was_held_out_is_not_fitted_by_the_black_box(flown):
+    known = black_box._not_held_out(flown.cut(0.5), flown.held)
+    assert len(known.flight) and not set(known.flight) & set(flown.held.flight)
+    top, mean = black_box._speeds(flown.logs, known)
     assert (top >= mean).all() and (mean > 0.0).all()
 
 
-def test_checks_know_the_logs_and_their_motors(drag, drag_checks):
+def test_checks_know_the_logs_and_their_motors(flown, drag_checks):
     assert isinstance(drag_checks, checks.Checks) and drag_checks.black_box is None
-    assert [fact.name for fact in drag_checks.facts] == [log.name for log in drag.logs]
+    assert [fact.name for fact in drag_checks.facts] == [log.name for log in flown.logs]
     assert drag_checks.actuators[0].followed > 0.9

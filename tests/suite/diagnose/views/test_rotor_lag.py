@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.actuators import another_lag
 from tests.support.diagnosis_flights import fly_all
@@ -24,7 +24,7 @@ def slow():
 
 
 def test_slow_rotors_are_named_beside_what_the_views_name(slow):
-    found = diagnose_by_views(slow, GIVEN)
+    found = diagnose(slow, GIVEN, by="views")
     told = diagnosis_json(found)
     effects = {effect["name"]: effect for effect in told["effects"]}
     assert {"motor_lag", "linear_drag"} <= set(effects)

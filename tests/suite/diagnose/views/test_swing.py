@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from suite.diagnose.by_views import diagnose_by_views
 from suite.diagnose.data.view import SmoothedFlight, weak_form
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.disturbances import Swing, find_swing
 from tests.support.real_flights import VEHICLE, flights
@@ -60,13 +60,12 @@ def test_noise_and_periods_that_flights_do_not_share_are_no_swing():
 
 @pytest.mark.slow
 def test_a_load_on_a_line_is_said_to_swing_with_its_period():
-    found = diagnose_by_views(flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5)),
-                              VEHICLE)  # fmt: skip
-    assert found.label in ("partly", "unknown") and found.swing is not None
+    logs = flights(4, seed=1, duration_s=10.0, speed=1.0, load=(0.08, 0.5))
+    found = diagnose(logs, VEHICLE, by="views")
+    swing = found.findings[0].remaining.swing
+    assert found.label in ("partly", "unknown") and swing is not None
     # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
-    assert found.swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
-    told = diagnosis_json(found)
-    assert f"length = {found.swing.length_m:.2g} into [effects.slung_load]" in told["headline"]
-    assert (
-        told["unexplained"]["where"].startswith("swings with 1.") and "swings" in told["headline"]
-    )
+    assert swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
+    entries = diagnosis_json(found)
+    assert f"length = {swing.length_m:.2g} into [effects.slung_load]" in entries["headline"]
+    assert entries["unexplained"]["where"].startswith("swings with 1.")

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates
 from suite.diagnose.evidence.moments import centred
-from suite.diagnose.search.look import Look, NamedEffect, contradicted
-from suite.diagnose.verdict.view_gap import closed_share, fit_black_box, inputs_of, judge
+from suite.diagnose.search.evaluation import Evaluation, NamedEffect
+from suite.diagnose.sources.examine import contradicted
+from suite.diagnose.sources.view_source import closed_share, fit_black_box, inputs_of
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 
@@ -18,40 +19,34 @@ DRAG = (0.4, 0.3, 0.2)
 
 @pytest.fixture(scope="module")
 def found():
-    return diagnose_by_views(flights(4, linear_drag=(DRAG,)), VEHICLE)
+    return diagnose(flights(4, linear_drag=(DRAG,)), VEHICLE, by="views")
 
 
 def test_a_drag_is_named_and_closes_what_any_model_could(found):
     assert found.label == "named" and found.warnings == []
     assert found.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
-    force = found.main.gap
-    assert force.share(force.closed) > 0.8 > 0.3 * force.share(force.explainable)
-    assert force.rms(force.after) < 0.6 * force.rms(force.before)
-    assert len(found.held_out) == 1
-
-
-def test_what_was_judged_can_be_judged_again(found):
-    one = found.main
-    again = judge(one.search, one.held, one.gap.floor)
-    assert np.allclose(again.after, one.gap.after)
+    force, left = found.main, found.main.remaining
+    assert left.gap_details["closed"] > 0.8 > 0.3 * left.explainable
+    assert force.after.rms < 0.6 * force.before.rms and force.removed(force.names) > 0.9
+    assert len(found.flights.held_out) == 1
 
 
 @pytest.mark.parametrize(("scale", "count"), [(0.9, 1), (1.0, 0)])
 def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
-    force, space = found.results[0].search, found.space
+    force, space = found.findings[0].search, found.space
     (one,) = [c for c in candidates(space, False, ()) if c.name == "thrust_scale"]
     theta = space.array("start")
     theta[list(one.indices)] = scale
     evidence, at = force.judged.evidence, force.estimate._replace(theta=theta)
     block = evidence.linearise(at, one.indices)
-    look = Look(evidence, at, block, block.equations())
+    here = Evaluation(evidence, at, block, block.equations())
     named = (NamedEffect(one, 0.001, 1.0),)
-    torque = replace(force, named=named, last=look, judged=look)
+    torque = replace(force, named=named, last=here, judged=here)
     assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
 def test_a_drag_that_only_the_file_has_is_named_and_goes():
-    found = diagnose_by_views(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)))
+    found = diagnose(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)), by="views")
     assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
     assert found.label == "named"
     assert found.vehicle.effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.05)
@@ -70,16 +65,16 @@ def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_ano
 
 def test_an_inertia_stands_though_each_flights_trim_weighs_more_on_it():
     logs = flights(4, seed=9, speed=4.0, inertia_scale=((0.8, 0.8, 0.8),))
-    found = diagnose_by_views(logs, VEHICLE)
+    found = diagnose(logs, VEHICLE, by="views")
     assert [name.candidate.name for _, name in found.named] == ["inertia_scale"]
     assert found.vehicle.effects["inertia_scale"].scale == pytest.approx((0.8, 0.8, 0.8), abs=0.02)
-    torque = found.main.gap
-    assert torque.rms(torque.after) > torque.rms(torque.before)  # of means of flights
+    assert found.main.after.rms > found.main.before.rms  # of means of flights
+    assert found.main.after.energy.sum() < found.main.before.energy.sum()
 
 
 def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
     logs = flights(4, seed=6, duration_s=20.0, battery_sag=(0.004, 0.0))
-    found = diagnose_by_views(logs, VEHICLE)
+    found = diagnose(logs, VEHICLE, by="views")
     ((_, name),) = found.named
     assert name.candidate.name == "battery_sag" and 0.8 < name.share < 1.0
     assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.004, rel=0.05)
@@ -99,18 +94,18 @@ def without_gyro(logs):
 
 
 def test_rates_that_a_log_lacks_are_those_of_its_attitude():
-    found = diagnose_by_views(without_gyro(flights(4, seed=5)), VEHICLE)
+    found = diagnose(without_gyro(flights(4, seed=5)), VEHICLE, by="views")
     assert (found.label, found.named) == ("no_gap", [])
 
 
 def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
     moved = flights(4, seed=5, com_offset=((0.006, -0.002, 0.0),))
-    found = diagnose_by_views(without_gyro(moved), VEHICLE)
+    found = diagnose(without_gyro(moved), VEHICLE, by="views")
     assert [name.candidate.name for _, name in found.named] == ["com_offset"]
 
 
 def test_the_vehicle_itself_has_no_gap():
-    none = diagnose_by_views(flights(3, seed=2), VEHICLE)
+    none = diagnose(flights(3, seed=2), VEHICLE, by="views")
     assert (none.label, none.named) == ("no_gap", [])
 
 
@@ -130,7 +125,7 @@ def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(found):
 def test_a_lone_reference_flight_is_refused():
     logs = flights(2, seed=4)
     with pytest.raises(ValueError, match="at least 2"):
-        diagnose_by_views(logs[:1], VEHICLE, logs[1:])
+        diagnose(logs[:1], VEHICLE, logs[1:])
 
 
 SIDE = (0.25, 0.45, 0.1)
@@ -140,8 +135,8 @@ SLOW = {"speed": 1.5, "noise": 3.0, "linear_drag": (SIDE,)}
 
 def names(logs, vehicle=VEHICLE):
     """Return what the force view names, with what could stand in its place."""
-    found = diagnose_by_views(logs, vehicle)
-    force = next(one for one in found.results if one.view.name == "force")
+    found = diagnose(logs, vehicle, by="views")
+    force = next(one for one in found.findings if one.source.name == "force")
     return {name.candidate.name: set(name.rivals) for name in force.names}, found
 
 
@@ -184,5 +179,5 @@ def test_a_wind_is_named_alone_where_the_file_has_the_drag(blown_at_one_heading)
 )
 def test_noise_of_the_rotor_speeds_is_no_inertia_and_no_thrust(seed, speed):
     """Noise in what drives makes every slope smaller, as more inertia would."""
-    found = diagnose_by_views(flights(4, seed=seed, speed=speed), VEHICLE)
+    found = diagnose(flights(4, seed=seed, speed=speed), VEHICLE, by="views")
     assert found.label == "no_gap"

@@ -14,7 +14,6 @@ from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
-from suite.diagnose.evidence.rollouts import RolloutEvidence
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class NamedEffect:
     """Of the squared error that was to be explained [1]."""
 
 
-class Look(NamedTuple):
+class Evaluation(NamedTuple):
     """What the evidence says at one estimate."""
 
     evidence: Evidence
@@ -44,14 +43,10 @@ class Look(NamedTuple):
     equations: NormalEquations
 
 
-def rollouts_of(look: Look) -> RolloutEvidence:
-    """Return the evidence of `look`, which is one of rollouts."""
-    assert isinstance(look.evidence, RolloutEvidence)
-    return look.evidence
-
-
-def look_at(found: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()) -> Look:
-    """Return the look at an estimate, with columns of what acts through composites `among`."""
+def evaluated_at(
+    found: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()
+) -> Evaluation:
+    """Return what evidence gives at an estimate, with columns of what acts through composites."""
     evidence, block = found
     lent = lent_at(evidence.space, at.theta, among, block.acts())
     if lent is not None:
@@ -64,42 +59,44 @@ def look_at(found: tuple[Evidence, Block], at: Estimate, among: Sequence[Candida
             free_slope=np.concatenate([block.free_slope, there.free_slope[..., columns]], axis=-1),
             along=(*block.along, *numbers),
         )
-    return Look(evidence, at, block, block.equations())
+    return Evaluation(evidence, at, block, block.equations())
 
 
-def fit_beside(look: Look, beside: Sequence[int], candidate: Candidate) -> tuple[Estimate, Block]:
-    """Fit `candidate` and the numbers at `beside`, from where `look` was taken."""
-    evidence, equations, limits = look.evidence, look.equations, look.evidence.limits
-    at, space, theta = sorted({*beside, *candidate.indices}), evidence.space, look.at.theta
+def fit_beside(
+    here: Evaluation, beside: Sequence[int], candidate: Candidate
+) -> tuple[Estimate, Block]:
+    """Fit `candidate` and the numbers at `beside`, from where `here` was taken."""
+    evidence, equations, limits = here.evidence, here.equations, here.evidence.limits
+    at, space, theta = sorted({*beside, *candidate.indices}), evidence.space, here.at.theta
     lent = [number for number in equations.lent() if number in candidate.indices]
     if not candidate.parts or not lent:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
-        return fit(evidence, look.at, at, rounds, look.block, limits)
-    change, told = asked_for(look, beside, candidate)
+        return fit(evidence, here.at, at, rounds, here.block, limits)
+    change, told = asked_for(here, beside, candidate)
     begin = begin_of(space, theta, candidate, lent, change, told)
-    return fit(evidence, Estimate(begin, look.at.free), at, limits.bilinear_rounds, None, limits)
+    return fit(evidence, Estimate(begin, here.at.free), at, limits.bilinear_rounds, None, limits)
 
 
 def asked_for(
-    look: Look, beside: Sequence[int], candidate: Candidate
+    here: Evaluation, beside: Sequence[int], candidate: Candidate
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the change (P,) of all numbers that slopes ask for, and what is told of each (P,).
 
     Those of `candidate` and at `beside` are changed.
     """
-    equations = look.equations
+    equations = here.equations
     some = equations.take(sorted({*beside, *equations.columns_of(candidate)}))
-    moved, _ = gauss_newton_step(some, look.at.theta, look.evidence.space)
-    change, told = np.zeros_like(look.at.theta), np.zeros_like(look.at.theta)
+    moved, _ = gauss_newton_step(some, here.at.theta, here.evidence.space)
+    change, told = np.zeros_like(here.at.theta), np.zeros_like(here.at.theta)
     numbers = list(some.numbers)
     change[numbers], told[numbers] = moved, np.diag(some.sums()[0])
     return change, told
 
 
-def chi2_of(look: Look, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
+def chi2_of(here: Evaluation, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
     """Return the squared error (G,) of each part of the flights under the others' fit."""
     equations = block.equations().along_numbers(sorted(indices))
-    return chi2_by_part(equations, at.theta, look.evidence.space, look.evidence.parts(block))
+    return chi2_by_part(equations, at.theta, here.evidence.space, here.evidence.parts(block))
 
 
 @dataclass(frozen=True)
@@ -109,9 +106,9 @@ class SearchResult:
     named: tuple[NamedEffect, ...]
     start: Estimate
     """Where it began."""
-    last: Look
+    last: Evaluation
     """At the fit of all names, weighed by the noise that was measured beside them."""
-    judged: Look
+    judged: Evaluation
     """The same, by which names, rivals and intervals were judged: where the model leaves more than
     noise, the noise is what it leaves."""
     first: list[CandidateScore]
@@ -152,10 +149,10 @@ class SearchResult:
         begin = Estimate(theta, self.estimate.free) if named else self.start
         at, judged = self.judged, self.judged.evidence
         best, block = fit(judged, begin, indices, limits=judged.limits)
-        last = at = Look(judged, best, block, block.equations())
+        last = at = Evaluation(judged, best, block, block.equations())
         if self.judged is not self.last:
             block = self.last.evidence.linearise(best, indices)
-            last = Look(self.last.evidence, best, block, block.equations())
+            last = Evaluation(self.last.evidence, best, block, block.equations())
         nothing = self.explained + float(self.last.equations.chi2.sum())
         explained = nothing - float(last.equations.chi2.sum()) if named else 0.0
         return replace(self, named=tuple(named), last=last, judged=at, explained=explained)
@@ -164,31 +161,3 @@ class SearchResult:
         """Return the estimate where the numbers at `indices` alone are fitted from `begin`."""
         judged = self.judged.evidence
         return fit(judged, begin, indices, limits=judged.limits)[0]
-
-
-APART = 1.5
-"""Numbers whose 95 % intervals are further apart than their half-widths by this contradict."""
-
-
-def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return which names of `found` the evidence `by` refuses, and in words what it says of them.
-
-    It does where the name's numbers, fitted to it beside its own names, come out elsewhere.
-    """
-    refused = []
-    widths = dict(zip(found.indices, found.half_widths(), strict=True))
-    evidence = by.judged.evidence
-    for name in found.candidates:
-        at = list(name.indices)
-        if not evidence.linearise(by.estimate, at).acts().any() or name in by.candidates:
-            continue
-        every = sorted({*by.indices, *at})
-        best, block = fit(evidence, by.estimate, every, limits=evidence.limits)
-        inside = intervals95(block.equations().along_numbers(every), evidence.draws).half_width
-        for k in at:
-            here, there = found.estimate.theta[k], best.theta[k]
-            wide = float(inside[every.index(k)])
-            if abs(here - there) > APART * (widths[k] + wide):
-                refused.append((name, f"{here:.3g} here, {there:.3g} ± {wide:.2g} there"))
-                break
-    return refused
