@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from eval.logs.flight_log import FlightLog
@@ -18,7 +18,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import integrator_of
 from suite.diagnose.verdict.diagnosis import Diagnosis, tested_in, verdict_on, with_names
 
-SOURCES: Mapping[str, Callable[[Given, Sequence[Source]], Sources | None]] = {
+SOURCES: dict[str, Callable[[Given, Sequence[Source]], Sources | None]] = {
     "rollouts": by_rollouts,
     "views": by_views,
 }
