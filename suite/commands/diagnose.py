@@ -40,9 +40,8 @@ class Config:
     """Write flights that separate the effects which these do not, in OUT/plan."""
     fly: str | None = None
     """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
-    recording: bool = True
-    """Write the held-out flights, measured and simulated, as a recording for rerun; --no-recording
-    leaves it out."""
+    no_recording: bool = False
+    """Do not write recording.rrd, the held-out flights measured and simulated, for rerun."""
     accept: tuple[str, ...] = ()
     """Known faults of the log's interface (names of suite check) that do not stop the command."""
     seed: Seed = 0
@@ -79,7 +78,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         compare_delta=config.compare_delta,
         plan=config.plan,
         fly=config.fly,
-        recording=config.recording,
+        recording=not config.no_recording,
         seed=config.seed,
         reference=config.reference,
         relevance=config.relevance,

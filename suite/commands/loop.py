@@ -53,7 +53,7 @@ class Config:
     fit_iterations: Iterations | None = None
     """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with quick; with
     a hidden vehicle 200."""
-    delta: bool = True
+    no_delta: bool = False
     """Leave out the Delta Action Models and the fine-tunings under them, which take half the time;
     with a hidden vehicle."""
     set: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         finetune_iterations=config.finetune_iterations,
         fit_iterations=config.fit_iterations,
-        delta=config.delta,
+        delta=not config.no_delta,
         changes=config.set,
     )
     return run_loop(resolved, config.out, console, workers)

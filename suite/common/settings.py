@@ -59,10 +59,9 @@ def options(command: type) -> Iterator[Setting]:
         named = next((n.name for n in notes if getattr(n, "name", None)), field.name)
         # A type variable stands for the subcommands.
         free = tyro.conf.Positional in notes or isinstance(kind, TypeVar)
-        dashed = ("no-" if field.default is True else "") + named.replace("_", "-")
         plain = isinstance(field.default, str | int | float) and not isinstance(field.default, bool)
         default = str(field.default) if plain else ""
-        name = field.name.upper() if free else f"--{dashed}"
+        name = field.name.upper() if free else f"--{named.replace('_', '-')}"
         yield Setting(name, default, "", texts.get(field.name, ""))
 
 

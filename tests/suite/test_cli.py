@@ -1,6 +1,8 @@
 """The command line's manners: fast help, exit codes, one clear message, clean JSON."""
 
+import dataclasses
 import errno
+import importlib
 import json
 import os
 import signal
@@ -294,6 +296,13 @@ def test_what_other_commands_take_by_name_is_listed(capfd):
         assert sorted(abouts) == found[kind] and all(abouts.values())
     assert cli.main(["list", "trakcs"]) == 2
     assert "Did you mean 'tracks'" in capfd.readouterr().err
+
+
+def test_no_flag_is_on_by_default():
+    for name in cli.COMMANDS:
+        module = importlib.import_module(f"suite.commands.{name}")
+        on = [field.name for field in dataclasses.fields(module.Config) if field.default is True]
+        assert not on, f"suite {name}: call it no_{on[0]}, with a text for what it then does not do"
 
 
 def test_a_shell_is_given_every_command_with_its_options(capsys):
