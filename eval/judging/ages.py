@@ -1,8 +1,8 @@
-"""States and images that are old when a policy decides: the sensor model `delay`.
+"""The sensor model `delay` in the judge: states and images that are old at a decision.
 
-Views are taken between decisions, at the physics step that lies an age before the decision that
-will see them, and kept until then. Ages may jitter: each decision then has an age of its own, drawn
-from the trial's seed. At a trial's start, before anything is old enough, the policy sees the start.
+Views are taken between decisions, at the physics step that precedes their decision by the age, and
+stored until then. With jitter, each decision has its own age from the trial's seed. At the start of
+a trial, before any view is old enough, the policy gets the first view.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from tracks.common.masks import select
 
 
 class Due(NamedTuple):
-    """Views to be taken before the next decision, for one decision that will see them."""
+    """Views to take before the next decision, for one later decision."""
 
     pause: np.ndarray
     """(N,) physics steps after the last decision."""
     rows: np.ndarray
-    """(N,) bool: slots in which that is so."""
+    """(N,) bool: slots with such a view."""
     place: int
-    """Among the views that are kept."""
+    """Index among the stored views."""
 
 
 class Moment(NamedTuple):
@@ -37,13 +37,13 @@ class Moment(NamedTuple):
     pause: np.ndarray
     """(N,) physics steps after the last decision, never less than the moment's before."""
     images: np.ndarray
-    """(N,) bool: slots whose image is looked at."""
+    """(N,) bool: slots whose image is needed."""
     taken: list[tuple[Aged, Due]]
-    """What the view is for, `Due.rows` being the slots that are at their pause."""
+    """Uses of the view; `Due.rows` are the slots at their pause."""
 
 
 class Aged:
-    """Views of N slots that are seen one age after they were taken."""
+    """Delayed views of N slots."""
 
     def __init__(
         self, age_s: float, jitter: float, slots: int, period_steps: float, dt: float
@@ -60,7 +60,7 @@ class Aged:
         self._mean, self._jitter, self._period = age_s / dt, jitter, period_steps
         longest = self._mean * (1.0 + jitter)
         self.ahead = math.ceil(longest / period_steps - 1e-9)
-        """Decisions from the one before a view is taken to the one that sees it, at most."""
+        """Largest number of decisions between taking a view and using it."""
         self._draws = [np.random.default_rng(0)] * slots
         self._ages = np.full((self.ahead, slots), self._mean)
         self._kept: list[View] = []
@@ -70,12 +70,12 @@ class Aged:
         self._draws[slot] = draws
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return what is old enough at a decision.
+        """Return the delayed view at a decision.
 
         Args:
-            now: what an ideal policy would see.
-            fresh: (N,) bool, slots whose trial begins: they see what is now.
-            flying: (N,) bool, the slots that fly.
+            now: the view without delay.
+            fresh: (N,) bool, slots whose trial begins: they get `now`.
+            flying: (N,) bool, slots in flight.
         """
         if not self.ahead:
             return now
@@ -87,7 +87,7 @@ class Aged:
         return oldest
 
     def _draw(self, fresh: np.ndarray, flying: np.ndarray) -> None:
-        """Draw the age at the last of the decisions ahead, of slots that are fresh at all."""
+        """Draw the age for the last future decision; for all of them in fresh slots."""
         self._ages = np.roll(self._ages, -1, axis=0)
         for slot in np.flatnonzero(flying).tolist():
             count = self.ahead if fresh[slot] else 1
@@ -95,7 +95,7 @@ class Aged:
             self._ages[-count:, slot] = self._mean * (1.0 + share)
 
     def due(self) -> Iterator[Due]:
-        """Yield what is to be taken before the next decision."""
+        """Yield the views to take before the next decision."""
         periods = np.maximum(np.ceil(self._ages / self._period - 1e-9), 1)
         for place, ages in enumerate(self._ages):
             rows = periods[place] == place + 1
@@ -104,7 +104,7 @@ class Aged:
                 yield Due(np.where(rows, pause, 0), rows, place)
 
     def take(self, due: Due, view: View) -> None:
-        """Keep what is seen now."""
+        """Store the current view."""
         self._kept[due.place] = select(due.rows, view, self._kept[due.place])
 
 
@@ -124,12 +124,12 @@ class Delays:
         self.image.start(slot, generator_of(trial, IMAGE_AGES))
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return what there is to see at a decision; see `Aged.see`."""
+        """Return the delayed view at a decision; see `Aged.see`."""
         depth_m = self.image.see(now, fresh, flying).depth_m
         return self.state.see(now, fresh, flying)._replace(depth_m=depth_m)
 
     def moments(self) -> Iterator[Moment]:
-        """Yield when views are taken before the next decision, each slot's in turn."""
+        """Yield the times at which views are taken before the next decision, in order."""
         whose = [(aged, due) for aged in (self.state, self.image) for due in aged.due()]
         if not whose:
             return

@@ -1,4 +1,4 @@
-"""A policy asked for its output, which is checked and limited on its way to the quadrotor."""
+"""Call a policy, and check and limit its output before it is flown."""
 
 from __future__ import annotations
 
@@ -16,26 +16,24 @@ from policies.spec import ActionSpec, NoAnswer
 
 @dataclass(frozen=True)
 class ActionLimits:
-    """What an action may be."""
+    """Limits of actions."""
 
     size: float = 50.0
-    """Largest |action_b| of an acceleration [m/s^2]; longer ones are shortened. Over the net
-    acceleration that a thrust-to-weight ratio of 5 can make, so that it stops faults and not
-    flying."""
+    """Largest |action_b| of an acceleration [m/s^2]; larger ones are reduced to it. It exceeds the
+    net acceleration of a thrust-to-weight ratio of 5, so that it affects only faulty outputs."""
     deadline_s: float | None = None
-    """An answer of the policy that takes longer than this is late: it is not flown, and ends the
-    trials that it was for as out of time [s]. None sets no deadline. With one, outcomes depend on
-    the machine's load and do not repeat."""
+    """Time limit of the policy's answer [s]; a late answer is not flown and ends its trials as
+    timeout. None: no limit. With a limit, outcomes depend on the machine's load."""
     action: ActionSpec = field(default_factory=ActionSpec)
-    """What the policy's output means."""
+    """The policy's kind of action."""
     low: tuple[float, ...] = ()
-    """Least of each component in SI units, of other kinds of action than acceleration."""
+    """Smallest value of each component in SI units, for other kinds of action than acceleration."""
     high: tuple[float, ...] = ()
-    """Largest of each component."""
+    """Largest value of each component."""
 
 
 def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> ActionLimits:
-    """Return `limits` for a policy's kind of action: those of a command are the vehicle file's."""
+    """Return `limits` for a policy's kind of action; commands have the vehicle file's limits."""
     low, high = (), ()
     if action.kind == "ctbr":
         rate = vehicle.controller.rate_max
@@ -46,7 +44,7 @@ def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> Act
 
 
 def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
-    """Return what counts as the last action at the start of a trial, (size,) SI: hovering."""
+    """Return the last action at the start of a trial, (size,) in SI units: hovering."""
     if action.kind == "acceleration":
         return np.zeros(3)
     if action.kind == "ctbr":
@@ -56,21 +54,21 @@ def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
 
 
 class Guarded(NamedTuple):
-    """Actions fit to fly, and what was wrong with them."""
+    """Checked actions, and their faults."""
 
     action_b: np.ndarray
     """(N, size) float64, SI units; (N, 3) [m/s^2] of an acceleration."""
     bad: np.ndarray
     """(N,) bool: not finite, replaced by the last good action."""
     limited: np.ndarray
-    """(N,) bool: shortened to the limit, or a component cut off at its limit."""
+    """(N,) bool: reduced to the limit, or a component clipped."""
     late: np.ndarray
-    """(N,) bool: came after the deadline or not at all, replaced by the last good action."""
+    """(N,) bool: late or missing, replaced by the last good action."""
     largest: np.ndarray
-    """(N,) largest component of the policy's own output by size, before its scale; NaN if bad."""
+    """(N,) largest absolute component of the policy's raw output; NaN if bad."""
 
 
-def ask(
+def call_policy(
     limits: ActionLimits,
     policy: Policy,
     hidden: Hidden,
@@ -79,30 +77,30 @@ def ask(
     fresh: np.ndarray,
     last_b: np.ndarray,
 ) -> tuple[Guarded, Hidden]:
-    """Ask a policy once, wait for its answer, and return it as it may be flown, and the memory.
+    """Call a policy once, and return its checked actions and the new hidden state.
 
-    A policy answers for all N trials at once, so an answer that comes late, or not at all since the
-    policy fails, is late for every one of them. The memory is then what it was.
+    A policy answers for all N trials at once, so a late or missing answer is late for all of them.
+    The hidden state is then unchanged.
 
     Args:
-        limits: what an action may be.
-        policy: who is asked; for its other arguments see `policies.policy.Policy.act`.
-        hidden: what it remembers.
+        limits: of actions.
+        policy: to call; for its other arguments see `policies.policy.Policy.act`.
+        hidden: its hidden state.
         state: (N, spec.state_size).
         image: (N, height, width).
         fresh: (N,) bool.
         last_b: (N, size) the action flown last in SI units, at first `first_action`.
 
     Raises:
-        ValueError: where the answer is no array of actions.
+        ValueError: where the answer is not an array of actions.
     """
-    asked = time.perf_counter()
+    called = time.perf_counter()
     try:
         answer, after = policy.act(hidden, state, image, fresh)
     except NoAnswer:
         nothing = np.zeros(len(last_b), bool)
         return Guarded(last_b, nothing, nothing, ~nothing, np.full(len(last_b), np.nan)), hidden
-    took_s = time.perf_counter() - asked
+    took_s = time.perf_counter() - called
     return guard_action(limits, answer, last_b, took_s, policy.name), after
 
 
@@ -112,7 +110,7 @@ def guard_action(
     """Check and limit what a policy returned.
 
     Args:
-        limits: what an action may be.
+        limits: of actions.
         action_b: what the policy returned; should be (N, size) real numbers.
         last_b: (N, size) the action flown last in SI units, at first `first_action`.
         took_s: how long the answer took [s].

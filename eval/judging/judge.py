@@ -1,8 +1,8 @@
-"""The judge: many trials of one policy through one world.
+"""The judge: flies many trials of one policy in one simulator.
 
-A trial's outcome is set by (track, difficulty, seed) alone, to the bit on one machine: policies
-are always called on the same number of rows, every row is computed by itself, and nothing random
-is shared between trials.
+A trial's outcome depends on (track, difficulty, seed) alone, to the bit on a machine. Policies are
+always called with the same number of rows, every row is computed separately, and trials share no
+random numbers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from eval.judging.ages import Delays
 from eval.judging.filtered import Filtered, single_steps
-from eval.judging.guard import ActionLimits, ask, first_action, limits_of
+from eval.judging.guard import ActionLimits, call_policy, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import Sensors
@@ -46,47 +46,47 @@ from tracks.families import check_family
 from tracks.track import Track
 
 COMPILED_SLOTS = 64
-"""Worlds that compile a program for their number of slots fly in multiples of this."""
+"""Simulators that compile a program for their number of slots use multiples of this."""
 MOST_A_PIECE = 640
-"""Trials; more are several pieces, where several processes share them."""
+"""Most trials of a piece, where several processes share the work."""
 Trial = TypeVar("Trial")
 OnResult = Callable[[TrialResult, Flight | None], None]
-"""Called with each trial as it ends, in no set order; the flight where flights are recorded."""
+"""Called with each trial at its end, in any order; with the flight where flights are recorded."""
 Numbered = tuple[int, TrialSpec]
-"""A trial and its place among those asked for."""
+"""A trial and its index in the request."""
 Ended = tuple[int, TrialResult, Flight | None]
-"""The place of a trial, what came of it, and its flight where flights are recorded."""
+"""The index of a trial, its result, and its flight where flights are recorded."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """What to record of each flight besides its result."""
+    """Optional parts of recorded flights."""
 
     depth: bool = False
-    """Depth images, one a decision of the policy."""
+    """Depth images, one for each decision of the policy."""
 
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """How trials are flown; `threads` and `workers` touch no outcome."""
+    """Settings of the judge; `threads` and `workers` do not change outcomes."""
 
     slots: int = 128
-    """Trials in the air at once, and rows of every call of the policy."""
+    """Simultaneous trials, and rows of every call of the policy."""
     threads: int = 1
-    """Of physics, in each process."""
+    """Threads for physics, in each process."""
     workers: Workers | None = None
-    """Who shares the trials; None takes a process a core where there is work for them."""
+    """Processes that share the trials; None: one for each core if there is enough work."""
     rules: Rules = field(default_factory=Rules)
     """When a trial ends."""
     limits: ActionLimits = field(default_factory=ActionLimits)
-    """What an action may be."""
+    """Limits of actions."""
     sensors: SensorSet = PERFECT
-    """What the policy sees of the truth."""
+    """Sensor models of the policy's observation."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a process needs to know to fly its share; the fields are those of `fly`."""
+    """Inputs of a process that flies a share of the trials; the fields are those of `fly`."""
 
     policy: Any
     vehicle: Vehicle
@@ -108,23 +108,23 @@ def fly(
 ) -> list[TrialResult]:
     """Fly every trial and return the results in the order of `trials`.
 
-    An interrupt ends it at once; what was handed to `on_result` by then is finished and final.
+    An interrupt ends it at once; results passed to `on_result` before that are final.
 
     Args:
         policy: who flies, or a function without arguments that makes it; several processes need
             one that can be pickled, such as `functools.partial(load_policy, name)`.
-        trials: what to fly.
-        vehicle: on what.
+        trials: to fly.
+        vehicle: that flies.
         world: a name in `eval.worlds.WORLDS`.
-        options: how.
-        on_result: called with each trial as it ends.
+        options: settings of the judge.
+        on_result: called at the end of each trial.
         record: what to record of the flights; None records none.
-        tracks: custom tracks by the name that trials call them; others are families.
+        tracks: custom tracks by their names in `trials`; other names are families.
 
     Raises:
         ValueError: for an unknown world or track, a policy faster than the physics, or a policy
             that returns something else than actions.
-        WorkerDied: where a process that works for this one died, and again at the same piece.
+        WorkerDied: where a worker process died twice with the same piece.
     """
     options = options or JudgeOptions()
     world_class(world)
@@ -155,10 +155,10 @@ def fly(
 
 
 def check_records(world: str) -> None:
-    """Refuse a world that records no flights.
+    """Refuse a simulator that records no flights.
 
     Raises:
-        ValueError: with what to do instead.
+        ValueError: with the alternative.
     """
     if world == REFERENCE:
         raise ValueError(
@@ -169,29 +169,29 @@ def check_records(world: str) -> None:
 def pieces_of(
     trials: Sequence[Trial], processes: int, most: int = MOST_A_PIECE
 ) -> list[Sequence[Trial]]:
-    """Cut trials into pieces of at most `most`, as many for each of so many processes.
+    """Divide trials into pieces of at most `most`, an equal number for each process.
 
-    A process that dies costs its piece; at the end of each the policy's rows fly empty.
+    Small pieces lose little when a process dies, but at the end of each piece slots are empty.
     """
     if processes == 1:
         return [trials] if trials else []
     pieces = min(len(trials), processes * math.ceil(len(trials) / (most * processes)))
-    # Every k-th trial, as neighbours, which are alike, then spread over the pieces.
+    # Every k-th trial, so that neighbours, which have similar costs, are in different pieces.
     return [trials[k::pieces] for k in range(pieces)]
 
 
 def _is_policy(policy: object) -> bool:
-    """Return whether this is a policy and not a function or class that makes one."""
+    """Return whether this is a policy; False for a function or class that makes one."""
     return hasattr(policy, "act") and not isinstance(policy, type)
 
 
 def _workers(task: Task, trials: int) -> Workers:
-    asked = task.options.workers
-    if isinstance(asked, int):
-        return max(1, min(asked, trials))
-    if asked is not None:
-        return asked
-    # A process takes seconds to start, and a policy object may not be of the kind that travels.
+    requested = task.options.workers
+    if isinstance(requested, int):
+        return max(1, min(requested, trials))
+    if requested is not None:
+        return requested
+    # A process takes seconds to start, and a policy object may not be picklable.
     if compiles(task.world) or _is_policy(task.policy) or trials < 2 * task.options.slots:
         return 1
     return usable_cores()
@@ -210,7 +210,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
             )  # fmt: skip
             yield index, result, None
         return
-    # A slot that stays empty only costs time, but one more number of slots may cost a compilation.
+    # An empty slot costs little time, but another number of slots may need a compilation.
     block = COMPILED_SLOTS if compiles(task.world) else 1
     slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))
     world = world_class(task.world)(
@@ -231,13 +231,13 @@ def _check_rate(policy: Policy, vehicle: Vehicle, dt: float) -> None:
 
 
 def _stepping(world: World) -> dict[str, Any]:
-    """Return what a log says of how `world` steps; nothing where it does not say."""
+    """Return the log's entries for the integrator of `world`; {} where it has none."""
     integrator = getattr(world, "integrator", None)
     return {} if integrator is None else {"integrator": integrator, "step_s": world.dt}
 
 
 class _Slots:
-    """The slots of a world with the trial and the policy's memory in each."""
+    """The slots of a simulator, with the trial and the policy's hidden state in each."""
 
     def __init__(self, task: Task, policy: Policy, world: World) -> None:
         rate = policy.spec.rate_hz
@@ -270,7 +270,7 @@ class _Slots:
             self._delays = Delays(wanted.ages, n, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
-        """Fly the numbered trials; every slot takes the next one when its own has ended."""
+        """Fly the numbered trials; a slot takes the next one when its trial has ended."""
         waiting = list(reversed(share))
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
@@ -310,9 +310,9 @@ class _Slots:
             self._world.load(entries)
 
     def _decide_and_fly(self) -> None:
-        """Ask the policy once and fly its answers, but late ones, until its next decision."""
+        """Call the policy once and fly its actions, except late ones, until the next decision."""
         spec, flying = self._policy.spec, self._index >= 0
-        seen = truth = self._look(flying)
+        seen = truth = self._current_view(flying)
         if self._delays:
             seen = self._delays.see(seen, self._fresh, flying)
         if self._sensors:
@@ -322,7 +322,7 @@ class _Slots:
         state, image = observe(spec, seen, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
-        guarded, self._hidden = ask(
+        guarded, self._hidden = call_policy(
             self._limits, self._policy, self._hidden, state, image,
             self._fresh | ~flying, self._action_b,
         )  # fmt: skip
@@ -339,19 +339,19 @@ class _Slots:
         self._fly_steps(np.where(flying, steps, 0), flying)
 
     def _fly_steps(self, steps: np.ndarray, flying: np.ndarray) -> None:
-        """Fly the actions for each slot's physics steps (N,); take views that will be old."""
+        """Fly the actions for each slot's physics steps (N,); take views for delayed sensors."""
         done = np.zeros_like(steps)
         for moment in self._delays.moments() if self._delays else ():
             part = np.minimum(steps, moment.pause)
             self._advance(part - done)
             done = part
-            view = self._look(flying, moment.images & flying)
+            view = self._current_view(flying, moment.images & flying)
             for aged, due in moment.taken:
                 aged.take(due, view)
         self._advance(steps - done)
 
-    def _look(self, flying: np.ndarray, images: np.ndarray | None = None) -> View:
-        """Return what there is to see now; images of all that fly."""
+    def _current_view(self, flying: np.ndarray, images: np.ndarray | None = None) -> View:
+        """Return the current view, with images of all flying slots."""
         view = self._world.view(flying if images is None else images)
         if not self._sensors:
             return view

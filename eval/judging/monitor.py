@@ -1,10 +1,10 @@
-"""A monitor around any policy: limits, and a last-moment way out where nothing else is left.
+"""A safety monitor around any policy: limits of tilt and speed, and evasive manoeuvres.
 
-It sees what the policy sees and shares nothing with it. Limits on tilt and speed bend an action;
-the way out replaces it, and only where it must: paths of the next moments are laid through the
-points of the depth image, one for each way out (stop, climb, to either side, back and up), begun
-now and begun one decision later. While a way out is still clear one decision later, the policy has
-its will. The judge and real-time flights (`suite fly`) fly with the same one.
+It uses the policy's observation only. The limits change an action; a manoeuvre replaces it, only
+when necessary. Predicted paths of each manoeuvre (stop, climb, left, right, back and up) are
+compared with the points of the depth image, for a start now and one decision later. While a
+manoeuvre is still possible one decision later, the policy's action is flown. The judge and
+real-time flights (`suite fly`) use the same monitor.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.input.ranges import Range
 
 SAMPLES = 24
-"""Places at which a path is looked at: 13 cm apart at 5 m/s."""
+"""Points of a predicted path: 13 cm apart at 5 m/s."""
 
 
 @dataclass(frozen=True)
 class MonitorLimits:
-    """What a monitored policy may do."""
+    """Limits and settings of the monitor."""
 
     tilt_deg: Annotated[float, Range(1.0, 89.0)] = 75.0
-    """Largest tilt that an action may ask for [deg]."""
+    """Largest tilt that an action may command [deg]."""
     speed: Annotated[float, Range(0.1, 100.0)] = 12.0
-    """Above this an action may not speed up [m/s]."""
+    """Speed above which an action may not accelerate further [m/s]."""
     clearance_m: Annotated[float, Range(0.0, 10.0)] = 0.15
-    """A path nearer than this to a point of the image is no way [m]."""
+    """Least distance of a path from the points of the image [m]."""
     way_out: Annotated[float, Range(0.1, 100.0)] = 12.0
-    """Acceleration of a way out [m/s^2]."""
+    """Acceleration of an evasive manoeuvre [m/s^2]."""
     lag_s: Annotated[float, Range(0.0, 1.0)] = 0.1
-    """Until then the last action still acts [s]."""
+    """Time for which the last action still acts [s]."""
     horizon_s: Annotated[float, Range(0.05, 5.0)] = 0.6
-    """How far ahead paths are laid [s]."""
+    """Horizon of the prediction [s]."""
 
 
 class Seen(NamedTuple):
-    """What the monitor makes of observations of N rows."""
+    """Observations of N rows, converted for the monitor."""
 
     vel_b: np.ndarray
     """(N, 3) [m/s]."""
@@ -52,24 +52,24 @@ class Seen(NamedTuple):
     last_b: np.ndarray
     """(N, 3) the last action [m/s^2]."""
     points_b: np.ndarray
-    """(N, P, 3) what the camera sees, body axes [m]."""
+    """(N, P, 3) points of the depth image, body axes [m]."""
     hit: np.ndarray
-    """(N, P) bool: whether there is something at that point."""
+    """(N, P) bool: whether the pixel shows an object within range."""
 
 
 @dataclass
 class Monitored:
-    """A `Policy` with a monitor around it; `interventions` counts the ways out taken."""
+    """A `Policy` with a monitor; `interventions` counts the evasive manoeuvres."""
 
     policy: Policy
-    """Who decides."""
+    """The monitored policy."""
     limits: MonitorLimits = MonitorLimits()
-    """What it may do."""
+    """Limits of the monitor."""
     interventions: int = field(default=0, compare=False)
-    """Ways out taken so far, over all rows."""
+    """Evasive manoeuvres so far, over all rows."""
 
     def __post_init__(self) -> None:
-        """Refuse actions that say nothing about the path, and images that hide the depth."""
+        """Refuse kinds of action and image that the monitor does not support."""
         action, depth = self.policy.spec.action, self.policy.spec.depth
         if action.kind != "acceleration" or not action.is_plain or depth.uint8:
             raise PolicyError(
@@ -79,7 +79,7 @@ class Monitored:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name in tables."""
         return f"{self.policy.name}+monitor"
 
     @property
@@ -88,13 +88,13 @@ class Monitored:
         return self.policy.spec
 
     def start(self, n: int) -> Hidden:
-        """Return the policy's memory of n trials."""
+        """Return the policy's hidden state of n trials."""
         return self.policy.start(n)
 
     def act(
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
-        """Return the policy's actions, bent or replaced where they must be."""
+        """Return the policy's actions, limited or replaced where necessary."""
         action, hidden = self.policy.act(hidden, state, image, fresh)
         seen = seen_of(self.spec, state, image)
         bent = limited(self.limits, np.asarray(action, float), seen)
@@ -104,7 +104,7 @@ class Monitored:
 
 
 def seen_of(spec: PolicySpec, state: np.ndarray, image: np.ndarray) -> Seen:
-    """Return what an observation says of speed, attitude and surroundings."""
+    """Return velocity, attitude and surrounding points from an observation."""
     depth, camera = spec.depth, spec.camera
     metres = depth.scale / np.maximum(np.asarray(image, float) + depth.offset, 1e-3)
     metres = metres.reshape(len(metres), -1)
@@ -134,7 +134,7 @@ def limited(limits: MonitorLimits, action_b: np.ndarray, seen: Seen) -> np.ndarr
 
 
 def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
-    """Return the actions (K, N, 3) of the ways out: stop, climb, left, right, back and up."""
+    """Return the actions (K, N, 3) of the manoeuvres: stop, climb, left, right, back and up."""
     speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
     back = -seen.vel_b / np.maximum(speed, 0.5)
     left = np.cross(seen.up_b, -back)
@@ -147,7 +147,7 @@ def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
 def last_moment(
     limits: MonitorLimits, action_b: np.ndarray, seen: Seen, period_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the actions (N, 3) to fly, and which of them are ways out (N,) bool.
+    """Return the actions (N, 3) to fly, and which of them are manoeuvres (N,) bool.
 
     A way out is taken where the policy's path is blocked, every way out would be blocked if it
     began one decision later, and one that begins now is not, or clears more.
@@ -181,14 +181,14 @@ def clearance(
     times: np.ndarray,
     period_s: float,
 ) -> np.ndarray:
-    """Return how near (N,) a path comes to what the camera sees [m].
+    """Return the least distance (N,) of a path from the points of the image [m].
 
     Args:
-        limits: its lag counts.
+        limits: with the lag.
         seen: of N rows.
         first_b: (N, 3) the action from now on [m/s^2].
-        then_b: (N, 3) the one after a period, or None for none.
-        times: (T,) at which the path is looked at [s].
+        then_b: (N, 3) the action after a period; None: the same.
+        times: (T,) of the path's points [s].
         period_s: between decisions [s].
     """
     path = seen.vel_b[:, None] * times[:, None]
@@ -206,5 +206,5 @@ def clearance(
 
 
 def _moved(action_b: np.ndarray, times: np.ndarray, since_s: float) -> np.ndarray:
-    """Return how far (N, T, 3) an acceleration since `since_s` has moved the body [m]."""
+    """Return the displacement (N, T, 3) by an acceleration since `since_s` [m]."""
     return 0.5 * action_b[:, None] * np.maximum(times - since_s, 0.0)[:, None] ** 2

@@ -1,8 +1,8 @@
-"""What a policy's outputs look like over trials: whether they are limited and scaled.
+"""Checks of a policy's outputs for usual mistakes of unit, scale and frame.
 
-Outputs of the wrong unit fly, badly, and look like a policy that has not learned. Their size and
-their mean along the vertical show which of the usual mistakes it is; so do a few made-up
-observations, level flight towards a gate to one side: whoever flies through it accelerates there.
+A policy with outputs in a wrong unit flies badly, like an untrained one. The size of its outputs
+and their mean vertical component identify the usual mistakes. So do a few synthetic observations of
+level flight towards a gate to one side, towards which a correct policy accelerates.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from policies.spec import ActionSpec, Note, PolicySpec
 LIMITED_MOST = 0.05
 """Share of limited actions above which there is a warning."""
 UNIT = 1.0 + 1e-6
-"""Outputs of a policy that are never larger are those of an action space from -1 to 1."""
+"""Largest output of a policy whose action space is -1 to 1."""
 UP_MOST = 6.0
-"""A mean vertical acceleration above this contains gravity [m/s^2]: what is wanted over a flight
-changes the velocity, which stays small."""
+"""A mean vertical acceleration above this contains gravity [m/s^2], since the mean over a flight is
+small otherwise."""
 
 
 LIFT = 3.0
-"""Whoever wants more than this upwards, even towards a gate below, counts gravity in [m/s^2]."""
+"""A vertical acceleration above this, even towards a gate below, contains gravity [m/s^2]."""
 CLEAR = 0.5
-"""Differences of an output between two sides below this say nothing [m/s^2]."""
+"""Least difference of an output between two sides that is used [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
 TIMES, ALIKE = 1.5, 1e-3
-"""Another image, and the share of what other images change within which an answer is the same."""
+"""Factor on a test image, and the largest relative change of the output that counts as none."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
-"""How far aside and ahead the gate is [m], the speed towards it [m/s], and the steps of memory."""
+"""Distances of the test gate [m], speed towards it [m/s], and number of steps."""
 
 
 class Outputs:
-    """What is summed up of the outputs in N slots, until a trial ends."""
+    """Statistics of the outputs in N slots, until each trial ends."""
 
     def __init__(self, slots: int, action: ActionSpec) -> None:
         self._is_acceleration = action.kind == "acceleration"
@@ -50,14 +50,14 @@ class Outputs:
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
 
     def add(self, guarded: Guarded, state: np.ndarray) -> None:
-        """Add one answer of every slot, for the observations `state` (N, spec.state_size)."""
+        """Add one output of every slot, for the observations `state` (N, spec.state_size)."""
         self._count += ~guarded.late
         self._largest = np.fmax(self._largest, guarded.largest)
         if self._is_acceleration:
             self._up += (state[:, 3:6] * guarded.action_b).sum(-1)
 
     def columns(self, slot: int) -> dict[str, Any]:
-        """Return what a `TrialResult` says of the outputs in `slot`."""
+        """Return the fields of `TrialResult` for the outputs in `slot`."""
         count = int(self._count[slot])
         up = float(self._up[slot]) / count if count and self._is_acceleration else 0.0
         return {
@@ -68,7 +68,7 @@ class Outputs:
 
 
 def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return what one policy's trials say of its outputs: shares, and warnings with their fix."""
+    """Return the statistics of one policy's outputs: shares, and warnings with a fix."""
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}
@@ -111,18 +111,18 @@ def _warnings(
 
 @runtime_checkable
 class FromFile(Protocol):
-    """A policy that was read from a file."""
+    """A policy from a file."""
 
     notes: tuple[Note, ...]
 
 
 def notes_of(policy: Policy) -> tuple[Note, ...]:
-    """Return what is assumed of a policy's file, and what its answers look like."""
-    return (*policy.notes, *doubts(policy)) if isinstance(policy, FromFile) else ()
+    """Return the assumptions about a policy's file, and the probable faults of its outputs."""
+    return (*policy.notes, *probable_faults(policy)) if isinstance(policy, FromFile) else ()
 
 
-def doubts(policy: Policy) -> tuple[Note, ...]:
-    """Return every usual mistake of unit and frame that the policy's answers look like."""
+def probable_faults(policy: Policy) -> tuple[Note, ...]:
+    """Return the probable faults of unit, scale and frame in the policy's outputs."""
     if policy.spec.action.kind != "acceleration":
         return ()
     name = policy.name
@@ -164,7 +164,7 @@ def doubts(policy: Policy) -> tuple[Note, ...]:
 
 
 def _divides_images(policy: Policy) -> bool:
-    """Return whether a policy makes all multiples of an image one, but sees what is in it."""
+    """Return whether a policy ignores the scale of an image, but uses its contents."""
     spec = policy.spec
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)

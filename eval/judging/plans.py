@@ -1,8 +1,8 @@
-"""Planned laps of 24 tracks, and how many times as long a policy's laps take.
+"""Planned laps of 24 tracks, and the ratio of a policy's lap times to them.
 
-A plan knows the whole track and has no camera and no noise. It was found by a local search over
-B-splines flown through the differentiable quadrotor, and then flown by this judge in MuJoCo on the
-vehicle `reference`. It is an upper bound on the least lap. The planner is in commit c6d768a
+A plan uses the whole track, without camera and noise. It comes from a local search over B-splines
+with the differentiable quadrotor, and this judge flew it in MuJoCo on the vehicle `reference`. Its
+lap time is an upper bound of the shortest one. The planner is in commit c6d768a
 (`suite reproduce laps --trials 2`), and docs/archive/laps.md describes it.
 """
 
@@ -21,13 +21,13 @@ from eval.judging.statistics import Interval, bootstrap_median
 from eval.worlds.trial import TrialResult, TrialSpec
 
 VEHICLE = "reference"
-"""The shipped vehicle that the plans were flown on; a ratio holds for no other."""
+"""The shipped vehicle of the plans; ratios are valid only for it."""
 PLANS = Path(__file__).with_name("plans.json.xz")
-"""A list of tracks with `lap_s`, and rows of the flight: `time_ms` (T,), `pos_mm` (T, 3)."""
+"""File with a list of tracks, each with `lap_s`, `time_ms` (T,) and `pos_mm` (T, 3)."""
 
 
 class Plan(NamedTuple):
-    """A plan as the judge saw it flown to the end."""
+    """A plan as flown by the judge."""
 
     lap_s: float
     """Its lap time [s]."""
@@ -51,7 +51,7 @@ class OverPlan(NamedTuple):
 
 @functools.cache
 def plans() -> dict[TrialSpec, Plan]:
-    """Return the plan of each track that has one: three families, levels 0, 3, 6, 9, seeds 0, 1."""
+    """Return the plans by track: three families, levels 0, 3, 6, 9, seeds 0, 1."""
     with lzma.open(PLANS, "rt", encoding="utf-8") as file:
         stored = json.load(file)
     return {
@@ -63,10 +63,10 @@ def plans() -> dict[TrialSpec, Plan]:
 
 
 def over_plan(results: Sequence[TrialResult]) -> list[OverPlan]:
-    """Return each policy's laps over the plans, for policies with trials on planned tracks.
+    """Return each policy's laps compared with the plans, for trials on planned tracks.
 
     Args:
-        results: on tracks of the families, flown by the vehicle `VEHICLE`.
+        results: on tracks of the families, with the vehicle `VEHICLE`.
     """
     found = []
     for policy in dict.fromkeys(row.policy for row in results):

@@ -1,4 +1,4 @@
-"""Flight records gathered slot by slot while trials fly."""
+"""Recorder of flights, slot by slot, during trials."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _EMPTY = (
     np.zeros(3),
     False,
 )
-"""Shapes of a row, for a trial that ended where it started."""
+"""An empty row, for a trial that ended at its start."""
 
 
 class Recorder:
-    """Gathers the rows of the flights in N slots; a slot's flight is taken out when it ends."""
+    """Collects the rows of the flights in N slots, and returns a slot's flight at its end."""
 
     def __init__(self, slots: int, depth: bool, first: np.ndarray | None = None) -> None:
         """Make a recorder.
@@ -48,7 +48,7 @@ class Recorder:
         self._action[slot] = self._first
 
     def decided(self, slots: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray) -> None:
-        """Note the actions (N, 3) that the policy just gave for `slots` (k,) and what it saw."""
+        """Store the policy's new actions (N, 3) and depth images for `slots` (k,)."""
         for slot in slots:
             self._action[slot] = action_b[slot]
             self._is_new[slot] = True
@@ -66,7 +66,7 @@ class Recorder:
             self._rows[slot].append((*values, self._action[slot].copy(), new))
 
     def finish(self, slot: int, about: dict[str, Any]) -> Flight:
-        """Return the flight in `slot` with where it comes from."""
+        """Return the flight in `slot` with the metadata `about`."""
         rows = self._rows[slot] or [_EMPTY]
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         if not self._rows[slot]:

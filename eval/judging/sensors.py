@@ -1,8 +1,8 @@
-"""Sensor models in the slots of a judge, with each trial's own draws.
+"""Sensor models in the judge's slots, with each trial's own draws.
 
-What they change is in the policy's observation alone: the autopilot below it, its heading included,
-and the judge see the truth. Everything random is drawn from the trial's own seed, model by model,
-in an order that nothing else can change, so a trial's outcome stays set by the trial.
+They change only the policy's observation: the autopilot, its heading and the judge use the truth.
+All random numbers come from the trial's own seed, model by model and in a fixed order, so that a
+trial's outcome depends on the trial alone.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Sensors:
         """Make the sensors.
 
         Args:
-            wanted: which models.
-            slots: how many trials fly at once.
+            wanted: the sensor models.
+            slots: number of simultaneous trials.
             rate_hz: observations a second [Hz].
             camera: the policy's.
         """
@@ -48,12 +48,12 @@ class Sensors:
             draw(self._trial[name], slot, generators[slot])
 
     def see(self, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return what the sensors show, whose errors walk on; call it once an observation.
+        """Return the view with sensor errors; call it once for each observation.
 
         Args:
-            truth: what there is to see in each slot, with the gates' numbers.
+            truth: the true view in each slot, with the gates' numbers.
             fresh: (N,) bool, slots whose trial begins.
-            flying: (N,) bool, the slots that fly; the others' rows stay as they are.
+            flying: (N,) bool, slots in flight; other rows are returned unchanged.
         """
         rows = np.flatnonzero(flying)
         for name, generators in self._generators.items():
@@ -61,7 +61,7 @@ class Sensors:
                 draw(self._draws[name], slot, generators[slot])
         if not len(rows):
             return truth
-        # What lies in an empty slot is no flight, and sensors are made for flights.
+        # Empty slots get a valid view, since their contents are undefined.
         whole = take(truth, np.where(flying, np.arange(len(flying)), rows[0]))
         models, about, memory = self._models, (self._dt_s, self._camera), self._memory
         if memory is None or fresh.any():

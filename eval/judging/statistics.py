@@ -1,4 +1,4 @@
-"""Intervals for what trials score: Wilson, bootstrap, and differences on the same seeds."""
+"""Confidence intervals of scores: Wilson, bootstrap, and differences on the same trials."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 CONFIDENCE = 0.95
-"""Of every interval in tables and result files."""
+"""Confidence of every interval in tables and result files."""
 AT_ONCE = 10_000_000
-"""Draws of a bootstrap that are held at once."""
+"""Most bootstrap draws in memory at once."""
 
 
 class Interval(NamedTuple):
@@ -24,7 +24,7 @@ class Interval(NamedTuple):
 
 
 class PairedDifference(NamedTuple):
-    """How much the first differs from the second on the same trials."""
+    """Difference of two success rates on the same trials."""
 
     value: float
     """First minus second."""
@@ -41,7 +41,7 @@ class PairedDifference(NamedTuple):
 def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Return the success rate with its score interval (Wilson 1927, no continuity correction).
 
-    A trial that was flown several times may count with its mean.
+    A trial that was flown several times counts with its mean.
 
     Raises:
         ValueError: unless 0 <= successes <= trials and trials >= 1.

@@ -1,7 +1,8 @@
-"""The catalogue of what a drone sees and knows; adding a model is adding its file and its name.
+"""The catalogue of sensor models: errors of state estimates, gate positions, depth images and IMU.
 
-Another package adds one with an entry point of the group `diffracing_suite.sensors`, a program for
-its own process with `SENSORS.register(sensor.name, sensor)`.
+To add a model, write its `Sensor` and list it here. Another package adds one with an entry point of
+the group `diffracing_suite.sensors`; a program adds one for its own process with
+`SENSORS.register(sensor.name, sensor)`.
 """
 
 from __future__ import annotations
@@ -12,20 +13,17 @@ from typing import Any
 from eval.effects.interface import as_arrays
 from eval.sensors import (
     delay,
-    exposure,
-    frame_loss,
     gate_detection,
     gate_filter,
     gate_map,
     image_motion,
     imu,
+    intermittent,
     measured_state,
     state_drift,
-    state_loss,
     state_noise,
     stereo,
     tof,
-    wrong_gate,
 )
 from eval.sensors.interface import Draws, Moment, Sensor, View
 from tracks.common.names import Registry
@@ -46,35 +44,34 @@ def _wrong(name: str, sensor: Any) -> str | None:
     return None
 
 
-_OWN = {
-    module.SENSOR.name: module.SENSOR
-    for module in (
-        delay,
-        gate_map,
-        state_drift,
-        state_noise,
-        measured_state,
-        state_loss,
-        gate_detection,
-        wrong_gate,
-        image_motion,
-        stereo,
-        tof,
-        exposure,
-        frame_loss,
-        imu,
-        gate_filter,
-    )
-}
-# In the order in which they act; each takes what those before it made of the truth.
-SENSORS: Registry[Sensor] = Registry("sensor model", "diffracing_suite.sensors", _OWN, _wrong)
+_OWN = (
+    delay.SENSOR,
+    gate_map.SENSOR,
+    state_drift.SENSOR,
+    state_noise.SENSOR,
+    measured_state.SENSOR,
+    intermittent.STATE_LOSS,
+    gate_detection.SENSOR,
+    intermittent.WRONG_GATE,
+    image_motion.SENSOR,
+    stereo.SENSOR,
+    tof.SENSOR,
+    intermittent.EXPOSURE,
+    intermittent.FRAME_LOSS,
+    imu.SENSOR,
+    gate_filter.SENSOR,
+)
+"""In the order of application; each model gets the output of those before it."""
+SENSORS: Registry[Sensor] = Registry(
+    "sensor model", "diffracing_suite.sensors", {sensor.name: sensor for sensor in _OWN}, _wrong
+)
 
 Models = Mapping[str, Any]
 """Values (the model's NamedTuple) by the model's name."""
 
 
 def sensing(models: Models) -> dict[str, Any]:
-    """Return those of `models` that change a view, as arrays, in the order in which they act."""
+    """Return those of `models` that change a view, as arrays, in the order of application."""
     return {
         name: as_arrays(models[name])
         for name, sensor in SENSORS.items()
@@ -83,12 +80,12 @@ def sensing(models: Models) -> dict[str, Any]:
 
 
 def scaled(name: str, values: Any, magnitude: Any) -> Any:
-    """Return a model's values with what is wrong grown by `magnitude`, within its limits.
+    """Return a model's values with their errors scaled by `magnitude`, within the bounds.
 
     Args:
         name: of the model.
         values: its NamedTuple of numbers.
-        magnitude: 0: nothing is wrong; 1: `values`; a number, or an array (N,) for N rows.
+        magnitude: 0: no errors; 1: `values`; a number, or an array (N,) for N rows.
     """
     sensor, grown = SENSORS.find(name), {}
     for parameter in sensor.parameters:
@@ -104,18 +101,18 @@ def scaled(name: str, values: Any, magnitude: Any) -> Any:
 
 
 def magnified(models: Models, magnitude: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `models` with each grown by its own magnitude, as `scaled`."""
+    """Return `models`, each scaled by its own magnitude with `scaled`."""
     return {name: scaled(name, values, magnitude[name]) for name, values in models.items()}
 
 
 def start(
     models: Models, truth: View, draws: Mapping[str, Draws], dt_s: Any, camera: Camera
 ) -> dict[str, Any]:
-    """Return what each of `models` (of `sensing`) remembers at the first observation.
+    """Return the state of each of `models` (of `sensing`) at the first observation.
 
     Args:
         models: values by name.
-        truth: (N, ...) what there is.
+        truth: (N, ...) the true view.
         draws: of the trials, by model.
         dt_s: time between observations [s].
         camera: the policy's.
@@ -136,12 +133,12 @@ def sense(
     dt_s: Any,
     camera: Camera,
 ) -> tuple[View, dict[str, Any]]:
-    """Return what is seen through all of `models`, and what they remember; arguments as `start`."""
+    """Return the view after all of `models`, and their states; arguments as in `start`."""
     seen, kept = truth, dict[str, Any]()
     for name, values in models.items():
-        look = SENSORS[name].sense
-        assert look is not None
-        seen, kept[name] = look(
+        apply = SENSORS[name].sense
+        assert apply is not None
+        seen, kept[name] = apply(
             values, memory[name], seen, Moment(truth, draws[name], dt_s, camera)
         )
     return seen, kept

@@ -1,6 +1,6 @@
 """Delay of the state and of the image, and its jitter.
 
-`eval/judging/ages.py` takes each view at the physics step that lies its age before the decision.
+`eval/judging/ages.py` takes each view at the physics step that precedes the decision by its age.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def ages(values: Delay) -> Ages:
 SENSOR = Sensor(
     name="delay",
     stage="state",
-    summary="State and image are old when the policy decides",
+    summary="State and image are delayed when the policy decides",
     equation="seen(t) = true(t - a), a = age (1 + jitter u), u even from -1 to 1 each decision",
     source="Falanga et al. 2019 (latency of vision in flight): 10 to 100 ms",
     values=Delay,

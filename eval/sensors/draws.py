@@ -1,4 +1,4 @@
-"""Random numbers for sensor models: by NumPy from a trial's generator, by JAX from a key."""
+"""Random numbers for sensor models: with NumPy from a trial's generator, with JAX from a key."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
-    """Return room for as many draws as `needs` says, of `rows` rows."""
+    """Return empty arrays for the draws `needs` of `rows` rows."""
     shape = camera.height, camera.width
     return Draws(
         np.zeros((rows, needs.normal)),
@@ -28,7 +28,7 @@ def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
 def blank_of_each(
     models: Iterable[Sensor], rows: int, camera: Camera
 ) -> tuple[dict[str, Draws], dict[str, Draws]]:
-    """Return room for the draws of a trial, and of an observation, by the models' names."""
+    """Return empty arrays for the draws of a trial and of an observation, by model."""
     each = list(models)
     trial = {one.name: blank_draws(one.trial, rows, camera) for one in each}
     return trial, {one.name: blank_draws(one.observation, rows, camera) for one in each}

@@ -1,6 +1,6 @@
-"""The map of the gates: shifted, turned and stretched as a whole, and gates moved since.
+"""Errors of the map of the gates: shift, rotation and scale of all, and displacement of each.
 
-Its errors stay for a whole trial. They turn and stretch about the place where the trial begins.
+The errors are constant in a trial. The centre of rotation and scaling is the start of the trial.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View
 from tracks.geometry.rotation import to_world
 
 GATES = 32
-"""Gates with an error of their own; on a longer course the errors come again."""
+"""Number of different gate errors; a longer course repeats them."""
 
 
 class GateMap(NamedTuple):
@@ -25,7 +25,7 @@ class GateMap(NamedTuple):
 
 
 def start(values: GateMap, moment: Moment) -> dict[str, Any]:
-    """Return where the map begins and what is wrong with it."""
+    """Return the map's origin and errors."""
     draws, pos_w = moment.draws.normal, moment.truth.pos_w
     moved = draws[..., 5 : 5 + 3 * GATES].reshape(*draws.shape[:-1], GATES, 3)
     return {
@@ -41,7 +41,7 @@ def start(values: GateMap, moment: Moment) -> dict[str, Any]:
 def sense(
     values: GateMap, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with both gates where the map has them."""
+    """Return the view with both gates at their mapped positions."""
     number = moment.truth.gate_number % GATES
     # The last gate is its own next one.
     last = (moment.truth.second_w == moment.truth.gate_w).all(-1)

@@ -1,4 +1,4 @@
-"""Motion within an image: blur over the exposure, and rows that are read one after the other.
+"""Motion within an image: blur over the exposure, and rolling shutter.
 
 As far as the policy's few pixels show it: turning moves all of an image alike, by the rate times
 the time over a pixel's angle. The rate is the mean one since the observation before.
@@ -22,7 +22,7 @@ class ImageMotion(NamedTuple):
 
 
 def start(values: ImageMotion, moment: Moment) -> Array:
-    """Return how the body is turned."""
+    """Return the body's attitude."""
     return moment.truth.rot_w
 
 
@@ -49,7 +49,7 @@ def sense(values: ImageMotion, memory: Array, seen: View, moment: Moment) -> tup
 def shifted(image: Array, pixels: Array, axis: int) -> Array:
     """Return images (..., H, W) moved by `pixels` (..., H, 1) along `axis`, -1 or -2.
 
-    In between pixels they are interpolated; beyond the border stands the last pixel.
+    Values between pixels are interpolated; beyond the border the last pixel is repeated.
     """
     xp, count = image.__array_namespace__(), image.shape[axis]
     places = np.arange(count) if axis == -1 else np.arange(count)[:, None]

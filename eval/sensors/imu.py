@@ -1,7 +1,7 @@
 """An inertial measurement unit: bias, noise, vibration that grows with thrust, saturation.
 
-It acts on samples of a gyroscope and an accelerometer, which an estimator uses, and not on what the
-policy sees.
+It changes samples of a gyroscope and an accelerometer, which an estimator uses, instead of the
+policy's observation.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from eval.sensors.interface import Array, Draws, Inertial, Moment, Needs, Parameter, Sensor, column
 
 UNLIMITED = 1e6
-"""Where a sensor does not saturate."""
+"""Limit of a sensor without saturation."""
 
 
 class Imu(NamedTuple):
@@ -42,7 +42,7 @@ def start(values: Imu, moment: Moment) -> dict[str, Any]:
 def measure(
     values: Imu, memory: dict[str, Any], truth: Inertial, draws: Draws, dt_s: Any
 ) -> tuple[Inertial, dict[str, Any]]:
-    """Return what is measured of a true sample, and the biases, which walk on."""
+    """Return the measurement of a true sample, and the biases after a step of their random walk."""
     normal = draws.normal
     xp = normal.__array_namespace__()
     root = dt_s**0.5

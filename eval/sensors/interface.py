@@ -1,8 +1,8 @@
-"""What a sensor model is: a few numbers, and how they change what a drone sees and knows.
+"""The `Sensor` dataclass: its parameters, and the functions that change a drone's observations.
 
-A model is written once, over rows of NumPy or JAX arrays: the judge calls it with draws from each
-trial's own seed, the trainer with draws from JAX keys. Randomness comes in as arrays, as many of
-them whatever the magnitude, so that two magnitudes of one model have the same draws.
+A model is written once, for rows of NumPy or JAX arrays. The judge calls it with draws from each
+trial's own seed, the trainer with draws from JAX keys. Random numbers are passed in as arrays whose
+number does not depend on the magnitude, so that two magnitudes of one model use the same draws.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ Memory = Any  # arrays (..., K), or nested tuples and dicts of them
 
 
 STAGES = ("state", "gates", "depth", "imu")
-"""What models act on: estimated state, gates, depth image, inertial sensor."""
+"""What a model changes: estimated state, gates, depth image, inertial sensor."""
 
 
 class Needs(NamedTuple):
-    """How many random numbers a model takes."""
+    """Numbers of random draws of a model."""
 
     normal: int = 0
     """Standard normal numbers."""
     uniform: int = 0
-    """Numbers even from 0 to 1."""
+    """Uniform numbers from 0 to 1."""
     grain: int = 0
     """Images of standard normal numbers."""
     chance: int = 0
-    """Images of numbers even from 0 to 1."""
+    """Images of uniform numbers from 0 to 1."""
 
 
 class Draws(NamedTuple):
-    """Random numbers of N rows, as many as `Needs` says."""
+    """Random numbers of N rows, with the numbers of `Needs`."""
 
     normal: Array
     """(..., K)."""
@@ -51,10 +51,10 @@ class Draws(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """What a model is given of one observation, apart from what the models before it made of it."""
+    """Inputs of a model for one observation, besides the output of the models before it."""
 
     truth: View
-    """What there truly is, at the time of what is seen."""
+    """The true view, at the time of the observation."""
     draws: Draws
     """Of this observation; for `start`, of the trial."""
     dt_s: Any
@@ -64,14 +64,14 @@ class Moment(NamedTuple):
 
 
 class Ages(NamedTuple):
-    """How old what is seen is at a decision."""
+    """Ages of an observation at a decision."""
 
     state_s: float = 0.0
     """Mean age of the state [s]."""
     image_s: float = 0.0
     """Mean age of the image [s]."""
     jitter: float = 0.0
-    """Each decision's age is up to this share of the mean more or less, evenly [1]."""
+    """Largest relative deviation of a decision's age from the mean, uniformly distributed [1]."""
 
 
 class Inertial(NamedTuple):
@@ -85,38 +85,38 @@ class Inertial(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor or estimator model; a model has the hooks that it needs."""
+    """A sensor or estimator model; unused functions are None."""
 
     name: str
     """The `kind` of its table in a sensors file."""
     stage: str
-    """The table of a sensors file that it stands in, one of `STAGES`."""
+    """Its table in a sensors file, one of `STAGES`."""
     summary: str
     """One sentence for people."""
     equation: str
-    """What is seen, from what is."""
+    """The observation as a function of the truth."""
     source: str
-    """Where the form and the usual sizes come from."""
+    """Publications of the equation and the usual sizes."""
     values: type
     """NamedTuple class with a field for each parameter, in order."""
     parameters: tuple[Parameter, ...]
-    """All plain numbers; with the neutral values nothing is wrong."""
+    """All plain numbers; the neutral values give no errors."""
     grows: tuple[str, ...]
-    """Parameters that grow with the magnitude; the others keep their values."""
+    """Parameters that scale with the magnitude; the others are constant."""
     trial: Needs = Needs()
     """Draws at the start of a trial."""
     observation: Needs = Needs()
     """Draws of an observation; of an inertial model, of a sample."""
     start: Callable[[Values, Moment], Memory] | None = None
-    """Returns what the model remembers at the first observation, from the trial's draws."""
+    """Returns the model's state at the first observation, from the trial's draws."""
     sense: Callable[[Values, Memory, View, Moment], tuple[View, Memory]] | None = None
-    """Takes what the models before it made of the truth; returns what is seen, and the memory."""
+    """Takes the view of the models before it; returns the changed view, and the state."""
     ages: Callable[[Values], Ages] | None = None
-    """For a delay: how old what is seen is."""
+    """For a delay: the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
     """For an estimator in the loop: its `eval.sensors.filter.settings.FilterSettings`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
-    """For an inertial sensor: (values, memory, truth, draws, dt_s) -> what it measures, memory."""
+    """For an inertial sensor: (values, state, truth, draws, dt_s) -> measurement, state."""
 
 
 def column(value: Array) -> Array:
@@ -130,21 +130,21 @@ def over_image(value: Array) -> Array:
 
 
 def absent(values: Values, moment: Moment) -> Array:
-    """Return, at the start, that a fault with one uniform draw a trial is not there (...,)."""
+    """Return the start of an intermittent fault with one uniform draw: absent (...,)."""
     del values
     return moment.draws.uniform[..., 0] < 0.0
 
 
 def sticky(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -> Array:
-    """Return whether a fault that comes and stays is there, bool (...,).
+    """Return whether an intermittent fault is present, bool (...,).
 
-    A two-state Markov chain: in the long run the fault is there for `share` of the observations and
-    lasts `length_s` on average; where that is shorter than chance alone gives, observations are
+    A two-state Markov chain: in the long run the fault is present in `share` of the observations
+    and lasts `length_s` on average. If that is shorter than for independent observations, they are
     independent.
 
     Args:
-        on: (...,) bool, whether it was there before.
-        chance: (...,) draws, even from 0 to 1.
+        on: (...,) bool, whether it was present before.
+        chance: (...,) uniform draws from 0 to 1.
         share: of the observations, below 1 [1].
         length_s: mean length [s].
         dt_s: time between observations [s].
@@ -156,7 +156,7 @@ def sticky(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -
 
 
 def remembered(kept: Array) -> Array:
-    """Return the share of a first-order process that one observation leaves, for exp(-dt / tau)."""
+    """Return the noise factor of a first-order process, for its decay factor exp(-dt / tau)."""
     xp = kept.__array_namespace__()
     return xp.sqrt(xp.maximum(1.0 - kept**2, 0.0))
 
@@ -168,7 +168,7 @@ def length(vector: Array) -> Array:
 
 
 def turned_by(rot_w: Array, before_w: Array) -> Array:
-    """Return how far a body has turned since `before_w`, as a vector in its axes (..., 3) [rad].
+    """Return the rotation of a body since `before_w`, as a vector in its axes (..., 3) [rad].
 
     It is the sine of the angle along the axis: exact to 1 % below a quarter of a radian.
     """
@@ -185,7 +185,7 @@ def turned_by(rot_w: Array, before_w: Array) -> Array:
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the matrices a b (..., 3, 3), rounded alike at every batch size."""
+    """Return the matrices a b (..., 3, 3), with the same rounding at every batch size."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 

@@ -1,6 +1,6 @@
-"""Errors of an estimated state axis by axis, as `suite identify --sensors` measures them.
+"""Errors of an estimated state for each axis, as estimated by `suite identify --sensors`.
 
-Position has its axes in the world, velocity and attitude theirs in the body.
+Position errors are along world axes, velocity and attitude errors along body axes.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ GROUPS = {"position": ("m", 10.0), "velocity": ("m/s", 10.0), "attitude": ("rad"
 AXES = tuple(f"{group}_{axis}" for group in GROUPS for axis in "xyz")
 """The nine errors, in order."""
 LASTS_S = 0.5
-"""How long errors last where a file does not say [s]."""
+"""Default correlation time [s]."""
 
 
 class Axis(NamedTuple):
-    """What is wrong along one axis: its parameters are `position_x`, `position_x_bias`, ..."""
+    """Errors along one axis; the parameters are `position_x`, `position_x_bias`, ..."""
 
     noise: Array
-    """Standard deviation of what comes and goes."""
+    """Standard deviation of the varying error."""
     bias: Array
-    """Standard deviation of what stays for a trial."""
+    """Standard deviation of the constant error of a trial."""
     fast: Array
-    """Share of the noise's variance that changes fast [1]."""
+    """Share of the noise's variance with the short correlation time [1]."""
     fast_lasts: Array
-    """Correlation time of that share; 0: it is new at every observation [s]."""
+    """Short correlation time; 0: independent at every observation [s]."""
     lasts: Array
-    """Correlation time of the rest [s]."""
+    """Correlation time of the remaining variance [s]."""
 
 
 def _named(axis: str) -> tuple[str, ...]:
@@ -61,7 +61,7 @@ def axes_of(values: Any) -> Axis:
 
 
 def start(values: Any, moment: Moment) -> dict[str, Any]:
-    """Return unit errors and biases (..., 9), no drift (..., 3) and where the drone is."""
+    """Return unit errors and biases (..., 9), zero drift (..., 3) and the position at the start."""
     draws, pos_w = moment.draws.normal, moment.truth.pos_w
     return {
         "slow": draws[..., :9],

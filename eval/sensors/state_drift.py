@@ -1,4 +1,4 @@
-"""Drift of dead reckoning: it grows with the distance flown and with the angle turned."""
+"""Drift of dead reckoning, which grows with the distance and the angle of rotation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eval.sensors.interface import (
 from tracks.geometry.rotation import to_world
 
 SMALL = 1e-3
-"""Below this, distances [m] and angles [rad] add no drift: the root has a finite slope there."""
+"""Distances [m] and angles [rad] below this add no drift, which keeps the root's slope finite."""
 
 
 class StateDrift(NamedTuple):
@@ -34,7 +34,7 @@ class StateDrift(NamedTuple):
 
 
 def start(values: StateDrift, moment: Moment) -> dict[str, Any]:
-    """Return the drift of what was flown before the trial, and where the drone is."""
+    """Return the drift of the distance flown before the trial, and the pose at the start."""
     xp, draws = moment.draws.normal.__array_namespace__(), moment.draws.normal
     before = xp.sqrt(values.flown)
     return {
@@ -49,7 +49,7 @@ def start(values: StateDrift, moment: Moment) -> dict[str, Any]:
 def sense(
     values: StateDrift, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the state as dead reckoning has it."""
+    """Return the view with the state of dead reckoning."""
     truth, draws = moment.truth, moment.draws.normal
     step_w = truth.pos_w - memory["pos_w"]
     way = root(length(step_w))
@@ -69,7 +69,7 @@ def sense(
 
 
 def root(size: Array) -> Array:
-    """Return the square root of sizes (...,) above `SMALL`, and less with a finite slope below."""
+    """Return the square root of sizes (...,), with a finite slope below `SMALL`."""
     xp = size.__array_namespace__()
     return size / xp.sqrt(size + SMALL)
 

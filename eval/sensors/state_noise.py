@@ -1,4 +1,4 @@
-"""Errors of the estimated state that come and go: coloured noise, and a bias for the trial."""
+"""Errors of the estimated state: coloured noise, and a constant bias in each trial."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Depth by stereo: errors in disparity, holes at edges and on thin things, limits of the range.
+"""Depth by stereo: errors of disparity, holes at edges and on thin objects, limits of the range.
 
-Disparity is that of a camera with `focal` pixels, whose image the policy's 24 x 32 is made of. A
-hole reads as the camera's range, as deployed drivers fill it.
+Disparity refers to a camera of focal length `focal` [pixel], from whose image the policy's 24 x 32
+pixels are made. A hole has the value of the camera's range, as in deployed drivers.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View
 from tracks.geometry.camera import Camera
 
 NEAREST_M = 1e-3
-"""Depths below this count as this where they are inverted [m]."""
+"""Smallest depth that is inverted [m]."""
 EDGE = 1.25
-"""A neighbour nearer by this factor makes an edge."""
+"""Ratio of neighbouring depths above which there is an edge."""
 
 
 class Stereo(NamedTuple):
@@ -33,12 +33,12 @@ class Stereo(NamedTuple):
 
 
 def start(values: Stereo, moment: Moment) -> Array:
-    """Return the trial's error of the disparity's zero (...,) [pixel]."""
+    """Return the trial's offset of the disparity (...,) [pixel]."""
     return values.offset * moment.draws.normal[..., 0]
 
 
 def sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with the image as stereo gives it."""
+    """Return the view with a stereo camera's image."""
     depth_m, grain, chance = seen.depth_m, moment.draws.grain, moment.draws.chance
     xp, range_m = depth_m.__array_namespace__(), moment.camera.range_m
     left, right = neighbour(depth_m, -1), neighbour(depth_m, 1)

@@ -1,6 +1,6 @@
 """Depth by time of flight: noise, pixels between two surfaces at edges, and wrapped ranges.
 
-Where nothing is within the camera's range there is no return, and the pixel reads as the range.
+A pixel without a return within the camera's range has the value of the range.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def start(values: TimeOfFlight, moment: Moment) -> Array:
 
 
 def sense(values: TimeOfFlight, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with the image as time of flight gives it."""
+    """Return the view with a time-of-flight camera's image."""
     depth_m, draws, range_m = seen.depth_m, moment.draws, moment.camera.range_m
     xp, chance = depth_m.__array_namespace__(), draws.chance
     neighbours = [neighbour(depth_m, side) for side in (-1, 1)]
@@ -40,7 +40,7 @@ def sense(values: TimeOfFlight, memory: Array, seen: View, moment: Moment) -> tu
     found_m = xp.where(mixed, share * nearer + (1.0 - share) * depth_m, depth_m)
     noise = over_image(values.noise) * draws.grain[..., 0, :, :]
     found_m = found_m * (1.0 + over_image(memory) + noise)
-    # Beyond half a wavelength of the modulation a range looks as if it were nearer by that.
+    # Ranges are ambiguous by half a wavelength of the modulation.
     half_m = over_image(LIGHT / (2.0 * xp.maximum(values.modulation, 1.0)))
     wrong = chance[..., 2, :, :] < over_image(values.wrapped)
     found_m = xp.where(wrong, found_m - half_m * xp.floor(found_m / half_m), found_m)

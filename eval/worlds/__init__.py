@@ -1,10 +1,10 @@
-"""Worlds: where trials are flown. The table of names; modules are imported when asked for.
+"""Simulators ("worlds") by name; their modules are imported on first use.
 
 Another package adds one with an entry point of the group `diffracing_suite.worlds`, a program for
 its own process with `WORLDS.register(name, a_class)`.
 
-A world flies the trials in a fixed number of slots and knows nothing of policies: it is given
-actions and hands back what a policy needs to see.
+A world simulates trials in a fixed number of slots. It is independent of policies: it gets actions
+and returns views.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tracks.common.names import Registry
 from tracks.track import Track
 
 REFERENCE = "reference"
-"""The world without slots: `eval.worlds.reference.fly_trial`, one trial after the other."""
+"""The simulator without slots: `eval.worlds.reference.fly_trial`, one trial at a time."""
 WORLDS: Registry[Any] = Registry(
     "simulator",
     "diffracing_suite.worlds",
@@ -64,16 +64,15 @@ class Rows(NamedTuple):
 class World(Protocol):
     """A fixed number of slots, each flying one trial at a time.
 
-    A world whose step shows in its flights has an attribute `integrator` (`"euler"`), which its
-    logs then carry together with the step; without it they count as continuous in time.
+    Optional attributes: `integrator` (`"euler"`) goes into its logs, with the step; logs without it
+    count as continuous in time. `cost` is the time of a trial relative to MuJoCo, for estimates; 1
+    without it. `compiles` is true where each number of slots compiles a program of its own: such a
+    world gets all trials at once, in one process. `actions` are the kinds of action besides
+    acceleration; the class then takes an argument `action`, a `policies.spec.ActionSpec`.
 
-    Static methods that it may have: `check()` raises a ValueError with what to do where a package
-    is missing; `differences(vehicle)` returns a sentence for everything that it flies otherwise
-    than the file says; `nearest(vehicle)` the vehicle whose file says best what it flies. `cost` is
-    what a trial costs over one in MuJoCo, for estimates; 1 without it. `compiles` is true where
-    every number of slots is a program of its own: such a world is given all trials at once, in one
-    process and in as many slots as are asked for. `actions` are the kinds that it flies besides
-    acceleration; it then takes an argument `action`, a `policies.spec.ActionSpec`.
+    Optional static methods: `check()` raises a ValueError for a missing package;
+    `differences(vehicle)` returns a sentence for each deviation from the vehicle file;
+    `nearest(vehicle)` returns the vehicle that describes the simulated one best.
     """
 
     name: str
@@ -83,7 +82,7 @@ class World(Protocol):
 
     @property
     def progress(self) -> Progress:
-        """Where the trial in each slot stands, numpy arrays (N, ...)."""
+        """Progress of the trial in each slot, numpy arrays (N, ...)."""
         ...
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
@@ -91,7 +90,7 @@ class World(Protocol):
         ...
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return what can be observed now; images only of the slots in `wanted` (N,) bool."""
+        """Return the current view; images only for the slots in `wanted` (N,) bool."""
         ...
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
@@ -111,7 +110,7 @@ def world_class(name: str) -> Any:
     """Return the class of the world `name` (for `REFERENCE` the function).
 
     Raises:
-        ValueError: where there is no such world, or it lacks a package.
+        ValueError: for an unknown simulator, or a missing package.
     """
     world = WORLDS.find(name)
     if hasattr(world, "check"):
@@ -120,10 +119,10 @@ def world_class(name: str) -> Any:
 
 
 def flown_by(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
-    """Return the argument that makes the world `name` fly another kind of action, if it is one.
+    """Return the argument for another kind of action than acceleration; {} for acceleration.
 
     Raises:
-        ValueError: where that world flies accelerations alone.
+        ValueError: where that simulator supports accelerations only.
     """
     if action.kind == "acceleration":
         return {}
@@ -141,10 +140,10 @@ def compiles(name: str) -> bool:
 
 
 def differences(name: str, vehicle: Vehicle) -> list[str]:
-    """Return a sentence for everything of `vehicle` that the world `name` flies otherwise.
+    """Return a sentence for each deviation of the simulator `name` from `vehicle`.
 
     Raises:
-        ValueError: where there is no such world, or it lacks a package.
+        ValueError: for an unknown simulator, or a missing package.
     """
     world = world_class(name)
     return world.differences(vehicle) if hasattr(world, "differences") else []

@@ -1,4 +1,4 @@
-"""What the two worlds on MuJoCo's C engine share: the model of a trial, its rays, its contacts."""
+"""Shared parts of the simulators on MuJoCo's C engine: models, rays and contacts."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
 BODY = 1
-"""Number of the quadrotor's body: the first after the world, as the scene has no bodies."""
+"""Number of the quadrotor's body: the first after the world body."""
 NO_AUTORESET = mujoco.mjtDisableBit.mjDSBL_AUTORESET
-"""The judge finds states that are none and ends the trial; MuJoCo shall not reset them first."""
+"""Disables MuJoCo's reset of invalid states, which the judge must detect."""
 
 
 def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujoco.MjModel:
     """Return the model of a vehicle on a track, padded so that all trials share one layout.
 
     Args:
-        track: what is flown through.
-        vehicle: what flies.
+        track: with its scene.
+        vehicle: that flies.
         dt: length of a physics step [s].
-        to: how many solids of each kind the model holds.
+        to: padded number of solids of each kind.
     """
     spec = mujoco.MjSpec()
     spec.option.disableflags |= NO_AUTORESET
@@ -35,7 +35,7 @@ def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujo
 
 
 class Eye:
-    """A depth camera on MuJoCo's own rays."""
+    """A depth camera that uses MuJoCo's rays."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -73,7 +73,7 @@ class Eye:
             depth,
             None,
             count,
-            # A nearer cut-off leaves out the ground as well, where its origin is further away.
+            # A shorter cut-off would also skip the ground where its origin is further away.
             mujoco.mjMAXVAL,
         )
         depth = np.where(geom < 0, self.camera.range_m, depth)
@@ -81,24 +81,24 @@ class Eye:
 
 
 def motion_of(data: mujoco.MjData) -> Motion:
-    """Return the quadrotor's state as a batch of one; `data` holds what `mj_step1` computes."""
+    """Return the quadrotor's state as a batch of one; needs the results of `mj_step1` in `data`."""
     rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
     pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
     return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
 
 
 def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
-    """Return the name of the solid that the quadrotor is deepest in; `data` holds the contacts."""
+    """Return the name of the solid with the deepest contact in `data`."""
     deepest = min(data.contact, key=lambda contact: contact.dist)
     own = [int(model.geom_bodyid[geom]) == BODY for geom in deepest.geom]
     return solid_name(model.geom(int(deepest.geom[1 if own[0] else 0])).name)
 
 
 def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
-    """Refuse a track on which `vehicle` touches something before it has flown.
+    """Refuse a track on which `vehicle` is in contact at the start.
 
     Raises:
-        ValueError: naming the track, the start and what is touched.
+        ValueError: naming the track, the start and the touched solid.
     """
     model = compile_model(track, vehicle, 1.0 / vehicle.controller.frequency, counts(track.scene))
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The world `mujoco`: many trials at once in MuJoCo's C engine (`mujoco.batch`)."""
+"""The simulator `mujoco`: many trials at once in MuJoCo's C engine (`mujoco.batch`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tracks.geometry.rotation import to_world
 class MujocoWorld(SceneSlots):
     """MuJoCo's C engine, the default.
 
-    It moves the bodies under the plant's wrench; a step goes on from the contacts.
+    It moves the bodies under the plant's force and torque; a step starts from the contacts.
     """
 
     name = "mujoco"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from eval.judging.guard import ActionLimits, Guarded, ask, first_action, limits_of
+from eval.judging.guard import ActionLimits, Guarded, call_policy, first_action, limits_of
 from eval.judging.outputs import Outputs
 from eval.judging.sensors import Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
@@ -127,7 +127,7 @@ def fly_trial(
             fresh = np.full(rows, decisions == 0)
             inputs = (_padded(x, rows) for x in (state, image))
             last_b = np.repeat(action_b, rows, 0)
-            guarded, hidden = ask(limits, policy, hidden, *inputs, fresh, last_b)
+            guarded, hidden = call_policy(limits, policy, hidden, *inputs, fresh, last_b)
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
             bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])

@@ -1,7 +1,7 @@
-"""Slots of `mujoco.batch`, where MuJoCo's C engine sees and touches the scene, whoever flies in it.
+"""Slots of `mujoco.batch`, in which MuJoCo computes contacts and mesh images of each trial.
 
-Every slot has its own model, padded to one layout, and its own MjData. A slot is always left with
-the contacts of its current state computed, so that a state is judged before it is flown on from.
+Every slot has its own model, padded to one layout, and its own MjData. After each operation the
+contacts of the current state are up to date, so that it is judged before the next step.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from tracks.geometry.tiles import depth_images, make_tiles
 from tracks.track import Track
 
 TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
-"""The last stage of the engine that a state needs to be judged."""
+"""Stage of the engine after which a state can be judged."""
 _NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
 class SceneSlots(ABC):
-    """A `World` but for what moves the bodies; everything but the engine is numpy over all slots.
+    """A `World` without the dynamics; everything but the engine is numpy over all slots.
 
-    A world says with `_control` what the autopilot asks for and with `_move` where that leads.
+    Subclasses define `_control` (the autopilot's output) and `_move` (the motion of the bodies).
     """
 
     name: str
@@ -69,13 +69,13 @@ class SceneSlots(ABC):
         """Make the world.
 
         Args:
-            vehicle: what flies.
+            vehicle: that flies.
             camera: the policy's.
-            layout: what every track that will be loaded fits into.
+            layout: sizes that fit every track.
             rules: when a trial ends.
             slots: how many trials fly at once.
             threads: for physics; the outcome is the same with any number.
-            action: what the policy commands; an acceleration without it.
+            action: the policy's action; None for an acceleration.
         """
         self.slots = slots
         self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
@@ -95,7 +95,7 @@ class SceneSlots(ABC):
 
     @property
     def progress(self) -> Progress:
-        """Where the trial in each slot stands."""
+        """Progress of the trial in each slot."""
         return self._progress
 
     def _build(self, model: mujoco.MjModel) -> None:
@@ -115,7 +115,7 @@ class SceneSlots(ABC):
         """Start trials from (slot, track, trial).
 
         Args:
-            entries: what is flown.
+            entries: the trials to fly.
             vehicles: one an entry, that have the effects of the world's with other values; where
                 some loads have them, all have.
         """
@@ -126,7 +126,7 @@ class SceneSlots(ABC):
             if not self._models:
                 self._build(model)
             self._models[slot] = model
-            if track.mesh_sizes:  # which do not move: places computed once serve all images
+            if track.mesh_sizes:  # meshes do not move: one computation serves all images
                 self._meshes[slot] = mujoco.MjData(model)
                 mujoco.mj_kinematics(model, self._meshes[slot])
             self._course.count[slot] = len(track.scene.gates.center_w)
@@ -151,7 +151,7 @@ class SceneSlots(ABC):
         self._judge(started, np.zeros(self.slots, bool))
 
     def _change(self, slots: list[int], vehicles: Sequence[Vehicle]) -> None:
-        """Give each of `slots` a vehicle of its own."""
+        """Assign a vehicle to each of `slots`."""
         for slot, vehicle in zip(slots, vehicles, strict=True):
             self._vehicles[slot] = vehicle
         values = {}
@@ -162,7 +162,7 @@ class SceneSlots(ABC):
         self._autopilot = replace(self._autopilot, plant=plant)
 
     def _scene_with(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
-        """Return the scenes of all slots, but for the meshes, with `scenes` in the slots `ids`."""
+        """Return the scenes of all slots without meshes, with `scenes` in the slots `ids`."""
         layout = self._layout
         padded = [
             scene._replace(
@@ -196,7 +196,7 @@ class SceneSlots(ABC):
         return contact_name(self._models[slot], self._batch.get_data(slot))
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return what can be observed now."""
+        """Return the current view."""
         motion = self._motion()
         camera, slots = self._eye.camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
@@ -206,7 +206,7 @@ class SceneSlots(ABC):
         return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)
 
     def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
-        """Return what the cameras in `slots` (K,) see from pos_w (K, 3) and rot_w (K, 3, 3)."""
+        """Return the depth images of `slots` (K,) from pos_w (K, 3) and rot_w (K, 3, 3)."""
         depth = depth_images(self._tiles, take(self._scene, slots), pos_w, rot_w)
         for row, slot in enumerate(slots.tolist()):
             if slot in self._meshes:
@@ -224,9 +224,9 @@ class SceneSlots(ABC):
         step: np.ndarray,
         noise: np.ndarray | None,
     ) -> tuple[AutopilotState, Any]:
-        """Return the loops after a physics step, and what they ask of `_move`.
+        """Return the loops after a physics step, and their output for `_move`.
 
-        The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, of all slots.
+        The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, for all slots.
         """
 
     @abstractmethod
@@ -234,7 +234,7 @@ class SceneSlots(ABC):
         """Fly one physics step in the slots `flying` (N,) bool, from `motion`, under `push`.
 
         Returns:
-            (N,) bool: slots in which no step can be taken, and which stay where they are.
+            (N,) bool: slots in which no step is possible, and which keep their state.
         """
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
@@ -260,12 +260,12 @@ class SceneSlots(ABC):
                 ended = ~np.isin(self._progress.ended, (FLYING, DIVERGED))
                 rows += self._rows(flying & ended, self._loops.plant.rotor_speed)
             lost = np.flatnonzero(flying & (self._progress.ended == DIVERGED))
-            if len(lost):  # the other slots' arithmetic shall not meet its numbers again
+            if len(lost):  # its numbers must not appear in later arithmetic of all slots
                 self._batch.reset(lost.astype(np.int32), stage=TO_CONTACTS)
         return rows
 
     def _draws(self, step: np.ndarray) -> np.ndarray | None:
-        """Return the draws (N, 3) that come after `step` (N,), -1 before the start."""
+        """Return the draws (N, 3) that follow `step` (N,); -1 is before the start."""
         if self._noise is None:
             return None
         pairs = zip(step.tolist(), self._noise, strict=True)

@@ -1,4 +1,4 @@
-"""What a world with slots keeps for each: the courses, the progress, the random numbers."""
+"""Shared parts of worlds with slots: layouts, courses and random numbers of trials."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tracks.track import Track
 
 
 class Layout(NamedTuple):
-    """What the scenes of all trials are padded to, so that any of them fits any slot."""
+    """Sizes to which all scenes are padded, so that any trial fits any slot."""
 
     solids: Counts
     gates: int
@@ -24,7 +24,7 @@ class Layout(NamedTuple):
 
 
 def layout_of(tracks: Iterable[Track]) -> Layout:
-    """Return the smallest layout that holds every track and every track of the families."""
+    """Return the smallest layout that fits all `tracks` and all tracks of the families."""
     layout = Layout(MAX_COUNTS, 8, 4)
     for track in tracks:
         opening = track.scene.gates.opening_g
@@ -38,12 +38,12 @@ def layout_of(tracks: Iterable[Track]) -> Layout:
 
 
 def fitting(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[list[int]]:
-    """Return the numbers of trials in groups whose scenes fit into each other's slots.
+    """Return the numbers of trials in groups that can share slots.
 
-    A model of MuJoCo is as large as its meshes: a track with meshes is a group of its own.
+    The size of a MuJoCo model depends on its meshes, so a track with meshes is its own group.
 
     Args:
-        trials: what is flown.
+        trials: to be flown.
         tracks: those from files.
     """
     groups: dict[str, list[int]] = {}
@@ -54,7 +54,7 @@ def fitting(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[li
 
 
 def empty_course(slots: int, layout: Layout) -> Course:
-    """Return the course of slots without a trial, where nothing is judged: room for gates."""
+    """Return the course of empty slots, with room for gates."""
     n, g = slots, layout.gates
     gates = Gates(
         np.zeros((n, g, 3)),
@@ -75,17 +75,17 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
 
 
 GUSTS, SENSED, STATE_AGES, IMAGE_AGES = range(1, 5)
-"""What a trial's random numbers are for; each use has a stream of its own."""
+"""Uses of a trial's random numbers; each has its own stream."""
 GUSTS_AT_ONCE = 1024
-"""Steps whose draws are made together."""
+"""Number of steps whose draws are made together."""
 IDLE = TrialSpec("", 0, 0)
-"""In a slot where none has been loaded."""
+"""Trial of a slot before the first load."""
 
 
 def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Generator:
-    """Return the random numbers of a trial for a part of one use, set by the three alone.
+    """Return the random generator of a trial for one use and part, which determine it.
 
-    Of a track's file the name counts, however the way to it was written.
+    For a track file only its name counts, without the folder.
     """
     name = PurePath(trial.track).name
     key = [trial.seed, trial.difficulty, *name.encode(), use, *part.encode()]
@@ -93,7 +93,7 @@ def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Genera
 
 
 class Gusts:
-    """A trial's draws for its gusts, as `noise_of` gives them, drawn as the flight goes on.
+    """A trial's draws for gusts, equal to `noise_of`, but generated during the flight.
 
     A flight of an hour at 10 kHz would need 0.9 GB at once.
     """
@@ -109,7 +109,7 @@ class Gusts:
     def at(self, step: int, count: int) -> np.ndarray:
         """Return the draws (count, 3) of the steps from `step` on.
 
-        Going on is cheap; what lies before the last `step` is drawn anew from the start.
+        Later steps are cheap; an earlier `step` repeats the draws from the start.
         """
         if step < self._first:
             self._rewind()
@@ -122,5 +122,5 @@ class Gusts:
 
 
 def noise_of(trial: TrialSpec, steps: int) -> np.ndarray:
-    """Return standard normal draws (steps, 3) for a trial's gusts, set by the trial alone."""
+    """Return standard normal draws (steps, 3) for a trial's gusts, determined by the trial."""
     return generator_of(trial, GUSTS).standard_normal((steps, 3))

@@ -1,6 +1,6 @@
-"""What a trial is, when it ends and what it scores; the same rules in every world.
+"""Trials: their specification, end and score, with the same rules in every simulator.
 
-The rules are pure functions of arrays over many trials (N rows) and take numpy and JAX alike.
+The rules are pure functions of arrays over many trials (N rows), for numpy and JAX.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from tracks.geometry.scene import Array, Gates
 from tracks.track import Track
 
 FLYING = 0
-"""The code in `Progress.ended` of a trial that goes on."""
+"""Code in `Progress.ended` of a running trial."""
 ENDINGS = ("finished", "collision", "tipped", "timeout", "diverged")
-"""What `ended_by` can be; `Progress.ended` holds 1 + the index."""
+"""Values of `ended_by`; `Progress.ended` is 1 + the index."""
 FINISHED, COLLISION, TIPPED, TIMEOUT, DIVERGED = range(1, 6)
 
 
 class TrialSpec(NamedTuple):
-    """What sets a trial's outcome, besides the policy and the vehicle."""
+    """Specification of a trial; with policy and vehicle it determines the outcome."""
 
     track: str
     """Name of the family, or path of a custom track's file."""
     difficulty: int
     """Level, 0 to 9."""
     seed: int
-    """Seed of the track and of everything random in the trial."""
+    """Seed of the track and of all random numbers of the trial."""
 
 
 class TrialResult(NamedTuple):
-    """How a trial went: a row of trials.parquet."""
+    """Outcome of a trial: a row of trials.parquet."""
 
     track: str
     difficulty: int
@@ -66,25 +66,25 @@ class TrialResult(NamedTuple):
     bad_actions: int
     """Actions that were not finite; the last good one was flown instead."""
     limited_actions: int
-    """Actions larger than the limit, shortened to it."""
+    """Actions beyond the limit, which were reduced to it."""
     late_actions: int
-    """1 where the trial ended, as out of time, by an answer that came after the deadline, where one
-    is set, or not at all; else 0."""
+    """1 where the policy exceeded a set deadline or gave no answer, which ends a trial as timeout;
+    else 0."""
     decisions: int = 0
-    """Answers of the policy; 0 in files that do not say."""
+    """Decisions of the policy; 0 in files without this column."""
     output_max: float = 0.0
-    """Largest component of the policy's own output by size, before its scale; 0 for none."""
+    """Largest absolute component of the policy's raw output; 0 for none."""
     action_up: float = 0.0
-    """Mean vertical component of wanted net accelerations [m/s^2]; 0 of other actions."""
+    """Mean vertical component of wanted net accelerations [m/s^2]; 0 for other actions."""
 
     @property
     def trial(self) -> TrialSpec:
-        """The trial that this is the result of."""
+        """The specification of the trial."""
         return TrialSpec(self.track, self.difficulty, self.seed)
 
     @property
     def ending(self) -> str:
-        """How it ended, for people: "collision with gate 3 frame"."""
+        """The end as text, such as "collision with gate 3 frame"."""
         return self.ended_by + (f" with {self.collided_with}" if self.collided_with else "")
 
 
@@ -97,7 +97,7 @@ def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
 
 @dataclass(frozen=True)
 class Rules:
-    """When a trial ends and what counts."""
+    """Rules for the end and the score of a trial."""
 
     time_limit_s: float = 20.0
     """A trial ends at this time [s]."""
@@ -123,7 +123,7 @@ class Course(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Where trials stand; every array is (N,) but `pos_w`."""
+    """Progress of trials; all arrays are (N,) except `pos_w`."""
 
     step: Array
     """Physics steps flown, int32."""
@@ -144,9 +144,9 @@ class Progress(NamedTuple):
 
 
 def steps_to_next(decision: Array, period: float) -> Array:
-    """Return the physics steps from each decision, by its number, to the next; whole ones.
+    """Return the whole physics steps from each decision, given by its number, to the next.
 
-    A `period` of 16.7 steps, as that of 30 Hz at 500 Hz of physics, is 17, 16 and 17 in turn.
+    A `period` of 16.7 steps (30 Hz at 500 Hz of physics) alternates between 17, 16 and 17.
     """
     xp = decision.__array_namespace__()
     return (xp.rint((decision + 1) * period) - xp.rint(decision * period)).astype(int)
@@ -160,12 +160,12 @@ def start_progress(pos_w: Array) -> Progress:
 
 
 def next_gate(course: Course, number: Array) -> Gates:
-    """Return each row's gate `number` (N,), past the last one the last, with arrays (N, ...)."""
+    """Return each row's gate `number` (N,), or the last one beyond it, with arrays (N, ...)."""
     return Gates(*_rows_of(course, number, course.gates))
 
 
 def next_centre(course: Course, number: Array) -> Array:
-    """Return the centre (N, 3) of each row's gate `number` (N,), as `next_gate` has it [m]."""
+    """Return the centre (N, 3) of each row's gate `number` (N,), as `next_gate` does [m]."""
     return _rows_of(course, number, [course.gates.center_w])[0]
 
 
@@ -176,7 +176,7 @@ def _rows_of(course: Course, number: Array, fields: Sequence[Array]) -> list[Arr
 
 
 def has_diverged(rules: Rules, motion: Motion) -> Array:
-    """Return which states are not finite or beyond any flight, (N,) bool."""
+    """Return which states are not finite or impossibly fast, (N,) bool."""
     xp = motion.pos_w.__array_namespace__()
     # A comparison with NaN is false.
     speed_fits = (xp.abs(motion.vel_w) <= rules.speed_limit).all(-1)
@@ -185,7 +185,7 @@ def has_diverged(rules: Rules, motion: Motion) -> Array:
 
 
 def is_wrench(rules: Rules, wrench: Wrench) -> Array:
-    """Return which forces and torques are finite and within any flight's, (N,) bool."""
+    """Return which forces and torques are finite and possible, (N,) bool."""
     xp = wrench.force_b.__array_namespace__()
     both = xp.concatenate(wrench, axis=-1)
     return (xp.abs(both) <= rules.wrench_limit).all(-1)  # a comparison with NaN is false
@@ -200,19 +200,19 @@ def judge_state(
     contact: Array,
     diverged: Array,
 ) -> Progress:
-    """Judge the states that trials have reached at their physics step `progress.step`.
+    """Return the progress after judging the states at physics step `progress.step`.
 
     A contact found in a state counts before a gate crossed on the way to it: a trial that touches
     the last gate's frame in the step in which it crosses has not finished.
 
     Args:
         rules: when a trial ends.
-        progress: of N trials; rows that have ended are returned as they are.
+        progress: of N trials; ended rows are returned unchanged.
         course: the gates of each trial's track.
         dt: length of a physics step [s].
         motion: (N, ...) the states.
-        contact: (N,) bool, the body touches something.
-        diverged: (N,) bool, the state is none; its numbers are not looked at.
+        contact: (N,) bool, the body is in contact.
+        diverged: (N,) bool, the state is invalid and its numbers are ignored.
     """
     pos_w, rot_w, vel_w, _ = motion
     xp = pos_w.__array_namespace__()

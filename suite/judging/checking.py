@@ -104,11 +104,11 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
         trials: short flights by which its actions are judged; 0 flies none.
         console: told the contract and the share of limited actions.
     """
-    from eval.judging.outputs import doubts
+    from eval.judging.outputs import probable_faults
 
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     found = [_record("contract", *note) for note in getattr(policy, "notes", ())]
-    found += [_record(doubt.fault.split("_")[0], *doubt) for doubt in doubts(policy)]
+    found += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
     known = {record["fault"] for record in found}
     seen = [each for each in _in_flight(policy, trials, console) if each[0] not in known]
     return found + [_record("action", *warning) for warning in seen]

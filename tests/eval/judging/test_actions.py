@@ -8,7 +8,7 @@ import pytest
 
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.outputs import actions_of, doubts, notes_of
+from eval.judging.outputs import actions_of, notes_of, probable_faults
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.block_policy import BlockPolicy
@@ -142,7 +142,7 @@ def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
     found = actions_of([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
     assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
     policy = load_policy("race-small")
-    assert isinstance(policy, BlockPolicy) and doubts(policy) == ()
+    assert isinstance(policy, BlockPolicy) and probable_faults(policy) == ()
     changes = {
         "action_gravity": lambda a: a + np.array([0, 0, 9.81], np.float32),
         "action_frame": lambda a: a * np.array([1, -1, -1], np.float32),
