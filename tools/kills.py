@@ -1,11 +1,15 @@
 """kill -9 at random moments: does the same command go on, and come to the same bits?
 
     python tools/kills.py COUNT [COMMAND ...] [--seed N]
+    python tools/kills.py COUNT --signals [--seed N]
 
 Every command of the table below runs without a disturbance; then COUNT times it is killed at a
 random moment of the time that took, and up to five times more, sooner, after it was called again,
 and then left to end. What it wrote must be equal to the undisturbed run's, but for times and
 stamps. Prints a line a run and fails where one differs. Only what was killed while it ran counts.
+
+With --signals a training without compiled code is sent Ctrl-C or SIGTERM instead, COUNT times at a
+random moment of its first 20 s. It fails where one does not end with 130 within 5 s.
 """
 
 from __future__ import annotations
@@ -13,7 +17,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import random
+import signal
 import subprocess
 import sys
 import tempfile
@@ -38,6 +44,8 @@ SHARES = (1.0, 0.5, 0.5, 0.5, 0.5, 0.5)
 """Up to which share of a whole run's time each of its kills comes."""
 TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
 """Keys that differ between runs that are alike: times, and the folders of what a loop made."""
+WITHIN_S = 5.0
+"""A signal is answered in this time [s]."""
 
 
 def start(command: str, out: Path) -> subprocess.Popen[bytes]:
@@ -97,14 +105,46 @@ def killed(command: str, out: Path, after_s: float) -> bool:
     return False
 
 
+def signalled(number: signal.Signals, after_s: float) -> tuple[int, float]:
+    """Return the exit code of a training that gets a signal, and how long after [s]."""
+    with tempfile.TemporaryDirectory() as folder:
+        training = subprocess.Popen(
+            [sys.executable, "-m", "suite.cli", *COMMANDS["train"].split(), "--out", folder],
+            env={**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            # A shell has background jobs ignore Ctrl-C, and what ignores it ends by nothing else.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        time.sleep(after_s)
+        sent = time.monotonic()
+        training.send_signal(number)
+        return training.wait(), time.monotonic() - sent
+
+
+def send_signals(count: int, draw: random.Random) -> int:
+    """Send so many signals and return the exit code."""
+    bad = 0
+    for _ in range(count):
+        number, after_s = draw.choice([signal.SIGINT, signal.SIGTERM]), draw.uniform(1.5, 20.0)
+        code, took_s = signalled(number, after_s)
+        bad += code != 130 or took_s > WITHIN_S
+        print(f"{number.name} after {after_s:.1f} s: {code}, {took_s:.1f} s later", flush=True)
+    print(f"{count - bad} of {count} ended with 130 within {WITHIN_S:g} s")
+    return min(bad, 1)
+
+
 def main() -> int:
-    """Kill what the command line asks for."""
+    """Kill or interrupt what the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
     parser.add_argument("commands", nargs="*", default=list(COMMANDS), metavar="COMMAND")
+    parser.add_argument("--signals", action="store_true", help="Ctrl-C and SIGTERM instead")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     draw, bad, tried = random.Random(asked.seed), 0, 0
+    if asked.signals:
+        return send_signals(asked.count, draw)
     with tempfile.TemporaryDirectory() as folder:
         if "delta" in asked.commands and "collect" not in asked.commands:
             finish("collect", Path(folder, "collect", "plain"))

@@ -12,18 +12,12 @@ survived.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
-import importlib
 import json
-import os
-import runpy
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -184,47 +178,19 @@ def tests_of(fault: Fault, names: list[str]) -> list[str]:
     return found
 
 
-def load_libraries() -> None:
-    """Import what tests need besides our code, once for all of them, with their settings."""
-    runpy.run_path(str(ROOT / "tests" / "conftest.py"))
-    sys.dont_write_bytecode = True
-    for name in ("jax", "optax", "scipy.optimize", "mujoco", "pyarrow.parquet", "matplotlib"):
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
-
-
 def run_tests(copy: Path, tests: list[str]) -> tuple[int, str]:
-    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line.
-
-    They run in a fork of this process, up to the first that fails.
-    """
-    with tempfile.TemporaryFile("w+") as file:
-        child = os.fork()
-        if child == 0:
-            code = 3
-            try:
-                import pytest
-
-                os.chdir(copy)
-                sys.path[0] = str(copy)
-                for stream in (1, 2):
-                    os.dup2(file.fileno(), stream)
-                plain = ["-p", "no:cacheprovider", "--assert=plain"]
-                code = pytest.main(["-x", "-q", "-n", "0", *plain, *tests])
-            finally:
-                sys.stdout.flush()
-                os._exit(code)
-        end = time.monotonic() + LONGEST_S
-        while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
-            if time.monotonic() > end:
-                os.kill(child, signal.SIGKILL)
-                os.waitpid(child, 0)
-                return FAILED, f"not done after {LONGEST_S:g} s"
-            time.sleep(0.1)
-        file.seek(0)
-        lines = file.read().splitlines() or ["said nothing"]
+    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line."""
+    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", "pytest", *options, *tests],
+            cwd=copy, capture_output=True, text=True, timeout=LONGEST_S,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return FAILED, f"not done after {LONGEST_S:g} s"
+    lines = (ended.stdout + ended.stderr).splitlines() or ["printed nothing"]
     failed = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
-    return os.waitstatus_to_exitcode(ended[1]), (failed or lines)[-1][:160]
+    return ended.returncode, (failed or lines)[-1][:160]
 
 
 class Work:
@@ -279,8 +245,6 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="print the faults and their tests")
     args = parser.parse_args()
     numbers = args.only or list(range(1, len(FAULTS) + 1))
-    if not args.list:
-        load_libraries()
     with tempfile.TemporaryDirectory() as folder:
         work = Work(args.tree, Path(folder) / "tree", args.out)
         for number in numbers:
