@@ -50,7 +50,7 @@ CASES = {
 def pulls(
     fleet: Fleet, recordings: Sequence[Recording], case: str, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
-    """Return (error over half-width, half-width over truth) of every number that is told."""
+    """Return (error over half-width, half-width over truth) of every estimated number."""
     drive, lacks = CASES[case]
     logs = [
         replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in lacks})
@@ -102,7 +102,7 @@ def found(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[s
 
 def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
     """Identify, and print the table."""
-    print("| log | number | told | held | 95 % interval of that | half-width | pulls |")
+    print("| log | number | estimated | held | 95 % interval of that | half-width | pulls |")
     print("|---|---|---|---|---|---|---|")
     for (case, key), rows in sorted(found(count, seed, cases, out).items()):
         pull, width = (np.array([row[k] for row in rows]) for k in (1, 2))

@@ -34,7 +34,7 @@ STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "ou
 
 
 def suite(*args: str | Path) -> None:
-    """Run a command of the suite that is installed beside this Python.
+    """Run a command of the suite that is installed next to this Python.
 
     Raises:
         subprocess.CalledProcessError: where it fails.

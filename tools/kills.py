@@ -141,19 +141,19 @@ def main() -> int:
     parser.add_argument("commands", nargs="*", default=list(COMMANDS), metavar="COMMAND")
     parser.add_argument("--signals", action="store_true", help="Ctrl-C and SIGTERM instead")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
-    draw, bad, tried = random.Random(asked.seed), 0, 0
-    if asked.signals:
-        return send_signals(asked.count, draw)
+    args = parser.parse_args()
+    draw, bad, tried = random.Random(args.seed), 0, 0
+    if args.signals:
+        return send_signals(args.count, draw)
     with tempfile.TemporaryDirectory() as folder:
-        if "delta" in asked.commands and "collect" not in asked.commands:
+        if "delta" in args.commands and "collect" not in args.commands:
             finish("collect", Path(folder, "collect", "plain"))
         # Flights first: what is fitted to them finds them.
-        for command in sorted(asked.commands, key=list(COMMANDS).index):
+        for command in sorted(args.commands, key=list(COMMANDS).index):
             plain = Path(folder, command, "plain")
             finish(command, plain)
             took_s, wanted = finish(command, Path(folder, command, "warm")), digest(plain)
-            for number in range(asked.count):
+            for number in range(args.count):
                 out, moments = Path(folder, command, str(number)), []
                 for share in SHARES:
                     moment = draw.uniform(0.3, share * took_s)

@@ -39,7 +39,7 @@ SHOWN = 10_000
 
 
 class Clock:
-    """Time since it was last asked."""
+    """Time since its last line."""
 
     def __init__(self) -> None:
         self.wall, self.busy = time.monotonic(), _spent_s()
@@ -207,7 +207,7 @@ def costs(count: int, args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Do what is asked for."""
+    """Run one measurement."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

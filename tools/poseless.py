@@ -80,10 +80,10 @@ def run(out: Path, cases: int, seed: int, first: int = 0) -> Iterator[dict[str, 
         folder.mkdir(parents=True, exist_ok=True)
         true = with_effects(nominal, hidden)
         save_vehicle(true, folder / "true.toml", name or "nothing")
-        asked = Collection(difficulty="0,3", trials=1, vehicle=str(folder / "true.toml"),
+        flights = Collection(difficulty="0,3", trials=1, vehicle=str(folder / "true.toml"),
                            seed=seed + 1000 * number)  # fmt: skip
         if not (folder / "flights" / "flights.json").exists():
-            collect(asked, folder / "flights", console, None)
+            collect(flights, folder / "flights", console, None)
         files = sorted((folder / "flights").glob("*.parquet"))
         logs = [without_pose(read_flight(f), nominal, rng) for f in files]
         logs = [log for log in logs if log.duration_s > 3.0]
@@ -96,12 +96,12 @@ def covered(truth: Any, effect: dict[str, Any]) -> Iterator[bool]:
     """Yield for every number of a named effect whether its interval holds the truth."""
     parameters = effect["parameters"]
     rotor = parameters.get("index", {}).get("value")
-    for key, told in parameters.items():
-        if key == "index" or told["ci95"] is None:
+    for key, entry in parameters.items():
+        if key == "index" or entry["ci95"] is None:
             continue
         true = np.atleast_1d(getattr(truth, key))
         true = true[[int(rotor) - 1]] if rotor is not None else true
-        pairs = told["ci95"] if isinstance(told["value"], list) else [told["ci95"]]
+        pairs = entry["ci95"] if isinstance(entry["value"], list) else [entry["ci95"]]
         for value, pair in zip(true, pairs, strict=False):
             if pair is not None and None not in pair and pair[1] > pair[0]:
                 yield bool(pair[0] <= value <= pair[1])
@@ -112,24 +112,25 @@ def main() -> None:
     out, *rest = sys.argv[1:]
     cases, seed, first = (int(v) for v in (*rest, *("60", "560000", "0")[len(rest) :]))
     keep_compiled()
-    outcome, held = Counter[str](), []
+    outcomes, held = Counter[str](), []
     for one in run(Path(out), cases, seed, first):
         effects, name = one["found"]["effects"], one["hidden"]
         alike = [{e["name"], *e["alternatives"]} for e in effects]
         if not name:
-            told = "accused" if effects else "clean"
+            outcome = "accused" if effects else "clean"
         elif len(effects) == 1 and name in alike[0]:
-            told = "named alone"
+            outcome = "named alone"
             if effects[0]["name"] == name:
                 held += list(covered(one["truth"], effects[0]))
         elif any(name in group for group in alike):
-            told = "named with another"
+            outcome = "named with another"
         else:
-            told = "another name" if effects else "not named"
-        outcome[told] += 1
+            outcome = "another name" if effects else "not named"
+        outcomes[outcome] += 1
         words = [" or ".join([e["name"], *e["alternatives"]]) for e in effects]
-        print(f"{one['case']:3d} {name or 'nothing':16} {told:18} {'; '.join(words)}", flush=True)
-    print(", ".join(f"{name}: {count}" for name, count in outcome.items()))
+        line = f"{one['case']:3d} {name or 'nothing':16} {outcome:18} {'; '.join(words)}"
+        print(line, flush=True)
+    print(", ".join(f"{name}: {count}" for name, count in outcomes.items()))
     print(f"intervals that hold the truth: {sum(held)} of {len(held)}")
 
 

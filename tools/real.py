@@ -62,7 +62,7 @@ def imported(files: Iterable[Path], folder: Path, *options: Any) -> dict[str, Pa
 
 def names_of(found: dict[str, Any]) -> str:
     """Return the names of a diagnosis with their numbers, in a line."""
-    told = []
+    named = []
     for effect in found["effects"]:
         sizes = []
         for key, entry in effect["parameters"].items():
@@ -70,8 +70,8 @@ def names_of(found: dict[str, Any]) -> str:
             shown = ", ".join("–" if v is None else f"{v:.3g}" for v in values)
             sizes.append(shown if key == "index" else f"{shown} {entry['unit']}".removesuffix(" 1"))
         or_else = "".join(f" or {name}" for name in effect["alternatives"])
-        told.append(f"{effect['name']}{or_else} ({'; '.join(sizes)})")
-    return "; ".join(told) or "–"
+        named.append(f"{effect['name']}{or_else} ({'; '.join(sizes)})")
+    return "; ".join(named) or "–"
 
 
 def nanobench(logs: Path, out: Path) -> list[str]:

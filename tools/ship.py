@@ -74,16 +74,16 @@ def main() -> None:
     parser.add_argument("--name", default="race", help="the shipped policy's name")
     parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
     options = parser.parse_args()
-    with replacing_folder(SHELF / options.name) as beside:
+    with replacing_folder(SHELF / options.name) as new:
         policy = options.run / "policy"
-        shutil.copy(policy / WEIGHTS, beside / WEIGHTS)
+        shutil.copy(policy / WEIGHTS, new / WEIGHTS)
         config = json.loads((policy / CONFIG).read_text(encoding="utf-8"))
         if options.speed is not None:
             config["spec"]["speed"] = options.speed
-        write_json(beside / CONFIG, config)
-        (beside / "curve.png").write_bytes(training_chart({BEFORE: curve.read(options.run)}))
+        write_json(new / CONFIG, config)
+        (new / "curve.png").write_bytes(training_chart({BEFORE: curve.read(options.run)}))
         text = card(options.name, options.run, options.eval)
-        (beside / "card.md").write_text(text, encoding="utf-8")
+        (new / "card.md").write_text(text, encoding="utf-8")
     print(f"shipped {SHELF / options.name}")
 
 

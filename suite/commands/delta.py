@@ -42,7 +42,7 @@ def written(config: Config) -> list[Path]:
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fit, and show the errors on held-out flights beside those of the plain point mass.
+    """Fit, and show the errors on held-out flights next to those of the plain point mass.
 
     Raises:
         ValueError: for an unknown recipe or logs that cannot be used.

@@ -33,8 +33,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     config.out.mkdir(parents=True, exist_ok=True)
     copied = real_files() if config.real else _simulated()
     for name, whole in copied.items():
-        with replacing_file(config.out / name) as beside:
-            beside.write_bytes(whole)
+        with replacing_file(config.out / name) as new:
+            new.write_bytes(whole)
     names = sorted(copied)
     console.say(f"wrote {', '.join(names)} to {config.out}")
     if config.real:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import importlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -74,96 +75,50 @@ class Kind(NamedTuple):
     about: Callable[[str], str]
 
 
-def _tracks() -> Iterable[str]:
-    from tracks.families import FAMILIES
-
-    return FAMILIES
-
-
-def _vehicles() -> Iterable[str]:
-    from eval.quadrotor.vehicle_file import shipped_vehicles
-
-    return shipped_vehicles()
+def _of(module: str) -> Any:
+    """Return a module, which is loaded when a list asks for it."""
+    return importlib.import_module(module)
 
 
 def _vehicle(name: str) -> str:
-    from eval.quadrotor.vehicle_file import load_vehicle
-
-    vehicle = load_vehicle(name)
+    vehicle = _of("eval.quadrotor.vehicle_file").load_vehicle(name)
     effects = ", ".join(vehicle.effects) or "no effects"
     return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
 
 
-def _policies() -> Iterable[str]:
-    from policies.shipped import names
-
-    return names()
-
-
 def _policy(name: str) -> str:
-    from policies.policy import load_policy
-
-    spec = load_policy(name).spec
+    spec = _of("policies.policy").load_policy(name).spec
     return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
 
 
-def _recipes() -> Mapping[str, Any]:
-    from suite.train.recipes import RECIPES
-
-    return RECIPES
+def _recipe(name: str) -> str:
+    return first_paragraph(_of("suite.train.recipes").RECIPES[name].__doc__)
 
 
-def _effects() -> Mapping[str, Any]:
-    from eval.effects import EFFECTS
-
-    return EFFECTS
-
-
-def _sensors() -> Iterable[str]:
-    from eval.sensors.sensors_file import shipped_sensors
-
-    return shipped_sensors()
-
-
-def _sensor(name: str) -> str:
-    from eval.sensors.sensors_file import load_sensors
-
-    return ", ".join(load_sensors(name).models) or "the truth"
-
-
-def _sensor_models() -> Mapping[str, Any]:
-    from eval.sensors import SENSORS
-
-    return SENSORS
-
-
-def _simulators() -> Iterable[str]:
-    from eval.worlds import WORLDS
-
-    return WORLDS
+def _sensors(name: str) -> str:
+    return ", ".join(_of("eval.sensors.sensors_file").load_sensors(name).models) or "the truth"
 
 
 def _simulator(name: str) -> str:
-    from eval.worlds import WORLDS
-
-    return first_paragraph(WORLDS.find(name).__doc__)
-
-
-def _benchmarks() -> Mapping[str, str]:
-    from suite.experiments.bench import BENCHES
-
-    return BENCHES
+    return first_paragraph(_of("eval.worlds").WORLDS.find(name).__doc__)
 
 
 KINDS: dict[str, Kind] = {
-    "tracks": Kind(_tracks, family_text),
-    "vehicles": Kind(_vehicles, _vehicle),
-    "policies": Kind(_policies, _policy),
-    "recipes": Kind(_recipes, lambda name: first_paragraph(_recipes()[name].__doc__)),
-    "effects": Kind(_effects, lambda name: _effects()[name].summary),
-    "sensors": Kind(_sensors, _sensor),
-    "sensor-models": Kind(_sensor_models, lambda name: _sensor_models()[name].summary),
-    "simulators": Kind(_simulators, _simulator),
-    "benchmarks": Kind(_benchmarks, lambda name: _benchmarks()[name]),
+    "tracks": Kind(lambda: _of("tracks.families").FAMILIES, family_text),
+    "vehicles": Kind(lambda: _of("eval.quadrotor.vehicle_file").shipped_vehicles(), _vehicle),
+    "policies": Kind(lambda: _of("policies.shipped").names(), _policy),
+    "recipes": Kind(lambda: _of("suite.train.recipes").RECIPES, _recipe),
+    "effects": Kind(
+        lambda: _of("eval.effects").EFFECTS, lambda name: _of("eval.effects").EFFECTS[name].summary
+    ),
+    "sensors": Kind(lambda: _of("eval.sensors.sensors_file").shipped_sensors(), _sensors),
+    "sensor-models": Kind(
+        lambda: _of("eval.sensors").SENSORS, lambda name: _of("eval.sensors").SENSORS[name].summary
+    ),
+    "simulators": Kind(lambda: _of("eval.worlds").WORLDS, _simulator),
+    "benchmarks": Kind(
+        lambda: _of("suite.experiments.bench").BENCHES,
+        lambda name: _of("suite.experiments.bench").BENCHES[name],
+    ),
 }
 """What can be listed."""

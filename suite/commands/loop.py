@@ -67,6 +67,10 @@ class Config:
     """Print one JSON object to standard output and nothing else."""
 
 
+OTHER = ("set", "no_delta", "out", "workers", "json")
+"""Options that `suite.loop.config.resolve` does not take by these names."""
+
+
 def written(config: Config) -> list[Path]:
     """Return the folders that the command writes into."""
     return [config.out]
@@ -82,22 +86,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.loop.run import run_loop
 
     workers = asked_workers(config.workers, whole_cores=True)
-    resolved = resolve(
-        recipe=config.recipe,
-        hidden_vehicle=config.hidden_vehicle,
-        simulator=config.simulator,
-        sensors=config.sensors,
-        policy=config.policy,
-        track=config.track,
-        difficulty=config.difficulty,
-        trials=config.trials,
-        flights=config.flights,
-        vehicle=config.vehicle,
-        seed=config.seed,
-        iterations=config.iterations,
-        finetune_iterations=config.finetune_iterations,
-        fit_iterations=config.fit_iterations,
-        delta=not config.no_delta,
-        changes=config.set,
-    )
+    about_loop = {name: value for name, value in vars(config).items() if name not in OTHER}
+    resolved = resolve(**about_loop, delta=not config.no_delta, changes=config.set)
     return run_loop(resolved, config.out, console, workers)

@@ -24,7 +24,7 @@ class Update(Protocol):
     """The function to call as work goes on."""
 
     def __call__(self, done: float, note: str = "") -> None:
-        """Show that `done` of the total is done, with a few words beside it."""
+        """Show that `done` of the total is done, with a few words."""
         ...
 
 

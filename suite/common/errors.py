@@ -1,4 +1,4 @@
-"""Exit codes, and what a person is told when a command does not end well.
+"""Exit codes, and what is printed when a command does not end well.
 
 A mistake of the user gets one message and no traceback. What nobody foresaw keeps its traceback,
 for it is a bug and we want to see it.

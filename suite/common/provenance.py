@@ -15,23 +15,9 @@ from tracks.common.work import usable_cores
 from tracks.input.reading import read_json
 
 PACKAGES = (
-    "numpy",
-    "scipy",
-    "jax",
-    "jaxlib",
-    "optax",
-    "safetensors",
-    "mujoco",
-    "mujoco-mjx",
-    "dm-control",
-    "gymnasium",
-    "trimesh",
-    "torch",
-    "rotorpy",
-    "onnx",
-    "onnxruntime",
-    "pyarrow",
-    "rerun-sdk",
+    *("numpy", "scipy", "jax", "jaxlib", "optax", "safetensors", "mujoco", "mujoco-mjx"),
+    *("dm-control", "gymnasium", "trimesh", "torch", "rotorpy", "onnx", "onnxruntime"),
+    *("pyarrow", "rerun-sdk"),
 )
 """The packages that can change a result."""
 

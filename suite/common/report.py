@@ -28,7 +28,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Links:
-    """Files beside the report."""
+    """Files next to the report."""
 
     entries: Sequence[tuple[str, str]]
     """Path relative to the report's folder, and what is there."""

@@ -37,10 +37,9 @@ def claim(out: Path, config: Any, seed: int) -> None:
         raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     changes = differences(theirs, plain(config))
     if changes:
-        shown = "; ".join(changes[:4]) + (f"; and {len(changes) - 4} more" if changes[4:] else "")
         raise ValueError(
-            f"{out} holds a run of another configuration ({shown}); give another --out, or move "
-            "the folder away to start over"
+            f"{out} holds a run of another configuration ({first_of(changes)}); give another "
+            "--out, or move the folder away to start over"
         )
 
 
@@ -53,6 +52,12 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
             found += differences(theirs.get(key), ours.get(key), below)
         return found
     return [] if theirs == ours else [f"{name} is {theirs!r} there, {ours!r} here"]
+
+
+def first_of(changes: Sequence[str]) -> str:
+    """Return the first four changes, and how many more there are, for a message."""
+    more = f"; and {len(changes) - 4} more" if changes[4:] else ""
+    return "; ".join(changes[:4]) + more
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def do_stages(out: Path, stages: Sequence[Stage], console: Console, what: str) -
     Args:
         out: the run's folder.
         stages: all of the run's, in order.
-        console: told what is done, after about how long all that is left will take.
+        console: shows what is done, after about how long all that is left will take.
         what: the run is, in a few words.
 
     Returns:

@@ -81,7 +81,7 @@ def all_done(
         jobs: what to do.
         workers: who; None or 1 is this process, on all cores. Several of this machine are pinned to
             as many cores each, and none to another's; a cluster's get folders by content.
-        console: told how many are done; `do` gets it in this process, and a silent one elsewhere.
+        console: shows how many are done; `do` gets it in this process, and a silent one elsewhere.
         what: the jobs are, in a few words.
 
     Raises:

@@ -48,7 +48,7 @@ class FitConfig:
     rate: Annotated[float, Range(0.0, 10.0)] = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
     velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
-    """Weight of the velocity's error beside the position's [s]."""
+    """Weight of the velocity's error next to the position's [s]."""
     blank_share: Annotated[float, Range(0.0, 1.0)] = 0.5
     """Share of a batch's windows that the network starts without a memory of what came before, as
     it does in worlds of the trainer that start on the way."""
@@ -83,7 +83,7 @@ class DeltaFit:
 
 @dataclass(frozen=True)
 class PointMassFit(DeltaFit):
-    """A network fitted through the point mass, beside its rival."""
+    """A network fitted through the point mass, and its rival."""
 
     identified: PointMassModel
     """The point mass whose lag, drag and delay were fitted."""

@@ -107,7 +107,7 @@ def fit_delta(
         dynamics: the trainer's point mass or quadrotor, which is corrected.
         paths: flight logs, and folders of them.
         out: folder for delta/, delta.json and table.md.
-        console: told how it goes.
+        console: shows the progress.
 
     Raises:
         ValueError: where the logs cannot be used.

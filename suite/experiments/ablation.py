@@ -93,7 +93,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
 
 
 def settings(config: Config) -> list[training.Row]:
-    """Return the rows that are asked for, in the paper's order.
+    """Return the chosen rows, in the paper's order.
 
     Raises:
         ValueError: for a recipe, a change or a row that does not exist.

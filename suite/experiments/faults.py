@@ -120,13 +120,13 @@ def _flights(config: Config, vehicle: Vehicle, folder: Path, console: Console) -
     true = with_effects(vehicle, TRUE_EFFECTS)
     folder.mkdir(parents=True, exist_ok=True)
     save_vehicle(true, folder / "true.toml", "the nominal vehicle, its centre of mass moved")
-    asked = Collection(
+    collection = Collection(
         difficulty="0,3,6",
         trials=-(-count * 12 // (9 * 10)),
         vehicle=str(folder / "true.toml"),
         seed=config.seed,
     )
-    flown = collect(asked, folder / "flights", console, None)["flights"]
+    flown = collect(collection, folder / "flights", console, None)["flights"]
     paths = [folder / "flights" / row["file"] for row in flown if row["file"] and row["time_s"] > 4]
     order = np.random.default_rng(config.seed).permutation(len(paths))
     return [paths[k] for k in order][:count]

@@ -92,7 +92,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
 
 
 def schemes(config: Config) -> list[training.Row]:
-    """Return the schemes that are asked for, in the paper's order.
+    """Return the chosen schemes, in the paper's order.
 
     Raises:
         ValueError: for a recipe, a change or a scheme that does not exist, and for worlds that PPO

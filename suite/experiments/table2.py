@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from eval.judging.tables import Tally, grids, percent, summarise
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import load_sensors
-from eval.worlds.trial import TrialResult
 from suite.common.choices import LEVELS
 from suite.common.console import Console
 from suite.common.report import Picture
@@ -18,12 +17,12 @@ from suite.experiments.pages.paper import goal_grid, goals, sim_to_sim
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import Place
 from suite.judging.flying import default_policy
-from suite.loop import compare
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
 
-OURS, WITH, CONTROL = "ours", "ours, with Delta Action Model", "ours, tuned as long without it"
+OURS = "ours"
+"""What tables call the policy next to the printed rows."""
 COLUMNS = [
     header
     for track in JUDGED
@@ -34,19 +33,12 @@ COLUMNS = [
 
 @dataclass(frozen=True)
 class Config:
-    """Judge a policy on three tracks at all ten levels, next to the paper's and baseline's rows.
-
-    The rows with the Delta Action Model are at the paper's four levels and need --delta-policy.
-    """
+    """Judge a policy on three tracks at all ten levels, next to the paper's and baseline's rows."""
 
     policy: str | None = None
     """A shipped policy's name, a checkpoint's folder or a policy file; by default the shipped."""
-    delta_policy: str | None = None
-    """The same fine-tuned with a Delta Action Model: tuned-with/policy of a `suite loop`."""
-    control_policy: str | None = None
-    """The same fine-tuned as long without it: tuned-without/policy of that loop."""
     trials: Trials = 100
-    """Trials of every policy on every track at every level that it flies."""
+    """Trials on every track at every level."""
     seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
@@ -59,75 +51,39 @@ def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; what is missing is flown first."""
     from suite.experiments.pages.charts import level_chart
 
-    vehicle, printed = load_vehicle(config.vehicle), sim_to_sim()
-    sensors = load_sensors(config.sensors)
-    given = {WITH: config.delta_policy, CONTROL: config.control_policy}
-    policies = {OURS: config.policy or default_policy(), **{n: p for n, p in given.items() if p}}
-    for path in policies.values():
-        judging.name_of(path)
-    about = judging.policy_facts(policies)
-    orders = {
-        name: judging.Order(
-            judging.Setup(policy, vehicle, sensors),
-            judging.trials_of(config, LEVELS if name == OURS else printed.levels),
-        )
-        for name, policy in policies.items()
-    }
-    results = judging.flown(orders, place, console, "judging all levels")
-    cells = {
-        name: summarise([row._replace(policy=name) for row in rows])["cells"]
-        for name, rows in results.items()
-    }
-    lines = _merit(results)
-    everything = [cell for some in cells.values() for cell in some]
+    policy = config.policy or default_policy()
+    name, about = judging.name_of(policy), judging.policy_facts({OURS: policy})
+    setup = judging.Setup(policy, load_vehicle(config.vehicle), load_sensors(config.sensors))
+    order = judging.Order(setup, judging.trials_of(config, LEVELS))
+    rows = judging.flown({OURS: order}, place, console, "judging all levels")[OURS]
+    cells = summarise([row._replace(policy=OURS) for row in rows])["cells"]
     facts = {
         **about,
         "vehicle": config.vehicle,
         "sensors": config.sensors,
         "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same for all",
     }
-    named = [c._replace(policy=judging.name_of(policies[c.policy])) for c in everything]
-    delta = {"With the Delta Action Model": compare.grids(lines)[:1]} if lines else {}
+    chart = level_chart([cell._replace(policy=name) for cell in cells])
     parts = {
         "Compared with the paper": [against_the_paper(cells)],
-        **delta,
-        **{f"Goals by cell: {name}": [goal_grid(some)] for name, some in cells.items()},
+        f"Goals by cell: {OURS}": [goal_grid(cells)],
         "All ten levels": [
-            Picture(level_chart(named), "Success and v_max at every level"),
-            *grids({"cells": everything, "paired": []}),
+            Picture(chart, "Success and v_max at every level"),
+            *grids({"cells": cells, "paired": []}),
         ],
     }
     numbers = {
-        "cells": everything,
-        "goals": {name: goals(some) for name, some in cells.items()},
-        "with_against_without": lines,
-        "policies": [{"name": n, "policy": p, "about": about[n]} for n, p in policies.items()],
+        "cells": cells,
+        "goals": {OURS: goals(cells)},
+        "policies": [{"name": OURS, "policy": policy, "about": about[OURS]}],
     }
     return Made(facts, parts, numbers)
 
 
-def _merit(results: Mapping[str, Sequence[TrialResult]]) -> list[compare.Line]:
-    """Return what the Delta Action Model changes, trial by trial; nothing without its control."""
-    names = {compare.BEFORE: OURS, compare.WITHOUT: CONTROL, compare.WITH: WITH}
-    if set(results) != set(names.values()):
-        return []
-    levels = sim_to_sim().levels
-    return compare.compare(
-        {
-            role: [row for row in results[name] if row.difficulty in levels]
-            for role, name in names.items()
-        }
-    )
-
-
-def against_the_paper(cells: Mapping[str, Sequence[Tally]]) -> Grid:
+def against_the_paper(cells: Sequence[Tally]) -> Grid:
     """Return our rows and the printed ones, a method and level each, tracks as columns."""
     printed = sim_to_sim()
-    lines = [
-        [name, str(level), *_ours(some, level)]
-        for name, some in cells.items()
-        for level in printed.levels
-    ]
+    lines = [[OURS, str(level), *_ours(cells, level)] for level in printed.levels]
     for method, name in printed.methods.items():
         for level in printed.levels:
             line = [name, str(level)]
@@ -139,7 +95,7 @@ def against_the_paper(cells: Mapping[str, Sequence[Tally]]) -> Grid:
 
 
 def _ours(cells: Sequence[Tally], level: int) -> list[str]:
-    """Return one policy's numbers at a level, track by track."""
+    """Return our numbers at a level, track by track."""
     by_track, texts = {cell.track: cell for cell in cells if cell.difficulty == level}, []
     for cell in (by_track[track] for track in JUDGED):
         lap = "-" if math.isnan(cell.lap_s.value) else f"{cell.lap_s.value:.1f}"

@@ -41,7 +41,7 @@ def check_flight_files(
         vehicle: a file or a shipped name; "" for none.
         policy: whose rate and camera the flights should have.
         out: folder for the flights as they are put right; None writes nothing.
-        console: told every finding.
+        console: shows every finding.
 
     Raises:
         ValueError: for files that cannot be used.
@@ -102,7 +102,7 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
     Args:
         policy: as it was loaded.
         trials: short flights by which its actions are judged; 0 flies none.
-        console: told the contract and the share of limited actions.
+        console: shows the contract and the share of limited actions.
     """
     from eval.judging.outputs import probable_faults
 

@@ -15,7 +15,7 @@ from suite.judging.flying import (
     by_content,
     default_policy,
     flying_needs,
-    load_flier,
+    load_in_manner,
     log_name,
     read_course,
     refuse_one_name,
@@ -62,7 +62,7 @@ def collect(
     check_records(collection.simulator)
     refuse_one_name({trial.track for trial in course.trials})
     asked = collection.policy or default_policy()
-    policy = load_flier(asked, collection.trust, manner)
+    policy = load_in_manner(asked, collection.trust, manner)
     out = Path(out)
     refuse_other_run(out, collection)
     about = {

@@ -17,7 +17,7 @@ from policies.policy import Policy, load_policy
 def flown_files(name_or_path: str | Path) -> dict[str, Path]:
     """Return the files of a policy, of a folder those that fly, by their path within its folder.
 
-    A card or a curve beside them may change and the policy be the same.
+    A card or a curve next to them may change and the policy be the same.
     """
     from policies.formats.checkpoint import CONFIG, WEIGHTS
 
@@ -30,7 +30,7 @@ def flown_files(name_or_path: str | Path) -> dict[str, Path]:
     if path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
-        # Links are followed to the file, whose data lie beside it and not beside a link.
+        # Links are followed to the file, whose data lie next to it and not next to a link.
         whole, *data = files_of(path)
         home = whole.resolve().parent
         return {path.name: whole, **{str(file.relative_to(home)): file for file in data}}

@@ -16,7 +16,7 @@ from suite.judging.flying import (
     default_policy,
     flying_needs,
     labels,
-    load_flier,
+    load_in_manner,
     read_course,
     say_notes,
     who_flies,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from tracks.track import Track
 
 
-class Flier(NamedTuple):
+class Entry(NamedTuple):
     """Who flies a share of the trials."""
 
     source: str
@@ -72,37 +72,37 @@ def evaluate(
     course, out = read_course(evaluation), Path(out)
     refuse_other_run(out, evaluation)
     asked = tuple(evaluation.policies or (default_policy(),))
-    policies = [load_flier(name, evaluation.trust) for name in asked]
+    policies = [load_in_manner(name, evaluation.trust) for name in asked]
     plain = list(zip(asked, policies, labels(asked, [p.name for p in policies]), strict=True))
-    fliers = [
-        Flier(name, manner(policy), manner.label(label), manner)
+    entries = [
+        Entry(name, manner(policy), manner.label(label), manner)
         for manner in manners(evaluation.speed, evaluation.monitor)
         for name, policy, label in plain
     ]
-    _refuse_twice([flier.label for flier in fliers])
+    _refuse_twice([entry.label for entry in entries])
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.simulator)
     if (out / "trials.parquet").is_file():
         console.note(f"{out} holds an evaluation; its results will be written over")
-    flown = count * len(fliers)
+    flown = count * len(entries)
     needs = flying_needs(flown, workers, evaluation.simulator)
-    journals = _open_journals(evaluation, course, fliers, out)
+    journals = _open_journals(evaluation, course, entries, out)
     announce(console, f"{flown} trials in {evaluation.simulator}", needs)
     say_notes(console, evaluation.simulator, course)
     for doubt in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(doubt))
     results: list[TrialResult] = []
-    for flier, journal in zip(fliers, journals, strict=True):
-        results += _fly_one(evaluation, course, flier, workers, journal, console)
+    for entry, journal in zip(entries, journals, strict=True):
+        results += _fly_one(evaluation, course, entry, workers, journal, console)
     over = _over_plan(results, course)
-    actions = {flier.label: _actions(flier, results, console) for flier in fliers}
+    actions = {entry.label: _actions(entry, results, console) for entry in entries}
     summary = {
         **summarise(results),
         "over_plan": over,
         "actions": actions,
         "sentences": _sentences(results),
         "judged": evaluation,
-        "policies": [about_policy(flier.source, flier.policy) for flier in fliers],
+        "policies": [about_policy(entry.source, entry.policy) for entry in entries],
         "sha256": file_digests(course.vehicle, course.tracks, course.sensors),
         "flown_otherwise": course.differences,
     }
@@ -156,18 +156,18 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
     ]
 
 
-def _actions(flier: Flier, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
+def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
     """Return what a policy's outputs were like in its trials, and print it."""
     from eval.judging.outputs import actions_of
 
-    rows = [result for result in results if result.policy == flier.label]
-    found = actions_of(rows, flier.policy.spec.action)
+    rows = [result for result in results if result.policy == entry.label]
+    found = actions_of(rows, entry.policy.spec.action)
     if found["decisions"]:
         console.say(
-            f"{flier.label}: {found['limited']:.1%} of {found['decisions']} actions were limited"
+            f"{entry.label}: {found['limited']:.1%} of {found['decisions']} actions were limited"
         )
     for warning in found["warnings"]:
-        console.note(f"warning: {flier.label}: {warning}")
+        console.note(f"warning: {entry.label}: {warning}")
     return found
 
 
@@ -199,22 +199,23 @@ def _refuse_twice(called: list[str]) -> None:
 
 
 def _open_journals(
-    evaluation: Evaluation, course: Course, fliers: Sequence[Flier], out: Path
+    evaluation: Evaluation, course: Course, entries: Sequence[Entry], out: Path
 ) -> list[Journal]:
-    """Return the journal in `out` of each of `fliers`.
+    """Return the journal in `out` of each of `entries`.
 
     Raises:
         ValueError: where one is there that is about something else; none is made then.
     """
     from eval.judging.results import Journal
 
-    paths = [out / f"journal-{number}.jsonl" for number in range(len(fliers))]
+    paths = [out / f"journal-{number}.jsonl" for number in range(len(entries))]
     opened = {}
-    for path, flier in sorted(zip(paths, fliers, strict=True), key=lambda one: not one[0].exists()):
+    pairs = zip(paths, entries, strict=True)
+    for path, entry in sorted(pairs, key=lambda pair: not pair[0].exists()):
         about = {
             **stamp(1, None),
-            "policy": about_policy(flier.source, flier.policy),
-            "speed": flier.manner.speed,
+            "policy": about_policy(entry.source, entry.policy),
+            "speed": entry.manner.speed,
             "vehicle": course.vehicle,
             "sensors": course.sensors,
             "world": evaluation.simulator,
@@ -229,7 +230,7 @@ def _open_journals(
 def _fly_one(
     evaluation: Evaluation,
     course: Course,
-    flier: Flier,
+    entry: Entry,
     workers: Workers,
     journal: Journal,
     console: Console,
@@ -239,7 +240,7 @@ def _fly_one(
     from eval.judging.judge import JudgeOptions, fly
     from eval.worlds.trial import Rules
 
-    label = flier.label
+    label = entry.label
     options = JudgeOptions(
         workers=workers,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
@@ -264,7 +265,7 @@ def _fly_one(
                 update(done, f"{share:.0%} success")
 
             fly(
-                who_flies(flier.policy, flier.source, evaluation.trust, workers, flier.manner),
+                who_flies(entry.policy, entry.source, evaluation.trust, workers, entry.manner),
                 missing,
                 course.vehicle,
                 evaluation.simulator,
@@ -272,5 +273,5 @@ def _fly_one(
                 keep,
                 tracks=course.tracks,
             )
-        # Flown before, perhaps beside other policies and under another label.
+        # Flown before, perhaps next to other policies and under another label.
         return [journal.done[trial]._replace(policy=label) for trial in course.trials]

@@ -103,7 +103,7 @@ def trial_list(
 
 
 class Course(NamedTuple):
-    """What a command is asked to fly, read and checked."""
+    """What a command flies, read and checked."""
 
     trials: list[TrialSpec]
     """In the order of the rows of results."""
@@ -116,7 +116,7 @@ class Course(NamedTuple):
     differences: list[str]
     """What of the vehicle the world flies otherwise, in sentences."""
     notes: list[str]
-    """What else a person is told, in sentences."""
+    """What else is printed, in sentences."""
 
 
 def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Course:
@@ -245,7 +245,7 @@ def who_flies(
     if workers == 1:
         return policy
     if isinstance(workers, int):
-        return partial(load_flier, name_or_path, trust, manner)
+        return partial(load_in_manner, name_or_path, trust, manner)
     return partial(_flier_of, PolicyContent.of(name_or_path, trust), manner)
 
 
@@ -253,7 +253,7 @@ def _flier_of(content: PolicyContent, manner: Manner) -> Policy:
     return manner(content())
 
 
-def load_flier(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Policy:
+def load_in_manner(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Policy:
     """Return a policy to fly, in its manner.
 
     Raises:

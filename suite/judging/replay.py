@@ -11,7 +11,7 @@ from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
-from suite.judging.flying import custom_tracks, default_policy, load_flier, trial_list
+from suite.judging.flying import custom_tracks, default_policy, load_in_manner, trial_list
 from suite.judging.requests import Evaluation, manners
 from tracks.input.ranges import check_ranges, shown
 from tracks.input.reading import read_json
@@ -125,7 +125,7 @@ def fly_again(
         sensors=sensors,
     )
     name = policy or (evaluation.policies or (default_policy(),))[0]
-    flier = load_flier(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
+    pilot = load_in_manner(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
@@ -139,7 +139,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        flier,
+        pilot,
         trials,
         vehicle,
         evaluation.simulator,
@@ -153,7 +153,7 @@ def fly_again(
         for trial, result in zip(trials, results, strict=True)
     ]
     # What is flown with is the policy's camera, whatever the vehicle's file says of one.
-    camera = flier.spec.camera
+    camera = pilot.spec.camera
     return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
 
 

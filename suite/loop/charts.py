@@ -19,7 +19,7 @@ COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
 SEVERAL = ("#8b93a1", "#c0504d", "#e0892b", "#7a5fb5", "#2463c9", "#2e9e6b")
 """Colours of up to six policies."""
-BESIDE_MOST = 8
+ONE_ROW_MOST = 8
 """Cells that have room for their names in two charts side by side."""
 PANELS = (
     ("gates", "Gates a rollout", 1),
@@ -31,9 +31,9 @@ PANELS = (
 
 def comparison_chart(lines: Sequence[Line]) -> bytes:
     """Return success rates and mean speeds of the three policies by track and level."""
-    beside = len(lines) <= BESIDE_MOST
-    figure = Figure(figsize=(10.4, 3.9 if beside else 6.6), layout="constrained")
-    panels = figure.subplots(1, 2) if beside else figure.subplots(2, 1)
+    one_row = len(lines) <= ONE_ROW_MOST
+    figure = Figure(figsize=(10.4, 3.9 if one_row else 6.6), layout="constrained")
+    panels = figure.subplots(1, 2) if one_row else figure.subplots(2, 1)
     cells = [line.track if line.difficulty is None else f"{line.track}\nlevel {line.difficulty}"
              for line in lines]  # fmt: skip
     titles = {"success": "Success [%]", "v_mean": "Mean speed, median over trials [m/s]"}
@@ -140,7 +140,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def delta_chart(fitted: Mapping[str, Any]) -> bytes:
-    """Return the Delta Action Model's error over its fit beside its rivals' (from delta.json)."""
+    """Return the Delta Action Model's error over its fit next to its rivals' (from delta.json)."""
     figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = figure.subplots()
     at = [row["iteration"] for row in fitted["curve"]]

@@ -75,7 +75,7 @@ def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = No
     Args:
         name: of what was flown again.
         errors: `position_m` and `velocity_m_s`.
-        base_m: the position error of which a share is told, if any.
+        base_m: the position error of which a share is printed, if any.
     """
     texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
     if base_m is not None:

@@ -1,4 +1,4 @@
-"""Any number of policies on the same trials, each against those that it is to be told from."""
+"""Any number of policies on the same trials, each compared with named others."""
 
 from __future__ import annotations
 

@@ -112,8 +112,8 @@ def _begin(run: LoopRun) -> Stage:
         return Stage("train", "training the first policy", needs, train)
 
     def copy(folder: Path) -> None:
-        with replacing_folder(folder / "policy") as beside:
-            shutil.copytree(checkpoint_folder(given), beside, dirs_exist_ok=True)
+        with replacing_folder(folder / "policy") as new:
+            shutil.copytree(checkpoint_folder(given), new, dirs_exist_ok=True)
 
     return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
 

@@ -31,7 +31,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
-from suite.common.stages import Estimate, announce
+from suite.common.stages import Estimate, announce, differences, first_of
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
 from tracks.common.work.threads import threads
@@ -293,20 +293,6 @@ def _save(run: Run, method: Method, state: Any) -> None:
     )
 
 
-def _differences(theirs: Mapping[str, Any], mine: Mapping[str, Any], part: str = "") -> list[str]:
-    """Return the settings in which a stored configuration differs, those of other versions too."""
-    found: list[str] = []
-    for key in sorted({*theirs, *mine}):
-        one, other = theirs.get(key), mine.get(key)
-        if isinstance(one, Mapping) and isinstance(other, Mapping):
-            found += _differences(one, other, f"{part}{key}.")
-        elif key not in mine:
-            found.append(f"{part}{key}, which this version does not have")
-        elif key not in theirs or one != other:
-            found.append(f"{part}{key}")
-    return found
-
-
 def _resume(run: Run, fresh: Any) -> Any:
     origin, folder = run.origin, run.folder
     place = folder / "state"
@@ -317,12 +303,12 @@ def _resume(run: Run, fresh: Any) -> Any:
         curve.cut(folder, 0, curve.WATCHED)
         return fresh
     theirs = read_config(place)["training"]
-    options = [f"--{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
-    settings = _differences(theirs["config"], origin["config"])
-    if options or settings:
+    options = [f"another --{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
+    changes = options + differences(theirs["config"], origin["config"])
+    if changes:
         raise ValueError(
-            f"{folder} holds another run (it differs in {', '.join(options + settings)}); "
-            "give another --out, or remove the folder to start over"
+            f"{folder} holds another run ({first_of(changes)}); give another --out, or remove the "
+            "folder to start over"
         )
     before, now = theirs.get("threads", threads()), threads()
     if (before == 1) != (now == 1):

@@ -81,10 +81,10 @@ def content(folder: Path) -> Content:
 
 def fill(folder: Path, files: Mapping[str, bytes]) -> None:
     """Make `folder` one of these files, whole or not at all."""
-    with replacing_folder(folder) as beside:
+    with replacing_folder(folder) as new:
         for name, data in files.items():
-            (beside / name).parent.mkdir(parents=True, exist_ok=True)
-            (beside / name).write_bytes(data)
+            (new / name).parent.mkdir(parents=True, exist_ok=True)
+            (new / name).write_bytes(data)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 Python hears of a signal between two of its own instructions. XLA compiles for half a minute within
 one, and an interpreter that ends while XLA's threads are at work crashes (it frees what they use).
-So a thread listens beside: where the main thread has not heard of the signal in time, the process
+So a second thread listens: where the main thread has not heard of the signal in time, the process
 ends at once. That is as safe as kill -9: every file is written whole or not at all, the lock of a
 folder is the system's, and what lies about half-written is swept by the next command.
 

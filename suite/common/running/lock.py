@@ -2,8 +2,8 @@
 
 The lock is `flock` on a file in the folder, so it ends with the process that holds it, however that
 ends. Nothing is written into that file, which may be another program's by its name; who holds it
-stands in a second one, which is written beside and renamed. What a killed process leaves of both
-says nothing any more.
+stands in a second one, which is written under another name and renamed. What a killed process
+leaves of both says nothing any more.
 """
 
 from __future__ import annotations

@@ -56,24 +56,24 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
     """
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
-    flier, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
+    pilot, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
     specs = [TrialSpec(JUDGED[k % 3], 9, k // 3) for k in range(trials)]
     ended: dict[str, list[TrialResult]] = {}
 
     def judged(world: str, slots: int) -> None:
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
-        ended[world] = fly(flier, specs, vehicle, world, options)
+        ended[world] = fly(pilot, specs, vehicle, world, options)
 
     ours = partial(judged, "mujoco", JudgeOptions().slots)
     seconds = in_turn(ours, partial(judged, BASELINE, 64), repeats=2, clock=time.process_time)
     pairs = list(zip(*ended.values(), strict=True))
     alike = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
     details = {
-        "policy": flier.name,
-        "rays_a_pixel": flier.spec.camera.rays**2,
+        "policy": pilot.name,
+        "rays_a_pixel": pilot.spec.camera.rays**2,
         "trials": trials,
         "trials_that_end_alike": alike,
-        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * flier.spec.rate_hz,
+        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * pilot.spec.rate_hz,
     }
     rates = [Figure(trials / taken, "trials/s of processor time") for taken in seconds]
     return Comparison("judge", rates[0], rates[1], details=details)

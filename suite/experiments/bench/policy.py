@@ -3,7 +3,7 @@
 The shipped policy is exported as C (float32 and int8), compiled for this machine and stepped one
 observation at a time with its memory, in turn with ONNX Runtime and torch, each called from Python.
 The baseline is ONNX Runtime as it is usually called, `session.run`; what is left of it with inputs
-and outputs bound to memory beforehand stands beside it.
+and outputs bound to memory beforehand is measured next to it.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ REFITTED = ("mass_offset", "com_offset", "inertia_scale")
 
 @dataclass(frozen=True)
 class Task:
-    """Stretches and what is asked of them."""
+    """Stretches and what is computed for them."""
 
     nominal: Vehicle
     """What both sides start from."""

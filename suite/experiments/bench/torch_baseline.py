@@ -150,7 +150,7 @@ class Baseline:
         total = torch.zeros(())
         for _ in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
-            images.append(self.look(worlds, body))
+            images.append(self.render(worlds, body))
             seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
             state = torch.cat([seen[0], body.rot_w[:, 2], seen[1], action], -1)
             states = [*(states or [state] * physics.state_delay), state]
@@ -178,7 +178,7 @@ class Baseline:
         return gate, gate.center_w + beyond * gate.rot_w[:, :, 0]
 
     @torch.no_grad()
-    def look(self, worlds: Worlds, body: TorchState) -> Tensor:
+    def render(self, worlds: Worlds, body: TorchState) -> Tensor:
         """Return the encoded images (B, height, width) with their noise."""
         camera, encoding = self.config.spec.camera, self.config.spec.depth
         axis = self.rays.mean(0)

@@ -1,6 +1,6 @@
 """Depth, distance, field and gate crossing in plain batched torch, for the eager baseline.
 
-Every function looks at all solids at once, (worlds, solids, rays or points), as one would write it
+Every function evaluates all solids at once, (worlds, solids, rays or points), as one would write it
 first; nothing here carries gradients.
 """
 

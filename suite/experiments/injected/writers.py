@@ -100,7 +100,7 @@ def write_usd(folder: Path, parts: Parts, full_thrust: float) -> Written:
 
 
 def write_blackbox(folder: Path, parts: Parts, full_thrust: float) -> Written:
-    """Write a CSV of `blackbox_decode`, and the pose by motion capture beside it."""
+    """Write a CSV of `blackbox_decode`, and the pose by motion capture next to it."""
     columns = {"loopIteration": np.arange(len(parts["time"]), dtype=float)}
     columns["time (us)"] = np.round(parts["time"] * 1e6) + 52e6
     for k in range(3):

@@ -46,10 +46,10 @@ def _dots(
 
 
 def level_chart(cells: Sequence[Tally]) -> bytes:
-    """Return success (above) and v_max (below) by level, a column a track, next to the paper's."""
+    """Return a policy's success and v_max below by level, a column a track, next to the paper's."""
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
-    policies, lowest = list(dict.fromkeys(cell.policy for cell in cells)), 100.0
+    lowest, dots = 100.0, {"fmt": "o", "ms": 4, "color": LINES[0]}
     for number, track in enumerate(JUDGED):
         upper, lower = rows[:, number]
         theirs = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
@@ -59,14 +59,13 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
         printed = [wilson(c.won, c.trials) for c in theirs]
         _dots(upper, at, printed, 100, words, **hollow)
         lower.plot(at, [c.v_max for c in theirs], "D", ms=5, color="#555b66", mfc="none")
-        for colour, policy in zip(LINES, policies, strict=False):
-            mine = [cell for cell in cells if (cell.policy, cell.track) == (policy, track)]
-            levels, style = [c.difficulty for c in mine], {"fmt": "o", "ms": 4, "color": colour}
-            words = f"{policy}, {mine[0].trials} trials a level"
-            _dots(upper, levels, [c.success for c in mine], 100, words, **style)
-            _dots(lower, levels, [c.v_max for c in mine], 1, "", **style)
-            lowest = min(lowest, *(100 * c.success.low for c in mine))
-        lowest = min(lowest, *(100 * c.value for c in printed))
+        mine = [cell for cell in cells if cell.track == track]
+        levels = [c.difficulty for c in mine]
+        words = f"{mine[0].policy}, {mine[0].trials} trials a level"
+        _dots(upper, levels, [c.success for c in mine], 100, words, **dots)
+        _dots(lower, levels, [c.v_max for c in mine], 1, "", **dots)
+        lowest = min([lowest, *(100 * c.success.low for c in mine)])
+        lowest = min([lowest, *(100 * c.value for c in printed)])
         titled(upper, track)
         plain_axes(lower)
         lower.set_xlabel("level", fontsize=9)

@@ -35,7 +35,7 @@ class Made(NamedTuple):
     parts: Mapping[str, Sequence[Grid | Picture]]
     """Tables and charts, by heading."""
     numbers: Mapping[str, Any]
-    """What NAME.json holds besides what was asked and how it was made."""
+    """What NAME.json holds next to the configuration and how it was made."""
 
 
 def check_page(out: Path, name: str) -> None:
@@ -59,9 +59,9 @@ def write_document(
     Args:
         place: where.
         name: of the experiment.
-        config: what was asked; its `seed` is what every seed was made from, or the first one.
+        config: of the experiment; its `seed` is what every seed was made from, or the first one.
         made: what came out.
-        console: told what was written.
+        console: shows what was written.
 
     Returns:
         What `name`.json holds, and `out`, the page's path.
@@ -86,8 +86,8 @@ def write_document(
                 continue
             file = f"{name}.png" if not figures else f"{name}-{len(figures) + 1}.png"
             figures.append(file)
-            with replacing_file(place.out / file) as beside:
-                beside.write_bytes(part.png)
+            with replacing_file(place.out / file) as new:
+                new.write_bytes(part.png)
             blocks.append(f"![{part.caption}]({file})")
     write_json(place.out / f"{name}.json", answer)
     write_text(page, "\n\n".join([before + BEGIN, *blocks, END]) + after)

@@ -1,4 +1,4 @@
-"""What the paper prints (paper.toml), and by how much a policy misses what is asked of a cell."""
+"""What the paper prints (paper.toml), and by how much a policy misses a cell's goal."""
 
 from __future__ import annotations
 
@@ -83,18 +83,18 @@ def sim_to_sim() -> SimToSim:
 
 
 class Goal(NamedTuple):
-    """One cell against what is asked of it; a miss of 0 is met."""
+    """One cell against its goal; a miss of 0 is met."""
 
     track: str
     level: int
     success: float
-    """What is asked: the best printed rate; 1 asks for an interval from `SURE` up."""
+    """The goal: the best printed rate; 1 needs an interval from `SURE` up."""
     success_miss: float
     floor: float
     """The shipped policy's success."""
     floor_miss: float
     v_max: float
-    """What is asked: the largest printed [m/s]."""
+    """The goal: the largest printed [m/s]."""
     v_max_miss: float
     """By how much the median over trials misses it [m/s]."""
     of_ten_miss: float | None = None
@@ -123,7 +123,7 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
 
 
 def goal_grid(cells: Sequence[Tally]) -> Grid:
-    """Return by how much each cell of one policy misses what is asked of it."""
+    """Return by how much each cell of one policy misses its goal."""
     by_key = {(cell.track, cell.difficulty): cell for cell in cells}
     headers = ["track", "level", "success", "best of the others", "missed by", "floor",
                "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip

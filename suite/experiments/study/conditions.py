@@ -29,7 +29,7 @@ class Condition:
     name: str
     """Of the effect or the sweep."""
     size: float
-    """How strong it is asked to be, in the sweep's or the effect's unit."""
+    """How strong it is, in the sweep's or the effect's unit."""
     words: str
     """How strong it is, for people, with its unit."""
     vehicle: Vehicle

@@ -135,10 +135,10 @@ def name_of(policy: str) -> str:
         ) from None
 
 
-def named_policies(asked: Sequence[str]) -> dict[str, str]:
+def named_policies(given: Sequence[str]) -> dict[str, str]:
     """Return the policies that are given, or the shipped one, by what tables call them."""
-    asked = asked or (default_policy(),)
-    return dict(zip(labels(asked, [name_of(path) for path in asked]), asked, strict=True))
+    given = given or (default_policy(),)
+    return dict(zip(labels(given, [name_of(path) for path in given]), given, strict=True))
 
 
 def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:

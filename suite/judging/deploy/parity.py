@@ -26,7 +26,7 @@ STEPS = 1000
 
 
 class Parity(NamedTuple):
-    """An export beside its policy, both given the same and each with a memory of its own."""
+    """An export and its policy, both given the same and each with a memory of its own."""
 
     steps: int
     """Steps in turn; 0 where no compiler is here and nothing was measured."""

@@ -1,4 +1,4 @@
-"""`suite fly` from its options to its answer: simulated flights beside the judge's, or one link."""
+"""`suite fly` from its options to its answer: simulated flights and the judge's, or one link."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from suite.judging.flying import (
     Course,
     about_policy,
     default_policy,
-    load_flier,
+    load_in_manner,
     read_course,
     refuse_one_name,
 )
@@ -71,10 +71,10 @@ def fly_commanded(
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
     (plain,) = manners(asked.speed, monitor=False)
-    loaded = load_flier(name, asked.trust, plain)
-    flier = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
+    loaded = load_in_manner(name, asked.trust, plain)
+    pilot = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if asked.monitor:
-        loaded, flier = Monitored(loaded), Monitored(flier)
+        loaded, pilot = Monitored(loaded), Monitored(pilot)
     flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
     refuse_other_run(out, flown)
     rules = Rules(time_limit_s=asked.time_limit_s)
@@ -83,11 +83,11 @@ def fly_commanded(
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
     if link:
-        found = _real(flier, course, link, limits, out, console, key)
+        found = _real(pilot, course, link, limits, out, console, key)
     else:
         flights: list[Flight] = []
         try:
-            for flight in fly_simulated(flier, course, rules, limits, out, console):
+            for flight in fly_simulated(pilot, course, rules, limits, out, console):
                 flights.append(flight)
         except KeyboardInterrupt as error:
             interrupt = error
@@ -95,8 +95,8 @@ def fly_commanded(
         found["flights"] = [flight.row for flight in flights]
         _show(found, flights, console)
     about = {"policy": flown.policy, "limits": limits, "link": flown.link}
-    if isinstance(flier, Monitored):
-        found["interventions"] = flier.interventions
+    if isinstance(pilot, Monitored):
+        found["interventions"] = pilot.interventions
     answer = {**stamp(1, asked.seed), **about, **found}
     write_json(out / FLY, answer)
     write_run_record(out, flown, asked.seed)

@@ -35,7 +35,7 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
     direction away from the nearest obstacle, in the frame of the current gate and scaled to numbers
     around one; the position again where it is near; how close solids are now and further on; when
     and where the gate's plane is reached, were the velocity kept; the opening's half width, how
-    many gates are left and, where the policy is told, how fast it is to fly: F numbers, see
+    many gates are left and, where the policy has the input, how fast it is to fly: F numbers, see
     `features_of`. Gates and obstacles are looked up on values without gradient.
     """
     gates = worlds.scene.gates

@@ -77,28 +77,6 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     assert len(sky.flown) == 30 + 3 * 4
 
 
-def test_table2_with_policies_tuned_under_the_delta_model(sky, tmp_path):
-    tuned = tmp_path / "tuned"
-    another_racer(tuned, 1001)
-    args = ["--trials", "1", "--delta-policy", str(tuned)]
-    assert reproduce(tmp_path, "table2", *args) == 0
-    assert len(sky.flown) == 30 + 12, "the paper's four levels"
-    text, numbers = page(tmp_path, "table2")
-    assert {cell["policy"] for cell in numbers["cells"]} == {
-        "ours",
-        "ours, with Delta Action Model",
-    }
-    assert "Goals by cell: ours, with Delta Action Model" in text
-    assert not numbers["with_against_without"], "without its control nobody knows its merit"
-    another_racer(tuned, 1002)
-    args = [*args, "--control-policy", "race-paper"]
-    assert reproduce(tmp_path, "table2", *args) == 0
-    text, numbers = page(tmp_path, "table2")
-    overall = numbers["with_against_without"][-1]
-    assert overall["track"] == "all" and overall["trials"] == 12
-    assert "With the Delta Action Model" in text and "with - without" in text
-
-
 @pytest.fixture
 def rotorpy(monkeypatch):
     monkeypatch.setattr(rotorpy_world, "rotorpy", lambda: STAND_IN)

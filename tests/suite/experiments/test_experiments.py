@@ -24,7 +24,7 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
     [
         ("table2 --trials 0", "--trials is 0"),
         ("table2 --policy race-papr", "Did you mean 'race-paper'?"),
-        ("table2 --delta-policy nowhere/policy", "nowhere/policy: no such file"),
+        ("table2 --policy nowhere/policy", "nowhere/policy: no such file"),
         ("table2 --vehicle referense", "Did you mean 'reference'?"),
         ("simulators --policy {folder}/mine.pt2", "suite reproduce does of no policy"),
         ("simulators --simulator reference", "--simulator reference: flies as mujoco does"),

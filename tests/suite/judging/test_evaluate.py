@@ -9,7 +9,7 @@ import eval.judging.judge
 import eval.logs.flight_log
 from eval.judging.results import read_trials
 from suite import cli
-from suite.judging.flying import load_flier, who_flies
+from suite.judging.flying import load_in_manner, who_flies
 from suite.judging.requests import Manner
 
 
@@ -181,7 +181,7 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     assert _eval(tmp_path / "out", *asked) == 0
     table = (tmp_path / "out" / "table.md").read_text()
     assert "| diver | zigzag" in table and "| diver+monitor | zigzag" in table
-    loaded = load_flier(pilots["diver"], False, Manner(monitored=True))
+    loaded = load_in_manner(pilots["diver"], False, Manner(monitored=True))
     make = who_flies(loaded, pilots["diver"], False, 2, Manner(monitored=True))
     assert callable(make) and make().name == "diver+monitor"
 

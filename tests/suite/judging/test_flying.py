@@ -16,7 +16,7 @@ from suite.cli import parse
 from suite.judging.flying import (
     flying_needs,
     labels,
-    load_flier,
+    load_in_manner,
     read_course,
     trial_list,
     who_flies,
@@ -74,7 +74,7 @@ def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):
 
 
 def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
-    policy = load_flier("race-paper", False)
+    policy = load_in_manner("race-paper", False)
     assert who_flies(policy, "race-paper", False, 1) is policy
     here, there = (
         who_flies(policy, "race-paper", False, 2),

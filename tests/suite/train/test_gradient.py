@@ -1,23 +1,14 @@
 """The trainer's gradient: images outside the loop, in chunks, and few of them."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from policies.networks import network
-from suite.train.gradient import encoder_gradient, make_gradient, sampled_encoder_gradient
+from suite.train.gradient import encoder_gradient, sampled_encoder_gradient
 from tests.support.canonical import NOISY, gradient_of
-from tests.support.training import (
-    KEY,
-    boxes_worlds,
-    fresh_params,
-    largest_difference,
-    loss_of,
-    small_config,
-)
+from tests.support.training import KEY, boxes_worlds, fresh_params, largest_difference, loss_of
 
 
 @pytest.fixture(scope="module")
@@ -57,23 +48,3 @@ def test_the_encoders_gradient_from_every_other_image_is_right_on_average(two_pa
     halves = [sampled_encoder_gradient(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
     mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
     assert largest_difference(mean, whole) < 1e-5
-
-
-@pytest.mark.slow
-def test_the_encoders_gradient_from_every_third_image_is_right_on_average():
-    """Without noise the key sets nothing but the first image: the three choices' mean is exact."""
-    config = small_config(steps=6, physics={"depth_noise": 0.0})
-    sparse = replace(config, episode=replace(config.episode, image_stride=3))
-    worlds, params = boxes_worlds(config), fresh_params()
-    whole = make_gradient(config)(params, worlds, KEY, None)[0]
-    run, found = jax.jit(make_gradient(sparse)), {}
-    for seed in range(40):
-        gradient = run(params, worlds, jax.random.key(seed), None)[0]
-        found[round(float(gradient["conv1.weight"][0, 0, 0, 0]), 9)] = gradient
-        if len(found) == 3:
-            break
-    assert len(found) == 3
-    mean = jax.tree.map(lambda *parts: sum(parts) / 3, *found.values())
-    assert largest_difference(mean, whole) < 1e-4
-    for gradient in found.values():
-        np.testing.assert_allclose(gradient["action.weight"], whole["action.weight"], atol=1e-6)

@@ -169,9 +169,9 @@ def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole,
 
 def test_a_folder_with_another_run_is_refused(whole):
     other = replace(CONFIG, episode=replace(CONFIG.episode, rest_share=0.5))
-    with pytest.raises(ValueError, match="differs in episode"):
+    with pytest.raises(ValueError, match=r"episode\.rest_share is 0\.3 there, 0\.5 here"):
         run.train(other, whole, Console())
-    with pytest.raises(ValueError, match="differs in --from, --delta"):
+    with pytest.raises(ValueError, match="another --from; another --delta"):
         delta = delta_network.init(jax.random.key(0))
         run.train(CONFIG, whole, Console(), fresh_params(), delta)
     with pytest.raises(ValueError, match="remove the folder"):

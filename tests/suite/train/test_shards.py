@@ -10,13 +10,7 @@ import pytest
 
 from suite.train import shards
 from suite.train.config import check
-from suite.train.shards import (
-    check_processes,
-    curve_numbers,
-    flight_numbers,
-    make_shards,
-    sample_hidden,
-)
+from suite.train.shards import check_processes, curve_numbers, flight_numbers, sample_hidden
 from suite.train.update import make_update, start_state
 from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
@@ -66,34 +60,23 @@ def test_shards_have_the_gradient_of_the_whole_batch(noisy):
     assert largest_difference(numbers, curve) < 1e-3
 
 
-def test_any_number_of_cores_comes_to_the_same_bits(noisy, monkeypatch):
-    monkeypatch.setattr(shards, "usable_cores", lambda: 3)
-    config, expected = noisy
-    jax.tree.map(np.testing.assert_array_equal, updated(config), expected)
-
-
-def test_shards_are_computed_at_once_and_stand_in_their_order(monkeypatch):
-    """Each of two threads waits for the other, so that one after the other would never end."""
+def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(noisy, monkeypatch):
+    """Each thread waits for the other, so that one after the other would never end."""
     monkeypatch.setattr(shards, "usable_cores", lambda: 2)
-    config = small_config(batch=4, shards=2)
-    both, names = threading.Barrier(2, timeout=60), set()
+    config, expected = noisy
+    both, names = threading.Barrier(2, timeout=60), list[str]()
     real = shards.jax.block_until_ready
 
     def met(found):
-        if calls:
+        names.append(threading.current_thread().name)
+        if len(names) > config.episode.shards:  # the first are computed one by one
             both.wait()
-            names.add(threading.current_thread().name)
         return real(found)
 
-    calls = []
     monkeypatch.setattr(shards.jax, "block_until_ready", met)
-    sharded, state = make_shards(config), start_state(config)
-    given = state.params, state.hidden, state.iteration, boxes_worlds(config)
-    cold = sharded(*given)
-    calls.append("warm")
-    warm = sharded(*given)
-    assert len(names) == 2
-    jax.tree.map(np.testing.assert_array_equal, warm, cold)
+    found = updated(config)
+    assert len(set(names[config.episode.shards :])) == 2
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_the_curve_is_of_steps_that_count():

@@ -318,7 +318,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     fast = load_policy("race")
     assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
-    monkeypatch.setattr(commanded, "load_flier", lambda *_: fast)
+    monkeypatch.setattr(commanded, "load_in_manner", lambda *_: fast)
     assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
     assert "decides at 2000 Hz" in told(capsys) and not (tmp_path / "b").exists()
 

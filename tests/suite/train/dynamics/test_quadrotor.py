@@ -18,7 +18,6 @@ from suite.train import losses
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics import quadrotor
 from suite.train.dynamics.quadrotor import QuadrotorParams, quadrotor_dynamics, substeps
-from suite.train.gradient import make_gradient
 from suite.train.recipes import named_recipe, with_quadrotor
 from suite.train.rollout import make_rollout
 from suite.train.worlds import sample_worlds
@@ -165,49 +164,6 @@ def test_no_vehicle_is_drawn_lighter_than_the_catalogue_knows():
     config = QuadrotorConfig(PLAIN, mass_std=0.9)
     drawn = quadrotor.draw_effects(config, 200, np.random.default_rng(0))["mass_offset"].offset
     assert drawn.min() == pytest.approx(-0.5 * PLAIN.mass) and np.ptp(drawn) > PLAIN.mass
-
-
-@pytest.mark.slow
-def test_gradients_of_a_flight_are_those_of_finite_differences(float64, monkeypatch):
-    """Through attitude loop, rate loop, mixer, rotors, delay and effects; heading held."""
-    monkeypatch.setattr(quadrotor, "blend_heading", lambda heading_w, *_: heading_w)
-    config = QuadrotorConfig(HIDDEN)
-    start, step = quadrotor_dynamics(config, 1 / 15, 0.0)
-    rng = np.random.default_rng(3)
-    effects = doubled(quadrotor.draw_effects(config, 2, rng))
-    constants = QuadrotorParams(np.full(2, 1 / 15), effects)
-    weight = [jnp.asarray(rng.normal(size=(2, 3))) for _ in range(3)]
-    still, keys = jnp.zeros((2, 3)), jax.random.split(jax.random.key(0), 2)
-
-    @jax.jit
-    @jax.value_and_grad
-    def score(inputs):
-        actions, vel_w = inputs
-        body = start(constants, still, vel_w, still + jnp.asarray([1.0, 0.0, 0.0]))
-
-        def one(body, action):
-            body = step(body, constants, action, still, keys)
-            parts = (body.pos_w, body.vel_w, body.rot_w[:, 2])
-            return body, jnp.stack([w * part for w, part in zip(weight, parts, strict=True)])
-
-        return jax.lax.scan(one, body, actions)[1].sum()
-
-    inputs = (
-        jnp.asarray(lively_actions(5, seed=1)),
-        jnp.asarray(rng.normal(size=(2, 3))),
-    )
-    slopes = score(inputs)[1]
-    for which in range(2):
-        direction = rng.normal(size=inputs[which].shape)
-
-        def moved(size, which=which, direction=direction):
-            changed = list(inputs)
-            changed[which] = changed[which] + size * direction
-            return score(tuple(changed))[0]
-
-        expected = float(moved(1e-6) - moved(-1e-6)) / 2e-6
-        assert abs(expected) > 1e-2
-        assert float((slopes[which] * direction).sum()) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatch):
@@ -381,15 +337,3 @@ def test_every_effect_of_a_vehicle_file_flies_in_training(name, flown_plainly):
     assert np.isfinite(flown).all()
     if name != "ground_effect":  # too high above the ground
         assert np.abs(flown_plainly - flown).max() > 1e-5
-
-
-@pytest.mark.slow
-def test_the_trainers_own_method_takes_a_finite_gradient():
-    config = replace(small_config(), quadrotor=QuadrotorConfig(HIDDEN))
-    worlds, params = boxes_worlds(config), fresh_params()
-    gradient, loss, records = jax.jit(make_gradient(config))(
-        params, worlds, jax.random.key(5), None
-    )
-    assert np.isfinite(float(loss)) and records.image.shape == (6, 4, 20, 20)
-    sizes = {name: float(np.abs(np.asarray(g)).max()) for name, g in gradient.items()}
-    assert all(np.isfinite(size) for size in sizes.values()) and min(sizes.values()) > 1e-8, sizes

@@ -57,12 +57,13 @@ def rollout_of(actor, seed=1, done=False):
         advantage=jnp.asarray(rng.normal(size=(STEPS, BATCH))),
         start=jnp.asarray(rng.normal(size=(1, BATCH, SPEC.hidden_size))),
     )
-    mean = action_means(actor.params, embeddings, sequences)
+    mean = means(actor.params, embeddings, sequences)
     action = mean + jnp.exp(actor.log_deviation) * rng.normal(size=mean.shape)
     log_prob = log_probability(mean, actor.log_deviation, action)
     return embeddings, sequences._replace(action_b=action, log_prob=log_prob)
 
 
+means = jax.jit(action_means)
 loss_and_slope = jax.jit(
     jax.value_and_grad(clipped_loss, argnums=1, has_aux=True), static_argnums=0
 )
@@ -116,7 +117,7 @@ def test_an_episode_that_ended_leaves_no_memory():
     """The world starts anew with its start's recurrent state, and its past has no gradient."""
     actor = actor_of()
     embeddings, sequences = rollout_of(actor, done=True)
-    mean = action_means(actor.params, embeddings, sequences)
+    mean = means(actor.params, embeddings, sequences)
     hidden, again = sequences.start[0], []
     for step in (3, 4):
         action, hidden = network.recur(

@@ -1,6 +1,7 @@
 """The reward and what the critic sees, worked by hand: gates along x, a sphere beside."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -47,12 +48,18 @@ def body_at(pos_w, vel_w=(0.0, 0, 0), acc_w=(0.0, 0, 0)):
     return point_mass.start(pos, vel, jnp.asarray([[1.0, 0, 0]]))._replace(acc_w=acc)
 
 
+@cache
+def reward_of(config):
+    """Return the reward, compiled once: op by op there is more to compile than to test."""
+    return jax.jit(make_reward(config))
+
+
 def rewarded(before, body, sphere_w=(0, 0, 90), target=0, config=CONFIG, wanted=None):
     """Return (terms as numbers by name, their sum, clearance, passed) of the step."""
     worlds = worlds_with(sphere_w)
     if wanted is not None:
         worlds = worlds._replace(wanted=jnp.asarray([wanted]))
-    terms, clearance, passed = make_reward(config)(worlds, before, body, jnp.asarray([target]))
+    terms, clearance, passed = reward_of(config)(worlds, before, body, jnp.asarray([target]))
     named = {name: float(term[0]) for name, term in terms._asdict().items()}
     return named, float(terms.total()[0]), float(clearance[0]), bool(passed[0])
 
