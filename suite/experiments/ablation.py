@@ -113,7 +113,7 @@ def settings(config: Config) -> list[training.Row]:
         row("normalised", "without, L_p^norm", w, progress=0.0, progress_norm=w, field_gain=0.0)
         for w in NORMALISED
     ]
-    return training.asked_rows(rows, config.only, "setting")
+    return list(options.chosen({row.key: row for row in rows}, config.only, "setting").values())
 
 
 def weight(row: Summary) -> float:

@@ -24,7 +24,6 @@ from suite.experiments.study.conditions import Condition, Sweep, sweep_condition
 from suite.experiments.study.disturbed import Tested
 from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
-from tracks.common.names import unknown_name
 from tracks.input.ranges import Trials
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
@@ -53,7 +52,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; what is missing is flown first."""
     from suite.experiments.pages.charts import sweeps_chart
 
-    vehicle, sets = load_vehicle(config.vehicle), asked_sets(config.only)
+    vehicle, sets = load_vehicle(config.vehicle), chosen_sets(config.only)
     policies = judging.named_policies(config.policy)
     cells, growing = judging.trials_of(config), replace(config, trials=config.growing_trials)
     base = Condition("perfect", 0.0, "", vehicle)
@@ -89,7 +88,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     return Made(facts, parts, {"conditions": numbers})
 
 
-def asked_sets(only: Sequence[str]) -> dict[str, SensorSet]:
+def chosen_sets(only: Sequence[str]) -> dict[str, SensorSet]:
     """Return the presets, then each model alone at its usual size, that are in `only`, or all.
 
     Raises:
@@ -102,11 +101,7 @@ def asked_sets(only: Sequence[str]) -> dict[str, SensorSet]:
         for name, sensor in SENSORS.items()
         if name in usual and not sensor.measure
     }
-    known = {**presets, **alone}
-    for name in only:
-        if name not in known:
-            raise unknown_name("preset or sensor model", name, known)
-    return {name: found for name, found in known.items() if name in (only or known)}
+    return options.chosen({**presets, **alone}, only, "preset or sensor model")
 
 
 def growing_sweeps(sets: Mapping[str, SensorSet]) -> list[Sweep]:

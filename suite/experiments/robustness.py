@@ -36,7 +36,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     from suite.experiments.pages.charts import effects_chart, sweeps_chart
 
     vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
-    alone, sweeps = disturbed.asked_conditions(vehicle, config.only)
+    alone, sweeps = disturbed.chosen_conditions(vehicle, config.only)
     base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.trials_of(config)
     effects, grown = disturbed.flown_under([base, *alone], sweeps, policies, trials, place, console)
     facts = {

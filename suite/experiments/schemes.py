@@ -111,13 +111,13 @@ def schemes(config: Config) -> list[training.Row]:
         training.Row("ours", "ours", ours),
         training.Row("projection", "ours without the field, with L_proj", bare),
     ]
-    rows = training.asked_rows(rows, config.only, "scheme")
-    if ppo.episode.batch % ppo.minibatches and "ppo" in [row.key for row in rows]:
+    rows = options.chosen({row.key: row for row in rows}, config.only, "scheme")
+    if ppo.episode.batch % ppo.minibatches and "ppo" in rows:
         raise ValueError(
             f"--worlds is {ppo.episode.batch}, allowed with PPO are multiples of its "
             f"{ppo.minibatches} minibatches"
         )
-    return rows
+    return list(rows.values())
 
 
 def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:

@@ -19,7 +19,7 @@ from suite.experiments.study.conditions import (
     sweeps,
 )
 from suite.experiments.study.judging import Order, Place, Setup, flown
-from tracks.common.names import unknown_name
+from suite.experiments.study.options import chosen
 
 
 class Tested(NamedTuple):
@@ -42,7 +42,7 @@ Grown = dict[Sweep, list[Tested]]
 """The points of each sweep, the undisturbed first."""
 
 
-def asked_conditions(
+def chosen_conditions(
     vehicle: Vehicle, only: Sequence[str]
 ) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
     """Return the effects and the sweeps of `vehicle` whose names are in `only`, all if it is empty.
@@ -52,13 +52,10 @@ def asked_conditions(
     """
     grown, alone = sweeps(vehicle), effect_conditions(vehicle)
     known = dict.fromkeys(entry.name for entry in (*grown, *alone))
-    for name in only:
-        if name not in known:
-            raise unknown_name("effect or sweep", name, known)
-    chosen = only or tuple(known)
+    names = chosen(known, only, "effect or sweep")
     return (
-        [condition for condition in alone if condition.name in chosen],
-        {sweep: sweep_conditions(vehicle, sweep) for sweep in grown if sweep.name in chosen},
+        [condition for condition in alone if condition.name in names],
+        {sweep: sweep_conditions(vehicle, sweep) for sweep in grown if sweep.name in names},
     )
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from suite.common.choices import parse_levels
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_owned
+from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
+
+T = TypeVar("T")
 
 GATES = 4
 """Of the paper's tracks in its ablation and its comparison of schemes."""
@@ -53,6 +57,18 @@ class FourGates:
     """Of a trial, from standing start."""
     seed: Seed = 1000
     """Of the unseen worlds; none of the training seeds."""
+
+
+def chosen(known: Mapping[str, T], only: Sequence[str], what: str) -> dict[str, T]:
+    """Return the entries of `known` whose names are in `only`, all where it is empty.
+
+    Raises:
+        ValueError: for a name that no entry has; `what` says what an entry is.
+    """
+    for name in only:
+        if name not in known:
+            raise unknown_name(what, name, known)
+    return {name: entry for name, entry in known.items() if name in (only or known)}
 
 
 def check(config: Any) -> None:

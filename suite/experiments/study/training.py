@@ -24,7 +24,6 @@ from suite.common.work import all_done
 from suite.experiments.study.cache import Place, digest
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
-from tracks.common.names import unknown_name
 
 if TYPE_CHECKING:
     from suite.train.rollout import Note
@@ -90,19 +89,6 @@ class Study:
         if self.by_seed:
             return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.rows]
         return [(r.key, replace(r.recipe, seed=s)) for r in self.rows for s in self.seeds]
-
-
-def asked_rows(rows: Sequence[Row], only: Sequence[str], what: str) -> list[Row]:
-    """Return the rows whose keys are in `only`, all where it is empty.
-
-    Raises:
-        ValueError: for a key that no row has; `what` says what a row is.
-    """
-    names = [row.key for row in rows]
-    for name in only:
-        if name not in names:
-            raise unknown_name(what, name, names)
-    return [row for row in rows if not only or row.key in only]
 
 
 def trained(study: Study, place: Place, console: Console) -> list[Trained]:

@@ -38,7 +38,7 @@ def test_the_same_setup_in_two_orders_flies_a_trial_once(sky, tmp_path):
 
 def test_policies_fly_the_same_trials_under_every_condition(sky, tmp_path):
     trials = [TrialSpec("zigzag", 0, seed) for seed in (1, 2, 3)]
-    alone, grown = disturbed.asked_conditions(VEHICLE, ("wind", "mass_offset"))
+    alone, grown = disturbed.chosen_conditions(VEHICLE, ("wind", "mass_offset"))
     assert [c.name for c in alone] == ["mass_offset"] * 2
     (wind,) = grown
     base, policies = Condition("undisturbed", 0.0, "", VEHICLE), {"p": "race-paper", "r": "race"}
