@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.common.work import WorkersOption, asked_workers
+from suite.common.work import WorkersOption, workers_given
 from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
                 f"--{name} is {shown}, but `suite blind {config.what}` does not take it, only "
                 f"{' and '.join(works)}; leave it out"
             )
-    workers = asked_workers(config.workers, whole_cores=True)
+    workers = workers_given(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)
     if config.what == "strengths":

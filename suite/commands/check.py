@@ -52,13 +52,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     answer: dict[str, Any] = {"findings": [], "not_identifiable": []}
     policy = None
     if config.policy:
-        policy, told = check_policy(config.policy, config.trust, config.trials, console)
-        answer |= told
+        policy, found = check_policy(config.policy, config.trust, config.trials, console)
+        answer |= found
     if config.flights or config.vehicle:
         out = config.out if config.fix else None
-        told = check_flight_files(config.flights, config.vehicle, policy, out, console)
-        told["findings"] = [*answer["findings"], *told["findings"]]
-        answer |= told
+        found = check_flight_files(config.flights, config.vehicle, policy, out, console)
+        found["findings"] = [*answer["findings"], *found["findings"]]
+        answer |= found
     if not any(finding["status"] in ("doubt", "corrected") for finding in answer["findings"]):
         console.say("nothing to report")
     return answer

@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
-from suite.common.work import WorkersOption, asked_workers
+from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Collection
 
 
@@ -41,4 +41,4 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """
     from suite.judging.collect import collect
 
-    return collect(config.flown, config.out, console, asked_workers(config.workers))
+    return collect(config.flown, config.out, console, workers_given(config.workers))

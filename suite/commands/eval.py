@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
-from suite.common.work import WorkersOption, asked_workers
+from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Evaluation
 from tracks.common.files import check_place
 
@@ -51,7 +51,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
         check_records(config.flown.simulator)
         check_place(config.rerun)
-    answer = evaluate(config.flown, config.out, console, asked_workers(config.workers))
+    answer = evaluate(config.flown, config.out, console, workers_given(config.workers))
     if config.rerun:
         from suite.judging.replay import record_first_trials
 

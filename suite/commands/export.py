@@ -43,8 +43,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if config.name and config.policy and config.name != config.policy:
         raise ValueError(f"--policy {config.policy}: {config.name} was asked for, too; give one")
-    asked = config.policy or config.name or default_policy()
-    answer = export(asked, config.out, config.formats, config.dtype, console)
+    given = config.policy or config.name or default_policy()
+    answer = export(given, config.out, config.formats, config.dtype, console)
     for path in answer["written"]:
         console.say(f"written: {path} ({size(path.stat().st_size)})")
     return answer

@@ -71,7 +71,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.judging.link.commanded import fly_commanded
     from suite.judging.link.messages import signing_key
 
-    asked = Evaluation(
+    evaluation = Evaluation(
         track=config.track,
         difficulty=config.difficulty,
         trials=config.trials,
@@ -90,6 +90,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.signing_key and not config.link:
         raise ValueError("--signing-key is of a real link, and no --link is given")
     return fly_commanded(
-        asked, config.policy, config.link, config.limits, config.out, console,
+        evaluation, config.policy, config.link, config.limits, config.out, console,
         signing_key(config.signing_key),
     )  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from suite.common.console import Console
-from suite.common.work import WorkersOption, asked_workers
+from suite.common.work import WorkersOption, workers_given
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 
@@ -85,7 +85,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 
-    workers = asked_workers(config.workers, whole_cores=True)
+    workers = workers_given(config.workers, whole_cores=True)
     about_loop = {name: value for name, value in vars(config).items() if name not in OTHER}
     resolved = resolve(**about_loop, delta=not config.no_delta, changes=config.set)
     return run_loop(resolved, config.out, console, workers)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, TypeVar, Union
 import tyro
 
 from suite.common.console import Console
-from suite.common.work import WorkersOption, asked_workers
+from suite.common.work import WorkersOption, workers_given
 from suite.experiments import EXPERIMENTS, OVER_ALL
 from tracks.common.grid import rich_table
 
@@ -102,7 +102,7 @@ def _made(config: Config[Any], console: Console) -> dict[str, Any]:
     from suite.experiments.pages.document import Place, check_page, write_document
     from suite.experiments.study.options import check
 
-    workers = asked_workers(config.workers, whole_cores=True)
+    workers = workers_given(config.workers, whole_cores=True)
     check(config.experiment)
     place, module = Place(config.out, config.cache, workers), type(config.experiment).__module__
     name, document = module.rpartition(".")[2], importlib.import_module(module).document

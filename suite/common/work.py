@@ -24,7 +24,7 @@ WorkersOption = Annotated[
         help_behavior_hint="(a cluster's owner can run code here: name your own)",
     ),
 ]
-"""As a command's option; `asked_workers` reads it."""
+"""As a command's option; `workers_given` reads it."""
 
 
 class Silent(Quiet):
@@ -45,7 +45,7 @@ class Silent(Quiet):
         yield update
 
 
-def asked_workers(text: str | None, whole_cores: bool = False) -> Workers | None:
+def workers_given(text: str | None, whole_cores: bool = False) -> Workers | None:
     """Return what `--workers` says, None where it was not given.
 
     Args:

@@ -82,8 +82,8 @@ def check_flight_files(
             write_flight(path, replace(fixed, about={**fixed.about, "findings": records}))
             written.append(str(path))
     for name in (None, *(log.name for log in logs)):
-        told = [finding for finding, flight in found if flight == name and finding.status != "ok"]
-        for text in finding_lines(told):
+        named = [finding for finding, flight in found if flight == name and finding.status != "ok"]
+        for text in finding_lines(named):
             console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
     if written:
         console.say(f"written: {', '.join(written)}")
@@ -120,9 +120,9 @@ def _in_flight(policy: Policy, trials: int, console: Console) -> list[tuple[str,
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import Rules, TrialSpec
 
-    asked = [TrialSpec("random", 0, 500_000 + seed) for seed in range(trials)]
+    trial_specs = [TrialSpec("random", 0, 500_000 + seed) for seed in range(trials)]
     options = JudgeOptions(workers=1, rules=Rules(time_limit_s=TIME_LIMIT_S))
-    results = fly(policy, asked, load_vehicle("racer5"), options=options)
+    results = fly(policy, trial_specs, load_vehicle("racer5"), options=options)
     actions = actions_of(results, policy.spec.action)
     if actions["decisions"]:
         share, count = actions["limited"], actions["decisions"]

@@ -61,13 +61,13 @@ def collect(
     course, manner = read_course(collection), Manner(speed=collection.speed)
     check_records(collection.simulator)
     refuse_one_name({trial.track for trial in course.trials})
-    asked = collection.policy or default_policy()
-    policy = load_in_manner(asked, collection.trust, manner)
+    given = collection.policy or default_policy()
+    policy = load_in_manner(given, collection.trust, manner)
     out = Path(out)
     refuse_other_run(out, collection)
     about = {
         "collection": collection,
-        "policy": about_policy(asked, policy),
+        "policy": about_policy(given, policy),
         "vehicle": course.vehicle,
         "tracks": course.tracks,
         "git_commit": git_commit(),
@@ -114,7 +114,7 @@ def _fly_missing(
     what = f"{len(missing)} flights in {collection.simulator}"
     announce(console, what, flying_needs(len(missing), workers, collection.simulator))
     say_notes(console, collection.simulator, course)
-    asked, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
+    given, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     rules = Rules(time_limit_s=collection.time_limit_s)
     options = JudgeOptions(workers=workers, rules=rules, sensors=course.sensors)
     with console.progress("flights", len(course.trials)) as update:
@@ -129,7 +129,7 @@ def _fly_missing(
 
         if missing:
             fly(
-                who_flies(policy, asked, collection.trust, workers, manner),
+                who_flies(policy, given, collection.trust, workers, manner),
                 missing,
                 course.vehicle,
                 collection.simulator,
@@ -175,7 +175,7 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
 
 
 def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
-    """Return the rows of an earlier call of the same collection, told by `by_content`."""
+    """Return the rows of an earlier call of the same collection, as `by_content` identifies it."""
     from eval.worlds.trial import TrialSpec
 
     path = out / LIST

@@ -42,7 +42,7 @@ class Entry(NamedTuple):
     """Who flies a share of the trials."""
 
     source: str
-    """What was asked for: a name or a path."""
+    """What was given: a name or a path."""
     policy: Policy
     """Loaded, in its manner."""
     label: str
@@ -71,9 +71,9 @@ def evaluate(
 
     course, out = read_course(evaluation), Path(out)
     refuse_other_run(out, evaluation)
-    asked = tuple(evaluation.policies or (default_policy(),))
-    policies = [load_in_manner(name, evaluation.trust) for name in asked]
-    plain = list(zip(asked, policies, labels(asked, [p.name for p in policies]), strict=True))
+    given = tuple(evaluation.policies or (default_policy(),))
+    policies = [load_in_manner(name, evaluation.trust) for name in given]
+    plain = list(zip(given, policies, labels(given, [p.name for p in policies]), strict=True))
     entries = [
         Entry(name, manner(policy), manner.label(label), manner)
         for manner in manners(evaluation.speed, evaluation.monitor)
@@ -89,8 +89,8 @@ def evaluate(
     journals = _open_journals(evaluation, course, entries, out)
     announce(console, f"{flown} trials in {evaluation.simulator}", needs)
     say_notes(console, evaluation.simulator, course)
-    for doubt in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
-        console.note(str(doubt))
+    for warning in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
+        console.note(str(warning))
     results: list[TrialResult] = []
     for entry, journal in zip(entries, journals, strict=True):
         results += _fly_one(evaluation, course, entry, workers, journal, console)

@@ -70,7 +70,7 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
 
 
 def labels(policies: Sequence[str], names: Sequence[str], option: str = "--policy") -> list[str]:
-    """Return what tables call each policy: its name, or what was asked for where names clash.
+    """Return what tables call each policy: its name, or what was given where names clash.
 
     Raises:
         ValueError: where one is given twice; `option` is named.
@@ -79,8 +79,8 @@ def labels(policies: Sequence[str], names: Sequence[str], option: str = "--polic
         twice = next(p for p in policies if list(policies).count(p) > 1)
         raise ValueError(f"{option} {twice} is given twice; give each policy once")
     return [
-        asked if list(names).count(name) > 1 else name
-        for asked, name in zip(policies, names, strict=True)
+        given if list(names).count(name) > 1 else name
+        for given, name in zip(policies, names, strict=True)
     ]
 
 
@@ -183,8 +183,9 @@ def refuse_one_name(tracks: Iterable[str]) -> None:
 
 
 def say_notes(console: Console, world: str, course: Course) -> None:
-    """Tell a person what of `course` is not as was asked for."""
-    for sentence in [*(f"{world}: {told}" for told in course.differences), *course.notes]:
+    """Print what of `course` differs from the request."""
+    differences = [f"{world}: {difference}" for difference in course.differences]
+    for sentence in [*differences, *course.notes]:
         console.note(sentence)
 
 
@@ -218,10 +219,10 @@ def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
     return {name: load_track(name) for name in names if is_track_file(name)}
 
 
-def workers_for(trials: int, asked: Workers | None, world: str) -> Workers:
-    """Return who flies `trials` where `asked` workers were given; None takes what is worth it."""
-    if asked is not None:
-        return asked
+def workers_for(trials: int, given: Workers | None, world: str) -> Workers:
+    """Return who flies `trials` where `given` workers were named; None takes what is worth it."""
+    if given is not None:
+        return given
     from eval.worlds import compiles
 
     worth = max(1, trials // TRIALS_A_PROCESS)

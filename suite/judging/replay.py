@@ -1,4 +1,4 @@
-"""Fly judged trials again to look at them: a trial repeats to the bit, so no flight is stored."""
+"""Fly judged trials again to see them: a trial repeats to the bit, so no flight is stored."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def read_evaluation(folder: Path) -> Evaluation:
     speeds = config.get("speed", [])
     if not isinstance(speeds, list) or not all(isinstance(s, (int, float)) for s in speeds):
         raise ValueError(f"{path}: speed is {shown(speeds)}, allowed is a list of numbers")
-    asked = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
-    for name, value in vars(asked).items():
+    evaluation = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
+    for name, value in vars(evaluation).items():
         default = getattr(Evaluation, name)
         # Those that are None by default are numbers, and JSON's are whole where Python's was.
         kind: type | tuple[type, ...] = type(default)
@@ -64,8 +64,8 @@ def read_evaluation(folder: Path) -> Evaluation:
             kind = (int, float, type(default))
         if not isinstance(value, kind) or (isinstance(value, bool) and default is not False):
             raise ValueError(f"{path}: {name} is {shown(value)}, expected one like {default!r}")
-    check_ranges(asked, f"{path}: ")
-    return asked
+    check_ranges(evaluation, f"{path}: ")
+    return evaluation
 
 
 def read_digests(folder: Path) -> dict[str, str]:

@@ -191,7 +191,7 @@ def difference_cell(
     return Cell(f"{value} [{low}, {high}]", tone)
 
 
-def told_apart(difference: Interval) -> str:
+def significance(difference: Interval) -> str:
     """Return how one policy's successes stand to another's, in words."""
     if difference.low > 0:
         return "more than"
@@ -209,7 +209,7 @@ def verdict(overall: Line) -> str:
     success = overall.success
     return (
         f"Fine-tuned with the Delta Action Model, {100 * success.with_delta.value:.0f} % of "
-        f"{overall.trials} trials succeed: {told_apart(success.with_minus_without)} the same "
+        f"{overall.trials} trials succeed: {significance(success.with_minus_without)} the same "
         f"fine-tuning without it ({100 * success.without.value:.0f} %; "
         f"difference {points(success.with_minus_without)}); before, "
         f"{100 * success.before.value:.0f} %."

@@ -21,7 +21,7 @@ from suite.common import curve
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.parameters_json import components, grid
 from suite.loop.charts import success_chart, tuning_chart
-from suite.loop.compare import BEFORE, points, told_apart
+from suite.loop.compare import BEFORE, points, significance
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.standings import Standing, cell_grid, overall_grid, standings
@@ -52,7 +52,7 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
     assert isinstance(config, HiddenLoopConfig)
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
     stand = standings(results, REFERENCES)
-    told = ("verdict", "effects", "gap", "unexplained")
+    kept = ("verdict", "effects", "gap", "unexplained")
     return Findings(
         verdict=verdict(stand, diagnosis, trials, place(config)),
         tables=[overall_grid(stand, REFERENCES, LABELS, trials), cell_grid(stand, LABELS)],
@@ -62,7 +62,7 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
             for name, whose in MODELS.items()
             if config.delta
         ],
-        numbers={"standings": stand, "diagnosis": {key: diagnosis[key] for key in told}},
+        numbers={"standings": stand, "diagnosis": {key: diagnosis[key] for key in kept}},
         facts={
             "tracks": config.track,
             "levels": config.difficulty,
@@ -105,17 +105,17 @@ def verdict(
         if lost.high < 0
         else "not significantly different from"
     )
-    told = (
+    text = (
         f"With {where} {percent(BEFORE)} of {trials} trials succeed, with the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
-        f"with it, {percent(NAMED)} succeed there: {told_apart(apart[CONTROL])} the "
+        f"with it, {percent(NAMED)} succeed there: {significance(apart[CONTROL])} the "
         f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "
         f"and {back} the policy where nothing is hidden (difference {points(lost)})."
     )
     if DELTA not in by_name:
-        return told
+        return text
     return (
-        f"{told} With the Delta Action Model instead {percent(DELTA)} succeed, "
+        f"{text} With the Delta Action Model instead {percent(DELTA)} succeed, "
         f"with both {percent(BOTH)}."
     )
 

@@ -96,12 +96,12 @@ _LICENCE = (
 
 
 def card_text(
-    asked: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, found: Parity
+    given: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, found: Parity
 ) -> str:
     """Return the card of an export as Markdown.
 
     Args:
-        asked: the policy as it was asked for.
+        given: the policy as it was asked for.
         name: what it is called.
         checkpoint: where it came from.
         dtype: of the weights.
@@ -127,12 +127,12 @@ def card_text(
     )
     table = "\n".join(f"| {key} | {markdown_cell(value)} |" for key, value in rows)
     title = f"# {markdown_cell(name)}, {dtype}, in C"
-    return f"{title}\n\n| | |\n| --- | --- |\n{table}\n\n{_success(asked)}"
+    return f"{title}\n\n| | |\n| --- | --- |\n{table}\n\n{_success(given)}"
 
 
-def _success(asked: str) -> str:
+def _success(given: str) -> str:
     """Return what the policy's own card says of its success, or that nothing is known."""
-    path = shipped.locate(asked) / "card.md"
+    path = shipped.locate(given) / "card.md"
     text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
     lines = [line for line in text.splitlines() if line.startswith("|") and "success" in line]
     if not lines:

@@ -52,7 +52,7 @@ class LinkFlights:
 
 
 def fly_commanded(
-    asked: Evaluation,
+    evaluation: Evaluation,
     policy: str,
     link: str,
     limits: Limits,
@@ -67,17 +67,17 @@ def fly_commanded(
         WorkFailed: where pymavlink is missing, or no vehicle answered.
     """
     dialect()
-    course = read_course(asked, real_time=True)
+    course = read_course(evaluation, real_time=True)
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
-    (plain,) = manners(asked.speed, monitor=False)
-    loaded = load_in_manner(name, asked.trust, plain)
+    (plain,) = manners(evaluation.speed, monitor=False)
+    loaded = load_in_manner(name, evaluation.trust, plain)
     pilot = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
-    if asked.monitor:
+    if evaluation.monitor:
         loaded, pilot = Monitored(loaded), Monitored(pilot)
-    flown = LinkFlights(asked, about_policy(name, loaded), limits, link or "simulated")
+    flown = LinkFlights(evaluation, about_policy(name, loaded), limits, link or "simulated")
     refuse_other_run(out, flown)
-    rules = Rules(time_limit_s=asked.time_limit_s)
+    rules = Rules(time_limit_s=evaluation.time_limit_s)
     # Before the flights: what the judge refuses is not flown.
     judged = [] if link else _judged(loaded, course, rules)
     out.mkdir(parents=True, exist_ok=True)
@@ -97,9 +97,9 @@ def fly_commanded(
     about = {"policy": flown.policy, "limits": limits, "link": flown.link}
     if isinstance(pilot, Monitored):
         found["interventions"] = pilot.interventions
-    answer = {**stamp(1, asked.seed), **about, **found}
+    answer = {**stamp(1, evaluation.seed), **about, **found}
     write_json(out / FLY, answer)
-    write_run_record(out, flown, asked.seed)
+    write_run_record(out, flown, evaluation.seed)
     if interrupt is not None:
         raise interrupt
     return {**answer, "out": str(out)}

@@ -8,7 +8,7 @@ import pytest
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
-from suite.common.work import Silent, all_done, asked_workers
+from suite.common.work import Silent, all_done, workers_given
 from tracks.common.work import core_shares
 
 CORES = sorted(os.sched_getaffinity(0))
@@ -33,10 +33,10 @@ def diverge(job, console):
 
 def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch):
     monkeypatch.setattr("suite.common.work.usable_cores", lambda: 2)
-    assert asked_workers("3") == 3 and asked_workers("2", whole_cores=True) == 2
-    assert asked_workers("a:1", whole_cores=True) == "tcp://a:1"
+    assert workers_given("3") == 3 and workers_given("2", whole_cores=True) == 2
+    assert workers_given("a:1", whole_cores=True) == "tcp://a:1"
     with pytest.raises(ValueError, match="--workers is 3; allowed is 1 to 2"):
-        asked_workers("3", whole_cores=True)
+        workers_given("3", whole_cores=True)
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
