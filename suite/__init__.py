@@ -97,12 +97,12 @@ def evaluate_policy(
     seeds, own = range(seed, seed + trials), {}
     if isinstance(track, str):
         levels = parse_levels(str(difficulty))
-        asked = [TrialSpec(t, d, s) for t in parse_tracks(track) for d in levels for s in seeds]
+        specs = [TrialSpec(t, d, s) for t in parse_tracks(track) for d in levels for s in seeds]
     else:
         own = {track.family: track}
-        asked = [TrialSpec(track.family, 0, s) for s in seeds]
+        specs = [TrialSpec(track.family, 0, s) for s in seeds]
     options = JudgeOptions(workers=workers, sensors=load_sensors(sensors))
-    return fly(flown, asked, body, simulator, options, tracks=own)
+    return fly(flown, specs, body, simulator, options, tracks=own)
 
 
 def train_policy(
@@ -130,8 +130,8 @@ def train_policy(
     from suite.commands.train import Config, resolve
     from suite.train.run import train
 
-    asked = Config(recipe=recipe, iterations=iterations, set=tuple(settings), seed=seed)
-    outcome = train(resolve(asked), Path(out), _console(progress))
+    options = Config(recipe=recipe, iterations=iterations, set=tuple(settings), seed=seed)
+    outcome = train(resolve(options), Path(out), _console(progress))
     return Path(outcome.policy)
 
 
