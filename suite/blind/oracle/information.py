@@ -36,9 +36,9 @@ SHORT_S, LONG_S = 0.5, LENGTH_S
 """Lengths of rollouts [s]; an error of force grows with the square of time."""
 THRESHOLD = 12.5
 """Expected log-likelihood ratio at which an effect can just be detected: five sigma."""
-REQUIRED = 2.0
-"""A name that leaves less log-likelihood ratio than this (two sigma) in long rollouts cannot be
-separated from the truth and must be among the alternatives."""
+REQUIRED = 0.125
+"""A name that leaves less log-likelihood ratio than this (half a sigma) in long rollouts, two sigma
+in some of twice their length, must be among the alternatives."""
 ALLOWED = THRESHOLD
 """A name that leaves less than this in short ones may be among them, any other may not."""
 MOSTLY = 0.25
