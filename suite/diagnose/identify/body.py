@@ -1,7 +1,7 @@
-"""The force and the torque on the body, by what drove the flights, and which numbers they tell.
+"""The force and the torque on the body, by what drove the flights, and which numbers they identify.
 
 Force: translation under the measured attitude. Where no flight has an attitude it is that of the
-path, and only its size is asked for: thrust is along what the path's acceleration and gravity make
+path, and only its size is compared: thrust is along what the path's acceleration and gravity make
 up together (differential flatness; Mellinger and Kumar 2011).
 
 Torque: rotation under known motors, as changes within a window.
@@ -17,7 +17,7 @@ import numpy as np
 from suite.diagnose.data.view import WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import Driven
-from suite.diagnose.identify.fit import Z95, Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Z95, Fitted, Known, Rows, Unknown, fit
 from suite.diagnose.identify.grid import FELT, LEANING, ROTOR_NOISE, FlightGrid
 
 WIDTH_S = 0.4
@@ -67,7 +67,7 @@ def fit_force(
         flights: on their grids, with positions; all with an attitude, or none.
         driven: the start.
         unknowns: from `unknowns_of_force`.
-        fixed: numbers that are not looked for, `lag` and `late` among them.
+        fixed: numbers that are not fitted, `lag` and `late` among them.
     """
     return fit(together([_force(flight, driven) for flight in flights], unknowns, fixed), unknowns)
 
@@ -124,14 +124,14 @@ motors slowly (trim, flapping at speed) turns nothing. Times this they are accel
 STILL = np.array([False, False, False])
 DILUTED = ("inertia_x", "inertia_y", "yaw")
 """What noise of the rotor speeds makes larger or smaller, by axis."""
-GIVEN = ("thrust", "curve", "battery")
+KNOWN = ("thrust", "curve", "battery")
 """The force's numbers that the torque is built on."""
 
 
 def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
     """Return the numbers of what lies between a command and the rotors' thrust.
 
-    Slow flights tell how late it is in all, `late`, and not how much of that is the lag.
+    Slow flights identify how late it is in all, `late`, and not how much of that is the lag.
     """
     late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
     return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
@@ -140,8 +140,8 @@ def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
 def unknowns_of_torque(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
     """Return the numbers of the torque; all but lag and delay are logarithms of ratios.
 
-    That of the inertia about z is over the other two's mean, which it follows where nothing tells
-    it; and without known torques `yaw` is of what turns the body about z, over that inertia.
+    That of the inertia about z is over the other two's mean, which it follows where it is not
+    identifiable. Without known torques `yaw` is of what turns the body about z, over that inertia.
     """
     lags = lag_and_delay(lag_s, delay_s)
     axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
@@ -159,7 +159,7 @@ def fit_torque(
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
     held: Sequence[str] = (),
-    doubted: Given | None = None,
+    known: Known | None = None,
 ) -> Fitted:
     """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
@@ -172,14 +172,14 @@ def fit_torque(
         flights: on their grids, with body rates.
         driven: the start.
         unknowns: from `unknowns_of_torque`.
-        fixed: numbers that are not looked for, `lag` and `late` among them.
-        held: numbers that are left as they are, in doubt.
-        doubted: numbers of the force among `fixed`, with their covariance.
+        fixed: numbers that are not fitted, `lag` and `late` among them.
+        held: numbers that are left as they are, with their uncertainty.
+        known: numbers of the force among `fixed`, with their covariance.
     """
-    given, steps = doubted or Given(), {"thrust": 1e-3}
+    known, steps = known or Known(), {"thrust": 1e-3}
     unknowns = [
         *unknowns,
-        *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in given.names),
+        *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in known.names),
     ]
     begun, held = tuple(unknowns), list(held)
     forms = [
@@ -188,9 +188,9 @@ def fit_torque(
     ]
     start = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
     credible = _credible(flights, forms, driven, start)
-    doubt: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(credible), strict=True))
+    unsure: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(credible), strict=True))
     unknowns = [
-        u._replace(floor=float(np.hypot(u.floor, Z95 * doubt.get(u.name, 0.0)))) for u in unknowns
+        u._replace(floor=float(np.hypot(u.floor, Z95 * unsure.get(u.name, 0.0)))) for u in unknowns
     ]
     parts = zip(flights, forms, strict=True)
     misses = together([_torque(*part, driven, credible) for part in parts], unknowns, fixed)
@@ -198,12 +198,12 @@ def fit_torque(
         best = _likeliest(unknowns, misses, forms, flights)
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
     while True:
-        found = fit(misses, unknowns, held, given)
+        found = fit(misses, unknowns, held, known)
         value = dict(zip((u.name for u in unknowns), found.value, strict=True))
         beyond = [
             u.name
             for u in unknowns
-            if u.name in doubt and found.has(u.name) and not u.low < value[u.name] < u.high
+            if u.name in unsure and found.has(u.name) and not u.low < value[u.name] < u.high
         ]
         if not beyond:
             return replace(found, unknowns=begun)

@@ -50,7 +50,7 @@ def with_battery(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
     """Return those whose motors' thrust is known as well as it can be.
 
     What motors give hangs on the battery: where some flights have its voltage, the others only blur
-    what these tell.
+    what these show.
     """
     have = [flight for flight in flights if flight.has("voltage")]
     return have if have and drive == "pwm" else list(flights)
@@ -123,7 +123,7 @@ class Driven:
         return MotorMap(thrust, self.motors.voltage, float(battery))
 
     def thrust_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return that of the rotors, which their measured speeds tell alone."""
+        """Return that of the rotors, which their measured speeds identify alone."""
         scale = float(np.exp(numbers.get("thrust", 0.0))) if self.drive == "rotors" else 1.0
         return self.start.rotors.thrust_coefficient * scale
 
@@ -166,13 +166,13 @@ class Driven:
         if self.drive == "pwm":
             vehicle = replace(self.start, motors=self.motor_map(numbers))
             volts = np.maximum(known["voltage"], 0.1) if flight.has("voltage") else None
-            # What is asked for is that of the voltage that is usual, where none was measured.
+            # The usual voltage counts where none was measured.
             volts = np.full(len(flight.time_s), self.volts) if volts is None else volts
-            asked = motor_speed(vehicle, known["pwm"], volts)
+            wanted = motor_speed(vehicle, known["pwm"], volts)
         else:
             each = 0.25 * self.start.mass * np.maximum(known["thrust_cmd"], 0.0)
-            asked = np.sqrt(each / self.start.rotors.thrust_coefficient)[:, None] * np.ones(4)
-        return behind(asked, numbers)
+            wanted = np.sqrt(each / self.start.rotors.thrust_coefficient)[:, None] * np.ones(4)
+        return behind(wanted, numbers)
 
     def acting(
         self,
@@ -183,7 +183,7 @@ class Driven:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return dv/dt in the world and dw/dt in body axes (G, 3) on the `rows` of `flight`.
 
-        As of rotors that stand still where nothing says how they turned, or not `powered`.
+        Rotors stand still where their speed is unknown, or not `powered`.
         """
         plant = self.plant(numbers)
         if powered:
@@ -248,7 +248,7 @@ def filled(values: np.ndarray) -> np.ndarray:
 
 
 KNOWN_MOTORS = ("rotors", "pwm")
-"""Drives under which the rotors' thrusts are known beside the commands."""
+"""Drives under which the rotors' thrusts are known, and not only commanded."""
 OWN = ("motor_lag", "inertia_scale", "rate_gain")
 """Effects that scale or replace a number which is fitted."""
 FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
@@ -258,7 +258,7 @@ FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
 def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     """Return `vehicle` with the numbers that its effects scale or replace, without these.
 
-    It flies as before. Left beside the number that flights tell they would count twice.
+    It flies as before. Next to the identified number they would count twice.
 
     Args:
         vehicle: as it was given.

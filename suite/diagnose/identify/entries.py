@@ -18,7 +18,7 @@ from suite.diagnose.identify.numbers import DELAY, Derived, Number, number
 
 
 def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the inertia (3,); what yaws is scaled as the others where nothing tells it."""
+    """Return the inertia (3,); about z it is scaled as the others where it is not identified."""
     found = np.asarray(vehicle.inertia) * np.exp(inertia_ratio(numbers))
     # No body has more about one axis than about the other two together.
     return np.minimum(found, found.sum() - found)
@@ -37,7 +37,7 @@ class _Entries(list[Number]):
 
 
 def of_force(driven: Driven, fitted: Fitted) -> list[Number]:
-    """Return the entries that the force tells: motors or rotors, and drag."""
+    """Return the entries that the force identifies: motors or rotors, and drag."""
     entries = _Entries(fitted)
     if "thrust" in entries.names and driven.drive == "pwm":
         thrust = lambda n: np.array(driven.motor_map(n).thrust)  # noqa: E731
@@ -57,7 +57,7 @@ def of_force(driven: Driven, fitted: Fitted) -> list[Number]:
 
 
 def of_torque(driven: Driven, fitted: Fitted, scale: float, lag_s: float) -> list[Number]:
-    """Return the entries that the torque tells: inertia, yaw torque, lag and delay.
+    """Return the entries that the torque identifies: inertia, yaw torque, lag and delay.
 
     Args:
         driven: the start.
@@ -70,8 +70,8 @@ def of_torque(driven: Driven, fitted: Fitted, scale: float, lag_s: float) -> lis
     if "inertia_x" in entries.names:
         entries.add("inertia", "kg m^2", lambda n: inertia_of(vehicle, n), *inertias)
     if "yaw" in entries.names:
-        # Torque per inertia is what is seen. The inertia about z is as far as it was told; what
-        # stays is given, and no doubt of this number.
+        # Torque per inertia is what is seen. The inertia about z counts as far as it is
+        # identified; the rest of it is held fixed.
         turns = [name for name in inertias if fitted.has(name)]
 
         def twist(n: Mapping[str, float]) -> np.ndarray:
@@ -88,7 +88,7 @@ def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
     if "lag" in entries.names:
         entries.add("rotors.time_constant", "s", lambda n: np.array([n["lag"]]), "lag")
     if "late" in entries.names:
-        # With a lag in doubt it is as much in doubt, however well their sum is told: the file keeps
+        # It is as uncertain as the lag, however well their sum is identified: the file keeps
         # the sum.
         room = fitted.unknowns[fitted.index("late")].room
         late = lambda n: np.array([n["late"] - n.get("lag", lag_s)])  # noqa: E731
@@ -101,7 +101,7 @@ def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
 
 
 def enter(vehicle: Vehicle, entries: Iterable[Number]) -> tuple[Vehicle, list[Number], list[str]]:
-    """Return the vehicle with what was told, the entries as it has them, and how these differ.
+    """Return the vehicle with what was identified, its entries, and how they differ.
 
     A delay that flights deny is no entry of the vehicle.
     """
@@ -118,15 +118,15 @@ def enter(vehicle: Vehicle, entries: Iterable[Number]) -> tuple[Vehicle, list[Nu
                 continue
             part = f"[{k}]" if len(entry.value) > 1 else ""
             then = "the file has none" if gone else f"the file has {now:.4g}, the nearest it may"
-            said = f"{was:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
-            notes.append(f"{entry.key}{part}: these flights say {said}; {then}")
+            found = f"{was:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
+            notes.append(f"{entry.key}{part}: these flights give {found}; {then}")
     return vehicle, numbers, notes
 
 
 def allowed(vehicle: Vehicle, entry: Number) -> Number:
     """Return an entry with the values nearest to its own that a file may hold.
 
-    Its intervals stay what the flights say.
+    Its intervals stay those of the flights.
     """
     table, _, _ = entry.key.rpartition(".")
     if not table.startswith("effects."):
@@ -137,7 +137,7 @@ def allowed(vehicle: Vehicle, entry: Number) -> Number:
 
 
 def put(vehicle: Vehicle, entry: Number) -> Vehicle:
-    """Return the vehicle with what was told of an `allowed` entry; the rest of it stays."""
+    """Return the vehicle with what was identified of an `allowed` entry; the rest of it stays."""
     if not entry.is_entered:
         return vehicle
     changed = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]

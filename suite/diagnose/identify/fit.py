@@ -1,8 +1,8 @@
-"""Least squares on misses of flights, with what flights cannot tell left as it was.
+"""Least squares on misses of flights, with what is not identifiable left as it was.
 
 Misses are evidence: Gauss and Newton with Huber's weights, intervals by stretches and flights.
-What another fit gave is known no better than that fit says (Murphy and Topel 1985). A number that
-the flights cannot tell is left as it was, the worst first, and the others are fitted again.
+What another fit has estimated keeps that fit's covariance (Murphy and Topel 1985). A number that
+is not identifiable is left as it was, the worst first, and the others are fitted again.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class NothingWhole(ValueError):
 
 
 class Unknown(NamedTuple):
-    """A number that is looked for."""
+    """A number that is fitted."""
 
     name: str
     start: float
     low: float
     high: float
     room: float
-    """It is told where its 95 % interval reaches less far than this to either side."""
+    """It is identified where its 95 % interval reaches less far than this to either side."""
     step: float
     """Of the finite differences."""
     floor: float = 0.0
@@ -65,8 +65,8 @@ Misses = Callable[[np.ndarray], Sequence[Rows]]
 """From all numbers to the residuals of every flight."""
 
 
-class Given(NamedTuple):
-    """Numbers that another fit has told; they are not looked for, and doubted as it doubts them."""
+class Known(NamedTuple):
+    """Numbers that another fit has identified, with that fit's covariance; they are held fixed."""
 
     names: tuple[str, ...] = ()
     covariance: np.ndarray = np.zeros((0, 0))
@@ -83,24 +83,24 @@ class Fitted:
     half_width: np.ndarray
     """(P,) of the 95 % interval; NaN where the number was left as it was."""
     covariance: np.ndarray
-    """(P, P) behind the intervals; of what was left, the doubt about it."""
-    untold: tuple[str, ...] = ()
-    """Left as they were: these flights cannot tell them."""
+    """(P, P) behind the intervals; of what was left, its prior variance."""
+    not_identified: tuple[str, ...] = ()
+    """Left as they were: not identifiable from these flights."""
     left: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(C,) root mean square of what is left in each channel."""
-    given: tuple[str, ...] = ()
-    """Told by another fit."""
+    known: tuple[str, ...] = ()
+    """Identified by another fit."""
 
     def has(self, name: str) -> bool:
-        """Return whether this fit told the number."""
-        looked_for = any(u.name == name for u in self.unknowns)
-        return looked_for and name not in (*self.untold, *self.given)
+        """Return whether this fit identified the number."""
+        fitted = any(u.name == name for u in self.unknowns)
+        return fitted and name not in (*self.not_identified, *self.known)
 
-    def give(self, *names: str) -> Given:
+    def as_known(self, *names: str) -> Known:
         """Return those of `names` that are there, for a fit that is built on them."""
         there = [k for k, unknown in enumerate(self.unknowns) if unknown.name in names]
-        told = tuple(self.unknowns[k].name for k in there)
-        return Given(told, self.covariance[np.ix_(there, there)])
+        found = tuple(self.unknowns[k].name for k in there)
+        return Known(found, self.covariance[np.ix_(there, there)])
 
     def index(self, name: str) -> int:
         """Return where the number is."""
@@ -109,7 +109,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class MissEvidence:
-    """Misses of flights as evidence on the numbers that are looked for."""
+    """Misses of flights as evidence on the numbers that are fitted."""
 
     misses: Misses
     unknowns: tuple[Unknown, ...]
@@ -165,7 +165,7 @@ def fit(
     misses: Misses,
     unknowns: Sequence[Unknown],
     held: Sequence[str] = (),
-    given: Given | None = None,
+    known: Known | None = None,
 ) -> Fitted:
     """Return the numbers that make `misses` least, with intervals.
 
@@ -175,34 +175,36 @@ def fit(
         misses: the residuals.
         unknowns: the numbers.
         held: those that are left as they are from the first.
-        given: those of `unknowns` that another fit has told.
+        known: those of `unknowns` that another fit has identified.
 
     Raises:
         NothingWhole: where there is not one window.
     """
-    untold, given = list(held), given or Given()
+    not_identified, known = list(held), known or Known()
     evidence = MissEvidence(misses, tuple(unknowns))
     at = evidence.at(np.array([unknown.start for unknown in unknowns]))
     if not sum(len(rows.value) for rows in misses(at.theta)):
         raise NothingWhole("no stretch of these flights is whole enough to compare anything in")
     while True:
-        left = (*untold, *given.names)
+        left = (*not_identified, *known.names)
         free = [k for k, unknown in enumerate(unknowns) if unknown.name not in left]
         for _ in range(ROUNDS if free else 0):
             before, evidence = at, evidence.weighed(at)
             at, _ = fit_numbers(evidence, at, free, limits=LIMITS)
             if (at.theta == before.theta).all():
                 break
-        covariance, half = _errors(evidence.weighed(at), at, free, given)
+        covariance, half = _errors(evidence.weighed(at), at, free, known)
         ratio = [half[k] / unknowns[k].room for k in free]
         if not free or max(ratio) <= 1.0:
             break
         worst = free[int(np.argmax(ratio))]
-        untold.append(unknowns[worst].name)
+        not_identified.append(unknowns[worst].name)
         at.theta[worst] = unknowns[worst].start
     misfit = np.concatenate([_levelled(row) for row in misses(at.theta)])
     rms = np.sqrt(np.mean(misfit**2, axis=0))
-    return Fitted(evidence.unknowns, at.theta, half, covariance, tuple(untold), rms, given.names)
+    return Fitted(
+        evidence.unknowns, at.theta, half, covariance, tuple(not_identified), rms, known.names
+    )
 
 
 def _levelled(rows: Rows) -> np.ndarray:
@@ -218,32 +220,32 @@ def _freed(values: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndar
 
 
 def _errors(
-    evidence: MissEvidence, at: Estimate, told: Sequence[int], given: Given
+    evidence: MissEvidence, at: Estimate, free: Sequence[int], known: Known
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance (P, P) and the half-widths (P,) of what is `told`."""
+    """Return the covariance (P, P) and the half-widths (P,) of what is `free`."""
     unknowns = evidence.unknowns
     total, names = len(unknowns), [unknown.name for unknown in unknowns]
     half = np.full(total, np.nan)
-    if not told:
+    if not free:
         return np.diag([unknown.room**2 for unknown in unknowns]), half
-    taken = [names.index(name) for name in given.names]
-    free = [k for k in range(total) if k not in taken]
+    taken = [names.index(name) for name in known.names]
+    others = [k for k in range(total) if k not in taken]
     equations = evidence.linearise(at).equations()
-    doubt = np.array([0.0 if k in told else 1.0 / unknowns[k].room ** 2 for k in free])
-    found = intervals95(equations.take(free), DIFFER_P, True, BLIND, doubt)
-    most = np.array([np.inf if k in told else Z95 * unknowns[k].room for k in free])
+    prior = np.array([0.0 if k in free else 1.0 / unknowns[k].room ** 2 for k in others])
+    found = intervals95(equations.take(others), DIFFER_P, True, BLIND, prior)
+    most = np.array([np.inf if k in free else Z95 * unknowns[k].room for k in others])
     widest = np.minimum(found.half_width, most)
     # The method's own errors are no part of what the noise makes alike in two numbers.
-    floor = np.array([unknowns[k].floor for k in free])
+    floor = np.array([unknowns[k].floor for k in others])
     floor = np.minimum(floor, np.sqrt(most**2 - widest**2))
     sd = np.sqrt(np.diag(found.by_stretch))
     alike = found.by_stretch / np.maximum(np.outer(sd, sd), 1e-30)
     np.fill_diagonal(alike, 1.0)
-    # What was given moves the numbers by so much.
-    follow = found.inverse @ equations.sums()[0][np.ix_(free, taken)]
+    # What is known moves the numbers by so much.
+    follow = found.inverse @ equations.sums()[0][np.ix_(others, taken)]
     noise = (alike * np.outer(widest, widest) + np.diag(floor**2)) / Z95**2
     covariance = np.zeros((total, total))
-    covariance[np.ix_(free, free)] = noise + follow @ given.covariance @ follow.T
-    covariance[np.ix_(taken, taken)] = given.covariance
-    half[list(told)] = Z95 * np.sqrt(np.diag(covariance)[list(told)])
+    covariance[np.ix_(others, others)] = noise + follow @ known.covariance @ follow.T
+    covariance[np.ix_(taken, taken)] = known.covariance
+    half[list(free)] = Z95 * np.sqrt(np.diag(covariance)[list(free)])
     return covariance, half

@@ -1,8 +1,8 @@
 """What moving air turns: the coefficient of blade flapping, by the torque view.
 
-Inertia and lags are told by fast changes alone (`torque.py`), since motors answer what disturbs the
-body slowly. What they answer is what flapping is told by, once all else is known; what is in doubt
-of that widens its interval.
+Fast changes alone identify inertia and lags (`body.py`), since motors answer what disturbs the body
+slowly. That answer identifies flapping, once all else is known; the uncertainty of that widens its
+interval.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.entries import inertia_of, of_force, put
 from suite.diagnose.identify.fit import Z95, Fitted
-from suite.diagnose.identify.numbers import Number, told
+from suite.diagnose.identify.numbers import Number, values_of
 from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.search.search import search
 
@@ -31,12 +31,12 @@ UNIT = "N s^2/rad"
 
 
 def flapping_of(
-    logs: Sequence[FlightLog], vehicle: Vehicle, doubted: Sequence[Vehicle] = ()
+    logs: Sequence[FlightLog], vehicle: Vehicle, others: Sequence[Vehicle] = ()
 ) -> Number | None:
-    """Return the coefficient that `logs` ask for beside all else in `vehicle`, None for no other.
+    """Return the coefficient that `logs` show next to all else in `vehicle`, None for no other.
 
-    Whole logs count. It has to pass what a name of a diagnosis has to. `doubted` are vehicles one
-    standard deviation off, each in its own way: by what they ask for the interval is wider.
+    Whole logs count. It has to pass what a name of a diagnosis has to. `others` are vehicles one
+    standard deviation off, each in its own way: by what they give the interval is wider.
     """
     whole = [log for log in logs if not log.partial]
     try:
@@ -55,7 +55,7 @@ def flapping_of(
         return None
     value = float(found.estimate.theta[found.indices[0]])
     half = float(found.half_widths()[0])
-    tasks = (_task(ready(whole, other), other, voltage) for other in doubted)
+    tasks = (_task(ready(whole, other), other, voltage) for other in others)
     moved = [_step(other, found) for other in tasks]
     half = float(np.hypot(half, Z95 * np.linalg.norm(moved)))
     return Number(f"effects.{EFFECT}.{KEY}", UNIT, [value], [(value - half, value + half)])
@@ -81,21 +81,21 @@ MOTORS = ("thrust", "curve", "battery")
 INERTIA = ("inertia_x", "inertia_y")
 
 
-def one_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
+def one_sigma_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
     """Return the fit with the numbers `names` one standard deviation off, each way independent."""
-    given = fitted.give(*names)
-    if not given.names:
+    known = fitted.as_known(*names)
+    if not known.names:
         return []
-    variance, ways = np.linalg.eigh(given.covariance)
+    variance, ways = np.linalg.eigh(known.covariance)
     found = []
     for size, way in zip(np.sqrt(np.maximum(variance, 0.0)), ways.T, strict=True):
         value = fitted.value.copy()
-        value[[fitted.index(name) for name in given.names]] += size * way
+        value[[fitted.index(name) for name in known.names]] += size * way
         found.append(replace(fitted, value=value))
     return found
 
 
-def doubted(vehicle: Vehicle, driven: Driven, force: Fitted, torque: Fitted) -> list[Vehicle]:
+def perturbed(vehicle: Vehicle, driven: Driven, force: Fitted, torque: Fitted) -> list[Vehicle]:
     """Return `vehicle` with its motors or its inertia off, by what force and torque leave open.
 
     Args:
@@ -105,12 +105,14 @@ def doubted(vehicle: Vehicle, driven: Driven, force: Fitted, torque: Fitted) -> 
         torque: that of the torque.
     """
     found = []
-    for fit in one_off(force, MOTORS):
+    for fit in one_sigma_off(force, MOTORS):
         other = vehicle
         for entry in of_force(driven, fit):
             if not entry.key.startswith("effects."):
                 other = put(other, entry)
         found.append(other)
-    for fit in one_off(torque, INERTIA):
-        found.append(replace(vehicle, inertia=tuple(inertia_of(driven.start, told(fit)).tolist())))
+    for fit in one_sigma_off(torque, INERTIA):
+        found.append(
+            replace(vehicle, inertia=tuple(inertia_of(driven.start, values_of(fit)).tolist()))
+        )
     return found

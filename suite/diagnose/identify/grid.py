@@ -48,7 +48,7 @@ class FlightGrid(NamedTuple):
     known: dict[str, np.ndarray]
     """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, and what drives."""
     in_turn: tuple[str, ...] = ()
-    """Those of which a row has some columns only, as of motors that are asked one after another."""
+    """Those of which a row has some columns only, as of motors polled one after another."""
 
     def has(self, *names: str) -> bool:
         """Return whether these signals are there."""
@@ -57,7 +57,7 @@ class FlightGrid(NamedTuple):
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return bumps of `width_s` in which all of `needs` is known; `slope` as `weak_form` has.
 
-        They begin a while after the first row: what was asked of rotors before it still acts then.
+        They begin a while after the first row: what was commanded before it still acts then.
         """
         good = self.time_s >= MEMORY_S
         for name in needs:
@@ -102,14 +102,14 @@ def grid_of(log: FlightLog) -> FlightGrid:
         "rate_b": log.rate_b,
         "rotor_speed": log.rotor_speed,
     }
-    asked = {
+    commanded = {
         "pwm": log.pwm,
         "thrust_cmd": log.thrust_cmd,
         "rate_cmd_b": log.rate_cmd_b,
         "torque_cmd_b": log.torque_cmd_b,
         "rotor_speed_cmd": log.rotor_speed_cmd,
     }
-    there = {name: v for name, v in (measured | asked).items() if v is not None and _enough(v)}
+    there = {name: v for name, v in (measured | commanded).items() if v is not None and _enough(v)}
     in_turn = tuple(name for name, values in there.items() if _whole_rows(values) < 2)
     for name, values in there.items():
         known[name] = (joined if name in measured else _held)(time_s, values, grid)

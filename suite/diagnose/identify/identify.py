@@ -1,4 +1,4 @@
-"""From flights and a vehicle file to the numbers that the flights tell.
+"""From flights and a vehicle file to the numbers that the flights identify.
 
 Force and torque are fitted in turn, each with what the other has found, since the rotors' lag acts
 in both. Mass is never fitted: scaling it together with inertia and thrust changes no flight.
@@ -15,7 +15,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.body import (
-    GIVEN,
+    KNOWN,
     fit_force,
     fit_torque,
     lag_and_delay,
@@ -39,7 +39,7 @@ from suite.diagnose.identify.entries import (
     of_torque,
 )
 from suite.diagnose.identify.fit import Fitted, NothingWhole, Unknown
-from suite.diagnose.identify.flapping import doubted, flapping_of
+from suite.diagnose.identify.flapping import flapping_of, perturbed
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.loop import (
     air_torques,
@@ -48,7 +48,13 @@ from suite.diagnose.identify.loop import (
     fit_rotor_lag,
     gains,
 )
-from suite.diagnose.identify.numbers import Number, beside, told, unasked, untold
+from suite.diagnose.identify.numbers import (
+    Number,
+    not_attempted,
+    not_identified,
+    notes_on,
+    values_of,
+)
 
 ROUNDS = 2
 """Force and torque in turn."""
@@ -58,14 +64,14 @@ NO_LAG_S = 0.004
 
 @dataclass(frozen=True)
 class Identified:
-    """What flights say of a vehicle."""
+    """A vehicle, as far as flights identify it."""
 
     vehicle: Vehicle
-    """The start with the numbers that were told."""
+    """The start with the numbers that were identified."""
     numbers: tuple[Number, ...]
-    """All that were looked for."""
-    untold: tuple[str, ...]
-    """What these flights cannot tell, in words; it was left as it was."""
+    """All that were fitted."""
+    not_identified: tuple[str, ...]
+    """What these flights do not identify, in words; it was left as it was."""
     drive: str
     """What drove the flights: pwm, rotors, torques, rates or thrust."""
     left: dict[str, list[float]]
@@ -77,11 +83,11 @@ class Identified:
 
 
 def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
-    """Return the numbers of `vehicle` that `logs` tell.
+    """Return the numbers of `vehicle` that `logs` identify.
 
     Args:
-        logs: flights of one vehicle; partial ones tell what they have the columns for.
-        vehicle: to start from; what cannot be told stays as it is there.
+        logs: flights of one vehicle; partial ones identify what they have the columns for.
+        vehicle: to start from; what is not identifiable stays as it is there.
         leave: what not to fit: any of drag, motors, inertia, lag, loop.
 
     Raises:
@@ -102,18 +108,18 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         names = ", ".join(flight.name for flight in flights)
         if not leave:
             raise ValueError(
-                f"{names}: no stretch of a second with positions or body rates beside what drove "
-                "it; import them again and read what it says"
+                f"{names}: no stretch of a second with positions or body rates and what drove "
+                "it; import them again and read its report"
             )
         lacking = "; ".join(state.lacking()) or "no stretch of a second with what it needs"
-        raise ValueError(f"{names}: nothing is told beside {', '.join(leave)}: {lacking}")
+        raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {lacking}")
     found = state.done(given)
     if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*state.fitted}:
         return found
     force_fit, torque_fit = state.fitted["force"], state.fitted["torque"]
-    others = doubted(found.vehicle, state.driven, force_fit, torque_fit)
+    others = perturbed(found.vehicle, state.driven, force_fit, torque_fit)
     entry = flapping_of(
-        [log for log in logs if log.name not in state.unheard], found.vehicle, others
+        [log for log in logs if log.name not in state.without_voltage], found.vehicle, others
     )
     if entry is None:
         return found
@@ -142,19 +148,19 @@ class _Start:
         self.fitted: dict[str, Fitted] = {}
         self.broken: set[str] = set()
         """Fits for which no stretch was whole."""
-        self.unheard: set[str] = set()
+        self.without_voltage: set[str] = set()
         """Names of flights without a voltage, where others have one."""
         self.begun_scale = float(np.log(_value(vehicle, "thrust_scale", "scale", 1.0)))
         self.scale = self.begun_scale
 
     def force(self) -> None:
         flights = [f for f in self.flights if f.has("vel_w") or f.has("pos_w")]
-        # Where no flight has an attitude, their paths say how they leaned.
+        # Where no flight has an attitude, their paths show how they leaned.
         leaning = not any(flight.has("rot_w") for flight in flights)
         flights = [flight for flight in flights if leaning or flight.has("rot_w")]
         if not flights:
             return
-        flights = self.heard(flights)
+        flights = self.with_known_thrust(flights)
         voltage = all(flight.has("voltage") for flight in flights)
         unknowns = unknowns_of_force(self.driven, voltage, leaning, self.begun_scale)
         left = {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")}
@@ -165,13 +171,13 @@ class _Start:
         found = self.tried("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
         if found is not None:
             self.fitted["force"] = found
-            self.scale = told(found).get("thrust", self.begun_scale)
+            self.scale = values_of(found).get("thrust", self.begun_scale)
 
-    def heard(self, flights: list[FlightGrid]) -> list[FlightGrid]:
-        """Return those that tell what motors give, and remember who the others are."""
+    def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
+        """Return those with a known thrust of the motors, and remember who the others are."""
         kept = with_battery(flights, self.drive)
         if len(kept) < len(flights):
-            self.unheard |= {flight.name for flight in flights if not flight.has("voltage")}
+            self.without_voltage |= {flight.name for flight in flights if not flight.has("voltage")}
         return kept
 
     def tried(self, name: str, fitted: Callable[[], Fitted]) -> Fitted | None:
@@ -191,19 +197,19 @@ class _Start:
         unknowns = _without(unknowns, left, self.leave)
         if not unknowns:
             return
-        flights = self.heard(flights)
-        given, doubted = self.lags(), None
+        flights = self.with_known_thrust(flights)
+        fixed, known = self.lags(), None
         if "force" in self.fitted and self.drive in KNOWN_MOTORS:
-            given |= told(self.fitted["force"])
-            doubted = self.fitted["force"].give(*GIVEN)
+            fixed |= values_of(self.fitted["force"])
+            known = self.fitted["force"].as_known(*KNOWN)
 
         def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
-            return fit_torque(flights, self.driven, unknowns, given, held, doubted)
+            return fit_torque(flights, self.driven, unknowns, fixed, held, known)
 
         found = self.tried("torque", lambda: fitted(unknowns))
         if found is None:
             return
-        if found.has("lag") and told(found)["lag"] < NO_LAG_S < self.begun_s:
+        if found.has("lag") and values_of(found)["lag"] < NO_LAG_S < self.begun_s:
             # No rotor follows at once: what blurs the commands in the log hides its lag.
             self.lag_s = self.begun_s
             unknowns = [u._replace(start=self.begun_s) if u.name == "lag" else u for u in unknowns]
@@ -214,7 +220,7 @@ class _Start:
         """Fit the nominal rate loop, and measured rotor speeds behind commanded ones."""
         both = lag_and_delay(self.lag_s, self.delay_s)
         rotors = ("rotor_speed", "rotor_speed_cmd")
-        # Speeds that were asked for in turn are blurred, which would be taken for a lag.
+        # Speeds that were polled in turn are blurred, which would be taken for a lag.
         commanded = [f for f in self.flights if f.has(*rotors) and not {*rotors} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
             found = self.tried("rotors", lambda: fit_rotor_lag(commanded, both))
@@ -223,15 +229,15 @@ class _Start:
         flown = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flown or self.start.controller.kind != "p" or "loop" in self.leave:
             return
-        # Lag and delay of known motors are told better by the torque.
-        known = "rotors" in self.fitted or self.drive == "pwm" or "lag" in self.leave
-        teller = self.fitted.get("rotors", self.fitted.get("torque"))
-        doubted = teller.give("late", "lag") if known and teller is not None else None
-        wanted = [u for u in both if not known or (doubted and u.name in doubted.names)]
+        # The torque identifies lag and delay of known motors better.
+        apart = "rotors" in self.fitted or self.drive == "pwm" or "lag" in self.leave
+        source = self.fitted.get("rotors", self.fitted.get("torque"))
+        known = source.as_known("late", "lag") if apart and source is not None else None
+        wanted = [u for u in both if not apart or (known and u.name in known.names)]
         besides = [*couplings(self.start), *air_torques(flown)]
         unknowns = [*gains(), *besides, *wanted]
         found = self.tried(
-            "loop", lambda: fit_loop(flown, self.start, unknowns, self.lags(), doubted)
+            "loop", lambda: fit_loop(flown, self.start, unknowns, self.lags(), known)
         )
         if found is not None:
             self.keep("loop", found)
@@ -241,16 +247,18 @@ class _Start:
 
     def keep(self, name: str, found: Fitted) -> None:
         self.fitted[name] = found
-        self.lag_s = told(found).get("lag", self.lag_s)
-        self.delay_s = told(found).get("late", self.lag_s + self.delay_s) - self.lag_s
+        self.lag_s = values_of(found).get("lag", self.lag_s)
+        self.delay_s = values_of(found).get("late", self.lag_s + self.delay_s) - self.lag_s
 
     def inertia(self) -> tuple[float, float, float]:
-        numbers = told(self.fitted["torque"]) if "torque" in self.fitted else {}
+        numbers = values_of(self.fitted["torque"]) if "torque" in self.fitted else {}
         x, y, z = inertia_of(self.start, numbers)
         return float(x), float(y), float(z)
 
     def lacking(self) -> list[str]:
-        return unasked(self.flights, self.start, self.drive, self.fitted, self.leave, self.broken)
+        return not_attempted(
+            self.flights, self.start, self.drive, self.fitted, self.leave, self.broken
+        )
 
     def done(self, given: Vehicle) -> Identified:
         """Return what was found, from the vehicle that was `given`."""
@@ -264,8 +272,8 @@ class _Start:
                 entries += of_loop(self.start, self.fitted[name], self.lag_s)
         kept: dict[str, Number] = {}
         for entry in entries:
-            # What a later fit tells is told better: it sees the rotors themselves.
-            if entry.key not in kept or entry.is_told:
+            # A later fit is better: it sees the rotors themselves.
+            if entry.key not in kept or entry.is_identified:
                 kept[entry.key] = entry
         vehicle, numbers, notes = enter(self.start, kept.values())
         if "torque" in self.fitted and self.drive != "rates":
@@ -280,11 +288,11 @@ class _Start:
         return Identified(
             vehicle,
             tuple(numbers),
-            (*untold(self.fitted, kept), *self.lacking()),
+            (*not_identified(self.fitted, kept), *self.lacking()),
             self.drive,
             left,
             tuple(flight.name for flight in self.flights),
-            (*beside(self.flights, self.unheard, given, vehicle), *notes),
+            (*notes_on(self.flights, self.without_voltage, given, vehicle), *notes),
         )
 
 

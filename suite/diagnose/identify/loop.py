@@ -1,7 +1,7 @@
 """The nominal rate loop under its commands, and rotors behind theirs.
 
 The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
-4.3): measured rates in the loop's own equation would make the gyro's noise look like slower gains.
+4.3): measured rates in the loop's own equation would turn the gyro's noise into slower gains.
 Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`, where `e` is what is
 missed of `w x J w`, since the controller makes up for it by rotors that lag, and what moving air
 turns besides. It is that of the rates without it (one step of Picard's iteration); rotor speeds are
@@ -19,7 +19,7 @@ from scipy.signal import cont2discrete, lfilter, lfilter_zi
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.identify.body import Misses, block_of, together
 from suite.diagnose.identify.drive import behind, delayed, filled, lagged
-from suite.diagnose.identify.fit import Fitted, Given, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Fitted, Known, Rows, Unknown, fit
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
 
 LOOP_WIDTH_S = 0.08
@@ -57,16 +57,16 @@ def fit_loop(
     vehicle: Vehicle,
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
-    doubted: Given | None = None,
+    known: Known | None = None,
 ) -> Fitted:
     """Return gains, lag and delay; a constant rate of each flight is free (bias, trim).
 
     Args:
         flights: with rates and commanded rates.
-        vehicle: gains to start from, and how often the loop looks.
+        vehicle: gains to start from, and the loop's frequency.
         unknowns: `gains`, `couplings` and `body.lag_and_delay`, or some of them.
         fixed: the others.
-        doubted: those of `unknowns` that another fit has told.
+        known: those of `unknowns` that another fit has identified.
     """
 
     def misses(flight: FlightGrid) -> Misses:
@@ -75,7 +75,7 @@ def fit_loop(
         return lambda n: Rows(rates - form.mean @ followed(flight, vehicle, n), block, FREE)
 
     every = together([misses(flight) for flight in flights], unknowns, fixed)
-    return fit(every, unknowns, given=doubted)
+    return fit(every, unknowns, known=known)
 
 
 SPEED_WIDTH_S = 0.16
@@ -88,19 +88,19 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
         form = flight.form(SPEED_WIDTH_S, ("rotor_speed", "rotor_speed_cmd"))
         mean, level = form.mean, np.ones(4, dtype=bool)
         measured, block = mean @ np.nan_to_num(flight.known["rotor_speed"]), block_of(form)
-        asked = flight.known["rotor_speed_cmd"]
-        return lambda n: Rows(measured - mean @ np.nan_to_num(behind(asked, n)), block, level)
+        wanted = flight.known["rotor_speed_cmd"]
+        return lambda n: Rows(measured - mean @ np.nan_to_num(behind(wanted, n)), block, level)
 
     return fit(together([misses(flight) for flight in flights], unknowns, {}), unknowns)
 
 
-def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) -> np.ndarray:
+def followed(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     """Return the rates (G, 3) of the loop under its commands alone [rad/s]."""
-    # The loop looks at rates that are half a period old on average: exp(-half s), to second order.
+    # The loop's rates are half a period old on average: exp(-half s), to second order.
     half = 0.5 / vehicle.controller.frequency
-    lag = max(told["lag"], 1e-4)
-    wanted = filled(delayed(flight.known["rate_cmd_b"], told["late"] - told["lag"]))
-    ratio = np.exp([told.get(f"gain_{axis}", 0.0) for axis in "xyz"])
+    lag = max(numbers["lag"], 1e-4)
+    wanted = filled(delayed(flight.known["rate_cmd_b"], numbers["late"] - numbers["lag"]))
+    ratio = np.exp([numbers.get(f"gain_{axis}", 0.0) for axis in "xyz"])
     gains = np.asarray(vehicle.controller.rate_gain) * ratio
 
     def answer(pushes: np.ndarray, tops: Sequence[list[float]]) -> np.ndarray:
@@ -116,10 +116,10 @@ def followed(flight: FlightGrid, vehicle: Vehicle, told: Mapping[str, float]) ->
     linear = answer(wanted, [[gain] for gain in gains])
     # The controller makes up for `w x J w` by rotors that lag.
     products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
-    coupled = products * [told[f"coupling_{axis}"] for axis in "xyz"]
-    push = lagged(coupled, told["lag"]) - coupled
-    if "air_x" in told:
+    coupled = products * [numbers[f"coupling_{axis}"] for axis in "xyz"]
+    push = lagged(coupled, numbers["lag"]) - coupled
+    if "air_x" in numbers:
         vel_b = filled(np.einsum("gji,gj->gi", flight.known["rot_w"], flight.known["vel_w"]))
-        push[:, 0] += told["air_x"] * vel_b[:, 1]
-        push[:, 1] -= told["air_y"] * vel_b[:, 0]
+        push[:, 0] += numbers["air_x"] * vel_b[:, 1]
+        push[:, 1] -= numbers["air_y"] * vel_b[:, 0]
     return linear + answer(push, [[lag, 1.0]] * 3)

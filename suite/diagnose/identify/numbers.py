@@ -1,4 +1,4 @@
-"""Fitted numbers as those of a vehicle file, and what flights cannot tell of it, in words."""
+"""Fitted numbers as those of a vehicle file, and what flights do not identify, in words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DELAY = "effects.command_delay.delay"
 
 
 class Number(NamedTuple):
-    """One entry of a vehicle file, with what the flights say of it."""
+    """One entry of a vehicle file, with its intervals."""
 
     key: str
     """As in the file, with a dot between table and key."""
@@ -25,24 +25,24 @@ class Number(NamedTuple):
     ci95: list[tuple[float, float] | None]
     """Of each component; None where it was left as it was."""
     follows: bool = False
-    """Not told and in the file all the same: a sum was told, and this is what the rest leaves."""
+    """Not identified and in the file all the same: what an identified sum leaves."""
 
     @property
-    def is_told(self) -> bool:
-        """Whether flights tell any component."""
+    def is_identified(self) -> bool:
+        """Whether any component was identified."""
         return any(span is not None for span in self.ci95)
 
     @property
     def is_entered(self) -> bool:
         """Whether the file has it from these flights."""
-        return self.is_told or self.follows
+        return self.is_identified or self.follows
 
 
 Derived = Callable[[Mapping[str, float]], np.ndarray]
 """Values of a file's entry from the fit's numbers."""
 
 
-def told(fitted: Fitted) -> dict[str, float]:
+def values_of(fitted: Fitted) -> dict[str, float]:
     """Return all numbers of a fit by name."""
     return {u.name: float(v) for u, v in zip(fitted.unknowns, fitted.value, strict=True)}
 
@@ -62,15 +62,15 @@ def number(
         unit: of the values.
         fitted: the fit.
         derived: the values.
-        needs: for each value, the numbers of which one at least must have been told.
-        room: a value whose interval reaches further than this to either side is not told, and
-            follows what else its numbers tell.
+        needs: for each value, the numbers of which one at least must be identified.
+        room: a value whose interval reaches further than this to either side is not
+            identified, and follows from the others.
     """
     names = [unknown.name for unknown in fitted.unknowns]
-    value = np.atleast_1d(derived(told(fitted)))
+    value = np.atleast_1d(derived(values_of(fitted)))
     slopes = np.zeros((len(value), len(names)))
     for k, unknown in enumerate(fitted.unknowns):
-        up, down = told(fitted), told(fitted)
+        up, down = values_of(fitted), values_of(fitted)
         up[unknown.name] += unknown.step
         down[unknown.name] -= unknown.step
         change = np.atleast_1d(derived(up)) - np.atleast_1d(derived(down))
@@ -86,10 +86,10 @@ def number(
 
 
 def as_json(numbers: Sequence[Number]) -> dict[str, Any]:
-    """Return the told entries for JSON: a plain value where there is one component."""
+    """Return the identified entries for JSON: a plain value where there is one component."""
     found = {}
     for entry in numbers:
-        if not entry.is_told:
+        if not entry.is_identified:
             continue
         one = len(entry.value) == 1
         spans = [None if span is None else list(span) for span in entry.ci95]
@@ -112,30 +112,30 @@ WHY = {
     "inertia_y": "inertia about y: the body hardly pitches, or the rotors' lag may be another",
     "inertia_z": "inertia about z: the body hardly yaws, or not while it rolls and pitches",
     "yaw": "torque_coefficient: the body hardly yaws",
-    "lag": "time_constant of the rotors: nothing fast enough is asked of them",
-    "late": "command_delay: nothing fast enough is asked of the motors",
+    "lag": "time_constant of the rotors: nothing fast enough is commanded",
+    "late": "command_delay: nothing fast enough is commanded",
     "gain_x": "rate_gain about x: the body hardly rolls",
     "gain_y": "rate_gain about y: the body hardly pitches",
     "gain_z": "rate_gain about z: the body hardly yaws",
 }
-"""What was fitted and not told, and what the flights lack for it."""
+"""What was fitted and not identified, and what the flights lack for it."""
 STILL = "no body rates and no attitude in these logs"
 NEVER = "these logs have no stretch with both"
 """Where the columns are there, and holes in them leave no window whole."""
 
 
-def untold(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
-    """Return what no fit has told of what was looked for.
+def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
+    """Return what was fitted and no fit has identified.
 
     Args:
         fitted: what was fitted, by the fit's name.
         entries: of the vehicle file, by their keys.
     """
     seen = {u.name for found in fitted.values() for u in found.unknowns if found.has(u.name)}
-    names = dict.fromkeys(name for found in fitted.values() for name in found.untold)
+    names = dict.fromkeys(name for found in fitted.values() for name in found.not_identified)
     lines = [WHY[name] for name in names if name not in seen and name in WHY]
-    late = [told(found)["late"] for found in fitted.values() if found.has("late")]
-    if late and not entries[DELAY].is_told:
+    late = [values_of(found)["late"] for found in fitted.values() if found.has("late")]
+    if late and not entries[DELAY].is_identified:
         rest = max(entries[DELAY].value[0], 0.0)
         lines.append(
             f"command_delay: only that it and the rotors' lag make {late[-1]:.3g} s together; of "
@@ -144,7 +144,7 @@ def untold(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[
     return lines
 
 
-def unasked(
+def not_attempted(
     flights: Sequence[FlightGrid],
     vehicle: Vehicle,
     drive: str,
@@ -152,7 +152,7 @@ def unasked(
     leave: Sequence[str],
     broken: Collection[str] = (),
 ) -> list[str]:
-    """Return what was not even looked for, since the logs have no such columns, or none whole.
+    """Return what was not even fitted, since the logs have no such columns, or none whole.
 
     Args:
         flights: on their grids.
@@ -179,19 +179,19 @@ def unasked(
             lines.append(f"thrust and drag: {why}")
     elif "drag" not in leave and not any(u.name == "drag_x" for u in force.unknowns):
         lines.append(
-            "drag along body x and y: without an attitude a force across the thrust looks like "
+            "drag along body x and y: without an attitude a force across the thrust equals "
             "a body that leans"
         )
     if drive == "pwm" and "motors" not in leave and not anywhere("voltage"):
         motors = vehicle.motors
         by = "it is 0, so that none counts"
         if motors is not None and motors.voltage_exponent:
-            by = f"what they tell of the thrust is taken for that at {motors.voltage:.4g} V"
+            by = f"the thrust that they show is taken for that at {motors.voltage:.4g} V"
         lines.append(f"voltage_exponent: these logs have no voltage; {by}")
     if "torque" not in fitted and "inertia" not in leave:
         if drive in ("rates", "thrust"):
             lines.append(
-                "inertia and torque_coefficient: commanded rates and thrust say nothing of "
+                "inertia and torque_coefficient: commanded rates and thrust contain no "
                 "torques; that needs motor commands, rotor speeds or commanded torques"
             )
         else:
@@ -205,12 +205,12 @@ def unasked(
         elif drive == "rotors":
             why = (
                 "measured rotor speeds are past them; that needs commanded ones (motor_cmd_1 to "
-                "motor_cmd_4) beside, and all four in every row"
+                "motor_cmd_4) as well, and all four in every row"
             )
         elif {"torque", "loop"} & set(broken):
             why = f"{NEVER} body rates and what was commanded"
         elif drive in ("rates", "thrust") and anywhere("rate_b"):
-            why = "commanded thrust tells none; that needs the gains of a nominal rate loop beside"
+            why = "commanded thrust contains none; that needs the gains of a nominal rate loop"
         lines.append(f"time_constant and command_delay: {why}")
     if "loop" not in fitted and "loop" not in leave:
         why = "rate_gain: these logs have no commanded body rates"
@@ -222,15 +222,15 @@ def unasked(
     return lines
 
 
-def beside(
-    flights: Sequence[FlightGrid], unheard: Collection[str], begun: Vehicle, found: Vehicle
+def notes_on(
+    flights: Sequence[FlightGrid], without_voltage: Collection[str], begun: Vehicle, found: Vehicle
 ) -> list[str]:
     """Return what was done with flights and vehicle that the numbers do not show.
 
     Args:
         flights: on their grids.
-        unheard: names of flights without a voltage, where others have one.
-        begun: the vehicle that was given.
+        without_voltage: names of flights without a voltage, where others have one.
+        begun: the start.
         found: what became of it.
     """
     lines = [
@@ -240,10 +240,10 @@ def beside(
         for flight in flights
         if flight.in_turn
     ]
-    if unheard:
+    if without_voltage:
         lines.append(
-            f"no voltage in {', '.join(sorted(unheard))}: what hangs on the motors' thrust is told "
-            "by the other flights alone"
+            f"no voltage in {', '.join(sorted(without_voltage))}: the other flights alone identify "
+            "what depends on the motors' thrust"
         )
     motors, had = found.motors, begun.motors
     volts = any(flight.has("voltage") for flight in flights)
@@ -252,7 +252,7 @@ def beside(
     if found.rotors.speed_max != begun.rotors.speed_max:
         lines.append(
             f"rotors.speed_max = {found.rotors.speed_max:.4g} rad/s, which these flights reach: by "
-            f"the thrust that they tell, {begun.rotors.speed_max:.4g} rad/s would be too slow to "
+            f"the thrust that they show, {begun.rotors.speed_max:.4g} rad/s would be too slow to "
             "hover"
         )
     return lines

@@ -59,10 +59,10 @@ def identify_files(
     logs, slow = without_slow_rotors(logs)
     warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
-    if beside := unknown_to_the_fits(start):
+    if besides := unknown_to_the_fits(start):
         warnings = [
             *warnings,
-            f"{start.name} has {', '.join(beside)} besides: the fits do not model them, so the "
+            f"{start.name} has {', '.join(besides)} besides: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them",
         ]
     found = identify(logs, start, leave)
@@ -76,7 +76,7 @@ def identify_files(
         "start": vehicle,
         "drive": found.drive,
         "parameters": as_json(found.numbers),
-        "untold": list(found.untold),
+        "untold": list(found.not_identified),
         "left": found.left,
         "flights": list(found.flights),
         "findings": findings,
@@ -97,5 +97,5 @@ def _head(found: Identified, start: str) -> str:
             if span is not None:
                 between = f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
                 lines.append(f"{entry.key}{part} = {value:.4g}: {between}")
-    lines += [f"not identifiable: {text}" for text in found.untold]
+    lines += [f"not identifiable: {text}" for text in found.not_identified]
     return "\n".join(lines)

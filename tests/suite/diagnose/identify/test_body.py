@@ -117,5 +117,5 @@ def test_what_is_mostly_noise_or_at_its_limit_is_not_told():
 
 def test_the_inertia_about_z_follows_the_others_but_for_its_own_ratio():
     np.testing.assert_allclose(inertia_ratio({"inertia_x": 0.2}), [0.2, 0.0, 0.1])
-    told = {"inertia_x": 0.2, "inertia_y": 0.4, "inertia_z": -0.1}
-    np.testing.assert_allclose(inertia_ratio(told), [0.2, 0.4, 0.2])
+    numbers = {"inertia_x": 0.2, "inertia_y": 0.4, "inertia_z": -0.1}
+    np.testing.assert_allclose(inertia_ratio(numbers), [0.2, 0.4, 0.2])

@@ -1,4 +1,4 @@
-"""Fitted numbers become entries of a vehicle file, and only told ones are put in."""
+"""Fitted numbers become entries of a vehicle file, and only identified ones are put in."""
 
 from dataclasses import replace
 
@@ -44,20 +44,20 @@ def test_a_delay_that_flights_deny_goes_and_is_said_to():
     vehicle, numbers, (note,) = enter(late, [none])
     assert set(vehicle.effects) == {"linear_drag"} and numbers == []
     assert note.endswith("these flights say -0.001 (-0.002 to 0) s; the file has none")
-    untold = none._replace(ci95=[None])
-    assert enter(late, [untold])[0] == late
+    not_identified = none._replace(ci95=[None])
+    assert enter(late, [not_identified])[0] == late
 
 
-@pytest.mark.parametrize(("half", "told"), [(0.008, True), (0.009, False)])
-def test_a_delay_in_doubt_is_not_told_however_well_its_sum_with_the_lag_is(half, told):
+@pytest.mark.parametrize(("half", "identified"), [(0.008, True), (0.009, False)])
+def test_a_delay_is_no_better_known_than_the_lag_however_well_their_sum_is(half, identified):
     """12 ms is the most: a sum of 8 ms less a lag of 8 ms is in doubt by 11.3 ms."""
     covariance = np.diag([half**2, half**2]) / 1.96**2
     fitted = Fitted(
         tuple(lag_and_delay(0.03, 0.01)), np.array([0.05, 0.03]), np.full(2, half), covariance
     )
     (delay,) = [entry for entry in of_loop(PLAIN, fitted, 0.03) if entry.key == DELAY]
-    assert (delay.ci95 != [None]) == told
-    assert delay.follows != told
+    assert (delay.ci95 != [None]) == identified
+    assert delay.follows != identified
     # The file keeps the sum.
     assert enter(PLAIN, [delay])[0].effects["command_delay"].delay == pytest.approx(0.02)
     gone = delay._replace(value=[-0.003])

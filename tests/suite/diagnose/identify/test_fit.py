@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.fit import Given, NothingWhole, Rows, Unknown, fit
+from suite.diagnose.identify.fit import Known, NothingWhole, Rows, Unknown, fit
 
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)
@@ -31,7 +31,7 @@ def test_a_slope_within_its_interval():
 
 def test_a_number_that_nothing_hangs_on_stays_as_it_was():
     found = fit(flights([2.0] * 4), [SLOPE, BLIND])
-    assert found.untold == ("blind",)
+    assert found.not_identified == ("blind",)
     assert found.value[1] == 4.0
     assert np.isnan(found.half_width[1])
     assert abs(found.value[0] - 2.0) < 0.02
@@ -52,21 +52,21 @@ def test_intervals_hold_the_truth_nineteen_times_in_twenty():
     assert 0.90 <= np.mean(inside) <= 0.99
 
 
-def test_what_is_given_widens_what_hangs_on_it():
-    """`y = (slope + given) x`: the slope is off by as much as what was given, and by no less."""
+def test_what_is_known_widens_what_depends_on_it():
+    """`y = (slope + other) x`: the slope is off by as much as the other, and by no less."""
     misses = flights([2.0] * 4)
 
     def both(value):
         return misses(np.array([value[0] + value[1]]))
 
-    given = Given(("given",), np.array([[0.1**2]]))
-    found = fit(both, [SLOPE, Unknown("given", 0.5, -9.0, 9.0, 1.0, 1e-3)], given=given)
+    known = Known(("other",), np.array([[0.1**2]]))
+    found = fit(both, [SLOPE, Unknown("other", 0.5, -9.0, 9.0, 1.0, 1e-3)], known=known)
     alone = fit(misses, [SLOPE])
     np.testing.assert_allclose(found.value, [1.5, 0.5], atol=0.02)
     wanted = np.hypot(alone.half_width[0], 1.96 * 0.1)
     np.testing.assert_allclose(found.half_width[0], wanted, rtol=1e-6)
-    assert np.isnan(found.half_width[1]) and not found.has("given") and found.untold == ()
-    np.testing.assert_allclose(found.give("given", "none").covariance, [[0.01]])
+    assert np.isnan(found.half_width[1]) and not found.has("other") and found.not_identified == ()
+    np.testing.assert_allclose(found.as_known("other", "none").covariance, [[0.01]])
 
 
 def test_the_methods_own_errors_do_not_go_out_of_a_difference():

@@ -1,11 +1,14 @@
-"""The torque of moving air, told once all else is known."""
+"""The torque of moving air, identified once all else is known."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.flapping import flapping_of
+from suite.diagnose.identify.drive import Driven
+from suite.diagnose.identify.fit import Fitted, Unknown
+from suite.diagnose.identify.flapping import flapping_of, one_sigma_off, perturbed
+from tests.support import identified as known
 from tests.support.real_flights import VEHICLE, flights
 
 TRUE = 4e-7
@@ -30,9 +33,39 @@ def test_a_vehicle_that_has_it_asks_for_none():
     assert flapping_of(flights(3, seed=6), VEHICLE) is None
 
 
-def test_logs_without_attitude_or_rotors_tell_none(blown):
+def test_logs_without_attitude_or_rotors_show_none(blown):
     level = [replace(log, quat_wxyz=np.full_like(log.quat_wxyz, np.nan)) for log in blown]
     assert flapping_of(level, VEHICLE) is None
     hover = np.full(len(blown[0].time_s), 9.81)
     bare = [replace(log, rotor_speed=None, thrust_cmd=hover) for log in blown]
     assert flapping_of(bare, VEHICLE) is None
+
+
+def fit_of(names, covariance):
+    unknowns = tuple(Unknown(name, 0.0, -1.0, 1.0, 1.0, 1e-3) for name in names)
+    half = 1.96 * np.sqrt(np.diag(covariance))
+    return Fitted(unknowns, np.zeros(len(names)), half, np.asarray(covariance))
+
+
+FORCE = fit_of(("thrust", "drag_x", "curve"), [[4e-4, 0, -1e-4], [0, 0.1, 0], [-1e-4, 0, 9e-4]])
+TORQUE = fit_of(("inertia_x", "inertia_y"), np.diag([0.01, 0.0004]))
+
+
+def test_what_is_off_has_the_covariance_of_the_fit_and_no_other_number():
+    moves = np.array([one.value for one in one_sigma_off(FORCE, ("thrust", "curve"))])
+    np.testing.assert_allclose(moves.T @ moves, FORCE.covariance * [1, 0, 1], atol=1e-15)
+    assert one_sigma_off(FORCE, ("battery",)) == []
+
+
+def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
+    start = known.start()
+    driven = Driven(start, "pwm", command=0.5, volts=15.0)
+    found = perturbed(start, driven, FORCE, TORQUE)
+    assert len(found) == 4
+    hover = [v.motors.thrust[0] * 0.5 + v.motors.thrust[1] * 0.25 for v in found[:2] if v.motors]
+    np.testing.assert_allclose(
+        np.linalg.norm(np.log(np.array(hover) / sum(driven.usual_thrust))), 0.02, rtol=0.05
+    )
+    off = np.log([np.asarray(v.inertia) / start.inertia for v in found[2:]])
+    np.testing.assert_allclose(np.linalg.norm(off, axis=0)[:2], [0.1, 0.02], rtol=1e-6)
+    assert all(v.motors == start.motors for v in found[2:])

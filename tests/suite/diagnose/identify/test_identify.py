@@ -29,7 +29,7 @@ TRUE = {
 
 
 def pulls(found):
-    """How many half-widths every told number is off, by key and component."""
+    """How many half-widths every identified number is off, by key and component."""
     off = {}
     for entry in found.numbers:
         true = TRUE[entry.key]
@@ -109,9 +109,9 @@ def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(coverage)
 
 def test_a_hover_tells_thrust_and_says_what_it_cannot():
     found = identify(known.logs("pwm", 0, known.HOVER), known.start())
-    told = as_json(found.numbers)
-    assert "motors.thrust" in told
-    words = " ".join(found.untold)
+    estimated = as_json(found.numbers)
+    assert "motors.thrust" in estimated
+    words = " ".join(found.not_identified)
     assert "drag along body x: too slow" in words
     assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
 
@@ -137,7 +137,7 @@ def test_without_an_attitude_the_thrust_is_told_and_the_drag_is_said_to_need_one
     off = pulls(found)
     assert {key for key, _ in off} >= {"motors.thrust"}
     assert np.max(np.abs(list(off.values()))) < 2.0
-    assert any(line.startswith("drag along body x and y: without") for line in found.untold)
+    assert any(line.startswith("drag along body x and y: without") for line in found.not_identified)
     assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
 
 
@@ -145,7 +145,7 @@ def test_without_attitude_and_rates_what_turns_is_said_to_be_untold():
     logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz", "rate_b")
     found = identify(logs, known.start())
     assert "motors.thrust" in as_json(found.numbers)
-    words = " ".join(found.untold)
+    words = " ".join(found.not_identified)
     assert "inertia and torque_coefficient: no body rates" in words
     assert "time_constant and command_delay: no body rates" in words
     assert found.vehicle.inertia == known.start().inertia
@@ -159,7 +159,9 @@ def test_without_rates_the_attitude_tells_the_inertia(coverage, fleet):
 def test_without_positions_the_rates_tell_what_turns():
     found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
     assert "rotors.torque_coefficient" in as_json(found.numbers)
-    assert any(line.startswith("thrust and drag: these logs have no") for line in found.untold)
+    assert any(
+        line.startswith("thrust and drag: these logs have no") for line in found.not_identified
+    )
 
 
 def test_flights_that_hold_nothing_are_refused_with_what_they_lack():
@@ -196,7 +198,7 @@ def test_a_file_from_flights_with_or_without_a_voltage_starts_flights_with_or_wi
     assert "motors.thrust" in as_json(again.numbers)
     after = again.vehicle.motors
     assert after is not None and after == replace(motors, thrust=after.thrust)
-    (line,) = [text for text in again.untold if text.startswith("voltage_exponent")]
+    (line,) = [text for text in again.not_identified if text.startswith("voltage_exponent")]
     assert ("taken for that at 16.4" in line) == first
 
 
@@ -219,24 +221,24 @@ def motor_pulls(found):
 def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
     found = identify(known.logs("pwm", 0), known.start())
     assert "effects.command_delay.delay" not in as_json(found.numbers)
-    # Their sum is told, and the file has it, however its lag shares it.
+    # Their sum is identified, and the file has it, however its lag shares it.
     rest = found.vehicle.effects["command_delay"].delay
     together = known.vehicle().rotors.time_constant + known.DELAY
     assert found.vehicle.rotors.time_constant + rest == pytest.approx(together, abs=0.004)
-    assert any(line.startswith("command_delay: only that it and") for line in found.untold)
+    assert any(line.startswith("command_delay: only that it and") for line in found.not_identified)
 
 
 @pytest.mark.parametrize(
-    ("drive", "column", "told", "line"),
+    ("drive", "column", "key", "line"),
     [
         ("rates", "rate_cmd_b", "effects.thrust_scale.scale", "rate_gain: these logs have no"),
         ("rotors", "rotor_speed_cmd", "inertia", "time_constant and command_delay: these logs"),
     ],
 )
-def test_commands_that_stop_early_leave_untold_what_needs_them(drive, column, told, line):
+def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column, key, line):
     found = identify(cut(known.logs(drive, 0), column), known.start())
-    assert told in as_json(found.numbers)
-    assert any(text.startswith(line) and "with both" in text for text in found.untold)
+    assert key in as_json(found.numbers)
+    assert any(text.startswith(line) and "with both" in text for text in found.not_identified)
 
 
 def test_a_flight_whose_commands_stop_early_takes_nothing_from_the_others():
@@ -259,7 +261,7 @@ def test_rotors_that_are_logged_in_turn_tell_all_but_their_lag():
     assert {key for key, _ in off} >= {"rotors.thrust_coefficient", "inertia"}
     assert np.max(np.abs(list(off.values()))) < 2.5
     assert not {"rotors.time_constant", "effects.command_delay.delay"} & {key for key, _ in off}
-    assert any("all four in every row" in line for line in found.untold)
+    assert any("all four in every row" in line for line in found.not_identified)
     assert sum("no row has all columns of rotor_speed" in note for note in found.notes) == 4
 
 
@@ -303,8 +305,8 @@ def test_flights_without_a_voltage_leave_the_motors_to_those_that_have_one():
 
 def test_what_cannot_be_compared_is_refused_with_parts_left_alone_as_well():
     logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
-    with pytest.raises(ValueError, match="nothing is told beside drag: thrust and drag: these"):
+    with pytest.raises(ValueError, match="without drag nothing is identifiable: thrust and"):
         identify(logs, known.start(), leave=("drag",))
     others = ("drag", "motors", "inertia", "lag")
-    with pytest.raises(ValueError, match="beside drag, .*: rate_gain: these logs have no comm"):
+    with pytest.raises(ValueError, match="without drag, .*: rate_gain: these logs have no comm"):
         identify(known.logs("pwm", 0), known.start(), leave=others)

@@ -64,8 +64,8 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     known["vel_w"][100:] = [-2.0, -3.0, 0.0]
     flight = FlightGrid("made", STEP_S * np.arange(count), known)
     assert [one.name for one in air_torques([flight])] == ["air_x", "air_y"]
-    told = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
-    rate = followed(flight, PLAIN, told)
+    numbers = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
+    rate = followed(flight, PLAIN, numbers)
     gain = PLAIN.controller.rate_gain
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
     bare = FlightGrid("made", flight.time_s, {"rate_cmd_b": known["rate_cmd_b"]})

@@ -69,7 +69,7 @@ def test_thrust_and_drag_are_identified_without_a_pose():
     assert told == pytest.approx(VEHICLE.rotors.thrust_coefficient, rel=0.01)
     drag = numbers["effects.linear_drag.coefficient"].value
     assert drag == pytest.approx([DRAG] * 3, abs=0.05)
-    assert any("heading" in line for line in found.untold)
+    assert any("heading" in line for line in found.not_identified)
 
 
 def test_views_are_of_what_a_log_has():

@@ -1,4 +1,4 @@
-"""What logs cannot tell is said with the column that it would need."""
+"""What logs do not identify is reported with the column that it would need."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.fit import Fitted, Unknown
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.numbers import DELAY, Number, beside, unasked, untold
+from suite.diagnose.identify.numbers import DELAY, Number, not_attempted, not_identified, notes_on
 from tests.support.vehicles import PLAIN
 
 
@@ -22,21 +22,21 @@ def found(*names, left=()):
     return Fitted(unknowns, none, none, np.diag(none), tuple(left))
 
 
-def test_what_one_fit_leaves_and_another_tells_is_told():
+def test_what_one_fit_leaves_and_another_identifies_is_identified():
     fitted = {"torque": found("lag", "late", left=["lag", "late"]), "loop": found("lag")}
     entries = {DELAY: Number(DELAY, "s", [0.0], [None])}
-    assert [line.split(":")[0] for line in untold(fitted, entries)] == ["command_delay"]
+    assert [line.split(":")[0] for line in not_identified(fitted, entries)] == ["command_delay"]
 
 
-def test_what_lag_and_delay_make_together_is_said_where_neither_is_told():
+def test_the_sum_of_lag_and_delay_is_reported_where_neither_is_identified():
     fitted = {"torque": found("late", "lag", left=["lag"])}
     fitted["torque"].value[:] = [0.042, 0.03]
-    lines = untold(fitted, {DELAY: Number(DELAY, "s", [0.012], [None], True)})
+    lines = not_identified(fitted, {DELAY: Number(DELAY, "s", [0.012], [None], True)})
     assert lines[-1] == (
         "command_delay: only that it and the rotors' lag make 0.042 s together; of that the file's "
         "lag leaves 0.012 s, which is its delay"
     )
-    (line,) = untold(fitted, {DELAY: Number(DELAY, "s", [0.012], [(0.01, 0.014)])})
+    (line,) = not_identified(fitted, {DELAY: Number(DELAY, "s", [0.012], [(0.01, 0.014)])})
     assert line.startswith("time_constant")
 
 
@@ -60,8 +60,8 @@ TORQUE = {"torque": found("inertia_x", "late", "lag")}
         ("pwm", ["pwm", "voltage"], FORCE | TORQUE | {"loop": found("gain_x")}, [], []),
     ],
 )  # fmt: skip
-def test_what_has_no_column_is_said(drive, signals, fitted, leave, words):
-    lines = unasked([flight(*signals)], PLAIN, drive, fitted, leave)
+def test_what_has_no_column_is_reported(drive, signals, fitted, leave, words):
+    lines = not_attempted([flight(*signals)], PLAIN, drive, fitted, leave)
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):
         assert line.startswith(word)
@@ -69,7 +69,7 @@ def test_what_has_no_column_is_said(drive, signals, fitted, leave, words):
 
 def test_a_firmwares_loop_is_not_fitted():
     loop = replace(PLAIN, controller=replace(PLAIN.controller, kind="px4"))
-    (line,) = unasked([flight("pwm", "voltage")], loop, "pwm", FORCE | TORQUE, [])
+    (line,) = not_attempted([flight("pwm", "voltage")], loop, "pwm", FORCE | TORQUE, [])
     assert line == "the rate loop: settings of a px4 loop are not fitted"
 
 
@@ -86,33 +86,33 @@ BOTH = "these logs have no stretch with both"
         ("rates", FORCE | TORQUE, ["loop"], ["rate_gain"]),
     ],
 )  # fmt: skip
-def test_columns_that_never_go_on_together_are_said(drive, fitted, broken, words):
+def test_columns_that_never_go_on_together_are_reported(drive, fitted, broken, words):
     leave = [] if "loop" in broken else ["loop"]
     signals = ["pwm", "voltage", "rotor_speed", "rate_b", "rate_cmd_b"]
-    lines = unasked([flight(*signals)], PLAIN, drive, fitted, leave, broken)
+    lines = not_attempted([flight(*signals)], PLAIN, drive, fitted, leave, broken)
     assert [line.split(f": {BOTH}")[0] for line in lines] == words
 
 
 @pytest.mark.parametrize(
-    ("exponent", "said"), [(0.0, "it is 0, so that none counts"), (1.2, "taken for that at 16 V")]
+    ("exponent", "end"), [(0.0, "it is 0, so that none counts"), (1.2, "taken for that at 16 V")]
 )
-def test_without_a_voltage_it_is_said_which_one_counts(exponent, said):
+def test_without_a_voltage_the_one_that_counts_is_reported(exponent, end):
     vehicle = replace(PLAIN, motors=MotorMap((1.0, 4.0), 16.0, exponent))
-    (line,) = unasked([flight("pwm")], vehicle, "pwm", FORCE | TORQUE, ["loop"])
-    assert line.startswith("voltage_exponent: these logs have no voltage") and line.endswith(said)
+    (line,) = not_attempted([flight("pwm")], vehicle, "pwm", FORCE | TORQUE, ["loop"])
+    assert line.startswith("voltage_exponent: these logs have no voltage") and line.endswith(end)
 
 
-def test_what_was_done_with_the_flights_is_said():
+def test_what_was_done_with_the_flights_is_reported():
     turns = flight("rotor_speed", "voltage")._replace(in_turn=("rotor_speed",))
     after = replace(
         PLAIN,
         motors=MotorMap((1.0, 4.0), 15.2),
         rotors=replace(PLAIN.rotors, speed_max=2500.0),
     )
-    words = ["made: no row has all columns of rotor_speed", "no voltage in a, b: what hangs",
+    words = ["made: no row has all columns of rotor_speed", "no voltage in a, b: the other flights",
              "motors.voltage = 15.2 V, the usual", "rotors.speed_max = 2500 rad/s"]  # fmt: skip
-    lines = beside([turns], {"b", "a"}, PLAIN, after)
+    lines = notes_on([turns], {"b", "a"}, PLAIN, after)
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):
         assert line.startswith(word)
-    assert beside([flight("rotor_speed")], (), after, after) == []
+    assert notes_on([flight("rotor_speed")], (), after, after) == []
