@@ -33,7 +33,7 @@ def test_what_no_file_may_hold_is_said_as_it_is_in_the_file():
     assert vehicle.effects["linear_drag"].coefficient == tuple(entry.value) == (0.3, 0.0, 0.0)
     assert entry.ci95 == spans
     assert note == (
-        "effects.linear_drag.coefficient[1]: these flights say -0.1 (-0.2 to 0) 1/s; "
+        "effects.linear_drag.coefficient[1]: these flights give -0.1 (-0.2 to 0) 1/s; "
         "the file has 0, the nearest it may"
     )
 
@@ -43,7 +43,7 @@ def test_a_delay_that_flights_deny_goes_and_is_said_to():
     none = Number(DELAY, "s", [-0.001], [(-0.002, 0.0)])
     vehicle, numbers, (note,) = enter(late, [none])
     assert set(vehicle.effects) == {"linear_drag"} and numbers == []
-    assert note.endswith("these flights say -0.001 (-0.002 to 0) s; the file has none")
+    assert note.endswith("these flights give -0.001 (-0.002 to 0) s; the file has none")
     not_identified = none._replace(ci95=[None])
     assert enter(late, [not_identified])[0] == late
 
