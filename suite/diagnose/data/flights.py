@@ -22,7 +22,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mix
 from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
-from suite.diagnose.data.inertial import by_inertia, is_inertial
+from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row
 from suite.diagnose.data.view import (
@@ -80,7 +80,7 @@ def ready(
             needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
             raise ValueError(f"{log.name}: nothing says how its rotors turned; it needs {needs}")
     acting = [one for one in rotors if one is not None]
-    whole = [on_every_row(completed(log), limits) for log in logs]
+    whole = [on_every_row(completed(log), limits) for log in posed(logs)]
     rows = [
         rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
     ]
@@ -140,7 +140,24 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
     _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
     _, noisy = wrench_difference(speed + noise, speed, vehicle)
-    return calibrated(flight, turned, noisy)
+    flight = calibrated(flight, turned, noisy)
+    return flight._replace(credible=flight.credible * _between_rows(flight, vehicle))
+
+
+def _between_rows(flight: SmoothedFlight, vehicle: Vehicle) -> np.ndarray:
+    """Return how much larger (3,) angular accelerations are than straight lines between rows say.
+
+    A rate loop that looks more often than the log has rows asks for less as the body turns: the
+    slope of an acceleration `a` falls by `gain * step * a / lag` from a row to the next, and the
+    trapezoid misses `step / 12` of that fall (Euler and Maclaurin). Of a firmware's loop, whose
+    settings are no gain, it is taken that it is as fast as the rotors.
+    """
+    lag, loop = vehicle.rotors.time_constant, vehicle.controller
+    step = float(np.median(np.diff(flight.rows.time_s)))
+    if step <= 1.0 / loop.frequency or step >= lag:
+        return np.ones(3)
+    gain = np.array(loop.rate_gain) if loop.kind == "p" else np.full(3, 1.0 / lag)
+    return 1.0 + gain * step**2 / (12.0 * lag)
 
 
 def parted(
@@ -204,14 +221,14 @@ SMOOTH_S = 0.1
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with the attitude from its path and the rates from the attitude, if it has none.
 
-    All of its pose is by gyro and accelerometer where it has no position; without an accelerometer
-    it has none, which only its turning does without.
+    A flight without a position and an accelerometer has no pose, which only its turning does
+    without; see `posed` for others without a position.
 
     Raises:
         ValueError: for a log without positions and without rates.
     """
-    if is_inertial(log):
-        return by_inertia(log)
+    if isinstance(log, InertialLog):
+        return log
     if "pos" in log.partial and "rate" in log.partial:
         raise ValueError(f"{log.name}: no position and no gyro: nothing says how it moved")
     if "pos" in log.partial:

@@ -5,15 +5,19 @@ turns the attitude, and the specific force in it, less gravity, moves the body. 
 follows from few numbers: the tilt and the velocity at the start, and the biases of gyro and
 accelerometer. Drag tells them, as the force across the thrust is against the velocity (Leishman et
 al. 2014, doi 10.1109/MCS.2013.2287362); how large it is along each axis is found with them, for the
-vehicle file may lack it. All are estimated by least squares with their usual sizes as priors, for
-pieces of `PIECE_S` of a flight. Yaw and position start from none, far above any ground.
+vehicle file may lack it. It is the same in all flights of a vehicle: a flight alone would make its
+velocity too large where it takes the drag for too small. All are estimated by least squares with
+their usual sizes as priors, for pieces of `PIECE_S` of a flight. Yaw and position start from none,
+far above any ground.
 
 What is compared in such flights is no derivative of this velocity but the accelerometer itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,8 +43,8 @@ LATER = np.repeat([0.05, 1.0, 0.005, 0.1], 3)
 DRAG, DRAG_PRIOR = np.array([0.3, 0.3, 0.0]), np.array([0.4, 0.4, 0.02])
 """Usual drag across the thrust and its standard deviation: linear along x and y [1/s], and with the
 speed [1/m]."""
-FORCE_NOISE = 0.2
-"""What a mean force is off a linear drag by [m/s^2]."""
+FORCE_NOISE, LEAST_NOISE = 0.2, 0.02
+"""What a mean force is off such a drag by, before it is estimated and at least [m/s^2]."""
 ROUNDS = 6
 HIGH_M = 1000.0
 """Height of the start: nothing near."""
@@ -73,30 +77,83 @@ def specific_force_w(log: FlightLog) -> np.ndarray | None:
     return (log.rot_w @ log.acc_b[..., None])[..., 0] - [0.0, 0.0, GRAVITY]
 
 
-def by_inertia(log: FlightLog) -> InertialLog:
-    """Return an inertial `log` with position, velocity and attitude by gyro and accelerometer."""
+def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
+    """Return `logs` of one vehicle; those without a position have their pose by inertia."""
+    found = iter(by_inertia([log for log in logs if is_inertial(log)]))
+    return [next(found) if is_inertial(log) else log for log in logs]
+
+
+def by_inertia(logs: Sequence[FlightLog]) -> list[InertialLog]:
+    """Return inertial `logs` of one vehicle with their pose by gyro and accelerometer."""
+    flights = [_pieces(log) for log in logs]
+    drag = _fitted(flights) if flights else DRAG
+    return [_whole(log, pieces, drag) for log, pieces in zip(logs, flights, strict=True)]
+
+
+def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
+    """Fit the numbers of all pieces and the drag that they share, and return that (3,)."""
+    drag, noise = DRAG, FORCE_NOISE
+    for _ in range(ROUNDS):
+        hessian, gradient = np.diag(DRAG_PRIOR**-2), (DRAG - drag) / DRAG_PRIOR**2
+        asked = []
+        for piece in (one for pieces in flights for one in pieces):
+            design, left = piece.sides(drag, noise)
+            own, shared = design[:, :12], np.column_stack([left, design[:, 12:]])
+            to_own = np.linalg.lstsq(own, shared, rcond=None)[0]
+            # What its own numbers do not explain is said of the drag that all share.
+            rest = shared - own @ to_own
+            hessian = hessian + rest[:, 1:].T @ rest[:, 1:]
+            gradient = gradient + rest[:, 1:].T @ rest[:, 0]
+            asked.append((piece, to_own))
+        change = np.maximum(np.linalg.solve(hessian, gradient), -drag)
+        for piece, to_own in asked:
+            piece.numbers = piece.numbers + to_own[:, 0] - to_own[:, 1:] @ change
+        drag = drag + change
+        for pieces in flights:
+            for before, piece in pairwise(pieces):
+                piece.begin_after(before)
+        off = np.concatenate([one.off(drag) for pieces in flights for one in pieces])
+        noise = max(float(np.sqrt((off**2).mean())), LEAST_NOISE)
+    return drag
+
+
+def _pieces(log: FlightLog) -> list[_Piece]:
+    """Return the pieces of a flight, each fitted alone where the one before it ends."""
     assert log.acc_b is not None
     time_s = log.time_s
     rate_b, acc_b = (interpolate(time_s, time_s, value) for value in (log.rate_b, log.acc_b))
-    rot_w, vel_w = np.empty((len(time_s), 3, 3)), np.zeros((len(time_s), 3))
     known = np.flatnonzero(np.isfinite(log.quat_wxyz).all(axis=1))
-    rot, vel, prior = _start(time_s, acc_b), np.zeros(3), PRIOR
-    if len(known):
-        rot = log.rot_w[known[0]]  # within moments of the first row
+    # An attitude is within moments of the first row.
+    rot = log.rot_w[known[0]] if len(known) else _start(time_s, acc_b)
     count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S))
     edges = np.linspace(0, len(time_s) - 1, count + 1).astype(int)
-    sway_b = np.zeros((len(time_s), 3, 12 * count))
-    for k, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        part = slice(first, last + 1)
-        piece = _Piece(time_s[part], rate_b[part], acc_b[part], rot, vel)
-        numbers, drag = piece.fitted(prior)
-        rot_w[part], vel_w[part] = piece.flown(numbers)
-        slopes = np.swapaxes(rot_w[part], 1, 2) @ piece.slopes(rot_w[part], numbers)
-        along = np.append(drag, drag.mean())[:, None]
-        sway_b[part, :, 12 * k : 12 * k + 12] = -along * slopes * prior
-        rot, vel, prior = rot_w[last], vel_w[last], LATER
+    parts = [slice(first, last + 1) for first, last in pairwise(edges)]
+    pieces = list[_Piece]()
+    for part in parts:
+        prior = LATER if pieces else PRIOR
+        pieces.append(_Piece(time_s[part], rate_b[part], acc_b[part], rot, prior))
+        if len(pieces) > 1:
+            pieces[-1].begin_after(pieces[-2])
+        if len(parts) > 1:
+            _fitted([pieces[-1:]])
+    return pieces
+
+
+def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> InertialLog:
+    """Return `log` with the pose of its `pieces`, which share the row between two of them."""
+    rot_w, vel_w = np.empty((len(log.time_s), 3, 3)), np.zeros((len(log.time_s), 3))
+    sway_b = np.zeros((len(log.time_s), 3, 12 * len(pieces)))
+    first = 0
+    for k, piece in enumerate(pieces):
+        part = slice(first, first + len(piece.time_s))
+        first = part.stop - 1
+        rot_w[part], vel_w[part] = piece.flown()
+        slopes = np.swapaxes(rot_w[part], 1, 2) @ piece.slopes(rot_w[part])
+        usual = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
+        along = np.append(usual, usual.mean())[:, None]
+        sway_b[part, :, 12 * k : 12 * k + 12] = -along * slopes * piece.prior
     pos_w = np.zeros_like(vel_w)
-    pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(time_s)[:, None], axis=0)
+    pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(log.time_s)[:, None], axis=0)
     pos_w[:, 2] += HIGH_M
     quat = np.asarray(rot_to_quat(rot_w))
     about = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
@@ -104,11 +161,12 @@ def by_inertia(log: FlightLog) -> InertialLog:
 
 
 class _Piece:
-    """A piece of a flight, and what its start and the sensors' biases make of it."""
+    """A piece of a flight, what it starts from, and its numbers (12,), see `PRIOR`."""
 
     def __init__(self, time_s: np.ndarray, rate_b: np.ndarray, acc_b: np.ndarray,
-                 rot: np.ndarray, vel: np.ndarray) -> None:  # fmt: skip
-        self.time_s, self.rate_b, self.acc_b, self.rot, self.vel = time_s, rate_b, acc_b, rot, vel
+                 rot: np.ndarray, prior: np.ndarray) -> None:  # fmt: skip
+        self.time_s, self.rate_b, self.acc_b, self.rot = time_s, rate_b, acc_b, rot
+        self.vel, self.prior, self.numbers = np.zeros(3), prior, np.zeros(12)
         self.span = np.diff(time_s)
         each = max(1, round(WIDTH_S / float(np.median(self.span))))
         self.first = np.arange(0, len(time_s), each)
@@ -119,43 +177,49 @@ class _Piece:
         sums = np.add.reduceat(values, self.first, axis=0)
         return sums / self.rows.reshape(-1, *[1] * (values.ndim - 1))
 
-    def flown(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return attitude (N, 3, 3) and velocity (N, 3) with these (12,), see `PRIOR`."""
-        tilt, vel, gyro, acc = numbers.reshape(4, 3)
+    def flown(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return attitude (N, 3, 3) and velocity (N, 3)."""
+        tilt, vel, gyro, _ = self.numbers.reshape(4, 3)
         rate_b = self.rate_b - gyro
         turns = Rotation.from_rotvec(0.5 * (rate_b[1:] + rate_b[:-1]) * self.span[:, None])
         rot_w = np.empty((len(self.time_s), 3, 3))
         rot_w[0] = Rotation.from_rotvec(tilt).as_matrix() @ self.rot
         for k, turn in enumerate(turns.as_matrix()):
             rot_w[k + 1] = rot_w[k] @ turn
-        moved = self.summed(self._force_w(rot_w, acc) - [0.0, 0.0, GRAVITY])
+        moved = self.summed(self._force_w(rot_w) - [0.0, 0.0, GRAVITY])
         return rot_w, self.vel + vel + moved
 
-    def fitted(self, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers (12,) by which drag is against the velocity, and its usual size."""
-        numbers, drag, usual = np.zeros(12), DRAG, DRAG[:2]
-        for _ in range(ROUNDS):
-            rot_w, vel_w = self.flown(numbers)
-            to_body = np.swapaxes(rot_w, 1, 2)
-            vel_b = (to_body @ vel_w[..., None])[:, :2, 0]
-            speed = np.linalg.norm(vel_w, axis=1)[:, None]
-            per = drag[:2] + drag[2] * speed
-            columns = np.zeros((len(speed), 2, 15))
-            columns[..., :12] = -per[..., None] * (to_body @ self.slopes(rot_w, numbers))[:, :2]
-            columns[:, [0, 1], [9, 10]] += 1.0
-            columns[:, [0, 1], [12, 13]] = -vel_b
-            columns[..., 14] = -speed * vel_b
-            force = self.acc_b[:, :2] - numbers[9:11]
-            left = self.means(force + per * vel_b).reshape(-1) / FORCE_NOISE
-            design = self.means(columns).reshape(-1, 15) / FORCE_NOISE
-            now, middle = np.append(numbers, drag), np.append(np.zeros(12), DRAG)
-            size = np.append(prior, DRAG_PRIOR)
-            design = np.concatenate([design, np.diag(1.0 / size)])
-            left = np.concatenate([left, (middle - now) / size])
-            now = now + np.linalg.lstsq(design, left, rcond=None)[0]
-            numbers, drag = now[:12], np.maximum(now[12:], 0.0)
-            usual = drag[:2] + drag[2] * float(speed.mean())
-        return numbers, usual
+    def begin_after(self, before: _Piece) -> None:
+        """Start where the piece `before` ends."""
+        rot_w, vel_w = before.flown()
+        self.rot, self.vel = rot_w[-1], vel_w[-1]
+
+    def off(self, drag: np.ndarray) -> np.ndarray:
+        """Return by what the mean forces (M, 2) along x and y are off `drag` (3,) [m/s^2]."""
+        rot_w, vel_w = self.flown()
+        vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
+        per = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
+        return self.means(self.acc_b[:, :2] - self.numbers[9:11] + per * vel_b)
+
+    def sides(self, drag: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the equations (R, 15) of changes of its numbers and the drag, and what they leave.
+
+        The first are those of the mean forces, the last its own numbers' priors.
+        """
+        rot_w, vel_w = self.flown()
+        to_body = np.swapaxes(rot_w, 1, 2)
+        vel_b = (to_body @ vel_w[..., None])[:, :2, 0]
+        speed = np.linalg.norm(vel_w, axis=1)[:, None]
+        per = drag[:2] + drag[2] * speed
+        columns = np.zeros((len(speed), 2, 15))
+        columns[..., :12] = -per[..., None] * (to_body @ self.slopes(rot_w))[:, :2]
+        columns[:, [0, 1], [9, 10]] += 1.0
+        columns[:, [0, 1], [12, 13]] = -vel_b
+        columns[..., 14] = -speed * vel_b
+        design = self.means(columns).reshape(-1, 15) / noise
+        left = self.off(drag).reshape(-1) / noise
+        prior = np.eye(12, 15) / self.prior[:, None]
+        return np.concatenate([design, prior]), np.append(left, -self.numbers / self.prior)
 
     def summed(self, values: np.ndarray) -> np.ndarray:
         """Return the integral (N, ...) of `values` (N, ...) from the first row."""
@@ -164,14 +228,14 @@ class _Piece:
         out[1:] = np.cumsum(0.5 * (values[1:] + values[:-1]) * span, axis=0)
         return out
 
-    def _force_w(self, rot_w: np.ndarray, bias_b: np.ndarray) -> np.ndarray:
-        return (rot_w @ (self.acc_b - bias_b)[..., None])[..., 0]
+    def _force_w(self, rot_w: np.ndarray) -> np.ndarray:
+        return (rot_w @ (self.acc_b - self.numbers[9:])[..., None])[..., 0]
 
-    def slopes(self, rot_w: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    def slopes(self, rot_w: np.ndarray) -> np.ndarray:
         """Return how the velocity changes with the numbers (N, 3, 12)."""
         count = len(self.time_s)
         each = np.broadcast_to(np.eye(3), (count, 3, 3))
-        force_w = self._force_w(rot_w, numbers[9:])[:, :, None]
+        force_w = self._force_w(rot_w)[:, :, None]
         tilts = np.concatenate([each, -self.summed(rot_w)], axis=2)  # by tilt and gyro bias
         by_tilt, by_gyro = np.split(self.summed(np.cross(tilts, force_w, axis=1)), 2, axis=2)
         return np.concatenate([by_tilt, each, by_gyro, -self.summed(rot_w)], axis=2)
@@ -183,6 +247,4 @@ def _start(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:
     size = float(np.linalg.norm(up))
     if abs(size - GRAVITY) > LIKE_GRAVITY:
         return np.eye(3)
-    left = np.cross(up / size, [1.0, 0.0, 0.0])
-    left /= np.linalg.norm(left)
-    return np.stack([np.cross(left, up / size), left, up / size])
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()

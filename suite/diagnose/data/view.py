@@ -136,7 +136,8 @@ class SmoothedFlight(NamedTuple):
     measured: np.ndarray
     """(M, 3) mean accelerations, axes as the view's model has them."""
     credible: np.ndarray = np.ones(3)
-    """(3,) share of the model's changes within the flight that is no noise of what turns it."""
+    """(3,) what the model's changes within the flight are multiplied by: their share that is no
+    noise of what turns it, and what the rows do not show of them."""
 
 
 def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:

@@ -14,7 +14,7 @@ from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
-from suite.diagnose.data.inertial import by_inertia, is_inertial, specific_force_w
+from suite.diagnose.data.inertial import specific_force_w
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import on_one_side
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
@@ -87,11 +87,8 @@ class FlightGrid(NamedTuple):
 
 
 def grid_of(log: FlightLog) -> FlightGrid:
-    """Return `log` on the grid; where it has no position, its pose is by inertia."""
-    felt_w = None
-    if is_inertial(log):
-        log = by_inertia(log)
-        felt_w = specific_force_w(log)
+    """Return `log` on the grid."""
+    felt_w = specific_force_w(log)
     time_s = log.time_s - log.time_s[0]
     grid = np.arange(0.0, time_s[-1], STEP_S)
     known: dict[str, np.ndarray] = {}

@@ -14,6 +14,7 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.inertial import posed
 from suite.diagnose.identify.body import (
     KNOWN,
     fit_force,
@@ -93,7 +94,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
     Raises:
         ValueError: where the flights share no drive, or hold nothing that can be compared.
     """
-    flights = [grid_of(log) for log in logs]
+    flights = [grid_of(log) for log in posed(logs)]
     drive = drive_of(flights)
     given, vehicle = vehicle, with_own_numbers(vehicle, drive in KNOWN_MOTORS)
     state = _Start(flights, vehicle, drive, tuple(leave))

@@ -7,11 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.plant import Command, Motion, make_plant
+from eval.quadrotor.stepper import Inputs, hover_state, step
+from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.data.flights import completed, ready
 from suite.diagnose.data.inertial import by_inertia
 from suite.diagnose.data.view import SPECIFIC, TORQUE
+from suite.diagnose.estimate.parameters import make_space
+from suite.diagnose.evidence.moments import ForceModel, compare
 from suite.diagnose.identify.identify import identify
 from tests.support.real_flights import VEHICLE
+from tracks.geometry.rotation import rot_to_quat
 
 DRAG = 0.4
 LACKS = {"partial": ["pos", "quat"]}
@@ -54,12 +60,30 @@ def flown(seed=0, end_s=10.0, bias=1.0):
 @pytest.mark.parametrize("end_s", [10.0, 40.0])
 def test_gyro_and_accelerometer_tell_the_velocity(end_s):
     log, vel_w, rot = flown(end_s=end_s)
-    found = by_inertia(log)
+    (found,) = by_inertia([log])
     off = found.vel_w - vel_w
     assert np.sqrt((off**2).mean()) < 0.3
     lean = (rot.as_matrix()[:, :, 2] * found.rot_w[:, :, 2]).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(lean, -1.0, 1.0))).mean() < 2.0
     assert found.sway_b is not None and found.sway_b.shape[:2] == (len(off), 3)
+
+
+def test_a_flight_may_begin_on_its_side():
+    log = flown(end_s=2.0)[0]
+    about_y = Rotation.from_euler("y", 90.0, degrees=True)
+    turned = {"rate_b": about_y.apply(log.rate_b), "acc_b": about_y.apply(log.acc_b)}
+    (found,) = by_inertia([replace(log, **turned)])
+    force_w = (found.rot_w[0] @ turned["acc_b"][:10].mean(axis=0)) / 9.81
+    assert force_w == pytest.approx([0.0, 0.0, 1.0], abs=0.1)
+
+
+def test_flights_share_their_drag():
+    logs, paths, _ = zip(*(flown(seed, end_s=5.0) for seed in range(6)), strict=True)
+
+    def off(found):
+        return np.mean([np.std(a.vel_w - v) for a, v in zip(found, paths, strict=True)])
+
+    assert off(by_inertia(logs)) < 0.95 * off([by_inertia([log])[0] for log in logs])
 
 
 def test_thrust_and_drag_are_identified_without_a_pose():
@@ -82,3 +106,26 @@ def test_views_are_of_what_a_log_has():
     thrust = replace(log, acc_b=None, rotor_speed=None, thrust_cmd=np.full(len(log.time_s), 9.81))
     with pytest.raises(ValueError, match="no accelerometer or no motor"):
         ready([thrust], VEHICLE)
+
+
+def test_a_rate_loop_faster_than_the_log_does_not_look_like_inertia():
+    vehicle, step_s = load_vehicle("reference"), 0.002
+    plant = make_plant(vehicle, step_s)
+    motion = Motion(np.array([0.0, 0.0, 50.0]), np.eye(3), *np.zeros((2, 3)))
+    state, rows, asked = hover_state(plant, ()), [], np.zeros(3)
+    for k in range(1500):
+        if k % 5 == 0:
+            asked = np.sin(k * step_s * np.array([9.0, 13.0, 5.0]))
+            rows.append((k * step_s, motion, state.rotor_speed))
+        inputs = Inputs(Command(np.asarray(9.81), asked))
+        state, motion, _ = step(plant, state, motion, inputs, k * step_s)
+    columns = [np.array(c) for c in zip(*((t, *m, s) for t, m, s in rows), strict=True)]
+    time_s, pos_w, rot_w, vel_w, rate_b, speed = columns
+    quat = np.asarray(rot_to_quat(rot_w))
+    log = FlightLog("fast", time_s, pos_w, quat, vel_w, rate_b, rotor_speed=speed)
+    flights = ready([log], vehicle).smoothed[TORQUE.name]
+    space = make_space(vehicle)
+    model = ForceModel(vehicle, space, voltage=False)
+    data = compare(TORQUE, model, space.array("start"), flights, [])
+    share = (data.value * data.residual).sum(axis=0) / (data.value**2).sum(axis=0)
+    assert share == pytest.approx([0.0] * 3, abs=0.0015)
