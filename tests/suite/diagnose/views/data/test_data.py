@@ -200,13 +200,16 @@ def test_the_measured_side_of_a_view_is_a_mean_acceleration():
 
 
 def test_a_model_is_believed_as_far_as_its_rotors_are_measured():
-    """By the share of noise in what its torque changes by; a quiet rotor's is believed whole."""
+    """By the share of noise in what its torque changes by; a quiet rotor's is believed whole.
+
+    What a rate loop does between the rows makes it up to 1 % more.
+    """
     rng = np.random.default_rng(0)
     time_s = np.arange(0.0, 20.0, 0.01)
     swing = np.sin(2.0 * np.pi * 1.5 * time_s)
     true = 900.0 + 4.0 * swing[:, None] * [1.0, 1.0, -1.0, -1.0]
     log = level(time_s, np.zeros((len(time_s), 3)))
-    for sigma, least, most in ((0.0, 0.99, 1.0), (6.0, 0.6, 0.95)):
+    for sigma, least, most in ((0.0, 0.99, 1.01), (6.0, 0.6, 0.95)):
         speed = true + sigma * rng.standard_normal(true.shape)
         (flight,) = ready([replace(log, rotor_speed=speed)], VEHICLE).smoothed["torque"]
         truth, seen = (flight.form.mean @ _about_x(part) for part in (true, speed))
