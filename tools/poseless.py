@@ -28,7 +28,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.startup import keep_compiled
-from suite.diagnose.by_views import diagnose_by_views
+from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plans.simulate import Sensors, fly, log_of
 from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
@@ -88,7 +88,7 @@ def run(cases: int, seed: int, first: int) -> Iterator[tuple[str, Any, dict[str,
         name = "" if number % CLEAN_EACH == 0 else SEEN[int(rng.integers(len(SEEN)))]
         truth = hidden_values(name, nominal, rng) if name else None
         true = with_effects(nominal, {name: truth} if name else {})
-        found = diagnose_by_views(flown(nominal, true, rng), nominal, seed=number)
+        found = diagnose(flown(nominal, true, rng), nominal, by="views", seed=number)
         yield name, truth, diagnosis_json(found)
 
 
@@ -96,18 +96,18 @@ def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
     """Yield by what the numbers of a named effect are off, over half their 95 % intervals."""
     parameters = effect["parameters"]
     rotor = parameters.get("index", {}).get("value")
-    for key, told in parameters.items():
-        if key == "index" or told["ci95"] is None:
+    for key, entry in parameters.items():
+        if key == "index" or entry["ci95"] is None:
             continue
         true = np.atleast_1d(getattr(truth, key))
         true = true[[int(rotor) - 1]] if rotor is not None else true
-        pairs = told["ci95"] if isinstance(told["value"], list) else [told["ci95"]]
+        pairs = entry["ci95"] if isinstance(entry["value"], list) else [entry["ci95"]]
         for value, pair in zip(true, pairs, strict=False):
             if pair is not None and None not in pair and pair[1] > pair[0]:
                 yield float((sum(pair) - 2.0 * value) / (pair[1] - pair[0]))
 
 
-def told_of(name: str, effects: list[dict[str, Any]]) -> str:
+def outcome_of(name: str, effects: list[dict[str, Any]]) -> str:
     """Return how what is named compares with what was hidden, `name`, in words."""
     alike = [{e["name"], *e["alternatives"]} for e in effects]
     if not name:
@@ -130,20 +130,20 @@ def main() -> None:
     given = sys.argv[1:]
     cases, seed, first = (int(v) for v in (*given, *("60", "5600000", "0")[len(given) :]))
     keep_compiled()
-    outcome, off = Counter[str](), list[float]()
+    outcomes, off = Counter[str](), list[float]()
     for number, (name, truth, found) in enumerate(run(cases, seed, first), first):
         effects = found["effects"]
-        told = told_of(name, effects)
-        outcome[told] += 1
+        outcome = outcome_of(name, effects)
+        outcomes[outcome] += 1
         words = [" or ".join([e["name"], *e["alternatives"]]) for e in effects]
         own = [e for e in effects if e["name"] == name]
         beside = list(errors(truth, own[0])) if own else []
         off += beside
-        print(f"{number:3d} {name or 'nothing':16} {told:18} {'; '.join(words)}  "
+        print(f"{number:3d} {name or 'nothing':16} {outcome:18} {'; '.join(words)}  "
               f"{' '.join(f'{e:+.2f}' for e in beside)}", flush=True)  # fmt: skip
-    clean = outcome["clean"] + outcome["accused"]
-    print(share("named, and nothing else", outcome["named alone"], cases - clean))
-    print(share("clean vehicles accused", outcome["accused"], clean))
+    clean = outcomes["clean"] + outcomes["accused"]
+    print(share("named, and nothing else", outcomes["named alone"], cases - clean))
+    print(share("clean vehicles accused", outcomes["accused"], clean))
     print(share("intervals that hold the truth", sum(abs(e) <= 1.0 for e in off), len(off)))
 
 
