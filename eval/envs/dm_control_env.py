@@ -1,4 +1,4 @@
-"""The race as a standard `dm_control.rl.control.Environment`."""
+"""The race as a `dm_control.rl.control.Environment`."""
 
 # pyright: reportIncompatibleMethodOverride=false
 # dm_control's own abstract methods are annotated as returning None.
@@ -23,17 +23,17 @@ from tracks.track import Track
 
 
 class RacePhysics(dm_mujoco.Physics):
-    """MuJoCo's physics in which every step goes through the quadrotor's plant."""
+    """MuJoCo's physics with the quadrotor's plant in every step."""
 
     race: Race
     reward: float
 
     def step(self, nstep: int = 1) -> None:
-        """Fly the action that the task has set for `nstep` physics steps."""
+        """Fly the task's action for `nstep` physics steps."""
         self.reward = self.race.advance(self.data.ptr, self.action_b, nstep)
 
     action_b: np.ndarray = np.zeros(ACTION_SIZE)
-    """(3,) set by the task before a step [m/s^2]."""
+    """(3,) set by the task before each step [m/s^2]."""
 
 
 class RaceTask(control.Task):
@@ -44,11 +44,11 @@ class RaceTask(control.Task):
         physics.race.place(physics.data.ptr)
 
     def before_step(self, action: np.ndarray, physics: RacePhysics) -> None:
-        """Take the wanted net acceleration in body axes (3,) [m/s^2]."""
+        """Set the wanted net acceleration in body axes (3,) [m/s^2]."""
         physics.action_b = np.asarray(action, float)
 
     def after_step(self, physics: RacePhysics) -> None:
-        """Do nothing: the judge has judged every step."""
+        """Do nothing: `Race.advance` judges every step."""
 
     def action_spec(self, physics: RacePhysics) -> specs.BoundedArray:
         """Return the bounds of an action [m/s^2]."""
@@ -56,7 +56,7 @@ class RaceTask(control.Task):
         return specs.BoundedArray((ACTION_SIZE,), np.float64, -bound, bound, "acceleration_b")
 
     def observation_spec(self, physics: RacePhysics) -> dict[str, specs.Array]:
-        """Return the shapes of what policies see."""
+        """Return the shapes of the observation."""
         camera = physics.race.spec.camera
         return {
             "state": specs.Array((physics.race.spec.state_size,), np.float32, "state"),
@@ -64,7 +64,7 @@ class RaceTask(control.Task):
         }
 
     def get_observation(self, physics: RacePhysics) -> dict[str, np.ndarray]:
-        """Return what policies see."""
+        """Return the observation."""
         return physics.race.observation(physics.data.ptr)
 
     def get_reward(self, physics: RacePhysics) -> float:
@@ -72,7 +72,7 @@ class RaceTask(control.Task):
         return physics.reward
 
     def get_termination(self, physics: RacePhysics) -> float | None:
-        """Return the discount of an ended episode (1 where time was over), None while it goes."""
+        """Return the discount of an ended episode (1 for a timeout), None for a running one."""
         ended = physics.race.ended_by
         if ended is None:
             return None
@@ -97,7 +97,7 @@ def load(
         seed: of the track.
         track: flown instead of the family's; gusts are drawn by its name, which the judge does by
             its file's.
-        vehicle: what flies; `eval/vehicles/reference.toml` where it is left out.
+        vehicle: that flies; None: `eval/vehicles/reference.toml`.
         spec: rate, camera and encoding of the observation; the rate is met to a whole number of
             physics steps.
         rules: when an episode ends.

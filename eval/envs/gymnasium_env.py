@@ -25,7 +25,7 @@ Observation = dict[str, np.ndarray]
 RENDER_SIZE = 640, 360
 """Width and height of a rendered frame [pixels]."""
 INSET = 4
-"""Share of a rendered frame's width that the depth image takes: one in so many."""
+"""Width of a rendered frame over that of its depth image."""
 
 
 def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
@@ -34,7 +34,7 @@ def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
 
 
 def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
-    """Return the space of what policies see: `state` and `image`."""
+    """Return the observation space of policies: `state` and `image`."""
     state = gymnasium.spaces.Box(-STATE_LIMIT, STATE_LIMIT, (spec.state_size,), np.float32)
     if spec.depth.uint8:
         image = gymnasium.spaces.Box(0, 255, spec.image_shape, np.uint8)
@@ -48,12 +48,12 @@ def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
 class RaceEnv(gymnasium.Env):
     """Fly the gates of a track in order with the judge's quadrotor and rules.
 
-    An action is -1 to 1 a component; `contract` says what they mean, and goes into the file of a
-    policy that is trained here. An observation is what policies see: `state`, the paper's 12
-    numbers (more where the spec has them, SI units), and `image`, the encoded inverse depth. The
-    reward is a weighted sum of the terms `eval.envs.races.REWARDS`. `terminated` is every end but
-    the time limit, which is `truncated`; `info["ended_by"]` is the reason. A `reset` without a
-    fixed track draws a new one; `options` may hold the `track_seed` to fly.
+    Each component of an action is from -1 to 1; `contract` defines its meaning, and belongs into
+    the file of a policy that is trained here. An observation has `state`, the paper's 12 numbers
+    (more where the spec has them, SI units), and `image`, the encoded inverse depth. The reward is
+    a weighted sum of the terms `eval.envs.races.REWARDS`. `terminated` is every end except the time
+    limit, which is `truncated`; `info["ended_by"]` is the reason. A `reset` without a fixed track
+    draws a new one; `options` may contain the `track_seed`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -68,8 +68,8 @@ class RaceEnv(gymnasium.Env):
                 spec, action, channel_axis, uint8, rewards, rules.
 
         Raises:
-            ValueError: for a value that cannot be used.
-            TypeError: for an argument that is none.
+            ValueError: for an invalid value.
+            TypeError: for an unknown argument.
         """
         self._races = Races(RaceConfig(**config), 1)
         self.action_space = action_space(self._races.spec)
@@ -81,7 +81,7 @@ class RaceEnv(gymnasium.Env):
 
     @property
     def contract(self) -> Contract:
-        """What goes into the file of a policy that is trained here."""
+        """The contract for the file of a policy that is trained here."""
         return self._races.contract
 
     @property
@@ -140,12 +140,12 @@ class RaceEnv(gymnasium.Env):
         return self.__reduce__()[0](*self.__reduce__()[1])
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Travel as the arguments: the copy is as new, before its first `reset`."""
+        """Return the arguments for pickling; the copy is new, before its first `reset`."""
         return _made, (type(self), vars(self._races.config), {"render_mode": self.render_mode})
 
 
 class RaceVectorEnv(VectorEnv):
-    """N races at once in one process; the numbers are those of N `RaceEnv`, to the bit.
+    """N races at once in one process, with the numbers of N `RaceEnv` to the bit.
 
     Autoreset is `SAME_STEP`: a step that ends an episode returns the first observation of the next
     one, and the last one of the old in `info["final_obs"]`, with its info in `info["final_info"]`.
@@ -159,7 +159,7 @@ class RaceVectorEnv(VectorEnv):
         Args:
             num_envs: how many.
             threads: for physics and images; the numbers are the same with any.
-            render_mode: none here; `RaceEnv` renders.
+            render_mode: not supported here; `RaceEnv` renders.
             config: as in `RaceEnv`.
         """
         self._races = Races(RaceConfig(**config), num_envs, threads)
@@ -174,7 +174,7 @@ class RaceVectorEnv(VectorEnv):
 
     @property
     def contract(self) -> Contract:
-        """What goes into the file of a policy that is trained here."""
+        """The contract for the file of a policy that is trained here."""
         return self._races.contract
 
     def reset(
@@ -240,7 +240,7 @@ def _made(cls: type, config: dict[str, Any], rest: dict[str, Any]) -> Any:
     return cls(**rest, **config)
 
 
-# gymnasium loads no plugins: an import registers, as its own convention has it.
+# gymnasium loads no plugins: by its convention an import registers environments.
 if ID not in gymnasium.registry:
     gymnasium.register(
         id=ID,

@@ -1,7 +1,7 @@
-"""Races in the judge's simulator, decision by decision: what the gymnasium environments wrap.
+"""Races in the judge's simulator, decision by decision, for the gymnasium environments.
 
-N slots fly at once, each an episode by the judge's rules; a slot's numbers do not depend on the
-others, to the bit, so that one environment and N at once give the same.
+N slots fly at once, each an episode by the judge's rules. A slot's numbers do not depend on the
+other slots, to the bit, so one environment and N environments give the same results.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from tracks.track import Track
 SEEDS = 2**31
 """Tracks are drawn with seeds below this."""
 BAD_ACTION = "bad_action"
-"""How an episode ends, besides `eval.worlds.trial.ENDINGS`, by an action that is not finite."""
+"""End of an episode by an action that is not finite, in addition to `eval.worlds.trial.ENDINGS`."""
 
 
 class Moments(NamedTuple):
-    """A decision of N episodes, before and after it; what reward terms are made of."""
+    """Quantities of one decision of N episodes, for the reward terms."""
 
     to_go_before: np.ndarray
-    """(N,) way left from gate to gate [m]."""
+    """(N,) remaining distance from gate to gate, before the decision [m]."""
     to_go: np.ndarray
-    """(N,) the same afterwards [m]."""
+    """(N,) the same after it [m]."""
     gates: np.ndarray
-    """(N,) gates passed in it."""
+    """(N,) gates passed during it."""
     crashed: np.ndarray
-    """(N,) bool: ended, but not by all gates or the time limit."""
+    """(N,) bool: ended other than by all gates or the time limit."""
     finished: np.ndarray
     """(N,) bool."""
     period_s: np.ndarray
@@ -62,19 +62,19 @@ REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
     "time": (0.0, lambda m: m.period_s),
     "action_change": (0.0, lambda m: m.action_change),
 }
-"""Name of a reward term -> its usual weight, and the term."""
+"""Name of a reward term -> default weight, and function."""
 
 
 @dataclass(frozen=True)
 class RaceConfig:
-    """What is raced; the arguments of the environments."""
+    """Arguments of the environments."""
 
     track: str = "random"
-    """A family, or a track file (.toml). The judge's tables fly other families: train elsewhere."""
+    """A family, or a track file (.toml). The judge's tables use the other families."""
     level: int | tuple[int, int] = 0
     """Difficulty 0 to 9, or a range from which each episode draws."""
     track_seed: int | None = None
-    """Of one track flown every time; None draws one for each episode."""
+    """Seed of one track for all episodes; None draws one for each episode."""
     vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
     """A shipped name, a file, a vehicle, or a function that draws one for each episode, all with
     other values of the same effects (`suite.train.dynamics.spreads.race_settings` has the
@@ -89,13 +89,13 @@ class RaceConfig:
     uint8: bool = False
     """Whether pixels are uint8, 0 to 255."""
     rewards: Mapping[str, float] = field(default_factory=dict)
-    """Weights of reward terms by name, in place of those of `REWARDS`."""
+    """Weights of reward terms by name, instead of the defaults in `REWARDS`."""
     rules: Rules = field(default_factory=Rules)
     """When an episode ends."""
 
 
 def levels_of(config: RaceConfig) -> tuple[int, int]:
-    """Return the lowest and the highest level that is flown."""
+    """Return the lowest and the highest level."""
     level = config.level
     return (level, level) if isinstance(level, int) else (int(level[0]), int(level[1]))
 
@@ -109,7 +109,7 @@ def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
 
 
 def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
-    """Return the spec of the environment, whose actions are -1 to 1 of what `vehicle` can do."""
+    """Return the environment's spec, whose actions from -1 to 1 cover the range of `vehicle`."""
     spec = config.spec or PolicySpec()
     if isinstance(spec, str):
         if not locate(spec).exists():

@@ -1,7 +1,7 @@
 """Races by the conventions of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`).
 
-It takes an image of two axes for a mistake, so here the pixels are one vector, row after row; an
-image with `channel_axis=True` stays an image.
+The library rejects images with two axes, so here the pixels are one vector, row by row; an image
+with `channel_axis=True` is unchanged.
 """
 
 # pyright: reportMissingImports=false, reportMissingModuleSource=false
@@ -65,11 +65,11 @@ class RaceVecEnv(VecEnv):
         return as_space(self._space, seen, self.num_envs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions (N, size) that `step_wait` flies."""
+        """Store the actions (N, size) for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Fly them; an episode that ends starts anew, as this library has it."""
+        """Fly the actions; as this library requires, an ended episode restarts at once."""
         seen, reward, terminated, truncated, infos = self.races.step(self._actions)
         over, each = terminated | truncated, []
         for slot in range(self.num_envs):

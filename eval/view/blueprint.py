@@ -1,4 +1,4 @@
-"""How a recording opens: one tab a trial, its track, what the drone saw, and plots over time."""
+"""Layout of a recording: one tab for each trial, with track, depth image and plots."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ TIMELINE = "time"
 
 
 class Tab(NamedTuple):
-    """What the layout of one trial needs."""
+    """Inputs of the layout of one trial."""
 
     root: str
     """Entity path of the trial."""
     title: str
     has_depth: bool
     low_w: np.ndarray
-    """(3,) lower corner of what is to be seen [m]."""
+    """(3,) lower corner of the visible region [m]."""
     high_w: np.ndarray
     """(3,) upper corner [m]."""
 
 
 def layout(tabs: Sequence[Tab], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return the blueprint of a recording with these trials, which plays `shown_s` [s]."""
+    """Return the blueprint of a recording of these trials, which plays the span `shown_s` [s]."""
     return tabbed([_tab(tab) for tab in tabs], shown_s)
 
 
 def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return a blueprint with a tab for each of `parts`, which plays between two times [s].
+    """Return a blueprint with a tab for each of `parts`, which plays the span `shown_s` [s].
 
-    The viewer has no setting for where the time stands, but a loop over a selection begins at the
-    selection's first moment. A file without it opens at its last moment, when all is over. (A
-    viewer that is slow to load plays from the start to the end and stops there: 0.41.)
+    The viewer has no setting for the initial time, but a loop over a selection begins at its start.
+    Without it a file opens at its last time. (A viewer of 0.41 that loads slowly plays from the
+    start to the end and stops there.)
     """
     begin, end = (round(1e9 * time) for time in shown_s)
     return rrb.Blueprint(
@@ -57,7 +57,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
     world = f"{tab.root}/world"
     overview = rrb.Spatial3DView(
         origin=world,
-        # Back-projected depth would hide the track, so it is left to the view from behind.
+        # Back-projected depth would hide the track, so only the view from behind shows it.
         contents=["$origin/**", "- $origin/drone/camera/**"],
         name="track",
         background=[245, 246, 248],
@@ -66,7 +66,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
     )
     side_views: list[rrb.View] = [
         rrb.Spatial3DView(
-            # In the drone's frame, so that the eye is carried along and turns with it.
+            # In the drone's frame, so that the camera moves and turns with it.
             origin=f"{world}/drone",
             contents=[f"{world}/**", "- $origin/pin"],
             name="behind the drone",
@@ -82,7 +82,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
     ]
     if tab.has_depth:
         camera = f"{world}/drone/camera"
-        side_views.append(rrb.Spatial2DView(origin=camera, name="depth image it saw"))
+        side_views.append(rrb.Spatial2DView(origin=camera, name="depth image"))
     plots = {
         "speed": "speed [m/s]",
         "rates": "body rates [rad/s]",
@@ -107,7 +107,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
 
 
 def _overview(tab: Tab) -> rrb.EyeControls3D:
-    """Return an eye that looks down on all of the track, from its long side."""
+    """Return a camera above the track's long side that shows all of it."""
     middle, size = (tab.low_w + tab.high_w) / 2, tab.high_w - tab.low_w
     away = np.array([0.0, -1.0, 0.75]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.75])
     distance = 0.57 * float(np.max(size[:2])) + 0.2 * float(np.min(size[:2])) + 1.0

@@ -1,4 +1,4 @@
-"""One picture of a drone on a track, from any eye or from behind it."""
+"""Pictures of a drone on a track, from any viewpoint or from behind it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from eval.view.solids import track_solids
 from tracks.track import Track
 
 OVERSAMPLING = 2
-"""Pictures are painted this much larger and then reduced, which smooths edges."""
+"""Pictures are drawn this much larger and then reduced, for smooth edges."""
 ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
 BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
-"""Where the eye of `chase_image` is, and how far before the drone it looks [m]."""
+"""Position of `chase_image`'s camera behind and above the drone, and of its target ahead [m]."""
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.0)
 
 
@@ -26,7 +26,7 @@ class Scenery(NamedTuple):
     corners_w: np.ndarray
     """(F, 3, 3) [m]."""
     gate: np.ndarray
-    """(F,) of which gate's frame each is a part, or -1."""
+    """(F,) number of the gate to whose frame each belongs, or -1."""
 
 
 class Drone(NamedTuple):
@@ -37,11 +37,11 @@ class Drone(NamedTuple):
     rot_w: np.ndarray
     """(3, 3) body to world."""
     gates: int
-    """Passed."""
+    """Number of passed gates."""
 
 
 def scenery_of(track: Track) -> Scenery:
-    """Return what `painted` shows of a track."""
+    """Return the triangles of a track, for `painted`."""
     solids = track_solids(track)
     corners, whose = cut_up(np.concatenate([solid.vertices[solid.faces] for solid in solids]))
     gates = [-1 if solid.gate is None else solid.gate for solid in solids]
@@ -56,17 +56,17 @@ def painted(
     size: tuple[int, int],
     lines: Lines = NO_LINES,
 ) -> Image.Image:
-    """Return the picture from `eye_to_w`, where the eye is and what it looks at [m].
+    """Return the picture from `eye_to_w`, the camera's position and its target [m].
 
-    What stands between the eye and the drone is left out.
+    Triangles between the camera and the drone are left out.
 
     Args:
         scenery: of the track.
-        drone: gates that it has passed are coloured so.
+        drone: sets the colours of passed and next gates.
         eye_to_w: (3,) each.
         fov_deg: field of view across [deg].
         size: width and height [pixels].
-        lines: drawn as well.
+        lines: additional lines.
     """
     eye, target = eye_to_w
     body = _drone_faces(drone.pos_w, drone.rot_w)
@@ -83,7 +83,7 @@ def chase_image(
     scenery: Scenery, drone: Drone, vel_w: np.ndarray, size: tuple[int, int], fov_deg: float = 78.0
 ) -> np.ndarray:
     """Return (height, width, 3) uint8 from behind a drone that flies at vel_w (3,) [m/s]."""
-    # The heading helps out where the drone stands still.
+    # The heading contributes for a drone at rest.
     way = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
     ahead = np.append(way / max(float(np.linalg.norm(way)), 1e-6), 0.0)
     eye = drone.pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
@@ -96,9 +96,9 @@ def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) 
 
     Args:
         picture: uint8.
-        depth_m: coloured up to `range_m`, the nearest pixel for each of the picture's.
+        depth_m: coloured up to `range_m`, enlarged with the nearest pixel.
         range_m: the camera's [m].
-        share: the depth image takes one in so many of the picture's columns.
+        share: the picture's width over that of the depth image.
     """
     width = picture.shape[1] // share
     height = min(picture.shape[0], max(1, width * depth_m.shape[0] // depth_m.shape[1]))
@@ -110,7 +110,7 @@ def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) 
 
 
 def _beyond(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
-    """Return which faces (F, 3, 3) are not before the drone, where they would hide it, (F,)."""
+    """Return which faces (F, 3, 3) are not between camera and drone, (F,)."""
     way = pos_w - eye_w
     return ((corners_w - eye_w) @ way).max(axis=1) > way @ way
 
@@ -124,7 +124,7 @@ def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
 
 
 def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
-    """Return a body and four rotors, the front ones orange."""
+    """Return the faces of a body and four rotors, the front ones orange."""
     x, y, z = 0.064, 0.064, 0.025
     box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

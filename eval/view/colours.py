@@ -1,4 +1,4 @@
-"""The colours that pictures, recordings and videos share."""
+"""Colours of pictures, recordings and videos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
 
 AHEAD, PASSED = (217, 130, 43), (42, 143, 91)
-"""Gates that were not passed and gates that were, 0-255."""
+"""Colours of gates ahead and of passed gates, 0-255."""
 CRASH, START = (208, 47, 47), (31, 59, 115)
 SOLID, SOLID_EDGE = (201, 206, 214), (138, 147, 160)
 DRONE = (40, 44, 52)
@@ -17,27 +17,27 @@ AXES = ((220, 60, 60), (60, 160, 70), (60, 100, 220))
 LIGHT_W = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
 """Unit vector towards the light."""
 SPEED_MAP = ListedColormap(colormaps["plasma"](np.linspace(0, 0.9, 256)))
-"""Colours of the speed, without the yellow that is hard to see on white."""
+"""Colours of the speed, without yellow, which is hard to see on white."""
 DEPTH_MAP = colormaps["turbo"]
 
 
 def hexed(colour: tuple[int, int, int]) -> str:
-    """Return a colour as matplotlib takes it, "#rrggbb"."""
+    """Return a colour as text for matplotlib, "#rrggbb"."""
     return "#" + "".join(f"{part:02x}" for part in colour)
 
 
 def speed_colours(speed: np.ndarray, top: float) -> np.ndarray:
-    """Return colours (..., 3) uint8 of speeds (...) where `top` is the fastest shown [m/s]."""
+    """Return colours (..., 3) uint8 of speeds (...) up to `top` [m/s]."""
     return SPEED_MAP(np.clip(speed / top, 0, 1), bytes=True)[..., :3]
 
 
 def top_speed(speed: np.ndarray) -> float:
-    """Return the speed that the colours end at, at least 1 [m/s]."""
+    """Return the largest speed of the colour scale, at least 1 [m/s]."""
     return max(1.0, float(np.nanmax(speed, initial=1.0)))
 
 
 def brightness(normals_w: np.ndarray) -> np.ndarray:
-    """Return what share of its colour a face of unit normal (..., 3) shows, 0.44 to 1."""
+    """Return the brightness of faces with unit normals (..., 3), 0.44 to 1."""
     return 0.72 + 0.28 * (normals_w @ LIGHT_W)
 
 

@@ -1,9 +1,9 @@
-"""Recordings of measured flights beside simulated ones, for the rerun viewer.
+"""Recordings of measured and simulated flights together, for the rerun viewer.
 
-A flight stands below `/flight_k`: `world/measured`, and `world/LABEL` for each simulation, each
+A flight has the entities `/flight_k/world/measured`, and `world/LABEL` for each simulation, each
 with its `path` and a moving `drone`; the series `error/LABEL/position`, `.../velocity`,
 `.../attitude` and `.../rates`, and `velocity_x/measured`, `velocity_x/LABEL`, ... on the timeline
-`time` in seconds from the flight's start. A simulation is cut into rollouts; lines break between
+`time` in seconds from the flight's start. A simulation consists of rollouts; lines break between
 them.
 """
 
@@ -26,13 +26,13 @@ SCHEMA = 1
 """Version of the recording's entities, in its properties."""
 MEASURED = (29, 36, 48)
 SIMULATED = ((224, 137, 43), (36, 99, 201), (122, 92, 184))
-"""Colours of what is compared, in order."""
+"""Colours of the simulations, in order."""
 ERRORS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "rad/s"}
 SERIES = tuple(f"{group}_{axis}" for group in ("velocity", "rates") for axis in "xyz")
 
 
 class Track(NamedTuple):
-    """Where a drone was, measured or simulated, at T times; NaN where nothing is known."""
+    """Measured or simulated states of a drone at T times; NaN where unknown."""
 
     time_s: np.ndarray
     """(T,) since the flight's start [s]."""
@@ -47,10 +47,10 @@ class Track(NamedTuple):
 
 
 class Simulation(NamedTuple):
-    """One simulation of a flight, in rollouts that start from what was measured."""
+    """One simulation of a flight, in rollouts that start from measured states."""
 
     label: str
-    """For people."""
+    """Name in the viewer."""
     rollouts: Sequence[Track]
     """One after another in time."""
     errors: Sequence[np.ndarray]
@@ -59,7 +59,7 @@ class Simulation(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """One flight beside its simulations."""
+    """One measured flight and its simulations."""
 
     name: str
     measured: Track
@@ -71,7 +71,7 @@ def write_comparison(
     flights: Sequence[Compared],
     half_size: tuple[float, float, float] = DRONE_HALF_SIZE,
 ) -> Path:
-    """Write flights beside their simulations as a rerun recording (.rrd) that opens laid out.
+    """Write flights and their simulations as a rerun recording (.rrd) with a layout.
 
     Args:
         path: file to write, ending in `.rrd`.
@@ -176,7 +176,7 @@ def _log_line(
 
 
 def _broken(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return `parts` joined, with a row of NaN after each but the last; times go on."""
+    """Return `parts` joined, with a row of NaN between them; times continue."""
     rows: list[np.ndarray] = []
     for number, part in enumerate(parts):
         rows.append(part)
@@ -188,7 +188,7 @@ def _broken(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 def _layout(flights: Sequence[Compared]) -> rrb.Blueprint:
     times = [flight.measured.time_s for flight in flights]
-    # The start is skipped, where the simulations still lie on what was measured.
+    # The start is skipped, where simulations still agree with the measurement.
     shown = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))
     return tabbed([_tab(f"/flight_{number}", f) for number, f in enumerate(flights)], shown)
 

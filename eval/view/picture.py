@@ -1,4 +1,4 @@
-"""Pictures of trials as PNG (or PDF, SVG): from above and from the side, no display needed."""
+"""Pictures of trials as PNG (or PDF, SVG), from above and from the side; need no display."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from tracks.common.files import replacing_file
 from tracks.track import Track
 
 Shown = tuple[Track, Flight | None, TrialResult | None]
-"""A track, and where one was flown, the flight and how it ended."""
+"""A track, with an optional flight and its result."""
 
 TOP, SIDE = (0, 1), (0, 2)
-"""Axes of the world that a view shows, across and up."""
+"""World axes of a view, horizontal and vertical."""
 MARGIN_M = 1.0
 PATH_WIDTH = 2.2
 PASSED, CRASH, START, GREY = map(
@@ -45,13 +45,13 @@ def write_picture(
     result: TrialResult | None = None,
     dpi: int = 130,
 ) -> Path:
-    """Draw a trial, or the bare track where there is no flight, from above and from the side.
+    """Draw a trial, or a track without a flight, from above and from the side.
 
     Args:
-        path: file to write; its ending says the format.
-        track: what was flown through.
+        path: file to write; its ending sets the format.
+        track: of the trial.
         flight: the path flown, coloured by speed.
-        result: how it ended, for the title and the mark at the end.
+        result: for the title and the mark at the end.
         dpi: dots per inch; the picture is up to 9.5 inches wide and 9.2 high.
 
     Raises:
@@ -59,7 +59,7 @@ def write_picture(
     """
     low, high = _limits(track, flight)
     across, deep, tall = high - low
-    # One metre is as long in both views, so the views' heights follow from the track's extent.
+    # Both views have the same scale, so their heights follow from the track's extent.
     scale = min(7.6 / across, 7.5 / (deep + tall))
     size = (max(across * scale, 4.5) + 1.9, (deep + tall) * scale + 1.65)
     figure = Figure(figsize=size, layout="constrained")
@@ -83,7 +83,7 @@ def write_picture(
 
 
 def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi: int = 110) -> Path:
-    """Draw several trials from above, one a panel, with one colour bar for all.
+    """Draw several trials from above, each in a panel, with one colour bar.
 
     Raises:
         ValueError: where `trials` is empty.
@@ -94,7 +94,7 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
     columns = min(columns, len(trials))
     rows = math.ceil(len(trials) / columns)
     limits = [_limits(track, flight) for track, flight, _ in trials]
-    # Rows are as tall as their panels' shapes ask for.
+    # Row heights follow from the shapes of their panels.
     shape = np.array([(high - low)[1] / (high - low)[0] for low, high in limits])
     shape = np.clip(shape, 0.3, 1.1)
     tall = [shape[row * columns : (row + 1) * columns].max() for row in range(rows)]
@@ -133,7 +133,7 @@ def _draw(
     gates, passed = track.scene.gates, _passed(flight, result)
     solids = track_solids(track)
     obstacles = [solid.vertices for solid in solids if solid.gate is None]
-    # What is nearer to the eye is drawn later: higher from above, lower y from the side.
+    # Nearer solids are drawn later: higher ones from above, those of lower y from the side.
     obstacles.sort(key=lambda at: at[:, 2].max() if view == TOP else -at[:, 1].min())
     axes.add_collection(
         PolyCollection(

@@ -1,10 +1,10 @@
-"""Recordings of trials that the rerun viewer opens, laid out; Parquet is the record, this a view.
+"""Recordings of trials for the rerun viewer; the data are in the Parquet logs.
 
-With `blueprint.py` and `comparison.py` the only file that touches rerun, whose interface moves
-every few releases (0.41 here). Columns of a whole flight are sent at once, which is far faster than
-step by step.
+Only this file, `blueprint.py` and `comparison.py` use rerun, whose interface changes every few
+releases (0.41 here). Columns of a whole flight are sent at once, which is much faster than row by
+row.
 
-Entities of trial k stand below `/trial_k`: `world/ground`, `world/obstacles/NAME`, `world/gates/N`,
+Entities of trial k are below `/trial_k`: `world/ground`, `world/obstacles/NAME`, `world/gates/N`,
 `world/path`, `world/start`, `world/end`, `world/drone` (moving, with `body`, `rotors` and
 `camera/depth`), and the series `speed`, `thrust`, `rates`, `action`, `rotors` and `events`, all on
 the timeline `time` in seconds from the trial's start.
@@ -35,18 +35,18 @@ SCHEMA = 1
 GROUND = (226, 228, 224)
 GROUND_MARGIN_M = 3.0
 BEFORE_GATE_S = 0.6
-"""How long before its first gate a trial is shown first [s]."""
+"""Time before the first gate at which the playback starts [s]."""
 DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
-"""The body that is drawn unless told otherwise [m]."""
+"""Default half extents of the drawn body [m]."""
 ROTOR_RADIUS_M = 0.0635
 ROTORS_B = ((0.075, -0.10, 0.03), (-0.075, -0.10, 0.03), (-0.075, 0.10, 0.03), (0.075, 0.10, 0.03))
-"""Where rotors are drawn, body [m]."""
+"""Default positions of the drawn rotors, body axes [m]."""
 
 Rollout = tuple[Track, Flight, TrialResult]
 
 
 class Drone(NamedTuple):
-    """What the drone looks like and sees through."""
+    """The drone's shape and camera in a recording."""
 
     half_size: tuple[float, float, float] = DRONE_HALF_SIZE
     """Half extents of the body's box [m]."""
@@ -59,12 +59,12 @@ class Drone(NamedTuple):
 def write_recording(
     path: str | Path, rollouts: Sequence[Rollout], drone: Drone | None = None
 ) -> Path:
-    """Write trials as a rerun recording (.rrd) that opens laid out; no viewer or network needed.
+    """Write trials as a rerun recording (.rrd) with a layout; needs no viewer and no network.
 
     Args:
         path: file to write, ending in `.rrd`.
         rollouts: track, flight and outcome of each trial; each gets a tab.
-        drone: what the drone looks like and sees through, the defaults otherwise.
+        drone: shape and camera; None for the defaults.
 
     Raises:
         ValueError: where there is no rollout.
@@ -75,7 +75,7 @@ def write_recording(
     drone = drone or Drone()
     several = len({result.policy for _, _, result in rollouts}) > 1
     tabs = [_tab(k, *rollout, several) for k, rollout in enumerate(rollouts)]
-    # Nothing goes out until the file is named, so that it holds the blueprint first.
+    # Nothing is sent before `save`, so that the blueprint comes first in the file.
     recording = rr.RecordingStream(APPLICATION)
     with replacing_file(path) as temporary:
         recording.save(temporary, default_blueprint=layout(tabs, _shown(rollouts)))
@@ -110,7 +110,7 @@ def _tab(number: int, track: Track, flight: Flight, result: TrialResult, several
 
 
 def _shown(rollouts: Sequence[Rollout]) -> tuple[float, float]:
-    """Return what a recording plays: from just before the first trial's first gate to the end."""
+    """Return the span of the playback, from just before the first trial's first gate to the end."""
     flight = rollouts[0][1]
     passed = flight.time_s[flight.gate > 0]
     begin = max(0.0, float(passed[0]) - BEFORE_GATE_S) if len(passed) else 0.0

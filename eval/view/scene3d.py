@@ -1,7 +1,7 @@
-"""A small painter of flat-shaded triangles and lines, so that a video needs no GPU and no GL.
+"""A small renderer of flat-shaded triangles and lines, so that a video needs no GPU and no GL.
 
 Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972),
-which is right for small faces but for rare overlaps; large ones are cut up before.
+which is correct for small faces except for rare overlaps; large faces are divided before.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from eval.view.colours import brightness
 from eval.view.solids import flat_normals
 
 NEAR_M = 0.05
-"""What is nearer to the eye than this is cut off [m]."""
+"""Distance from the camera below which faces are clipped [m]."""
 FOG_M = 45.0
-"""Distance at which a colour has faded all the way it does [m]."""
+"""Distance at which a colour has faded by `FOG_SHARE` [m]."""
 FOG_SHARE = 0.65
 SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
 GRID_REACH_M = 24
 
 
 LONGEST_M = 2.0
-"""Sides of faces that are longer are cut: a floor's middle is far from what stands on it [m]."""
+"""Longest side of a face before it is divided [m]."""
 MOST_FACES = 6000
-"""No more are made by cutting, whatever their sides."""
+"""Largest number of faces after division."""
 
 
 class Viewpoint(NamedTuple):
@@ -62,7 +62,7 @@ class Lines(NamedTuple):
 
 
 def cut_up(corners_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles (F, 3, 3) cut until no side is long, and of which each is a part, (F',)."""
+    """Return triangles (F, 3, 3) divided until no side is long, and their origins (F',)."""
     whose = np.arange(len(corners_w))
     while True:
         sides = np.linalg.norm(corners_w - np.roll(corners_w, -1, axis=1), axis=-1)
@@ -81,7 +81,7 @@ def cut_up(corners_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def look_at(
     eye_w: np.ndarray, target_w: np.ndarray, fov_deg: float, size: tuple[int, int]
 ) -> Viewpoint:
-    """Return the level camera at `eye_w` that looks at `target_w`; `fov_deg` is across."""
+    """Return the level camera at `eye_w` towards `target_w`; `fov_deg` is horizontal."""
     forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= max(float(np.linalg.norm(right)), 1e-9)
@@ -157,7 +157,7 @@ def _paint_ground(draw: ImageDraw.ImageDraw, view: Viewpoint) -> None:
 
 
 def _clip(shape_c: np.ndarray) -> np.ndarray:
-    """Return what of a polygon (k, 3) is in front of the eye (Sutherland, Hodgman 1974)."""
+    """Return the part of a polygon (k, 3) in front of the camera (Sutherland, Hodgman 1974)."""
     kept = []
     for here, after in zip(shape_c, np.roll(shape_c, -1, axis=0), strict=True):
         if here[2] > NEAR_M:

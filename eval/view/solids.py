@@ -1,4 +1,4 @@
-"""A track's solids, the frames of its gates apart from the obstacles."""
+"""A track's solids as triangles, with gate frames and obstacles separated."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Solid(NamedTuple):
 
     name: str
     gate: int | None
-    """Number of the gate whose frame it is a bar of, or None."""
+    """Number of the gate to whose frame it belongs, or None."""
     vertices: np.ndarray
     """(V, 3) [m]."""
     faces: np.ndarray
@@ -49,7 +49,7 @@ def flat_normals(corners: np.ndarray) -> np.ndarray:
 def outline(points: np.ndarray) -> np.ndarray:
     """Return the corners (k, 2) of the convex hull of `points` (n, 2), counter-clockwise.
 
-    Andrew's monotone chain (1979), which takes points on one line, too.
+    Andrew's monotone chain (1979), which also works for points on one line.
     """
     ordered = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     if len(ordered) < 3:

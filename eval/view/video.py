@@ -28,16 +28,16 @@ from tracks.track import Track
 ENDINGS = (".mp4", ".gif")
 DEPTH_RANGE_M = 10.0
 TRAIL_S = 1.6
-"""How long the path is shown behind the drone [s]."""
+"""Duration of the path shown behind the drone [s]."""
 
 
 SIDE_SHARE = 1 / 3
-"""Share of a frame's width that the depth image takes, where the flight has any."""
+"""Width of the depth image over that of a frame, for flights with depth images."""
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """How a video looks."""
+    """Size, speed and camera of a video."""
 
     size: tuple[int, int] = (960, 540)
     """Width and height, even numbers [pixels]."""
@@ -48,15 +48,15 @@ class VideoOptions:
     fov_deg: float = 78.0
     """Field of view across [deg]."""
     behind_m: float = 1.5
-    """Distance of the eye behind the drone [m]."""
+    """Distance of the camera behind the drone [m]."""
     above_m: float = 0.55
-    """Height of the eye above the drone [m]."""
+    """Height of the camera above the drone [m]."""
     hold_s: float = 1.0
-    """How long the last frame stays [s]."""
+    """Duration of the last frame [s]."""
 
 
 SMALL = VideoOptions(size=(720, 360), fps=12)
-"""For a page: what a GIF of a race takes stays below some 3 MB."""
+"""Options for web pages: a GIF of a race has less than about 3 MB."""
 
 
 def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
@@ -78,11 +78,11 @@ def write_video(
 
     Args:
         path: file to write, ending in `.mp4` or `.gif`.
-        track: what was flown through.
-        flight: what was flown; its depth images are shown where there are any.
-        result: how it ended.
+        track: of the trial.
+        flight: with optional depth images.
+        result: of the trial.
         options: size and speed.
-        on_frame: called with the number of frames that are done, of `len(frame_times(...))`.
+        on_frame: called with the number of finished frames, of `len(frame_times(...))`.
 
     Raises:
         ValueError: where the ending is another, the size odd, or the flight has no two rows.
@@ -140,7 +140,7 @@ def video_frames(
 
 
 def _swatches() -> np.ndarray:
-    """Return the colours (n, 3) that come in a video but hardly in its first frame."""
+    """Return the colours (n, 3) that occur in a video but hardly in its first frame."""
     gates = np.array([colours.AHEAD, colours.PASSED, colours.CRASH, colours.START])
     shades = [gates * shade for shade in (0.5, 0.65, 0.8, 0.95)]
     depths = colours.depth_colours(np.linspace(0, DEPTH_RANGE_M, 40), DEPTH_RANGE_M)
@@ -164,9 +164,9 @@ def _at(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
 def _chase(
     flight: Flight, rot_w: np.ndarray, options: VideoOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the eye is and what it looks at for every row, (T, 3) each [m]."""
+    """Return the camera's position and target for every row, (T, 3) each [m]."""
     step = max(float(np.median(np.diff(flight.time_s))), 1e-6)
-    # The heading helps out where the drone stands still.
+    # The heading contributes for a drone at rest.
     way = flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0]
     way = gaussian_filter1d(np.nan_to_num(way), 0.25 / step, axis=0, mode="nearest")
     way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
@@ -179,7 +179,7 @@ def _chase(
 
 
 def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
-    """Paint what the policy saw at the right, below a line that says what it is."""
+    """Draw the policy's depth image at the right, below its label."""
     size = (width, max(1, width * depth_m.shape[0] // depth_m.shape[1]))
     small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
     corner = (frame.width - width, (frame.height - size[1]) // 2)
@@ -187,7 +187,7 @@ def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
     draw = ImageDraw.Draw(frame)
     font = ImageFont.load_default(size=_font_size(frame))
     draw.line([corner[0] - 1, 0, corner[0] - 1, frame.height], fill=colours.DRONE)
-    text = f"depth it saw, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
+    text = f"depth image, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
     middle = corner[0] + width / 2
     draw.text((middle, corner[1] - 6), text, fill=colours.DRONE, font=font, anchor="mb")
     # The scale of its colours.

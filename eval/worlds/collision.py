@@ -1,4 +1,4 @@
-"""Collisions by distance (JAX): does the body's box meet a solid?
+"""Collisions by distance (JAX): does the body's box touch a solid?
 
 All is looked at in the box's own axes. Boxes and triangles are apart where some axis parts them
 (separating axes: Gottschalk, Lin and Manocha 1996; Akenine-Moeller 2001); the distance of a capsule
@@ -23,13 +23,13 @@ from tracks.geometry.rotation import cross, to_local, to_world
 from tracks.geometry.scene import Array, Counts, Rods, Scene
 
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
-"""Solids looked at: of each kind those with the nearest surface, found anew every `NEAR_STEPS`."""
+"""Number of tested solids of each kind, the nearest ones; updated every `NEAR_STEPS`."""
 NEAR_STEPS = 40
 """Physics steps: 0.4 m at 5 m/s and 500 Hz."""
 HALVINGS = 20
-"""Of a capsule's length: a millionth of it is left."""
+"""Number of halvings of a capsule's length, to a millionth of it."""
 ROUNDS = 12
-"""To a cylinder and back."""
+"""Number of projections to a cylinder and back."""
 REACH = 1.5
 """Length of a projection over the way to the surface: beyond 1 the rounds converge faster, from 2
 on they may not."""
@@ -38,7 +38,7 @@ CONTACT_M = 1e-3
 [m]."""
 _CULLED = ("boxes", "cylinders", "capsules", "spheres")
 PARALLEL = 1e-3
-"""Directions this near to parallel [rad] have no axis across both: what they have, others have."""
+"""Directions within this angle of parallel [rad] need no common normal: other axes cover them."""
 _OWN = tuple(np.eye(3, dtype=np.float32))
 _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(8, 3)
 
@@ -61,7 +61,7 @@ def near_solids(scene: Scene, pos_w: Array) -> Scene:
 def box_distances(
     scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: Array
 ) -> Array:
-    """Return how far (N, S + 1) [m] boxes and solids are apart at least; 0 or less: they meet.
+    """Return lower bounds of the distances (N, S + 1) [m] of box and solids; 0 or less: contact.
 
     Args:
         scene: batched, (N, ...), S solids in all.
@@ -100,7 +100,7 @@ def box_distances(
 
 
 def _out(point: Array, half_size: Array) -> Array:
-    """Return the way to points (..., 3) from what of the box is nearest, 0 inside."""
+    """Return the vector from the nearest point of the box to points (..., 3), 0 inside."""
     return point - jnp.clip(point, -half_size, half_size)
 
 
@@ -113,7 +113,7 @@ def _beyond(point: Array, half_size: Array) -> Array:
 def _parted(
     axes: list[Array], low_high: Callable[[Array], tuple[Array, Array]], half_size: Array
 ) -> Array:
-    """Return how far the box and a convex solid are apart along the axis that parts them most.
+    """Return the largest separation of the box and a convex solid over a set of axes.
 
     Args:
         axes: (..., 3) each, of any length; those of none part nothing.
@@ -130,7 +130,7 @@ def _parted(
 
 
 def _from_boxes(center: Array, sides: list[Array], reach: Array, half_size: Array) -> Array:
-    """Return how far boxes are apart: middles (N, K, 3), unit vectors of sides, half sizes."""
+    """Return the separation of boxes: centres (N, K, 3), unit vectors of sides, half sizes."""
 
     def low_high(axis: Array) -> tuple[Array, Array]:
         middle = (axis * center).sum(-1)
@@ -141,7 +141,7 @@ def _from_boxes(center: Array, sides: list[Array], reach: Array, half_size: Arra
 
 
 def _from_triangles(corners: list[Array], half_size: Array) -> Array:
-    """Return how far triangles are apart: (N, K, 3) of each corner."""
+    """Return the separation of triangles: (N, K, 3) for each corner."""
 
     def low_high(axis: Array) -> tuple[Array, Array]:
         along = [(axis * corner).sum(-1) for corner in corners]
@@ -154,7 +154,7 @@ def _from_triangles(corners: list[Array], half_size: Array) -> Array:
 
 
 def _across(directions: list[Array]) -> list[Array]:
-    """Return what is square to a side of the box and to each of `directions`."""
+    """Return the common normals of the box's sides and each of `directions`."""
     return [
         cross(jnp.broadcast_to(own, direction.shape), direction)
         for own in _OWN
@@ -168,7 +168,7 @@ def _unit(vector: Array) -> Array:
 
 
 def _from_capsules(rods: Rods, half_size: Array) -> Array:
-    """Return how far capsules are apart, by halving the part of each that may be nearest."""
+    """Return the separation of capsules, by bisection of each axis."""
 
     def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
@@ -184,7 +184,7 @@ def _from_capsules(rods: Rods, half_size: Array) -> Array:
 
 
 def _from_cylinders(rods: Rods, half_size: Array) -> Array:
-    """Return how far cylinders are apart, less `CONTACT_M`, from two points of the box."""
+    """Return the separation of cylinders less `CONTACT_M`, from two points of the box."""
     alone = jax.tree.map(lambda array: array[:, :, None], rods)
 
     def from_point(point: Array) -> tuple[Array, Array]:

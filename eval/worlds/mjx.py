@@ -1,4 +1,4 @@
-"""The world `mjx`: many trials at once in JAX, for accelerators.
+"""The simulator `mjx`: many trials at once in JAX, for accelerators.
 
 MuJoCo's JAX engine moves the free body; its contacts are off, since they cost ten times as much as
 all else and a trial ends at the first of them: collisions are found by signed distance, images by
@@ -56,7 +56,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # its import prints what option
 
 
 FARTHEST_M = 1000.0
-"""From the world's origin along an axis: there a float32's step is 0.06 mm [m]."""
+"""Largest coordinate, at which a float32's resolution is 0.06 mm [m]."""
 
 
 class Flying(NamedTuple):
@@ -71,7 +71,7 @@ class Flying(NamedTuple):
 
 
 class MjxWorld:
-    """MuJoCo in JAX, for GPUs: slots of one compiled program."""
+    """MuJoCo in JAX, for GPUs: all slots in one compiled program."""
 
     name = "mjx"
     integrator = "euler"
@@ -88,7 +88,7 @@ class MjxWorld:
         threads: int = 1,
         action: ActionSpec | None = None,
     ) -> None:
-        """Make the world; the arguments are those of `MujocoWorld`, `threads` is left to JAX."""
+        """Make the world; the arguments are those of `MujocoWorld`, but JAX sets the threads."""
         self.slots = slots
         self._layout, self._rules, self._camera = layout, rules, camera
         self._autopilot = make_autopilot(vehicle, action)
@@ -118,7 +118,7 @@ class MjxWorld:
 
     @property
     def progress(self) -> Progress:
-        """Where the trial in each slot stands."""
+        """Progress of the trial in each slot."""
         return jax.tree.map(np.asarray, self._state.progress)
 
     def _no_draws(self) -> np.ndarray | None:
@@ -176,7 +176,7 @@ class MjxWorld:
     def _judge(
         self, state: Flying, which: Array, bad: Array, course: Course, near: Scene
     ) -> Flying:
-        """Judge the current states of the slots in `which`; lost ones come back at rest."""
+        """Judge the current states of the slots in `which`; diverged ones are reset to rest."""
         motion = _motion(state.qpos, state.qvel)
         diverged = bad | has_diverged(self._rules, motion)
         pos_w, rot_w, _, _ = motion
@@ -206,7 +206,7 @@ class MjxWorld:
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return what can be observed now."""
+        """Return the current view."""
         assert self._on_device is not None
         course, scene = self._on_device
         seen = self._look(self._state, course, scene)

@@ -1,4 +1,4 @@
-"""The world `rotorpy`: RotorPy's multirotor flies the trials (Folk, Paulos and Kumar 2023).
+"""The simulator `rotorpy`: RotorPy's multirotor flies the trials (Folk, Paulos and Kumar 2023).
 
 Policy, autopilot, rate loop and mixer are ours, since they are what a vehicle file describes, and
 so are scene, images, contacts and rules. From the rotor speeds that are asked for, all is RotorPy's
@@ -32,14 +32,14 @@ STEPS_A_LAG = 1.0
 """The rotors' time constant is no shorter than so many steps: RotorPy divides by it, and its
 integrator follows a shorter one badly."""
 XYZW = [1, 2, 3, 0]
-"""Where RotorPy's quaternion has each number of ours."""
+"""Index in RotorPy's quaternion of w, x, y and z."""
 
 
 class Push(NamedTuple):
-    """What a step of RotorPy is given."""
+    """Inputs of a step of RotorPy."""
 
     rotor_speed: np.ndarray
-    """(N, 4) asked for, held during the step [rad/s]."""
+    """(N, 4) commanded, held during the step [rad/s]."""
     wind_w: np.ndarray
     """(N, 3) held during the step [m/s]."""
 
@@ -73,7 +73,7 @@ class RotorpyWorld(SceneSlots):
 
     @staticmethod
     def check() -> None:
-        """Check that RotorPy can be used.
+        """Check that RotorPy is installed and usable.
 
         Raises:
             ValueError: where it is not installed, with what to do.
@@ -82,12 +82,12 @@ class RotorpyWorld(SceneSlots):
 
     @staticmethod
     def differences(vehicle: Vehicle) -> list[str]:
-        """Return a sentence for everything of `vehicle` that is flown otherwise, or not at all."""
+        """Return a sentence for each deviation of the simulation from `vehicle`."""
         return rotorpy_vehicle.differences(vehicle, STEPS_A_LAG / vehicle.controller.frequency)
 
     @staticmethod
     def nearest(vehicle: Vehicle) -> Vehicle:
-        """Return the vehicle whose file says best what is flown of `vehicle`."""
+        """Return the vehicle file that describes the simulation of `vehicle` best."""
         return rotorpy_vehicle.as_flown(vehicle)
 
     def _control(
@@ -122,7 +122,7 @@ class RotorpyWorld(SceneSlots):
 
 
 class Multirotor:
-    """N of RotorPy's multirotors of one vehicle, each stepped by itself, in double precision."""
+    """N of RotorPy's multirotors of one vehicle, stepped independently, in double precision."""
 
     def __init__(self, vehicle: Vehicle, dt: float, count: int) -> None:
         """Make `count` of `vehicle` for steps of `dt` [s].
@@ -147,7 +147,7 @@ class Multirotor:
     def step(
         self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray, push: Push
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return qpos, qvel and rotor speeds after one step; nothing is kept from step to step.
+        """Return qpos, qvel and rotor speeds after one step; the object has no state.
 
         Args:
             qpos: (N, 7) position [m] and quaternion wxyz.
@@ -176,7 +176,7 @@ class Multirotor:
     def specific_force_b(
         self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray
     ) -> np.ndarray:
-        """Return force over mass in still air, (N, 3) [m/s^2]; the arguments are `step`'s."""
+        """Return force over mass in still air, (N, 3) [m/s^2]; arguments as in `step`."""
         import torch
 
         vel_b = to_local(quat_to_rot(qpos[:, 3:]), qvel[:, :3])
@@ -188,7 +188,7 @@ class Multirotor:
 
 @contextmanager
 def _in_doubles() -> Iterator[None]:
-    """Let RotorPy's arrays be doubles: they are of torch's default type."""
+    """Set torch's default type to double, which RotorPy uses for its arrays."""
     import torch
 
     usual = torch.get_default_dtype()

@@ -1,4 +1,4 @@
-"""A vehicle file in RotorPy's parameters, and in words what of it RotorPy has otherwise or not.
+"""Convert a vehicle file to RotorPy's parameters, and list the differences.
 
 RotorPy's own constants of a vehicle are those of its rotors, body and air (Folk, Paulos and Kumar
 2023, "RotorPy: A Python-based Multirotor Simulator with Aerodynamics"). Commands, and when they
@@ -28,19 +28,19 @@ AIR: Mapping[str, Callable[[Any, float], Mapping[str, float]]] = {
     "translational_lift": lambda values, mass: {"k_h": 0.25 * mass * float(values.coefficient)},
     "blade_flapping": lambda values, mass: {"k_flap": -float(values.coefficient)},
 }
-"""Our effect -> RotorPy's parameters of it, from its values and the true mass [kg]."""
+"""Effect -> RotorPy's parameters, from the effect's values and the true mass [kg]."""
 CONSTANTS = ("motor_lag", "thrust_scale", "mass_offset", "com_offset", "inertia_scale")
-"""Effects that change constants which RotorPy is given."""
+"""Effects that change constants of RotorPy's model."""
 ROTORPY_EFFECTS = (*AIR, *CONSTANTS)
-"""Effects that RotorPy's own equations have."""
+"""Effects that RotorPy's own equations contain."""
 OUTSIDE = ("command_delay", "rate_gain", "constant_wind", "gusts")
-"""Effects outside its vehicle: of the autopilot, and the wind that it is given."""
+"""Effects outside RotorPy's vehicle: of the autopilot, and wind, which is an input."""
 AT_HOVER = "linear_drag"
-"""RotorPy has none that does not go with the rotors' speed."""
+"""RotorPy's drag is always proportional to the rotors' speed."""
 
 
 def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[str, Any]:
-    """Return RotorPy's parameters of a vehicle; effects that it has not are left out.
+    """Return RotorPy's parameters of a vehicle, without effects that it does not model.
 
     Args:
         vehicle: what flies.
@@ -77,7 +77,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
 
 
 def _fastest(vehicle: Vehicle) -> float:
-    """Return the largest speed that the autopilot may ask of a rotor [rad/s].
+    """Return the largest rotor speed that the autopilot may command [rad/s].
 
     Behind a firmware's loop it is what the motors' curve gives at full command.
     """
@@ -88,7 +88,7 @@ def _fastest(vehicle: Vehicle) -> float:
 
 
 def as_flown(vehicle: Vehicle) -> Vehicle:
-    """Return the vehicle whose file says best what RotorPy flies of `vehicle`."""
+    """Return the vehicle file that describes RotorPy's model of `vehicle` best."""
     known = (*ROTORPY_EFFECTS, *OUTSIDE)
     kept = {name: value for name, value in vehicle.effects.items() if name in known}
     if AT_HOVER in vehicle.effects:
@@ -99,7 +99,7 @@ def as_flown(vehicle: Vehicle) -> Vehicle:
 
 
 def differences(vehicle: Vehicle, shortest_lag_s: float) -> list[str]:
-    """Return a sentence for everything of `vehicle` that RotorPy flies otherwise, or not at all.
+    """Return a sentence for each deviation of RotorPy's model from `vehicle`.
 
     The arguments are those of `rotorpy_parameters`.
     """

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
-from eval.importers.assemble import assemble
-from eval.importers.findings import usable_for
+from eval.importers.assemble import assemble, usable_for
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
