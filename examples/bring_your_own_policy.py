@@ -60,7 +60,7 @@ def write_torch(module: torch.nn.Module, path: Path) -> None:
 
 
 def main(folder: Path) -> None:
-    """Export the policy to `folder` in both ways, and ask each for one action."""
+    """Export the policy to `folder` in both formats, and compute one action with each."""
     folder.mkdir(parents=True, exist_ok=True)
     module = ToTheGate().eval()
     write_onnx(module, folder / "to_the_gate.onnx")

@@ -47,7 +47,7 @@ class Agent(nn.Module):
 
 
 def seen_by(state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return what both networks take (N, 12 + H W), numbers around one."""
+    """Return the input of both networks (N, 12 + H W), scaled to about one."""
     return torch.cat([SCALE * state, 0.3 * image.flatten(1)], 1)
 
 
@@ -76,7 +76,7 @@ def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
             ended = terminated | truncated
             for k in np.flatnonzero(ended):
                 gates.append(int(info["final_info"]["gates"][k]))
-                if truncated[k]:  # what would have followed counts
+                if truncated[k]:  # bootstrap from the value of the last observation
                     last = {key: part[None] for key, part in info["final_obs"][k].items()}
                     with torch.no_grad():
                         reward[k] += GAMMA * float(agent.critic(tensors(last)))

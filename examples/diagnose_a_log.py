@@ -1,4 +1,4 @@
-"""Ask what a simulation lacks, of three flight logs that come with the suite.
+"""Diagnose which effects a simulation lacks, from three flight logs shipped with the suite.
 
 They were flown with a battery strapped on, so that the centre of mass is off. Run: python
 examples/diagnose_a_log.py [FOLDER]; it writes report.html, diagnosis.json and vehicle.toml. Logs of

@@ -1,4 +1,4 @@
-"""Fly the shipped policy once and draw what it did.
+"""Fly the shipped policy once and draw the flight.
 
 Run: python examples/fly_and_plot.py [FOLDER]; it writes trial.png, trial.gif and trial.rrd.
 """

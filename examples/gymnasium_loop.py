@@ -30,12 +30,12 @@ def main(episodes: int) -> None:
         while not over:
             seen, reward, terminated, truncated, info = env.step(pilot(seen["state"]))
             total, steps, over = total + float(reward), steps + 1, terminated or truncated
-        depth = seen["image"]  # (24, 32) encoded inverse depth, what our policies see
+        depth = seen["image"]  # (24, 32) encoded inverse depth, the policies' input
         print(
             f"{info['gates']} gates, {info['ended_by']} after {steps} decisions, return {total:.1f}"
             f", nearest pixel {depth.max():.2f}"
         )
-        seen, info = env.reset()  # another track; options={"track_seed": 5} asks for one
+        seen, info = env.reset()  # another track; options={"track_seed": 5} selects one
     env.close()
 
 

@@ -23,7 +23,7 @@ class Tether(NamedTuple):
 
 
 def pull(values: Tether, flow: Flow) -> Array:
-    """Return R^T (-k p) (..., 3) [N]; numpy and JAX arrays of any leading shape alike."""
+    """Return R^T (-k p) (..., 3) [N], for numpy and JAX arrays of any leading shape."""
     return to_local(flow.rot_w, -values.stiffness[..., None] * flow.pos_w)
 
 

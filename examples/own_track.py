@@ -35,7 +35,7 @@ length = 3.0
 
 [[meshes]]                 # any file that trimesh reads; connected parts must be convex
 name = "roof"
-file = "roof.stl"          # beside this file
+file = "roof.stl"          # in the folder of this file
 position = [5.5, -2.0, 0.0]
 yaw_deg = 30.0
 """

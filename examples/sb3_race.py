@@ -25,7 +25,7 @@ SETTINGS = {"track": "random", "level": 0, "spec": SPEC}  # and the defaults
 
 
 class Judged(torch.nn.Module):
-    """The actor as the judge calls it: what it remembers is the frame before, zeros at first."""
+    """The actor for the judge; its hidden state is the previous frame, zeros at the start."""
 
     def __init__(self, model: PPO, seen: VecNormalize) -> None:
         """Take the policy of a trained `model`, and how its observations were normalised."""

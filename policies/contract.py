@@ -228,7 +228,7 @@ def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract
 
 
 def refuse_other(contract: Contract, other: Contract, where: str, whose: str) -> None:
-    """Refuse a contract that differs from `other`, which is `whose`, in what both speak of.
+    """Refuse a contract that contradicts `other`, which belongs to `whose`.
 
     Raises:
         PolicyError: naming the first part that differs.
@@ -265,7 +265,7 @@ def _short(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield (path, value, other value) of what differs in two trees of the same class."""
+    """Yield (path, value, other value) of the differences of two trees of the same class."""
     for key in (entry.name for entry in dataclasses.fields(one)):
         a, b, path = getattr(one, key), getattr(other, key), f"{name}{key}"
         if dataclasses.is_dataclass(a):

@@ -33,7 +33,7 @@ def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> Blo
     def model(
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        # Accelerators multiply in fewer bits unless told; a policy flies alike on all of them.
+        # Accelerators use fewer bits by default; full precision gives equal flights on all devices.
         with jax.default_matmul_precision("highest"):
             action, after = step(held, hidden, state, image)
         return np.asarray(action), np.asarray(after)

@@ -34,7 +34,7 @@ class View(NamedTuple):
     depth_m: Any = None
     """(..., H, W) planar depth, clipped to the camera's range [m]; None without a camera."""
     gate_number: Any = None
-    """(...,) of the next gate, counted from the track's first; None where no sensor model asks."""
+    """(...,) number of the next gate from 0; None where no sensor model needs it."""
 
 
 class Observation(NamedTuple):
@@ -68,7 +68,7 @@ EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
 def observe(
     spec: PolicySpec, view: View, last_action_b: Array, speed: Array | None = None
 ) -> Observation:
-    """Return what a policy of `spec` is given.
+    """Return the observation of a policy with `spec`.
 
     Args:
         spec: the policy's; its extras and its depth encoding count.

@@ -15,7 +15,7 @@ class MassOffset(NamedTuple):
 
 
 def mass_offset_constants(values: MassOffset, constants: Constants) -> Constants:
-    """Return the constants with the mass added; the inertia stays."""
+    """Return the constants with the mass added and the same inertia."""
     return constants._replace(mass=constants.mass + values.offset)
 
 

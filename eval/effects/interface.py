@@ -115,7 +115,7 @@ class Parameter:
     size: int = 0
     """Components; 0 for a plain number."""
     required: bool = True
-    """Whether a vehicle file must give it; the neutral value stands for one left out."""
+    """Whether a vehicle file must contain it; otherwise its default is the neutral value."""
     fitted: bool = True
     """Whether it is identifiable from flights; otherwise a given constant of the vehicle."""
     unseen: tuple[int, ...] = ()
@@ -265,7 +265,7 @@ def neutral(effect: Effect, vehicle: Vehicle) -> Values:
 
 
 def as_arrays(values: Values) -> Values:
-    """Return an effect's `values` with numbers and tuples as float arrays; JAX arrays stay."""
+    """Return an effect's `values` with numbers and tuples as float arrays; JAX arrays are kept."""
 
     def convert(value: Any) -> Array:
         if hasattr(value, "__array_namespace__"):

@@ -89,7 +89,7 @@ def _share(values: SlungLoad, flow: Flow) -> Array:
 
 
 def _lag(flow: Flow) -> Array:
-    """Return by what the tension at the end of a step of h is less than one taken at its start.
+    """Return the ratio of an explicit tension to the implicit one at the end of a step of h.
 
     With x'' = -a and a = w^2 x + 2 z w x' at the end of the step (backward Euler) it is
     1 + 2 z w h + w^2 h^2.

@@ -15,7 +15,7 @@ class ThrustScale(NamedTuple):
 
 
 def thrust_scale_constants(values: ThrustScale, constants: Constants) -> Constants:
-    """Return the constants with k_T scaled; k_Q stays."""
+    """Return the constants with k_T scaled and the same k_Q."""
     return constants._replace(
         thrust_coefficient=constants.thrust_coefficient * per_axis(values.scale)
     )
@@ -108,7 +108,7 @@ class ThrustTilt(NamedTuple):
 
 
 def thrust_tilt_constants(values: ThrustTilt, constants: Constants) -> Constants:
-    """Return the constants with the thrust's axis tilted; the torques stay."""
+    """Return the constants with the thrust's axis tilted and the same torques."""
     return constants._replace(thrust_axis_b=tilted_e3(values.angle))
 
 

@@ -1,4 +1,4 @@
-"""One race on MuJoCo's C engine, driven action by action: what both environments wrap."""
+"""One race on MuJoCo's C engine, action by action, for the dm_control environment."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from tracks.track import Track
 ACTION_LIMIT = 20.0
 """Largest component of an action [m/s^2]."""
 STATE_LIMIT = 1e4
-"""Components of the state observation are clipped to this; flights stay far below."""
+"""Limit to which components of the state are clipped; flights are far below it."""
 GATE_REWARD = 5.0
 """For a gate passed; the way that is left earns 1 a metre as it gets shorter."""
 CRASH_REWARD = -1.0
@@ -72,7 +72,7 @@ class Race:
 
     @property
     def ended_by(self) -> str | None:
-        """One of `eval.worlds.trial.ENDINGS`, or None while it goes on."""
+        """One of `eval.worlds.trial.ENDINGS`, or None for a running episode."""
         code = int(self.progress.ended[0])
         return None if code == FLYING else ENDINGS[code - 1]
 
@@ -145,7 +145,7 @@ class Race:
             )
 
     def observation(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        """Return what a policy sees: `state` (spec.state_size,) and `image` (H, W), float32."""
+        """Return the observation: `state` (spec.state_size,) and `image` (H, W), float32."""
         pos_w, rot_w, vel_w, _ = motion_of(data)
         gate = next_gate(self._course, self.progress.gates)
         if self.ended_by == "diverged":

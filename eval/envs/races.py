@@ -215,15 +215,15 @@ class Races:
         return vehicle
 
     def track(self, slot: int) -> Track:
-        """Return what is flown through."""
+        """Return the track."""
         return self._tracks[slot]
 
     def view(self) -> View:
-        """Return what can be observed, (N, ...)."""
+        """Return the current views, (N, ...)."""
         return self._world.view(np.ones(self.slots, bool))
 
     def observation(self) -> dict[str, np.ndarray]:
-        """Return what policies see, (N, ...): `state` and `image`."""
+        """Return the observations, (N, ...): `state` and `image`."""
         state, image = observe(self.spec, self.view(), self._action)
         state = np.nan_to_num(np.clip(state, -STATE_LIMIT, STATE_LIMIT))
         return {
@@ -284,14 +284,14 @@ class Races:
         return np.array([way_left(pos, t.scene.gates.center_w, gates) for pos, t, gates in parts])
 
     def ended_by(self, slot: int) -> str | None:
-        """Return one of `ENDINGS`, `BAD_ACTION`, or None while the episode goes on."""
+        """Return one of `ENDINGS`, `BAD_ACTION`, or None for a running episode."""
         if self._bad[slot]:
             return BAD_ACTION
         code = int(self.ended[slot])
         return None if code == FLYING else ENDINGS[code - 1]
 
     def info(self, slot: int) -> dict[str, Any]:
-        """Return what there is to say of an episode besides observation and reward."""
+        """Return the info of an episode, besides observation and reward."""
         how = self.ended_by(slot)
         info = {
             "track_seed": int(self.track_seed[slot]),

@@ -129,7 +129,7 @@ def _values(part: Part, column: Column, name: str) -> Part:
         raise FlightLogError(name, column.names[0], None, reason)
     if column.mixer:
         mixed = (value * np.asarray(column.factor)) @ MIXERS[column.mixer].T
-        return time_s, np.clip(mixed, 0.0, 1.0)  # as what drives the motors does
+        return time_s, np.clip(mixed, 0.0, 1.0)  # as the motor drivers do
     return time_s, value * np.asarray(column.factor)
 
 

@@ -32,7 +32,7 @@ HOLE_S = 0.1
 HOLE_STEPS = 5.0
 """A gap exceeds both: in seconds, and in median steps."""
 HOLD_S = 0.5
-"""A command is not held for longer than this (and ten of its own steps) [s]."""
+"""Longest time for which a command is held, unless ten of its steps are longer [s]."""
 FAR_FASTER = 0.6
 """Signals whose step is below this share of a row's are smoothed."""
 LOST = 0.8

@@ -21,11 +21,11 @@ from eval.logs.faults.reading import TIMES, Readings, option, read_as
 NEEDED = ("pos", "quat", "rate")
 """What a flight cannot do without."""
 BACKWARDS_MAX = 0.05
-"""A signal with a larger share of rows whose time does not increase is refused."""
+"""Largest share of rows with non-increasing time in an accepted signal."""
 LARGEST = 1e20
 """Larger numbers are damage in any unit (Unix time in ns is 1.8e18); their squares overflow."""
 LEAST_STEP = 1e-15
-"""Times closer than this do not count as increasing: what is divided by the step overflows."""
+"""Least step of increasing times, so that a division by it does not overflow."""
 
 
 class Signal(NamedTuple):
@@ -50,13 +50,13 @@ class Recording:
     motor_side: tuple[tuple[float, float], ...] | None = None
     """For the file's motors 1 to 4: where they are, (x forward, y left), in any length unit."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """What the file says of itself: firmware, airframe, start."""
+    """Metadata of the file: firmware, airframe, start."""
 
 
 def signal(
     time_s: np.ndarray, value: np.ndarray, name: str, what: str
 ) -> tuple[Signal | None, Finding | None]:
-    """Return the finite samples of increasing time, and what there is to say about the others.
+    """Return the finite samples of increasing time, and a finding on the others.
 
     Args:
         time_s: (N,) [s], NaN where unknown.

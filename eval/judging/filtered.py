@@ -105,7 +105,7 @@ class Filtered:
         self._memory: dict[str, Any] | None = None
         self._truth: View | None = None
         self.filters: Delayed | None = None
-        """Of all slots; what lies in an empty one is no flight."""
+        """Of all slots; contents of empty slots are undefined."""
 
     def start(self, slot: int, trial: TrialSpec, gates: Gates) -> None:
         """Begin `trial`, on a track with these gates, in `slot`."""
@@ -258,7 +258,7 @@ def corners_of(gates: Gates) -> np.ndarray:
 
 
 def inertial(before: View, after: View, dt: float) -> Inertial:
-    """Return what an ideal IMU measures in a step: means, in the body axes of its middle."""
+    """Return an ideal IMU's measurement of a step: means in body axes at its middle."""
     sine_b = turned_by(after.rot_w, before.rot_w)
     size = np.sqrt((sine_b**2).sum(-1))[..., None]
     turn_b = sine_b * np.where(size > 1e-9, np.arcsin(np.minimum(size, 1.0)) / (size + 1e-300), 1.0)

@@ -59,7 +59,7 @@ def write_results(
 def write_trials(
     path: str | os.PathLike[str], results: Sequence[TrialResult], header: dict[str, Any]
 ) -> None:
-    """Write one row a trial to a Parquet file whose metadata key `suite` holds `header`."""
+    """Write one row for each trial to a Parquet file, with `header` in the metadata key `suite`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -109,7 +109,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
             raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
         there = [name for name in kinds if name in schema.names]
         _check_columns(path, schema, there)
-        # A text stays coded as in the file: a long one of every row fits there, not in memory.
+        # Texts stay dictionary-encoded: a long text in every row would not fit in memory.
         texts = [name for name in there if kinds[name].startswith("str")]
         with pq.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read(there)
@@ -117,7 +117,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     except MemoryError:  # Arrow's own is one as well
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        first = str(error).splitlines()[0]  # Arrow says more than a line of a damaged file
+        first = str(error).splitlines()[0]  # Arrow's messages have several lines
         raise ValueError(
             f"{path}: not a readable Parquet file ({first}); run suite eval again"
         ) from error
@@ -250,11 +250,11 @@ class Journal:
         return [trial for trial in trials if trial not in self.done]
 
     def others(self, trials: Iterable[TrialSpec]) -> int:
-        """Return how many finished trials are none of `trials`."""
+        """Return the number of finished trials outside `trials`."""
         return len(self.done.keys() - set(trials))
 
     def close(self) -> None:
-        """Close the file, which stays where it is; `append` opens it again."""
+        """Close the file; `append` opens it again."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -272,7 +272,7 @@ class Journal:
 
 
 def _differing(entry: Any, about: dict[str, Any]) -> str:
-    """Say in what a journal's first line is about something else; nothing: in nothing."""
+    """Return the difference between a journal's first line and this run; empty for none."""
     was = entry.get("about") if isinstance(entry, dict) else None
     if not isinstance(was, dict):
         return "it does not say how"

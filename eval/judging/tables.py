@@ -20,13 +20,13 @@ from eval.worlds.trial import ENDINGS, TrialResult
 from tracks.common.grid import Grid, markdown, table
 
 PRINTED_TRIALS = 10
-"""Trials a cell of the papers whose tables we stand beside."""
+"""Trials of a cell in the papers' tables."""
 NOTE = (
     "Success: rate with its 95 % Wilson interval. v_max, v_mean, lap: median over the cell's "
     "trials (lap: over its finished ones) with its 95 % bootstrap interval; v_max is each trial's "
     "largest speed before any contact."
 )
-"""What stands under every table."""
+"""Note below every table."""
 HEADERS = (
     "policy",
     "track",
@@ -168,7 +168,7 @@ def with_interval(interval: Interval) -> str:
 
 
 def grids(summary: dict[str, Any]) -> list[Grid]:
-    """Return what `summarise` gave as tables for people: the cells, and the pairings if any."""
+    """Return a summary of `summarise` as tables: the cells, and the pairings if any."""
     made = [_cell_grid(summary["cells"])]
     if summary["paired"]:
         made.append(_pair_grid(summary["paired"]))
@@ -176,7 +176,7 @@ def grids(summary: dict[str, Any]) -> list[Grid]:
 
 
 def markdown_table(summary: dict[str, Any]) -> str:
-    """Return what `summarise` gave as Markdown."""
+    """Return a summary of `summarise` as Markdown."""
     return "\n".join(map(markdown, grids(summary)))
 
 

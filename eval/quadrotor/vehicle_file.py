@@ -34,7 +34,7 @@ KEYS = (
 
 
 class VehicleFileError(ValueError):
-    """A vehicle file that cannot be used; the message says where and what is allowed."""
+    """A vehicle file is refused; the message has the key and what is allowed."""
 
 
 def shipped_vehicles() -> list[str]:

@@ -50,7 +50,7 @@ def sense(
     map_w = xp.stack([seen.gate_w, seen.second_w], axis=-2)
     axes_w = xp.stack([seen.axis_w, seen.second_axis_w], axis=-2)
     true_w = xp.stack([truth.gate_w, truth.second_w], axis=-2)
-    # Once through a gate, the second one is the next, and what is held of it stays.
+    # After a gate the second one becomes the next, with its stored estimate.
     passed = column(truth.gate_number > memory["number"])
     moved_w = xp.concatenate([memory["gates_w"][..., 1:, :], map_w[..., 1:, :]], axis=-2)
     moved = xp.concatenate([memory["held"][..., 1:], memory["held"][..., 1:] & False], axis=-1)

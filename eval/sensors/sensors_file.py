@@ -25,12 +25,12 @@ NO_AGES = Ages()
 
 
 class SensorsFileError(ValueError):
-    """A sensors file that cannot be used; the message says where and what is allowed."""
+    """A sensors file is refused; the message has the key and what is allowed."""
 
 
 @dataclass(frozen=True)
 class SensorSet:
-    """What a drone sees and knows; without models it is the truth."""
+    """A set of sensor models; without models the observation is the truth."""
 
     name: str = "perfect"
     """For people."""
@@ -39,7 +39,7 @@ class SensorSet:
     `eval.sensors.SENSORS`."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled and copied: a read-only view of a dict cannot be."""
+        """Return a picklable state, since a read-only view of a dict is not picklable."""
         return {**vars(self), "models": dict(self.models)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -47,7 +47,7 @@ class SensorSet:
 
     @property
     def ages(self) -> Ages:
-        """How old what is seen is."""
+        """Ages of the observation."""
         found = [SENSORS[name].ages for name in self.models]
         late = [(name, ages) for name, ages in zip(self.models, found, strict=True) if ages]
         return next((ages(self.models[name]) for name, ages in late), NO_AGES)
@@ -85,7 +85,7 @@ def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") 
 
 
 def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
-    """Return `sensors` with what is wrong grown by `magnitude`; 0: the truth, 1: as they are."""
+    """Return `sensors` with their errors scaled by `magnitude`; 0: the truth, 1: unchanged."""
     if magnitude in (0.0, 1.0):
         return sensors if magnitude else PERFECT
     models = {name: scaled(name, values, magnitude) for name, values in sensors.models.items()}

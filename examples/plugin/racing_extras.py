@@ -25,7 +25,7 @@ class FinDrag(NamedTuple):
 
 
 def fin_force(values: FinDrag, flow: Flow) -> Array:
-    """Return -c |v_y| v_y along body y (..., 3) [N]; numpy or JAX arrays alike."""
+    """Return -c |v_y| v_y along body y (..., 3) [N], for numpy and JAX arrays."""
     xp = flow.air_vel_b.__array_namespace__()
     across = flow.air_vel_b[..., 1]
     push = -values.coefficient * xp.abs(across) * across
@@ -59,7 +59,7 @@ def staircase(d: float, rng: np.random.Generator) -> Layout:
 
 
 SUMMARY = "simlog: numbers in lines, t x y z qw qx qy qz p q r m1 m2 m3 m4"
-"""With `detect` and `read`, what makes this module a log format."""
+"""Summary of the log format; with `detect` and `read` it makes this module a format."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -68,7 +68,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the file holds: SI units, z-up world, forward-left-up body."""
+    """Return the file's signals in SI units, z-up world and forward-left-up body."""
     table = np.loadtxt(path)
     places = {"pos": slice(1, 4), "quat": slice(4, 8), "rate": slice(8, 11), "motor": slice(11, 15)}
     parts = {name: (table[:, 0], table[:, place]) for name, place in places.items()}

@@ -69,7 +69,7 @@ def step(
     x = jnp.concatenate([vel_b, row3, action_b], axis=-1) * jnp.asarray(INPUT_SCALE)
     x = leaky_relu(x @ params["input.weight"] + params["input.bias"])
     gates_x = x @ params["gru.weight_input"] + params["gru.bias"]
-    # Of the two biases of a gate only the new one's differ: the reset stands between them.
+    # A gate's two biases are equivalent, except in the new gate, where the reset is between them.
     bias_h = jnp.pad(params["gru.bias_new"], (2 * HIDDEN, 0))
     hidden = gru_update(gates_x, hidden @ params["gru.weight_hidden"] + bias_h, hidden)
     return hidden @ params["output.weight"] + params["output.bias"], hidden

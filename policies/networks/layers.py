@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 PIECE = 8
-"""Images whose sums are one product in the gradient of `patch_product`: too few to be shared."""
+"""Images in one product of `patch_product`'s gradient, too few to split among threads."""
 
 
 @jax.custom_vjp
@@ -120,7 +120,7 @@ def gru_update(from_input: jax.Array, from_hidden: jax.Array, hidden: jax.Array)
 
 
 def uniform(key: jax.Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, jax.Array]:
-    """Return numbers in [0, 1) by name, float32, each array from a key of its own.
+    """Return numbers in [0, 1) by name, float32, each array from its own key.
 
     They are those of `jax.random.uniform(key, shape)`: JAX makes a number from its place alone, so
     a short array is the beginning of a long one. A program for each shape takes ten times as long

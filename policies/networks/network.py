@@ -77,7 +77,7 @@ def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
     """
     for entry in dataclasses.fields(spec):
         has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
-        if entry.name == "camera":  # Its rays change what a pixel reads, not how many there are.
+        if entry.name == "camera":  # rays change the pixels' values, but not their number
             has = dataclasses.replace(has, rays=wanted.rays)
         if has != wanted and entry.name not in (*EXTRAS, "speed", "rate_hz"):
             raise ValueError(

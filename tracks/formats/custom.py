@@ -88,7 +88,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
 
 
 class _Names:
-    """Gives every solid a name of its own and refuses those given twice."""
+    """Gives every solid a unique name and refuses duplicates."""
 
     def __init__(self, taken: list[str]) -> None:
         self._taken = set(taken)

@@ -1,4 +1,4 @@
-"""Mesh files from elsewhere, read in a process of its own that has limits and can be killed.
+"""Read untrusted mesh files in a separate process with limits, which can be killed.
 
 A mesh of few bytes may refer to files that never end, or unpack to more than the memory. The
 process answers with numbers alone. It is kept for the next track, and ends by itself when it was
@@ -40,7 +40,7 @@ _PROGRAM = (
 
 
 def load_convex_parts(paths: Sequence[Path]) -> list[list[np.ndarray]]:
-    """Return what `convex_parts.convex_parts` says of each mesh file.
+    """Return the result of `convex_parts.convex_parts` for each mesh file.
 
     Raises:
         ValueError: where a file cannot be read, or a part is open or not convex, naming both;
@@ -85,7 +85,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
-            with contextlib.suppress(BrokenPipeError):  # what it was not told is not told now
+            with contextlib.suppress(BrokenPipeError):  # unsent data is discarded
                 pipe.close()
     process.wait()
 
@@ -106,7 +106,7 @@ def _ask(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
         return _answer_of(process, paths)
     except (EOFError, BrokenPipeError):
         late_s = f"within {READ_S:g} s" if late.finished.is_set() else ""
-    except BaseException:  # Ctrl-C: what it answers later would be taken for another answer
+    except BaseException:  # Ctrl-C: a later answer would be read as the next one
         process.kill()
         raise
     finally:
@@ -143,7 +143,7 @@ def serve() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     while line := sys.stdin.readline():
-        signal.setitimer(signal.ITIMER_REAL, READ_S + 5.0)  # where who asked has gone
+        signal.setitimer(signal.ITIMER_REAL, READ_S + 5.0)  # in case the parent is gone
         parts, path = [], ""
         try:
             for path in json.loads(line):

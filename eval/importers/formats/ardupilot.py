@@ -56,7 +56,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the log at `path` holds.
+    """Return the signals of the log at `path`.
 
     Raises:
         FlightLogError: where the reader is not installed, or it is no such log.
@@ -105,14 +105,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 
 def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
-    """Return columns by message, parameters, and what the log says of itself."""
+    """Return columns by message, parameters, and the log's metadata."""
     try:
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
         raise FlightLogError(str(path), None, None, MISSING) from None
     table: dict[str, list[dict[str, Any]]] = {name: [] for name in MESSAGES}
     try:
-        # The reader prints what it makes of damaged files.
+        # The reader prints messages about damaged files.
         with (
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(io.StringIO()),
@@ -138,7 +138,7 @@ def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
 
 
 def _outputs(parameters: Mapping[str, float]) -> list[int]:
-    """Return which outputs drive motors 1 to 4; the first four where the log does not say."""
+    """Return the outputs of motors 1 to 4; the first four where the log has no assignment."""
     by = {parameters.get(f"SERVO{k}_FUNCTION"): k for k in range(14, 0, -1)}
     wired = [by.get(float(MOTOR_1 + k)) for k in range(4)]
     found = [k for k in wired if k is not None]

@@ -112,7 +112,7 @@ class Blackbox:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the CSV at `path` holds; its motors turn `options.motor_poles` magnets.
+    """Return the signals of the log at `path`; its motors have `options.motor_poles` magnets.
 
     Raises:
         FlightLogError: where a column of every Betaflight log is missing or unusable.

@@ -62,7 +62,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the log at `path` holds.
+    """Return the signals of the log at `path`.
 
     Raises:
         FlightLogError: where it is no such log, of an unknown version, or broken in its header.

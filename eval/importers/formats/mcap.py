@@ -54,7 +54,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the MCAP file at `path` holds.
+    """Return the signals of the MCAP file at `path`.
 
     Raises:
         FlightLogError: where it is no MCAP file, damaged, or the extra is not installed.
@@ -218,7 +218,7 @@ def _wxyz(quat: Any) -> list[float]:
 
 
 def _unless(message: Any, ignored: int, value: list[float]) -> list[float]:
-    """Return `value`, NaN where the message's mask says that it is to be ignored."""
+    """Return `value`, or NaN where the message's mask marks it as ignored."""
     return [float("nan")] * len(value) if message.type_mask & ignored else value
 
 

@@ -70,7 +70,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the ULog file at `path` holds.
+    """Return the signals of the ULog file at `path`.
 
     Raises:
         FlightLogError: where it is no ULog file or is damaged beyond reading.
@@ -263,7 +263,7 @@ _READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
 
 
 def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> list[Finding]:
-    """Return a finding where the vehicle is none of four motors: by type, rotors, and what turns.
+    """Return a finding where the vehicle is not a quadrotor: by type, rotors and turning motors.
 
     `esc_count` alone misleads: it counts what is wired.
     """

@@ -38,7 +38,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return what the table at `path` holds, read as `options.map` says.
+    """Return the signals of the table at `path`, by the mapping `options.map`.
 
     Raises:
         FlightLogError: for a file that is no table, or lacks a column of the mapping.
@@ -48,12 +48,12 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 
 def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
-    """Return what the table at `path` holds, read as the mapping at `map_path` says; see `read`."""
+    """Return the signals of the table at `path`, by the mapping at `map_path`; see `read`."""
     described_by = None if map_path is None else read_map(map_path)
     columns, text, warnings = read_columns(path)
     mapping = described_by or own_map(columns)
     name, about = str(path), {}
-    if described_by is None:  # a log of ours says how it was flown
+    if described_by is None:  # a flight log has metadata
         about, more = flight_metadata(text, name)
         warnings += more
     time_s = _time(columns, mapping, name, map_path is not None)

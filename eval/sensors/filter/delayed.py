@@ -17,7 +17,7 @@ from tracks.geometry.scene import Array
 
 
 class Delayed(NamedTuple):
-    """Filters of N drones, and what they have not taken yet."""
+    """Filters of N drones, and their pending measurements."""
 
     state: FilterState
     """At the horizon, one delay ago."""
@@ -54,7 +54,7 @@ def step(
 
 
 def present(filters: Delayed) -> FilterState:
-    """Return the nominal states of now; the covariance stays that of the horizon."""
+    """Return the current nominal states, with the covariance of the delayed horizon."""
     state = filters.state
     for place in range(filters.waiting.shape[1]):
         sample = filters.waiting[:, place]

@@ -30,7 +30,7 @@ SIZE = 15
 
 
 class ImuNoise(NamedTuple):
-    """What the filter takes the IMU's errors for: spectral densities, each a number or (N,)."""
+    """The IMU's errors as assumed by the filter: spectral densities, each a number or (N,)."""
 
     acc: Array
     """White noise of the accelerometer [m/s^2/sqrt(Hz)]."""
@@ -43,7 +43,7 @@ class ImuNoise(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What the filter knows of N drones."""
+    """State and covariance of the filters of N drones."""
 
     pos_w: Array
     """(N, 3) [m]."""
@@ -71,7 +71,7 @@ class Corners(NamedTuple):
 
 
 def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState:
-    """Return the state of drones whose biases are taken for zero.
+    """Return the state at the start, with biases of zero.
 
     Args:
         pos_w: (N, 3) [m].
@@ -85,7 +85,7 @@ def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState
 
 
 def move(state: FilterState, gyro_b: Array, acc_b: Array, dt: Array) -> FilterState:
-    """Return the nominal state after `dt`; the covariance stays. See `predict`."""
+    """Return the nominal state after `dt`, with the same covariance. See `predict`."""
     xp = gyro_b.__array_namespace__()
     step = dt[:, None]
     turn_b = (gyro_b - state.gyro_bias_b) * step
@@ -149,7 +149,7 @@ def project(pos_w: Array, rot_w: Array, camera_b: Array, corner_w: Array) -> tup
 def update_gate(
     state: FilterState, observation: Corners, variance: Array, camera_b: Array
 ) -> FilterState:
-    """Return the state after corners of gates were seen from where it stands.
+    """Return the state after a measurement of gate corners.
 
     Args:
         state: at the time of the image.
@@ -208,7 +208,7 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
 
 
 def error_of(state: FilterState, truth: FilterState) -> Array:
-    """Return what the state is off by, (N, 15): the truth's covariance is not looked at."""
+    """Return the error of the state, (N, 15); the truth's covariance is not used."""
     xp = state.pos_w.__array_namespace__()
     turn = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
     sine_b = 0.5 * xp.stack(

@@ -28,4 +28,4 @@ class FilterSettings(NamedTuple):
     start_sigma: np.ndarray
     """(15,) of the error at the start, in the order of the filter's."""
     imu: ImuNoise
-    """What the filter takes the IMU for."""
+    """The IMU's errors as assumed by the filter."""

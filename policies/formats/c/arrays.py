@@ -15,7 +15,7 @@ from policies.spec import CHANNEL_BLOCK, PolicySpec
 BLOCK = CHANNEL_BLOCK
 """Outputs of a block."""
 LAYERS = ("conv2", "conv3", "image", "gru_input", "gru_hidden")
-"""Those with nearly all weights; the others stay floats whatever the type."""
+"""Layers with nearly all weights; the others are floats for every type."""
 
 
 def padded(size: int) -> int:
@@ -37,7 +37,7 @@ def matrices(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np
 
 
 def small_arrays(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np.ndarray]:
-    """Return what stays floats whatever the type: first layer, state, biases, action."""
+    """Return the arrays that are floats for every type: first layer, state, biases, action."""
     wide, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
     plain = {name: np.asarray(value, np.float32) for name, value in params.items()}
     return {

@@ -1,4 +1,4 @@
-"""policy.c as `Policy`: compiled, and called row after row in a process of its own."""
+"""policy.c as `Policy`: compiled, and called row by row in its own process."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
 
 
 def _proven(policy: CPolicy, file: Path) -> CPolicy:
-    """Refuse what keeps a memory of its own: rows that are given the same must answer alike."""
+    """Refuse code with global state: equal inputs must give equal outputs."""
     rng = np.random.default_rng(0)
     spec, n = policy.spec, 3
     hidden, fresh = policy.start(n), np.ones(n, bool)

@@ -17,15 +17,15 @@ from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
 HERE = ("-march=native",)
-"""For this machine's own processor, left out where the compiler does not know it."""
+"""Options for this machine's processor, left out where the compiler does not support them."""
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
-"""What policy.c of ours compiles under without a word."""
+"""Options under which the suite's policy.c compiles without warnings."""
 COMPILE_S = 600.0
-"""A compiler that takes longer is ended [s]."""
+"""Time limit of the compiler [s]."""
 
 
 def find_compiler() -> list[str] | None:
-    """Return the C compiler's command: what CC says, or cc; None where there is none.
+    """Return the C compiler's command: the variable CC, or cc; None where there is none.
 
     Raises:
         PolicyError: where CC is no command line.
@@ -42,7 +42,7 @@ def find_compiler() -> list[str] | None:
 
 
 def source_files(policy_c: Path) -> list[Path]:
-    """Return policy.c and the policy.h beside it.
+    """Return policy.c and the policy.h of its folder.
 
     Raises:
         PolicyError: where one is missing.
@@ -97,7 +97,7 @@ def _cache() -> Path:
 
 def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     policy_c, _, library_c = files
-    # Not resolved: where policy.c is a link, policy.h need not be beside what it points to.
+    # Not resolved: where policy.c is a link, policy.h may be in the link's folder only.
     source = policy_c.absolute()
     ends = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
     message = ""

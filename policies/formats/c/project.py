@@ -1,4 +1,4 @@
-"""A policy of ours as a folder of C: policy.h, policy.c, and what checks them where they land."""
+"""A policy as a folder of C files: policy.h, policy.c, and a test program for the target."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def c_project(
             )
         layers = quantise(params, spec, observed)
         name = f"{name}-int8"
-    name = printable(name, keep="")  # it stands in comments
+    name = printable(name, keep="")  # it is written into comments
     label = embed(spec, name, checkpoint.seed)
     part = Observed(*(x[:VECTORS] for x in observed or drawn(spec, VECTORS)))
     part = part._replace(fresh=np.arange(len(part.state)) == 0)

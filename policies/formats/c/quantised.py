@@ -28,19 +28,19 @@ class Quantised(NamedTuple):
     weight: np.ndarray
     """(inputs, outputs) int8 from -127 on."""
     scale: np.ndarray
-    """(outputs,) float32, what one unit of the integer sum is worth."""
+    """(outputs,) float32, value of one unit of the integer sum."""
     offset: np.ndarray
-    """(outputs,) float32, what the inputs' zero point adds to every sum, taken off."""
+    """(outputs,) float32, correction for the inputs' zero point."""
     inverse: float
     """Bytes in one unit of the input."""
     zero: int
-    """The byte that stands for an input of 0."""
+    """The byte of an input of 0."""
 
 
 def quantise(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> dict[str, Quantised]:
-    """Return each of `arrays.LAYERS` with 8 bits, scaled by what `observed` makes of its inputs.
+    """Return each of `arrays.LAYERS` with 8 bits, scaled by its inputs for `observed`.
 
     Raises:
         PolicyError: where a sum of products may leave 32 bits.
@@ -55,7 +55,7 @@ def quantise(
 
 
 def check_sums(name: str, weight: np.ndarray) -> None:
-    """Refuse a layer whose integer sums may leave 32 bits, as those of a large image do.
+    """Refuse a layer whose integer sums may exceed 32 bits, as for a large image.
 
     Args:
         name: of the layer.
@@ -86,7 +86,7 @@ def input_ranges(
         return x @ weights[name]
 
     forward.actions(small_arrays(params, spec), spec, layer, observed)
-    # The memory's values lie between -1 and 1 by what they are.
+    # The hidden state is a convex combination of tanh values, from -1 to 1.
     return {**ranges, "gru_hidden": (-1.0, 1.0)}
 
 

@@ -1,4 +1,4 @@
-"""policy.h and policy.c of a policy of ours."""
+"""The text of policy.h and policy.c for one of the suite's policies."""
 
 from __future__ import annotations
 
