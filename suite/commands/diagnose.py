@@ -62,7 +62,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     from suite.delta.run import flight_files
-    from suite.diagnose.report.parameters_json import components, size_words
+    from suite.diagnose.report.parameters_json import components
+    from suite.diagnose.report.summary import next_steps
     from suite.diagnose.run import diagnose_files
 
     check_no_input(config.out / "vehicle.toml", [config.vehicle, config.fly], "--out")
@@ -85,6 +86,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         accept=config.accept,
     )
     console.say(f"verdict: {result['verdict']}")
+    console.say(result["headline"])
     for effect in result["effects"]:
         rivals = ", ".join(effect["alternatives"])
         same = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
@@ -92,15 +94,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         for one in sorted(components(effect), key=lambda one: not one.found):
             shown, between = one.shown()
             console.say(f"    {one.label}: {shown}" + (f", 95 %: {between}" if between else ""))
-    for effect in result["effects"]:
-        console.say(f"  {size_words(effect)}")
-    gap = result["gap"]
-    console.say(f"gap on held-out flights: {gap['before']:.2f} before, {gap['after']:.2f} after; "
-                f"{gap['noise_floor']:.2g} is the noise floor")  # fmt: skip
-    if "headline" in result:
-        console.say(result["headline"])
-    if result["unexplained"]["where"]:
-        console.say(f"unexplained: {result['unexplained']['where']}")
+    for step in next_steps(result):
+        console.say(f"next: {step}")
     for line in result["separate_with"]:
         console.say(f"to separate {line}")
     for side in ("held_out", "outside"):

@@ -44,7 +44,14 @@ class Details:
     """Shown as it is."""
 
 
-Part = str | Grid | Picture | Links | Details
+@dataclass(frozen=True)
+class Steps:
+    """What to do, in order."""
+
+    texts: Sequence[str]
+
+
+Part = str | Grid | Picture | Links | Details | Steps
 """A text is a paragraph."""
 
 
@@ -56,6 +63,8 @@ class Section:
     """The heading."""
     parts: Sequence[Part]
     """One below the other."""
+    folded: bool = False
+    """Whether only the heading is shown until it is opened."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +97,17 @@ def html(report: Report) -> str:
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
         for name, value in report.facts.items()
     )
-    body = "\n".join(
-        f"<section>\n<h2>{escape(section.title)}</h2>\n"
-        + "\n".join(_part(part) for part in section.parts)
-        + "\n</section>"
-        for section in report.sections
-    )
+    body = "\n".join(_section(section) for section in report.sections)
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=escape(report.title), lead=escape(report.lead), facts=facts, body=body
     )
+
+
+def _section(section: Section) -> str:
+    title, parts = escape(section.title), "\n".join(_part(part) for part in section.parts)
+    if section.folded:
+        return f'<details class="section"><summary>{title}</summary>\n{parts}\n</details>'
+    return f"<section>\n<h2>{title}</h2>\n{parts}\n</section>"
 
 
 def _part(part: Part) -> str:
@@ -116,4 +127,6 @@ def _part(part: Part) -> str:
     if isinstance(part, Details):
         summary = f"<summary>{escape(part.summary)}</summary>"
         return f"<details>{summary}<pre>{escape(part.text)}</pre></details>"
+    if isinstance(part, Steps):
+        return f"<ol>{''.join(f'<li>{escape(text)}</li>' for text in part.texts)}</ol>"
     return f"<p>{escape(part)}</p>"

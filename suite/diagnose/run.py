@@ -121,12 +121,12 @@ def diagnose_files(
             fitted = result.main.theta if result.main.names else None
             write_rollouts(out / "recording.rrd", flown, fitted)
             files.add("recording.rrd")
+    found["findings"], found["not_examined"] = findings, not_examined(logs)
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
     write_report(out / "report.html", page(result, found, checks, toml, files))
     for warning in found["warnings"][shown:]:
         console.note(f"warning: {warning}")
-    found["findings"], found["not_examined"] = findings, not_examined(logs)
     if found["verdict"] == "no_gap" and found["not_examined"]:
         console.note(f"not examined: {', '.join(found['not_examined'])}")
     write_json(out / "diagnosis.json", found)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from suite.diagnose.plans.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
+from suite.diagnose.report.summary import answer
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.black_box import BlackBoxComparison
@@ -25,9 +26,8 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
     """Return what diagnosis.json has of the names and of the gap."""
     main, control = found.main, found.main.control
     limits = found.limits
-    return {
+    entries: dict[str, Any] = {
         "verdict": found.label,
-        "headline": headline(found),
         "effects": effects_json(found),
         "negligible": [
             {"name": name, "size": size.as_json(), "relevant": False}
@@ -56,6 +56,7 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
         },
         "reference": list(found.references),
     }
+    return {"headline": headline(found, entries), **entries}
 
 
 def gap_json(found: Diagnosis) -> dict[str, Any]:
@@ -142,28 +143,14 @@ def _undecided(finding: Finding, ones: Sequence[NamedEffect]) -> list[int]:
     ]  # fmt: skip
 
 
-VERDICTS = {
-    "no_gap": "Simulation and flights agree within the measurement noise.",
-    "named": "The gap is explained.",
-    "partly": "The gap is explained in part; a structured error remains.",
-    "unknown": "There is a gap that nothing in the catalogue explains.",
-}
-CHANGES = {**VERDICTS, "no_gap": "Nothing that the flights agree on has changed."}
-
-
-def headline(found: Diagnosis) -> str:
-    """Return the answer in a few sentences."""
-    main = found.main
-    words = [(CHANGES if found.references else VERDICTS)[found.label]]
+def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:
+    """Return the answer in a few sentences; `entries` is the rest of the JSON."""
+    main, words = found.main, [answer(entries)]
     if found.named:
-        names = " and ".join(
-            " or ".join([name.candidate.label, *name.rivals]) for _, name in found.named
-        )
-        since = " since the reference flights" if found.references else ""
         source = main.source
         words.append(
-            f"Named{since}: {names}. The {source.subject} on held-out flights is "
-            f"{main.after.rms:.3g} instead of {main.before.rms:.3g} {source.unit}."
+            f"The {source.subject} on held-out flights is {main.after.rms:.3g} instead of "
+            f"{main.before.rms:.3g} {source.unit}."
         )
     words += [one.words or f"Named: {one.name}." for one in found.tested]
     if found.verdict.where:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from eval.effects import EFFECTS
-from suite.common.report import Details, Links, Part, Picture, Report, Section
+from suite.common.report import Details, Links, Part, Picture, Report, Section, Steps
 from suite.diagnose.data.windows import UNITS
 from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.diagnosis_json import VERDICTS
-from suite.diagnose.report.parameters_json import cells, components, grid, short_name, size_words
+from suite.diagnose.report.parameters_json import cells, components, grid, short_name
 from suite.diagnose.report.sections import (
     actuators_section,
     agreement_section,
@@ -22,6 +22,7 @@ from suite.diagnose.report.sections import (
     residual_section,
     rivals_section,
 )
+from suite.diagnose.report.summary import next_steps
 from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
@@ -73,24 +74,28 @@ def page(
     }
     if diagnosis.references:
         facts["reference"] = f"{len(diagnosis.references)} flights"
-    first = [logs_section(diagnosis, checks), noise_section(diagnosis)] if checks else []
-    warnings = [Details("what was odd", "\n".join(found["warnings"]))]
+    details = [
+        Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
+        *([logs_section(diagnosis, checks), noise_section(diagnosis)] if checks else []),
+        *(actuators_section(checks, flights.driven_by) if checks else []),
+        candidates_section(diagnosis),
+        rivals_section(diagnosis, found),
+        residual_section(found),
+        evidence_section(diagnosis, found, checks),
+        agreement_section(diagnosis),
+        *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
+    ]
     return Report(
         title=f"Diagnosis: {found['verdict']}",
         lead=found["headline"],
         facts=facts,
         sections=[
-            Section("What was measured, and what the model gives", _measured(diagnosis, found)),
+            *_measured(diagnosis),
+            Section("What to do next", [Steps(next_steps(found))]),
+            *_findings(found.get("findings", ())),
             Section("The answer in numbers", _answer(found)),
-            *first,
-            *(actuators_section(checks, flights.driven_by) if checks else []),
-            candidates_section(diagnosis),
-            rivals_section(diagnosis, found),
-            residual_section(found),
-            evidence_section(diagnosis, found, checks),
-            agreement_section(diagnosis),
             _written(found, toml, files),
-            *([Section("Warnings", warnings)] if found["warnings"] else []),
+            *(replace(section, folded=True) for section in details),
         ],
     )
 
@@ -100,12 +105,27 @@ def _few(names: list[str]) -> str:
     return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
 
 
-def _measured(diagnosis: Diagnosis, found: Mapping[str, Any]) -> list[Part]:
-    """Return measured, simulated, and simulated with what was named, as picture and numbers."""
+def _measured(diagnosis: Diagnosis) -> list[Section]:
+    """Return measured, simulated, and simulated with what was named, as a picture."""
     main = diagnosis.main
     series = main.source.series(main.search)
-    parts: list[Part] = [] if series is None else [Picture(series_chart(series), series.caption)]
-    return [*parts, channels_grid(found["gap"]["channels"])]
+    if series is None:
+        return []
+    return [Section("Measured and simulated", [Picture(series_chart(series), series.caption)])]
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
+    """Return the faults of the logs that were corrected, or that may be there."""
+    rows = [
+        tuple(
+            str(one[key] or "")
+            for key in ("flight", "signal", "status", "fault", "evidence", "fix")
+        )
+        for one in findings
+        if one["status"] in ("corrected", "doubt")
+    ]
+    headers = ["log", "signal", "status", "fault", "evidence", "fix"]
+    return [Section("Findings about the logs", [grid("", headers, rows)])] if rows else []
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
@@ -128,14 +148,14 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     names = {"explainable": "black box"}
     headers = ["", "channel", "as given", "with what was named", "noise floor"]
     headers += [names.get(key, key) for key in shown]
-    return Grid("On held-out flights", headers, rows, note=CHANNELS)
+    return Grid("", headers, rows, note=CHANNELS)
 
 
 def _answer(found: Mapping[str, Any]) -> list[Part]:
     """Return the names, what they are and do, and their parameters."""
     effects = found["effects"]
     if not effects:
-        return [f"{VERDICTS[found['verdict']]} Nothing was named: the vehicle file is as it was."]
+        return ["Nothing was named: the vehicle file is as it was."]
     rows = [
         (
             effect["name"],
@@ -149,8 +169,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         for one in sorted(components(effect), key=lambda one: not one.found)
     ]
     about = [EFFECTS[effect["name"]] for effect in effects]
-    words: list[Part] = [f"{one.name}: {one.summary}: {one.equation}." for one in about]
-    words += [f"{size_words(effect)}." for effect in effects]
+    words: list[Part] = [f"{one.name}: {one.equation}." for one in about]
     words += in_words([(e["name"], *e["alternatives"]) for e in effects])
     headers = [
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"

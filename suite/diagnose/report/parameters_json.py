@@ -56,17 +56,6 @@ def in_digits(number: float, interval: Sequence[float]) -> str:
     return f"{number:.{-last}f}"
 
 
-def size_words(effect: Mapping[str, Any]) -> str:
-    """Return what a named `effect`, an entry of diagnosis.json, does on these flights."""
-    size = effect.get("size")
-    if size is None:
-        return f"{effect['name']}: its size is not in these units"
-    parts = [f"{size['force']:.2g} m/s² of force", f"{size['torque']:.2g} rad/s² of torque"]
-    if size["drift"] is not None:
-        parts.append(f"{size['drift']:.2g} m after a second")
-    return f"{effect['name']} does on these flights (RMS): {', '.join(parts)}"
-
-
 def components(effect: Mapping[str, Any]) -> Iterator[Component]:
     """Yield every number of a named `effect`, an entry of diagnosis.json."""
     known = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()

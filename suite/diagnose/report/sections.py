@@ -55,7 +55,7 @@ def logs_section(diagnosis: Diagnosis, checks: Checks) -> Section:
     else:
         parts.append(_kinematics(checks.kinematics, diagnosis.limits.clock_resolution_s))
     parts.append(_faults(diagnosis))
-    return Section("1. The logs and their faults", parts)
+    return Section("The logs and their faults", parts)
 
 
 def _kinematics(found: Kinematics, resolution_s: float) -> Grid:
@@ -111,7 +111,7 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         "all that changes slowly is taken off. Everything below is in units of it; where the gap "
         "does not exceed what it gives, the verdict is no_gap."
     )
-    return Section("2. The measurement noise", [words, grid("", ["measured", "noise"], rows)])
+    return Section("The measurement noise", [words, grid("", ["measured", "noise"], rows)])
 
 
 def actuators_section(checks: Checks, input_source: str) -> list[Section]:
@@ -183,7 +183,7 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
             ),
             Details("all candidates", "\n".join([head, *rows])),
         ]
-    return Section("3. The candidates", parts)
+    return Section("The candidates", parts)
 
 
 def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
@@ -207,7 +207,7 @@ def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         parts.append("No other name explains the same flights as well.")
     if found["separate_with"]:
         parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
-    return Section("4. What could stand in its place", parts)
+    return Section("What could stand in its place", parts)
 
 
 def residual_section(found: Mapping[str, Any]) -> Section:
@@ -229,7 +229,7 @@ def residual_section(found: Mapping[str, Any]) -> Section:
         rows = [(axis, f"{p:.2g}") for axis, p in left["coloured"].items()]
         note = "How often noise alone has as much energy in a smooth push along the axis."
         parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
-    return Section("5. Remaining error", parts)
+    return Section("Remaining error", parts)
 
 
 def evidence_section(
@@ -263,7 +263,7 @@ def evidence_section(
         grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
     ]
     if checks is None:
-        return Section("6. The evidence", parts)
+        return Section("The evidence", parts)
     if checks.black_box is None:
         parts.append(
             "A black box on the same split, and outside the speeds of its fit: "
@@ -276,7 +276,7 @@ def evidence_section(
         parts += [_comparison(side, seed) for side in sides]
         if checks.black_box.outside is None:
             parts.append("There are too few stretches to fit slow ones and judge fast ones.")
-    return Section("6. The evidence", parts)
+    return Section("The evidence", parts)
 
 
 AGREEMENT = (

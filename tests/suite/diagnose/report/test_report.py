@@ -144,7 +144,12 @@ def test_charts_are_pictures(drag, monkeypatch):
 
 def test_the_page_stands_alone(drag, drag_checks, found):
     text = html(page(drag, found, drag_checks, "name = 'x'", {"vehicle.toml"}))
-    assert text.count("<h2>") >= 9 and "linear_drag" in text and "vehicle.toml" in text
+    assert (
+        text.count("<h2>") == 4
+        and text.count('class="section"') >= 6
+        and "linear_drag" in text
+        and "vehicle.toml" in text
+    )
     assert "recording.rrd" not in text
 
 

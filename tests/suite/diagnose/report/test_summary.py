@@ -1,0 +1,57 @@
+"""The first screen of a report: one answer and the next steps for each verdict."""
+
+import pytest
+
+from suite.diagnose.report.summary import answer, next_steps
+
+DRAG = {
+    "name": "linear_drag",
+    "alternatives": ["rotor_drag"],
+    "parameters": {
+        "coefficient": {
+            "value": [0.31, 0.302, 0.01],
+            "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]],
+            "unit": "1/s",
+        }
+    },
+    "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
+}
+
+
+def found(verdict, effects=(), where=None, **more):
+    base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
+    return {**base, "unexplained": {"where": where}, "not_examined": [], **more}
+
+
+def test_an_answer_has_the_effect_its_values_and_its_size():
+    assert answer(found("named", [DRAG])) == (
+        "Drag proportional to the airspeed (linear_drag or rotor_drag): coefficient x 0.31 1/s, "
+        "coefficient y 0.302 1/s. On these flights it causes 0.8 m/s², 0 rad/s² and 0.4 m after "
+        "one second (RMS). This explains the gap between simulation and flights."
+    )
+    by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
+    assert "causes 0.8 m/s² and 0 rad/s² (RMS). This explains a part" in answer(
+        found("partly", [by_force])
+    )
+    assert "has changed since the reference" in answer(found("named", [DRAG], reference=["a"]))
+
+
+def test_no_gap_lists_what_is_too_small_and_what_was_not_examined():
+    small = found("no_gap", negligible=[{"name": "torque_trim"}], not_examined=["torque"])
+    assert answer(small).endswith("Significant but too small to matter: torque_trim.")
+    assert any("These logs do not show: torque." in step for step in next_steps(small))
+    assert not any("do not show" in step for step in next_steps(found("no_gap")))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("named", ["vehicle.toml", "do not separate linear_drag, rotor_drag", "expect no_gap"]),
+        ("partly", ["approximate", "do not separate", "suite check", "a swing at 1 Hz"]),
+        ("unknown", ["suite check", "suite identify", "a swing at 1 Hz", "suite delta"]),
+    ],
+)
+def test_every_verdict_says_what_to_do_next(verdict, words):
+    effects = [] if verdict == "unknown" else [DRAG]
+    steps = next_steps(found(verdict, effects, where="a swing at 1 Hz"))
+    assert all(word in step for word, step in zip(words, steps, strict=True))
