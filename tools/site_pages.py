@@ -1,8 +1,9 @@
-"""What `make docs` changes: links that lead out of docs/, and what the search finds.
+"""What `make docs` changes: links that lead out of docs/, pages from the root, and the search.
 
 On a page read in the repository such a link opens a file. The site holds no such files, so their
 path within the repository stands there instead. A link to a file that does not exist ends the
-build. The search leaves out docs/archive, whose pages are of removed policies and experiments.
+build. CONTRIBUTING.md and CHANGELOG.md become pages, so that the navigation has them. The search
+leaves out docs/archive, whose pages are of removed policies and experiments.
 """
 
 from __future__ import annotations
@@ -12,6 +13,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.structure.files import File
+
+ROOT = {"contributing.md": "CONTRIBUTING.md", "releases.md": "CHANGELOG.md"}
+"""Page of the site -> file of the repository's root."""
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
 """A link, not a picture, that climbs at least one folder."""
 
@@ -31,6 +36,16 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
         return path if text.strip("`") in (target.name, path.strip("`")) else f"{text} ({path})"
 
     return OUTSIDE.sub(named, markdown)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages of `ROOT`, with links as they are within docs/."""
+    root = Path(config["docs_dir"]).resolve().parent
+    for page, name in ROOT.items():
+        text = (root / name).read_text(encoding="utf-8")
+        links = re.sub(r"\]\((?!\w+:)(?!docs/)", "](../", text).replace("](docs/", "](")
+        files.append(File.generated(config, page, content=links))
+    return files
 
 
 def on_post_build(config: Any, **_: Any) -> None:
