@@ -110,7 +110,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         name: Counter(_outcome(c, done[c]) for c in held if done[c])
         for name, held in groups.items()
     }
-    accused = [c for c in clean if _accused(done[c])]
+    accused = [c for c in clean if _reported(done[c])]
     return Made(facts, parts, {"outcomes": numbers, "clean": len(clean), "accused": len(accused)})
 
 
@@ -223,57 +223,50 @@ def _real(path: Path) -> tuple[FlightLog, Vehicle]:
     return import_log(path, None, options)[0], vehicle
 
 
+def _reported(answer: Answer) -> list[str]:
+    """Return the names of what is found, of a refusal "refused"."""
+    if isinstance(answer, str):
+        return ["refused"]
+    return [f["fault"] for f in answer or () if f["status"] != "not identifiable"]
+
+
 def _outcome(case: Case, answer: Answer) -> str:
-    names = KINDS[case.kind].names
+    names, reported = set(KINDS[case.kind].names), set(_reported(answer))
     if isinstance(answer, str):
         return "refused"
-    said = {f["fault"] for f in answer or () if f["status"] != "not identifiable"}
-    if said & set(names):
+    if reported & names:
         return "named"
-    if set(names) & {f["fault"] for f in answer or ()}:
+    if names & {f["fault"] for f in answer or ()}:
         return "not identifiable"
-    return "another name" if said else "silent"
-
-
-def _accused(answer: Answer) -> bool:
-    return isinstance(answer, str) or any(f["status"] != "not identifiable" for f in answer or ())
+    return "another name" if reported else "silent"
 
 
 def _kinds_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
-    count: dict[str, Counter[str]] = {}
-    for case, answer in done:
-        count.setdefault(case.kind, Counter())[_outcome(case, answer)] += 1
-    total = Counter[str]()
-    for one in count.values():
-        total += one
+    count = Counter((case.kind, _outcome(case, answer)) for case, answer in done)
     rows = [
         [("(race) " if KINDS[kind].race else "") + kind, " or ".join(KINDS[kind].names)]
-        + [str(c[o] or "") for o in OUTCOMES]
-        for kind, c in count.items()
+        + [str(count[kind, outcome] or "") for outcome in OUTCOMES]
+        for kind in dict.fromkeys(kind for kind, _ in count)
     ]
-    share = sum(total.values())
-    rows.append(
-        ["all", f"{share} logs", *(f"{total[o]} ({total[o] / share:.1%})" for o in OUTCOMES)]
-    )
-    return table(["fault", "name", *OUTCOMES], rows)
+    total, logs = Counter[str](), count.total()
+    for (_, outcome), number in count.items():
+        total[outcome] += number
+    shares = [f"{total[outcome]} ({total[outcome] / logs:.1%})" for outcome in OUTCOMES]
+    return table(["fault", "name", *OUTCOMES], [*rows, ["all", f"{logs} logs", *shares]])
 
 
 def _clean_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
-    logs, accused, names = Counter[str](), Counter[str](), {}
+    logs, accused, names = Counter[str](), Counter[str](), Counter[tuple[str, str]]()
     for case, answer in done:
+        reported = _reported(answer)
         logs[case.format] += 1
-        accused[case.format] += _accused(answer)
-        for f in answer if isinstance(answer, list) else ():
-            if f["status"] != "not identifiable":
-                names.setdefault(case.format, Counter())[f["fault"]] += 1
-        if isinstance(answer, str):
-            names.setdefault(case.format, Counter())["refused"] += 1
+        accused[case.format] += bool(reported)
+        names.update((case.format, name) for name in reported)
     rows = [
         [format, str(count), str(accused[format]),
-         ", ".join(f"{n} {c}" for n, c in names.get(format, Counter()).items())]
+         ", ".join(f"{name} {c}" for (where, name), c in names.items() if where == format)]
         for format, count in logs.items()
     ]  # fmt: skip
-    simulated = [f for f in logs if f != "real"]
-    both = [str(sum(c[f] for f in simulated)) for c in (logs, accused)]
+    both = [str(sum(c[f] for f in logs if f != "real")) for c in (logs, accused)]
     rows.append(["all simulated", *both, ""])
     return table(["format", "logs", "with a finding", "which"], rows)

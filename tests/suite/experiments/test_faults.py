@@ -45,6 +45,6 @@ def test_outcomes_are_counted_by_name(judged):
     assert faults._outcome(cases["named"], answer) == "named"
     assert faults._outcome(cases["silent"], []) == "silent"
     assert faults._outcome(cases["silent"], "refused for a reason") == "refused"
-    assert faults._accused(answer) and not faults._accused([])
+    assert faults._reported(answer) and not faults._reported([])
     grid = faults._kinds_grid([(cases["named"], answer)])
     assert "1 (100.0%)" in {cell.text for cell in grid.rows[-1]}
