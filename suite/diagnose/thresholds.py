@@ -10,7 +10,12 @@ class Thresholds:
     """What counts as enough, near, sure or beyond noise, in the order of the diagnosis's steps."""
 
     most_windows: int = 200
-    """Stretches of a second that are flown at most: more take longer and tell little more."""
+    """Stretches of a second that are flown at most: more take longer and add little."""
+    most_rotor_windows: int = 100
+    """The same where measured rotor speeds drive: their errors along a stretch are estimated too,
+    which takes twice as long."""
+    most_rows: int = 100_000
+    """Rows of all flights together that force and torque use at most; of more each so many-th."""
     longest_hole_s: float = 0.1
     """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5

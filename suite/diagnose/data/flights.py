@@ -24,7 +24,7 @@ from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row
+from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row, with_fewer_rows
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,
@@ -74,6 +74,7 @@ def ready(
     Raises:
         ValueError: where a log has nothing that turns or pushes, or none has a stretch.
     """
+    logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
     for log, one in zip(logs, rotors, strict=True):
         if one is None:
@@ -109,7 +110,7 @@ def ready(
     without = f"no stretch of {main.width_s:g} s in flight without a hole"
     if not kept:
         raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
-    notes = [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
+    notes += [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
     parts = {name: [flights[k] for k in kept] for name, flights in parts.items()}
     for view in views[1:]:
         empty = [

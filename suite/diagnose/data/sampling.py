@@ -72,6 +72,36 @@ def without_slow_rotors(
     return kept, notes
 
 
+def with_fewer_rows(
+    logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
+) -> tuple[list[FlightLog], list[str]]:
+    """Return `logs` with no more rows than the limits allow, and what was left out, in words.
+
+    Every so many-th value of each signal stays, for signals may have rows of their own.
+    """
+    count = sum(len(log.time_s) for log in logs)
+    every = -(-count // limits.most_rows)
+    if every <= 1:
+        return list(logs), []
+    thin = []
+    for log in logs:
+        kept = {}
+        for name in (*MEASURED, *HELD, "acc_b", "voltage"):
+            values = getattr(log, name)
+            if values is None:
+                continue
+            table = np.full_like(values, np.nan)
+            own = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(axis=1))[::every]
+            table[own] = values[own]
+            kept[name] = table
+        rows = np.zeros(len(log.time_s), bool)
+        for table in kept.values():
+            rows |= np.isfinite(table.reshape(len(rows), -1)).all(axis=1)
+        parts = {name: table[rows] for name, table in kept.items()}
+        thin.append(replace(log, time_s=log.time_s[rows], **parts))
+    return thin, [f"every {every}. row is used of {count} rows: more take minutes, and add little"]
+
+
 def own_spacing_s(time_s: np.ndarray, values: np.ndarray) -> float:
     """Return the median time [s] between a column's own rows, the slowest column's of (T, K).
 

@@ -143,7 +143,7 @@ def cut(
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
 
-    Of more than `limits.most_windows` so many are kept, evenly spread over the flights.
+    Of more than the limits allow so many are kept, evenly spread over the flights.
 
     Args:
         logs: flights, known by their place.
@@ -167,11 +167,10 @@ def cut(
         places += [(number, first) for first in starts]
     if not places:
         return None, warnings
-    if len(places) > limits.most_windows:
-        warnings.append(
-            f"{limits.most_windows} stretches of 1 s, evenly spread, are used of {len(places)}"
-        )
-        kept = np.linspace(0, len(places) - 1, limits.most_windows).astype(int)
+    most = min(limits.most_windows, limits.most_rotor_windows if rotor_input else len(places))
+    if len(places) > most:
+        warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(places)}")
+        kept = np.linspace(0, len(places) - 1, most).astype(int)
         places = [places[k] for k in kept]
     longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
     if coarser is not None and integrator != "euler":

@@ -54,7 +54,7 @@ def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
         limits = replace(limits, least_view_share=limits.least_inertial_share)
         unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
     earlier, spread, left_out = _references(given, flights, model, limits)
-    rows = sum(len(log.time_s) for log in logs)
+    rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip

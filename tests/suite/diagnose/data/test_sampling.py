@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.noise import noise_of, rotor_noise
-from suite.diagnose.data.sampling import on_every_row, thinned, without_slow_rotors
+from suite.diagnose.data.sampling import (
+    on_every_row,
+    thinned,
+    with_fewer_rows,
+    without_slow_rotors,
+)
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.estimate.gauss_newton import solve
+from suite.diagnose.thresholds import Thresholds
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 
@@ -101,3 +107,22 @@ def test_equations_that_are_not_finite_are_refused():
     for hessian, gradient in ((one * np.nan, room), (one, room * np.inf)):
         with pytest.raises(ValueError, match="not finite"):
             solve(hessian, gradient, -room, room, room)
+
+
+def test_of_too_many_rows_every_so_many_th_of_each_signal_stays(log, row):
+    sparse = replace(log, rate_b=on_rows(log.rate_b, row % 3 == 1))
+    (same,), nothing = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
+    assert same is sparse and nothing == []
+    (few,), (note,) = with_fewer_rows([sparse], Thresholds(most_rows=len(row) // 2))
+    assert "every 3. row" in note
+    position = np.isfinite(few.pos_w).all(axis=1)
+    np.testing.assert_array_equal(few.time_s[position], log.time_s[::3])
+    turning = np.isfinite(few.rate_b).all(axis=1)
+    np.testing.assert_array_equal(few.rate_b[turning], log.rate_b[row % 3 == 1][::3])
+    assert len(few.rotor_speed) == len(few.time_s) < len(row)
+
+
+def test_rollouts_under_measured_rotor_speeds_are_fewer(log):
+    limits = Thresholds(most_rotor_windows=1)
+    count = [len(cut([log], PLAIN, by, limits=limits)[0].flight) for by in (True, False)]
+    assert count[0] == 1 < count[1]

@@ -1,0 +1,69 @@
+"""Mistakes that a diagnosis has made before: each on small flights, by force and torque."""
+
+from dataclasses import replace
+
+import pytest
+
+from suite.diagnose.diagnose import diagnose
+from tests.support.diagnosis_flights import fly_all
+from tests.support.real_flights import VEHICLE, flights
+
+FALL = 0.08
+"""Of the battery's voltage [V/s]."""
+
+
+def found_in(logs):
+    """Return the verdict, and what is named with what could stand in its place."""
+    found = diagnose(logs, VEHICLE, by="views")
+    names = {name.candidate.name: set(name.rivals) for _, name in found.named}
+    return found.label, names, found
+
+
+def pushed(extra, seed, duration_s=6.0):
+    """Return flights with an acceleration that no effect of the catalogue makes."""
+    return fly_all(
+        [VEHICLE] * 4, range(seed, seed + 4), duration_s, 3.0, motors=True, extras=[extra] * 4
+    )
+
+
+def test_a_battery_that_sags_with_its_voltage_is_named_with_its_size():
+    logs = [
+        replace(log, voltage=16.8 - FALL * (log.time_s - log.time_s[0]))
+        for log in flights(4, seed=6, battery_sag=(0.008, 0.0))
+    ]
+    label, names, found = found_in(logs)
+    assert label == "named" and set(names) == {"battery_sag"}
+    assert found.vehicle.effects["battery_sag"].per_volt == pytest.approx(0.008 / FALL, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [20, 30])
+def test_a_drag_to_one_side_is_no_wind(seed):
+    def forwards(motion, t):
+        ahead = motion.rot_w[:, 0]
+        return -0.5 * max(float(motion.vel_w @ ahead), 0.0) * ahead
+
+    label, names, _ = found_in(pushed(forwards, seed))
+    assert label in ("partly", "unknown") and "constant_wind" not in names
+
+
+def test_a_hysteresis_outside_the_catalogue_is_no_thrust_alone():
+    def stuck(motion, t):
+        return (2.0 if motion.vel_w[2] > 0.0 else -1.0) * motion.rot_w[:, 2]
+
+    label, names, found = found_in(pushed(stuck, 40, 12.0))
+    assert label in ("partly", "unknown"), names
+    assert found.verdict.where is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("thrust_tilt", (0.035, 0.0)), ("blade_flapping", 2e-6)]
+)
+def test_one_effect_is_named_without_a_second_small_one(name, value):
+    label, names, _ = found_in(flights(4, seed=11, speed=4.0, hidden={name: (value,)}))
+    assert label == "named" and len(names) == 1
+    assert name in {*names, *next(iter(names.values()))}
+
+
+def test_a_thrust_that_no_torque_tells_from_a_mass_has_it_as_an_alternative():
+    _, names, _ = found_in(flights(4, seed=12, speed=1.0, hidden={"mass_offset": (0.08,)}))
+    assert {"mass_offset", "thrust_scale"} <= {*names, *set().union(*names.values())}
