@@ -48,13 +48,13 @@ def diagnose(
         by: the source of evidence, one of `SOURCES`, or "auto": all that the logs allow.
         drive: what the model's input is: "commands", "motors", or "auto".
         integrator: how the flights' bodies were moved: "continuous", as every real one, "euler",
-            as MuJoCo's steps of the rate loop's period do it, or "auto": what the logs say.
+            as MuJoCo's steps of the rate loop's period do it, or "auto": what the logs have.
         say: receives a line for people about each step.
         seed: of the null's draws.
         limits: of every step.
 
     Raises:
-        ValueError: where no flight can be used, or not in the way that was asked for.
+        ValueError: where no flight can be used, or not in the way that was chosen.
     """
     began = time.monotonic()
     if by not in ("auto", *SOURCES):

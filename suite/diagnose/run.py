@@ -59,7 +59,7 @@ def diagnose_files(
         drive: what the model's input is: "auto", "commands" or "motors".
         integrator: how the bodies were moved: "auto", "continuous" or "euler".
         compare_delta: fit a Delta Action Model to the same flights and compare it.
-        plan: write flights that tell apart what these could not.
+        plan: write flights that separate what these could not.
         fly: fly the plan in simulation with this vehicle.
         recording: write a recording for rerun.
         seed: of all draws.

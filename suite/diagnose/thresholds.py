@@ -24,7 +24,7 @@ class Thresholds:
     speed_mean_s: float = 0.1
     """Rotor speeds are compared with the loop's as means over this time, to be rid of noise [s]."""
     still_speed: float = 10.0
-    """Rotor speeds that change by less, or are off by less, say nothing [rad/s]."""
+    """Rotor speeds that change by less, or are off by less, do not count [rad/s]."""
     loop_settled_s: float = 0.3
     """After the first row, until the rotors' lag has forgotten how they began [s]."""
     lag_settled_s: float = 0.2
@@ -32,12 +32,12 @@ class Thresholds:
     longest_lag_s: float = 0.15
     """Slowest motors that are thought of [s]."""
     lag_followed_share: float = 0.99
-    """Commands tell the rotors' lag where they give this share of how the speeds change, with it:
-    where speeds change little, noise of the rates in what is asked for looks like a lag [1]."""
+    """Commands show the rotors' lag where they give this share of how the speeds change, with it:
+    where speeds change little, noise of the rates in the commanded speeds looks like a lag [1]."""
     lag_closed_share: float = 0.25
     """And where it closes this share of the squared error that the vehicle's lag leaves [1]."""
     lag_least_flights: int = 3
-    """Flights that tell it must be as many."""
+    """Flights that show it must be as many."""
     longest_delay_s: float = 0.06
     """Latest commands that are thought of [s]."""
     delays_tried: int = 9
@@ -54,7 +54,7 @@ class Thresholds:
     """Offsets below are left unsaid: sampling and a simulator's steps shift pose and gyro so far
     against each other [s]."""
     noise_rows: int = 20
-    """Rows that a polynomial is taken off: what is left of a model's error in 0.2 s is none."""
+    """Rows that a polynomial is taken off: a model's error in 0.2 s is negligible then."""
     rotor_noise_rows: int = 8
     """The same for rotor speeds that are an input, which change faster."""
     noise_degree: int = 3
@@ -65,7 +65,7 @@ class Thresholds:
     colour_gain: float = 3.0
     """Rise of the log-likelihood below which noise is taken for white [1]."""
     drift_gain: float = 3.0
-    """Rise of the log-likelihood below which there is no error of the model beside noise [1]."""
+    """Rise of the log-likelihood below which there is no error of the model besides noise [1]."""
     colour_aside: float = 3.0
     """Rows up to which a stretch's rows may be off the others' times."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
@@ -81,7 +81,7 @@ class Thresholds:
     rotor_knot_excess: float = 1.5
     """Errors of rotor speeds may be this much larger, for what happens between the knots [1]."""
     singular: float = 1e-5
-    """A column with less than this of its own beside the others needs Householder's way [1]."""
+    """A column with less than this of its own next to the others needs Householder's way [1]."""
     fit_rounds: int = 3
     """Gauss-Newton steps of a fit, where no other number of them is given."""
     converged: float = 0.05
@@ -108,7 +108,7 @@ class Thresholds:
     near_share: float = 0.5
     """Candidates whose linear gain is less than this share of the best are not fitted so [1]."""
     rival_chi2: float = 9.0
-    """A rival less than this above a name's chi-square (three sigma) cannot be told from it."""
+    """A rival less than this above a name's chi-square (three sigma) cannot be ruled out."""
     rival_share: float = 0.25
     """Nor can one that leaves less than this share of what the name explains, where that is
     little [1]."""
@@ -131,7 +131,7 @@ class Thresholds:
     first_order_share: float = 0.1
     """Nor one that is worse by more than this share besides: large effects are not linear [1]."""
     diverged_m: float = 50.0
-    """A simulated window that ends this far from the flight says nothing [m]."""
+    """A simulated window that ends this far from the flight does not count [m]."""
     least_windows: int = 2
     """Windows to fit without which nothing can be left out."""
     integrator_share: float = 0.6
@@ -145,38 +145,38 @@ class Thresholds:
     ground_margin_s: float = 1.0
     """Time before and after standing on the ground in which it takes off or lands [s]."""
     least_flights: int = 3
-    """Flights from which their means tell how trims differ between flights."""
+    """Flights from which their means show how trims differ between flights."""
     longest_memory: int = 40
     """Neighbouring moments of a view up to which errors may hang together."""
     least_fast_share: float = 0.5
-    """Fast changes that surely ask for less than this share of a name speak against it [1]."""
+    """Fast changes that surely show less than this share of a name speak against it [1]."""
     least_view_share: float = 0.03
     """An effect that takes less than this share of a view's squared error is not named [1]."""
     least_inertial_share: float = 0.06
     """The same in flights without a position: what is not known of their pose makes as much [1]."""
     implausible_times: float = 3.0
-    """Beyond so many times its usual size an effect is said to be implausible [1]."""
+    """Beyond so many times its usual size an effect is implausible [1]."""
     hopeless_chi2: float = 10.0
     """Squared error a row, in units of the noise, that all numbers of the catalogue together leave:
     beyond it flights are not judged by rollouts of a second, but by their views."""
     hopeless_windows: int = 16
-    """Stretches to which all numbers are fitted where slopes alone say that so much is left."""
+    """Stretches to which all numbers are fitted where by slopes alone so much remains."""
     hopeless_rounds: int = 6
     """Steps of that fit."""
     view_left_share: float = 0.1
     """Share of a view's squared error that a black box may close beyond what was named, before
-    something is said to be missing [1]."""
+    something is missing [1]."""
     least_rotor_gain: float = 0.01
     """Share of the largest gain below which rotors do nothing along an axis [1]."""
     carried_ridge: float = 0.01
     """How strongly what reference flights lack within a flight is held to none, a moment [1]."""
     carried_least: float = 0.1
-    """Velocities [m/s] and accelerations [m/s^2, rad/s^2] that vary by less tell nothing of it."""
+    """Velocities [m/s] and accelerations [m/s^2, rad/s^2] that vary by less do not count."""
     gain_doubt: float = 0.5
     """Share of a change by which the vehicle file may be wrong along an axis: inertia, arms and the
     rotors' torque are known no better where nobody identified them [1]."""
     spread_freedom: int = 4
-    """Degrees of freedom for which the spread of all axes counts beside an axis's own [1]."""
+    """Degrees of freedom for which the spread of all axes counts next to an axis's own [1]."""
     change_p_value: float = 0.02
     """Chance of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
@@ -200,7 +200,7 @@ class Thresholds:
     gap_stride_s: float = 0.25
     """From one start to the next of the rollouts that measure the gap [s]."""
     doubt_chi2: float = 25.0
-    """Rise of chi-square on held-out flights from which a name is doubted (five sigma)."""
+    """Rise of chi-square on held-out flights from which a name is withdrawn (five sigma)."""
     shown_chi2: float = 9.0
     """Fall of chi-square on held-out flights that is expected of a name at its fitted size, from
     which it is withdrawn where none comes (three sigma)."""
@@ -218,7 +218,7 @@ class Thresholds:
     disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
     """Quantiles of the information along all directions at which a disturbance is seen."""
     informed_share: float = 1e-9
-    """Directions with less than this share of the largest information are not looked at [1]."""
+    """Directions with less than this share of the largest information do not count [1]."""
     noise_doubt: float = 0.02
     """Share by which the measured noise power may be wrong [1]."""
     shape_p_value: float = 0.001

@@ -1,9 +1,9 @@
 """The colour of measurement noise: a state estimator's errors last from one row to the next.
 
 Position, attitude and velocity have white noise and noise of a first-order Gauss-Markov process,
-that decays as exp(-t / T). How much of it there is, and T, maximise the likelihood of what is left
+that decays as exp(-t / T). How much of it there is, and T, maximise the likelihood of what remains
 of every window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson
-1971). A model's error adds up along a window, where noise does not: beside the noise there may be
+1971). A model's error adds up along a window, where noise does not: besides the noise there may be
 an error that is white in force and torque, so that it is not taken for noise.
 """
 
@@ -31,7 +31,7 @@ ESTIMATED = ("position", "attitude", "velocity")
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """By group, how often a force or torque is integrated to move it; other groups follow at once."""
 LEAST_ROWS = 30
-"""A window with fewer rows says nothing of colours."""
+"""A window with fewer rows does not show colours."""
 
 
 class Noise(NamedTuple):
@@ -58,7 +58,7 @@ class _Stretches(NamedTuple):
 
 
 class _Process(NamedTuple):
-    """Noise of unit variance, and a model's error beside it."""
+    """Noise of unit variance, and a model's error besides."""
 
     share: float
     """Of the noise, that is coloured."""
@@ -211,7 +211,7 @@ def _drift(time_s: np.ndarray, integrated: int) -> np.ndarray:
 
 
 def _beside_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
-    """Return the energy (V * C,) beside the polynomial, its freedom, and half a log-determinant.
+    """Return the energy (V * C,) off the polynomial, its freedom, and half a log-determinant.
 
     Rows are whitened by `process` first.
     """
@@ -242,12 +242,12 @@ def _by_time(
 ) -> list[tuple[_Process, float]]:
     """Return for each of `times_s` the likeliest process, and its gain over white noise.
 
-    What noise explains nearly as well as a drift beside it is noise.
+    What noise explains nearly as well as a drift besides is noise.
     """
 
     def likely(process: _Process) -> float:
-        beside = limits.drift_gain if process.drift else 0.0
-        return _likelihood(stretches, process) - beside
+        cost = limits.drift_gain if process.drift else 0.0
+        return _likelihood(stretches, process) - cost
 
     drifts = DRIFTS if stretches.drift.any() else (0.0,)
     white = max((_Process(0.0, 1.0, drift) for drift in drifts), key=likely)

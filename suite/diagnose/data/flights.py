@@ -3,8 +3,8 @@
 What a partial log lacks comes from what it has: rates are those of the attitude, and where that is
 lacking as well, thrust is along body z and in slow flight nearly all of the force besides gravity,
 so that the body's z axis is that of the path's acceleration less gravity (differential flatness;
-Mellinger and Kumar 2011). The yaw is taken for none then. A force across the thrust cannot be told,
-and rates only as means over a second.
+Mellinger and Kumar 2011). The yaw is taken for none then. A force across the thrust is not
+identifiable, and rates only as means over a second.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
-"""Width of the bumps where rates come from a path, which tells them as means over a second [s]."""
+"""Width of the bumps where rates come from a path, which gives them as means over a second [s]."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def ready(
     if not views:
         raise ValueError(
             f"{', '.join(log.name for log in logs)}: no position, and no accelerometer or no motor "
-            "of its own beside the gyro: nothing says what moved"
+            "of its own next to the gyro: nothing shows what moved"
         )
     parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
     main = views[0]
@@ -120,7 +120,7 @@ def ready(
         ]
         if empty:
             notes.append(
-                f"{view.name}: not looked at, as {', '.join(empty)} has no {view.width_s:g} s "
+                f"{view.name}: not examined, as {', '.join(empty)} has no {view.width_s:g} s "
                 f"with {LEAST_ROWS} rows; log faster"
             )
             views, parts = views[:1], {main.name: parts[main.name]}
@@ -285,7 +285,7 @@ def choose_held_out(
     `flight` (W,) is the number of each window's flight, `start_s` (W,) when it starts there.
 
     Held out are the flights that can best be spared: those of whose `information` (W, K), of each
-    window on each number of the catalogue, the others have most. What was measured has no say in
+    window on each number of the catalogue, the others have most. What was measured has no part in
     it, only what was flown; a lone chirp or the only pass near the ground is fitted.
     """
     flight = np.asarray(flight)
@@ -306,7 +306,7 @@ def choose_held_out(
 
 
 class ActingRotors(NamedTuple):
-    """Rotor speeds of a log, and what they tell."""
+    """Rotor speeds of a log."""
 
     speed: np.ndarray
     """(N, 4) [rad/s]."""
@@ -321,9 +321,9 @@ class ActingRotors(NamedTuple):
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ActingRotors | None:
-    """Return the speeds that turned in `log`, measured or as asked for; None where nothing says.
+    """Return the speeds that turned in `log`, measured or commanded; None where nothing shows them.
 
-    They are those of every row, as far as no hole is in between. What was asked for is followed by
+    They are those of every row, as far as no hole is in between. What was commanded is followed by
     the vehicle's lag.
     """
     noise = None
@@ -369,6 +369,6 @@ def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
     speed = wanted.copy()
     for row in range(1, len(wanted)):
         before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
-        asked = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
-        speed[row] = asked + left[row - 1] * (before - asked)
+        target = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
+        speed[row] = target + left[row - 1] * (before - target)
     return np.where(np.isfinite(wanted), speed, np.nan)

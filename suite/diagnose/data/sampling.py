@@ -5,7 +5,7 @@ have no value. Each signal counts on its own rows. Where a value is needed on an
 a line between two of its own, but not across a hole; what is commanded is held.
 
 A row's command acts from its stamp on and the rate loop starts its period there, so every step of
-the model lies between two rows. Between them the loop looks about as often as the vehicle's own
+the model lies between two rows. Between them the loop samples about as often as the vehicle's own
 does, or every `LONGEST_S` where that is rarer, and carries the rates on by what that leaves out.
 """
 
@@ -54,7 +54,7 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
 def without_slow_rotors(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` without rotor speeds that are too slow to say what drove, and notes of it.
+    """Return `logs` without rotor speeds that are too slow to show what drove, and notes of it.
 
     What a motor does between two of its rows is unknown where they are further apart than the
     longest hole.
@@ -65,7 +65,7 @@ def without_slow_rotors(
         if spacing_s > limits.longest_hole_s:
             notes.append(
                 f"{log.name}: rotor speeds at {1.0 / spacing_s:.2g} Hz are left out; at least "
-                f"{1.0 / limits.longest_hole_s:.3g} Hz say what the rotors did between two rows"
+                f"{1.0 / limits.longest_hole_s:.3g} Hz show what the rotors did between two rows"
             )
             log = replace(log, rotor_speed=None)
         kept.append(log)
@@ -120,7 +120,7 @@ def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
 
 
 def thinned(seen: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
-    """Return the places (at most `most`) of rows that say as much of every signal as can be.
+    """Return the places (at most `most`) of rows that keep as much of every signal as can be.
 
     Args:
         seen: (N, K) bool: what the rows have of K signals.
@@ -211,9 +211,9 @@ class StepGrid(NamedTuple):
     edge_s: np.ndarray
     """(T + 1,) ends of steps [s]."""
     look_s: np.ndarray
-    """(T,) until the rate loop's next look; 0 where it does not look at the step's start [s]."""
+    """(T,) until the rate loop's next sample; 0 where it takes none at the step's start [s]."""
     lead_s: np.ndarray
-    """(T,) by how much later than the steps' looks those of the vehicle are, on average [s]."""
+    """(T,) by how much later than the steps' samples those of the vehicle are, on average [s]."""
 
 
 def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) -> StepGrid:
@@ -232,10 +232,10 @@ def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) 
     rest = np.maximum(spacing - whole * period_s, 0.0)
     old = np.add.reduceat(0.5 * (whole * period_s**2 + rest**2), kept[:-1])
     length = np.diff(row_s[kept])
-    looks = np.maximum(np.rint(length / max(period_s, longest_s)), 1).astype(int)
-    hold = length / looks
+    samples = np.maximum(np.rint(length / max(period_s, longest_s)), 1).astype(int)
+    hold = length / samples
     parts = np.maximum(np.rint(hold / longest_s), 1).astype(int)
-    count = looks * parts
+    count = samples * parts
     of_row = np.repeat(np.arange(len(count)), count)
     number = np.arange(len(of_row)) - np.repeat(np.cumsum(count) - count, count)
     edge_s = row_s[kept][of_row] + number * (length / count)[of_row]
@@ -303,7 +303,7 @@ def rotors_at(
     """Return rotor speeds (S, 4) at `at_s` (S,) [s] from `every` so many of each rotor's own rows.
 
     Between rows they run along the first-order response to one command. What a firmware's loop
-    asks for changes all the time, by filtered slopes of rates: a `smooth` curve is nearer then.
+    commands changes all the time, by filtered slopes of rates: a `smooth` curve is nearer then.
     """
     columns = []
     for column in speed.T:
@@ -324,7 +324,7 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
     """Return the RMS error [rad/s] of rotor speeds that follow commands at measured rates (N, 3).
 
     Between rows the rates are not known. By how far a line between every second row misses the row
-    in the middle, the loop is asked for other rotor speeds; a line between neighbours misses by a
+    in the middle, the loop commands other rotor speeds; a line between neighbours misses by a
     quarter of it where rates are smooth and by about all of it where they are noise: half is taken.
     """
     if len(time_s) < 3:
@@ -337,6 +337,6 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
     plant = make_plant(vehicle, LONGEST_S)
     hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))
     rates = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
-    asked = np.asarray(wanted_speed(plant, hover, rates))
-    error = 0.5 * missed @ ((asked[1:] - asked[0]) / 0.1)
+    wanted = np.asarray(wanted_speed(plant, hover, rates))
+    error = 0.5 * missed @ ((wanted[1:] - wanted[0]) / 0.1)
     return max(float(np.sqrt((error**2).mean())), LEAST_START_ERROR)

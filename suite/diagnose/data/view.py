@@ -101,7 +101,7 @@ def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray
 
 @dataclass(frozen=True)
 class View:
-    """One way to look at a flight: some equations under measurements of all else."""
+    """One part of the dynamics: some equations under measurements of all else."""
 
     name: str
     """As in a diagnosis."""
@@ -116,7 +116,7 @@ class View:
     in_world: bool
     """Whether its accelerations are in world axes; they are turned into the body's."""
     axes: tuple[int, ...] = (0, 1, 2)
-    """Of the body, along which it can be asked."""
+    """Of the body, along which it is identifiable."""
 
 
 FORCE = View(

@@ -2,7 +2,7 @@
 
 A window's start is measured with the same noise as its other rows. It is left free: what 12 small
 changes of it can explain is projected out of residuals and slopes, and what stays has the
-measurement's own white noise. The rotor speeds' errors are free as well, but for rows that say how
+measurement's own white noise. The rotor speeds' errors are free as well, but for rows that hold how
 large they may be: all along a window where measured ones are the input, else at its start.
 """
 
@@ -95,7 +95,7 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 
     Cholesky's factor of the Gram matrix, twice (CholeskyQR2; Yamamoto et al. 2015): products of
     whole matrices, where Householder's way through so tall a matrix is many small steps. Where a
-    column has less than `singular` of its own beside the others, Householder's way is taken.
+    column has less than `singular` of its own next to the others, Householder's way is taken.
     """
     size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
     base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])

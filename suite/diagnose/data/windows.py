@@ -91,7 +91,7 @@ class FlightWindows(NamedTuple):
     command_sum: Array
     """(W, K, 4) their integral from the first one's time to each one's."""
     burn_in_rate_b: Array
-    """(W, Q, 3) measured, where the loop looks [rad/s]."""
+    """(W, Q, 3) measured, where the loop samples [rad/s]."""
     rotor_speed: Array
     """(W, S, 4) measured, in the middle of each step [rad/s]; zeros where there is none."""
     voltage_drop: Array
@@ -194,8 +194,8 @@ def trusted(
 ) -> FlightWindows:
     """Return `windows`, each up to where the model has not left the flight by too much.
 
-    Beyond, slopes taken where the model is say nothing of where the flight was: it may have turned
-    over, or sunk below the ground. What is named brings the model back, and the next look is
+    Beyond, slopes taken where the model is do not hold where the flight was: it may have turned
+    over, or sunk below the ground. What is named brings the model back, and the next evaluation is
     longer. `residual` is (W, N, 19).
     """
     error = np.abs(residual)
@@ -241,7 +241,7 @@ def _starts(
 
 
 def _driven(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
-    """Return (T,) bool each: rows of what drives, and of the rates that the loop looks at."""
+    """Return (T,) bool each: rows of what drives, and of the rates that the loop samples."""
     if rotor_input:
         assert log.rotor_speed is not None
         return [np.isfinite(column) for column in log.rotor_speed.T]

@@ -1,4 +1,4 @@
-"""Evidence: what a source of information says of the numbers of a space, in blocks of its noise.
+"""Evidence: what a source of information holds on the numbers of a space, in blocks of its noise.
 
 Everything that is done with numbers (fit, intervals, search, hold-out) is done with blocks, so that
 a new source of information is one class that makes them.
@@ -37,7 +37,7 @@ class Block:
     slope: np.ndarray
     """(B, M, K) of the model."""
     along: tuple[int, ...]
-    """Place in the vector of each column's number; lent columns come once more, last."""
+    """Place in the vector of each column's number; inactive ones come once more, last."""
     flight: np.ndarray
     """(B,) number of each stretch's flight."""
     start_s: np.ndarray
@@ -70,9 +70,9 @@ class Linearised(Protocol):
         ...
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return what it says at an estimate, along the numbers at `indices` or along all.
+        """Return what it gives at an estimate, along the numbers at `indices` or along all.
 
-        A source that has all slopes at once may return more than it is asked for.
+        A source that has all slopes at once may return more than that.
         """
         ...
 
@@ -97,14 +97,14 @@ class NormalEquations(NamedTuple):
         return tuple(range(self.gradient.shape[1])) if self.along is None else self.along
 
     def columns_of(self, candidate: Candidate) -> list[int]:
-        """Return the columns of `candidate`; of a composite the lent ones."""
+        """Return the columns of `candidate`; of a composite the repeated ones."""
         numbers = self.numbers
         place = {number: column for column, number in enumerate(numbers)}
         if not candidate.parts:
             place |= {n: numbers.index(n) for n in candidate.indices}
         return [place[number] for number in candidate.indices]
 
-    def lent(self) -> tuple[int, ...]:
+    def repeated(self) -> tuple[int, ...]:
         """Return the numbers whose columns come twice."""
         return tuple(n for k, n in enumerate(self.numbers) if n in self.numbers[:k])
 

@@ -68,7 +68,7 @@ def carried(among: Sequence[Candidate]) -> list[Candidate]:
 
 
 def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return what there is to say of composites in the `sets` of names of a diagnosis, a line each.
+    """Return the words on composites in the `sets` of names of a diagnosis, a line each.
 
     A set has the name first and then what could stand in its place.
     """
@@ -86,7 +86,7 @@ def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Lent:
+class Inactive:
     """Numbers that do nothing as things stand, and where what they act through is there."""
 
     numbers: tuple[int, ...]
@@ -95,13 +95,13 @@ class Lent:
     """(P,) where they act: with what they act through at its usual size."""
 
 
-def lent_at(
+def inactive_at(
     space: ParameterSpace, theta: np.ndarray, among: Sequence[Candidate], acts: np.ndarray
-) -> Lent | None:
+) -> Inactive | None:
     """Return what acts through parts of composites alone and so does nothing at `theta` (P,).
 
-    None where all of it acts. The first composite of a number says through what it acts; `acts`
-    (P,) says which numbers do something at `theta`.
+    None where all of it acts. The first composite of a number determines through what it acts;
+    `acts` (P,) holds which numbers do something at `theta`.
     """
     for composite in COMPOSITES:
         whole = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
@@ -113,47 +113,47 @@ def lent_at(
         raised, usual = theta.copy(), usual_size(space)
         through = [i for i in whole.indices if i not in carried]
         raised[through] = theta[through] + usual[through]
-        return Lent(carried, raised)
+        return Inactive(carried, raised)
     return None
 
 
 def usual_size(space: ParameterSpace) -> np.ndarray:
     """Return the middle (P,) of the usual magnitudes of every number."""
-    told = {(e.name, p.name): p.typical for e in EFFECTS.values() for p in e.parameters}
-    return np.array([np.mean(told[entry.effect, entry.parameter]) for entry in space.entries])
+    usual = {(e.name, p.name): p.typical for e in EFFECTS.values() for p in e.parameters}
+    return np.array([np.mean(usual[entry.effect, entry.parameter]) for entry in space.entries])
 
 
 def begin_of(
     space: ParameterSpace,
     theta: np.ndarray,
     candidate: Candidate,
-    lent: Sequence[int],
+    inactive: Sequence[int],
     change: np.ndarray,
     weight: np.ndarray,
 ) -> np.ndarray:
-    """Return the numbers (P,) from which a composite with `lent` numbers is fitted.
+    """Return the numbers (P,) from which a composite with `inactive` numbers is fitted.
 
-    A drag times a wind is what the slopes tell; where they ask for no drag it takes the smallest
+    The slopes identify a drag times a wind; where they give no drag it takes the smallest
     usual one, and the wind as much more.
 
     Args:
         space: of the vehicle.
         theta: (P,) where the slopes were taken.
         candidate: the composite.
-        lent: its numbers that act through the others, whose slopes were taken with those at their
-            usual size.
-        change: (P,) of all numbers that the slopes ask for.
-        weight: (P,) what the flights tell of each number.
+        inactive: its numbers that act through the others, whose slopes were taken with those at
+            their usual size.
+        change: (P,) of all numbers by the slopes.
+        weight: (P,) information of the flights on each number.
     """
     begin = np.clip(theta + change, space.array("low"), space.array("high"))
-    through = np.array([i for i in candidate.indices if i not in lent])
+    through = np.array([i for i in candidate.indices if i not in inactive])
     usual = usual_size(space)[through]
     least = space.array("start")[through] + 0.3 * usual
     begin[through] = np.maximum(begin[through], least)
     share = (begin[through] - space.array("start")[through]) / usual
-    told = weight[through] * usual**2
-    mean = float((share * told).sum() / told.sum()) if told.sum() > 0.0 else float(share.mean())
-    at = np.array(lent, dtype=int)
+    info = weight[through] * usual**2
+    mean = float((share * info).sum() / info.sum()) if info.sum() > 0.0 else float(share.mean())
+    at = np.array(inactive, dtype=int)
     begin[at] = theta[at] + change[at] / mean
     return np.clip(begin, space.array("low"), space.array("high"))
 

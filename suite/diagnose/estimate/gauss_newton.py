@@ -103,10 +103,10 @@ def fit(
     """Fit the numbers at `indices` and what is free in every stretch.
 
     At most `rounds` steps are taken, those of the limits if not given; `known` is what the evidence
-    says at `start`, to save its calculation.
+    gives at `start`, to save its calculation.
 
     Returns:
-        The best estimate, and what the evidence says there.
+        The best estimate, and what the evidence gives there.
     """
     at, space = np.array(indices, dtype=int), evidence.space
     low, high = space.array("low")[at], space.array("high")[at]
@@ -140,9 +140,9 @@ Z95 = 1.96
 TINY = 1e-12
 """Information below this is none."""
 RIDGE = 1e-9
-"""Makes what cannot be told apart wide, where a pseudo-inverse would hide it."""
+"""Makes what is not identifiable wide, where a pseudo-inverse would hide it."""
 FEWEST = 3
-"""Flights from which how they differ says something."""
+"""Flights from which on their differences count."""
 
 
 class Intervals(NamedTuple):
@@ -174,10 +174,10 @@ def intervals95(
         equations: along the fitted numbers.
         differ_p: flights differ where chance makes them do so more rarely than this: 0 never, 1
             always.
-        leave_out: stretches are left out in turn, too (CR3): a stretch with much to say fits
+        leave_out: stretches are left out in turn, too (CR3): a stretch with much information fits
             itself. With few of them their spread is itself not well known (Bell & McCaffrey 2002).
         noise_share: share of the interval by curvature below which no interval is.
-        prior: (K,) information on each number beside the flights', as of one that was held.
+        prior: (K,) information on each number besides the flights', as of one that was held.
     """
     count, size = equations.gradient.shape
     if not size:
@@ -195,7 +195,7 @@ def intervals95(
         return np.linalg.inv(matrix * both + RIDGE * np.eye(size)) * both
 
     def moves(own: np.ndarray, pulls: np.ndarray) -> np.ndarray:
-        """Return by how much draws (N, K) move the numbers, by what all others say of these."""
+        """Return by how much draws (N, K) move the numbers, by the others' estimate of these."""
         return np.einsum("nij,nj->ni", inverted(hessian - own), pulls)
 
     inverse = inverted(hessian)
@@ -215,7 +215,7 @@ def intervals95(
         away, share = inside @ moved, len(numbers) / (len(numbers) - 1)
         q = away**2 / np.maximum(inside @ moved**2, 1e-300)
         differ = chi2.sf(q.sum(axis=0), len(numbers) - 1) < differ_p
-        if not leave_out:  # a flight with much to say fits itself, where its stretches do not
+        if not leave_out:  # a flight with much information fits itself, where its stretches do not
             own = np.einsum("fb,bij->fij", inside, equations.hessian)
             away, share = moves(own, inside @ gradient), 1.0 / share
             away -= away.mean(axis=0)

@@ -119,7 +119,7 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 
 
 def make_space(vehicle: Vehicle) -> ParameterSpace:
-    """Return the vector of `vehicle`: all but what acts by chance or no flight can tell.
+    """Return the vector of `vehicle`: all but what acts by chance or is not identifiable.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -182,11 +182,11 @@ def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> li
     """
     found = []
     for name, effect in EFFECTS.items():
-        told = {parameter.name: parameter for parameter in effect.identifiable(voltage)}
-        at_ = [i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in told]
+        fitted = {parameter.name: parameter for parameter in effect.identifiable(voltage)}
+        at_ = [i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in fitted]
         if not at_ or not set(effect.needs) <= set(has):
             continue
-        if any(parameter.one_at_a_time for parameter in told.values()):
+        if any(parameter.one_at_a_time for parameter in fitted.values()):
             found += [Candidate(name, (i,), f"{name} {k + 1}") for k, i in enumerate(at_)]
         else:
             found.append(Candidate(name, tuple(at_), name))
@@ -212,19 +212,19 @@ def implausible(
     """Return the numbers of `candidate` that are beyond their usual size at `theta` (P,), in words.
 
     Usual is what the catalogue has as the upper usual magnitude; beyond three times that a number
-    is said to be implausible.
+    is implausible.
     """
-    told = []
+    words = []
     for index in candidate.indices:
         entry = space.entries[index]
         parameter = _parameter(entry)
         away = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
         if away > limits.implausible_times * parameter.typical[1]:
             place = "" if entry.component is None else f" {entry.component + 1}"
-            told.append(
+            words.append(
                 f"{entry.effect} {entry.parameter}{place} = {theta[index]:.3g} {parameter.unit}"
             )
-    return told
+    return words
 
 
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:

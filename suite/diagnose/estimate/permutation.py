@@ -13,7 +13,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class CandidateScore(NamedTuple):
-    """How much a candidate explains, beside what is named already."""
+    """How much a candidate explains, next to what is named already."""
 
     candidate: Candidate
     gain: float
@@ -69,13 +69,13 @@ def permutation_test(
     hessian: np.ndarray,
     gradient: np.ndarray,
     groups: Sequence[tuple[int, ...]],
-    beside: tuple[int, ...],
+    always: tuple[int, ...],
     fold: np.ndarray,
     seed: int,
     room: tuple[np.ndarray, np.ndarray] | None = None,
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[list[float], list[float], float]:
-    """Return the gain of each group of columns over those `beside`, its p-value, and chance's gain.
+    """Return the gain of each group of columns over those `always`, its p-value, and chance's gain.
 
     The null is the largest gain of all groups where the signs of whole windows are shuffled, which
     keeps all that is coloured within a window. What the best group explains, with those that are
@@ -87,8 +87,8 @@ def permutation_test(
     Args:
         hessian: (W, K, K) of the normal equations, columns of like size.
         gradient: (W, K).
-        groups: columns that are fitted together, those of `beside` among them.
-        beside: columns that are fitted anyhow.
+        groups: columns that are fitted together, those of `always` among them.
+        always: columns that are fitted in any case.
         fold: (W,) windows of one number are left out together.
         seed: of the null's draws.
         room: (K,) lowest and highest change of each column; no bounds if not given.
@@ -125,7 +125,7 @@ def permutation_test(
             total += 2 * (pull * moved).sum(1) - ((moved @ test) * moved).sum(1)
         return total
 
-    without = gain(beside)
+    without = gain(always)
     falls = [gain(group) - without for group in groups]
     rng = np.random.default_rng(seed)
     if len(fold) >= limits.few_windows:
@@ -139,7 +139,7 @@ def permutation_test(
     else:
         noise = _noise_like(hessian, draws, rng)
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
-    null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(beside)
+    null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(always)
     p_values = [float((1 + (null >= fall).sum()) / (1 + draws)) for fall in falls]
     return falls, p_values, float(np.quantile(null, 0.99))
 

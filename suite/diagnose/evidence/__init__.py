@@ -1,1 +1,1 @@
-"""What flights say of the model: rollouts of a second, force and torque."""
+"""Flights as evidence on the model: rollouts of a second, force and torque."""

@@ -1,4 +1,4 @@
-"""What a source of information is, so that names are looked for in it: one class a source.
+"""What a source of information is, for the search: one class a source.
 
 It makes blocks, and knows its noise. All else has a default.
 """
@@ -34,7 +34,7 @@ class Evidence(ABC):
 
     @abstractmethod
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return what it says at an estimate, along the numbers at `indices` or along all."""
+        """Return what it gives at an estimate, along the numbers at `indices` or along all."""
 
     @abstractmethod
     def weighed(self, at: Estimate) -> tuple[Evidence, Block]:
@@ -78,7 +78,7 @@ class Evidence(ABC):
         among: Sequence[Candidate],
         seed: int,
     ) -> list[CandidateScore]:
-        """Return the scores of `among` beside the numbers `named` at `theta` (P,), best first."""
+        """Return the scores of `among` next to the numbers `named` at `theta` (P,), best first."""
         fold = self.folds(block)
         return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
 
@@ -114,7 +114,7 @@ class Evidence(ABC):
 def flights_agree(gains: np.ndarray) -> bool:
     """Return whether all flights but one gain (G,), and together without the one that gains most.
 
-    Two flights or one cannot tell.
+    Two flights or one do not show it.
     """
     if len(gains) < 3:
         return True

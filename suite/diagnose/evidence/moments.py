@@ -1,9 +1,9 @@
 """Moments of force and torque: what flights and model differ by, moment by moment.
 
-What is left is the noise, and flights have trims of their own: an unchanged vehicle flies each time
-with a slightly other trim, so that each flight's mean of each axis is a draw of its own, a random
-effect (Laird and Ware 1982). Rows are made independent of it by taking off a share of their
-flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is off by
+The remaining error is the noise, and flights have trims of their own: an unchanged vehicle flies
+each time with a slightly other trim, so that each flight's mean of each axis is a draw of its own,
+a random effect (Laird and Ware 1982). Rows are made independent of it by taking off a share of
+their flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is off by
 a draw, too, which is the same for all: there a share of the mean of all goes.
 """
 
@@ -45,7 +45,7 @@ FELT = FlightRows._fields.index("felt_w")
 
 
 class RowForces(NamedTuple):
-    """What the equations say of N rows."""
+    """What the equations give on N rows."""
 
     value: np.ndarray
     """(N, 6) dv/dt in the world [m/s^2] and dw/dt in body axes [rad/s^2]."""
@@ -72,16 +72,16 @@ class ForceModel:
         """
         count, everything = len(rows.time_s), np.eye(len(theta))
         directions = [everything] if indices is None else grouped(everything, indices)
-        asked = len(theta) if indices is None else len(indices)
+        size = len(theta) if indices is None else len(indices)
         values, slopes = [], []
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 at = np.minimum(np.arange(first, first + CHUNK), count - 1)
                 part = FlightRows(*(np.asarray(field)[at] for field in rows[:FELT]))
-                said = [self._compiled(self._given, theta, part, group) for group in directions]
-                values.append(np.asarray(said[0][0])[: count - first])
-                slope = np.concatenate([np.asarray(each) for _, each in said], axis=-1)
-                slopes.append(slope[: count - first, :, :asked])
+                made = [self._compiled(self._given, theta, part, group) for group in directions]
+                values.append(np.asarray(made[0][0])[: count - first])
+                slope = np.concatenate([np.asarray(each) for _, each in made], axis=-1)
+                slopes.append(slope[: count - first, :, :size])
         return RowForces(np.concatenate(values), np.concatenate(slopes))
 
 
@@ -142,11 +142,11 @@ class Weights(NamedTuple):
     """What a view's numbers are judged by."""
 
     scatter: np.ndarray
-    """(3,) RMS of what is left within flights, by axis."""
+    """(3,) RMS of the residual within flights, by axis."""
     memory: np.ndarray
-    """(3,) how many neighbouring moments tell as much as one that is independent."""
+    """(3,) autocorrelation time, in moments."""
     trim: np.ndarray
-    """(3,) standard deviation of flights' means; infinite where too few flights can tell."""
+    """(3,) standard deviation of flights' means; infinite where too few flights show it."""
     base: np.ndarray | None = None
     """(3,) standard deviation of what all flights are judged from, where only their means count;
     None where that is known."""
@@ -216,7 +216,7 @@ def units_of(flight: np.ndarray) -> np.ndarray:
 
 
 def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
-    """Return the weights that `data`, the best model's, ask for."""
+    """Return the weights by `data`, the best model's."""
     flights = [data.residual[data.flight == n] for n in np.unique(data.flight)]
     inside = [f - f.mean(axis=0) for f in flights]
     count = sum(len(f) for f in inside)
@@ -261,7 +261,7 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
                 residual[rows], slope[rows], data.sway[rows], unit
             )
     if weights.base is not None:
-        # Where flights' means tell nothing this is 0.
+        # Where flights' means hold no information this is 0.
         own = weights.scatter**2 * weights.memory + weights.trim**2
         share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / own)
         residual -= share * residual.mean(axis=0)
@@ -330,11 +330,11 @@ def changes_of(data: ViewData) -> ViewData:
 def fast_share(
     data: ViewData, columns: Sequence[int], away: np.ndarray, limits: Thresholds
 ) -> tuple[float, float]:
-    """Return which share of a name's numbers fast changes ask for, and how surely.
+    """Return which share of a name's numbers fast changes show, and how surely.
 
     Motors answer what disturbs the body. A controller that holds it still against a slow torque
     makes the motors' torque look like one that turns nothing, as if inertia were larger or thrust
-    less. Where the equations are right, what changes from one moment to the next asks for the same
+    less. Where the equations are right, what changes from one moment to the next shows the same
     numbers as the whole does (a specification test; Hausman 1978, doi 10.2307/1913827).
 
     Args:
@@ -344,7 +344,7 @@ def fast_share(
         limits: of independent stretches.
 
     Returns:
-        1 where fast changes ask for the same, 0 where they ask for none of it, to first order; and
+        1 where fast changes show the same, 0 where they show none of it, to first order; and
         half of its 95 % interval.
     """
     fast = changes_of(data)

@@ -153,7 +153,7 @@ def _burned_in(
         carry = update_loop(plant, carry, span, unpacked(acting), rate_b)
         return turn_rotors(plant, carry, span)[0], None
 
-    # The rates where the loop looks are known here: none has to be carried on.
+    # The rates where the loop samples are known here: none has to be carried on.
     still = jnp.zeros_like(rates_b[0])
     carry = Carry(speed, speed, still, Wrench(still, still))
     carry, _ = jax.lax.scan(burn_in_step, carry, (spans, command, rates_b))
@@ -170,12 +170,12 @@ def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None
 
 
 def _acting(windows: FlightWindows, delay: Any) -> Any:
-    """Return the commands (B, Q + S, 4) that act between a look of the loop and the next, as means.
+    """Return the commands (B, Q + S, 4) that act between samples of the loop, as means.
 
     They act `delay` (...,) [s] after their rows, within steps too.
     """
     since_s = jnp.asarray(windows.edge_s)[:, :-1] - delay
-    # Where the loop does not look any command will do, but for the first: the rotors begin with it.
+    # Where the loop takes no sample any command will do, but for the first: rotors begin with it.
     look_s = jnp.asarray(windows.look_s)
     held = jnp.where(look_s > 0.0, look_s, LONGEST_S)
 

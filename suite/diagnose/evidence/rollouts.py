@@ -164,7 +164,7 @@ def block_of(
 def information(
     linear: Linearisation, windows: FlightWindows, size: int, limits: Thresholds = THRESHOLDS
 ) -> np.ndarray:
-    """Return what each window tells of each of the first `size` numbers, (W, K)."""
+    """Return the information of each window on each of the first `size` numbers, (W, K)."""
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     block = block_of(whitening, linear, range(size), windows)
@@ -180,8 +180,8 @@ def least_left(
 ) -> float:
     """Return the squared error a value, 1 of noise, that all numbers of the catalogue leave.
 
-    To first order about `linear`, the slopes of `windows` along all numbers. Slopes say too little
-    of large effects: where more than `enough` is left, all numbers are fitted to some windows.
+    To first order about `linear`, the slopes of `windows` along all numbers. Slopes do not
+    decide on large effects: where more than `enough` is left, some windows are fitted.
     """
     evidence, block = weighed_by(model, windows, linear, limits)
 
@@ -207,7 +207,7 @@ def least_left(
 BATCH = 12
 """Windows a call: one shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes a call, compiled once: a wider program beside it would take longer to compile than it
+"""Slopes a call, compiled once: a wider program besides would take longer to compile than it
 saves in a diagnosis of fewer than some 150 stretches."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
@@ -246,7 +246,7 @@ class RolloutModel:
     ) -> None:
         """Prepare the rollout of `vehicle` with the numbers of `space`.
 
-        With `rotor_input` measured rotor speeds are the input, not the commands; `voltage` says
+        With `rotor_input` measured rotor speeds are the input, not the commands; `voltage` is
         whether the windows have one; `integrator` is that of `fly_windows`.
         """
         self.space = space
@@ -296,24 +296,22 @@ class RolloutModel:
         `starts`.
         """
         everything = np.eye(self.size + self.free)
-        asked, groups = (
-            len(everything if indices is None else indices),
-            grouped(everything, indices),
-        )
+        count = len(everything if indices is None else indices)
+        groups = grouped(everything, indices)
         values, slopes = [], []
         with jax.enable_x64(True):
-            for x, w, count in batches(offset, windows):
+            for x, w, whole in batches(offset, windows):
                 answers = [self._linear(self.given, theta, x, w, group) for group in groups]
-                values.append(np.asarray(answers[0][0])[:count])
-                slopes.append(np.concatenate([np.asarray(a[1])[:count] for a in answers], axis=-1))
-        slope = np.concatenate(slopes)[..., :asked]
+                values.append(np.asarray(answers[0][0])[:whole])
+                slopes.append(np.concatenate([np.asarray(a[1])[:whole] for a in answers], axis=-1))
+        slope = np.concatenate(slopes)[..., :count]
         return Linearisation(-np.concatenate(values), slope, offset)
 
 
 def grouped(everything: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
     """Return `DIRECTIONS` rows at a time, at least once, of `everything` or those at `indices`."""
-    asked = everything if indices is None else everything[list(indices)]
-    parts = [asked[k : k + DIRECTIONS] for k in range(0, max(len(asked), 1), DIRECTIONS)]
+    rows = everything if indices is None else everything[list(indices)]
+    parts = [rows[k : k + DIRECTIONS] for k in range(0, max(len(rows), 1), DIRECTIONS)]
     return [np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))) for part in parts]
 
 

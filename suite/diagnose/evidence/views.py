@@ -44,14 +44,14 @@ class ViewBlock(Block):
 
 @dataclass(frozen=True)
 class ViewEvidence(Evidence):
-    """The flights of one view; what they say of the numbers once they are weighed."""
+    """The flights of one view; evidence on the numbers once they are weighed."""
 
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     limits: Thresholds = THRESHOLDS
     carried: np.ndarray | None = None
-    """(M, 3) what the model is known to lack in these flights, taken off what is left."""
+    """(M, 3) what the model is known to lack in these flights, taken off the residual."""
     means: bool = False
     """Only the mean of each flight counts, and nothing that changes within one."""
     weights: Weights | None = None
@@ -64,7 +64,7 @@ class ViewEvidence(Evidence):
 
     @property
     def repeatability(self) -> np.ndarray:
-        """(3,) how flights' means differ among themselves; infinite where too few tell it."""
+        """(3,) how flights' means differ among themselves; infinite where too few show it."""
         return np.full(3, np.inf) if self.weights is None else self.weights.trim
 
     @property
@@ -135,7 +135,7 @@ def holds_at_any_speed(
 ) -> bool:
     """Return whether fast changes do not speak against the numbers at `indices`, fitted in `then`.
 
-    They do where they ask for less than a share of them, and surely for less than all. Means of
+    They do where they show less than a share of them, and surely for less than all. Means of
     flights have no changes. `away` (P,) is how far all numbers are from the vehicle file's.
     """
     if len(np.unique(then.data.flight)) == len(then.data.flight):

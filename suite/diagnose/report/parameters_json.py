@@ -27,7 +27,7 @@ class Component(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether there is a value that is not the neutral one, as far as its interval says."""
+        """Whether there is a value that is not the neutral one, as far as its interval shows."""
         if self.value is None or self.ci95 is None or self.neutral is None:
             return self.value is not None
         return not self.ci95[0] <= self.neutral <= self.ci95[1]

@@ -33,7 +33,7 @@ SHOWN = 12
 
 
 def logs_section(diagnosis: Diagnosis, checks: Checks) -> Section:
-    """Return what the logs hold, and what pose and gyro say about each other."""
+    """Return what the logs hold, and how pose and gyro agree."""
     rows = [
         (
             short_name(fact.name),
@@ -64,16 +64,16 @@ def _kinematics(found: Kinematics, resolution_s: float) -> Grid:
     )
     sure = bool((np.abs(found.bias) > found.bias_ci).any())
     rows = [("gyro less the attitude's turn", f"{bias} mrad/s", "not zero" if sure else "")]
-    late, said = "rates change too little", ""
+    late, note_ = "rates change too little", ""
     if np.isfinite(found.offset_ci):
         late = f"{1e3 * found.offset:.2f} ± {1e3 * found.offset_ci:.2f} ms"
-        said = "not zero" if abs(found.offset) > max(found.offset_ci, resolution_s) else ""
-    rows.append(("pose later than gyro", late, said))
+        note_ = "not zero" if abs(found.offset) > max(found.offset_ci, resolution_s) else ""
+    rows.append(("pose later than gyro", late, note_))
     if found.velocity_scale is not None:
         rows.append(("velocity over the path's slope", f"{found.velocity_scale:.4f}", ""))
     note = (
         "From pose and gyro alone, without any model of forces, 95 %. Faults of a log imitate "
-        "physics, so that they are looked at first."
+        "physics, so that they come first."
     )
     return grid("Pose, gyro and path among themselves", ["", "value", ""], rows, note)
 
@@ -107,7 +107,7 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         if np.isfinite(values := sigma[place]).any()
     ]
     words = (
-        "Standard deviation by axis, from the data: what is left of measured minus simulated when "
+        "Standard deviation by axis, from the data: the residual of measured minus simulated when "
         "all that changes slowly is taken off. Everything below is in units of it; where the gap "
         "does not exceed what it gives, the verdict is no_gap."
     )
@@ -115,12 +115,12 @@ def noise_section(diagnosis: Diagnosis) -> Section:
 
 
 def actuators_section(checks: Checks, input_source: str) -> list[Section]:
-    """Return what measured rotor speeds say of the actuators; nothing where there are none."""
+    """Return what measured rotor speeds show of the actuators; nothing where there are none."""
     if not checks.actuators:
         return []
     words = (
         f"The model is driven by {input_source}. The difference between rotor speeds that are "
-        "asked for and measured is the flight controller's and the motors', no physics of the air: "
+        "commanded and measured is the flight controller's and the motors', no physics of the air: "
         "integrators and filters that the nominal rate loop has not show here."
     )
     return [Section("Actuators, apart from the air", [words, *map(_mismatch, checks.actuators)])]
@@ -132,13 +132,13 @@ def _mismatch(found: ActuatorMismatch) -> Grid:
     given = f"{100 * max(found.followed, 0.0):.0f} % of the change is given"
     rows = [
         ("speeds change by", f"{found.spread:.1f} rad/s"),
-        ("off what is asked for, with the vehicle file's lag", f"{found.rms:.1f} rad/s ({given})"),
+        ("off the commanded ones, with the vehicle file's lag", f"{found.rms:.1f} rad/s ({given})"),
         ("lag that fits best", f"{1e3 * found.time_constant:.1f} ms"),
         ("delay before it", f"{1e3 * found.delay:.1f} ms"),
-        ("measured over asked, by rotor", scale),
+        ("measured over commanded, by rotor", scale),
         ("what these leave", f"{found.rms_fitted:.1f} rad/s"),
-        ("thrust more than asked for", f"{found.thrust[0]:.2f} ± {found.thrust[1]:.2f} m/s²"),
-        ("turning more than asked for, x y z", f"{turn} rad/s²"),
+        ("thrust more than commanded", f"{found.thrust[0]:.2f} ± {found.thrust[1]:.2f} m/s²"),
+        ("turning more than commanded, x y z", f"{turn} rad/s²"),
     ]
     note = "± is the spread over the flights."
     return grid(f"Against the {found.asked_by}", ["", ""], rows, note)

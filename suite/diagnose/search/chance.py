@@ -22,17 +22,17 @@ def chance_of(
     gains: Sequence[float],
     slope: np.ndarray,
     groups: Sequence[Sequence[int]],
-    beside: Sequence[int],
+    always: Sequence[int],
     sizes: np.ndarray,
     rng: np.random.Generator,
 ) -> list[float]:
     """Return how often any group gains as much by chance, for the gain of each.
 
     Args:
-        gains: falls of chi-square by each group of columns beside those of `beside`.
+        gains: falls of chi-square by each group of columns next to those of `always`.
         slope: (F, 3, P) of flights' means along all columns, in units of independent noise.
         groups: columns that are fitted together.
-        beside: columns that are fitted anyhow.
+        always: columns that are fitted in any case.
         sizes: (D, 3) draws of the estimate of each axis's variance over the true one; the smallest
             p-value is one in as many.
         rng: of the noise; what `sizes` were drawn by may go on, but not begin again.
@@ -42,12 +42,12 @@ def chance_of(
     noise = (noise / np.sqrt(sizes)[:, None]).reshape(draws, -1)
     slope = slope.reshape(-1, slope.shape[-1])
     slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
-    known = _directions(slope[:, list(beside)])
+    known = _directions(slope[:, list(always)])
     free = slope - known @ (known.T @ slope)
     least = np.ones(draws)
     for group in groups:
-        told = ((noise @ _directions(free[:, list(group)])) ** 2).sum(axis=1)
-        least = np.minimum(least, _alone(told, len(group)))
+        gain = ((noise @ _directions(free[:, list(group)])) ** 2).sum(axis=1)
+        least = np.minimum(least, _alone(gain, len(group)))
     return [
         float((1 + (least <= _alone(max(gain, 0.0), len(group))).sum()) / (1 + draws))
         for gain, group in zip(gains, groups, strict=True)
@@ -74,11 +74,11 @@ class RotorSpread:
     freedom: int
     """Degrees of freedom that it was estimated with."""
     along: Mapping[str, np.ndarray]
-    """By view, the same along each axis (3,): its own differences beside those of all."""
+    """By view, the same along each axis (3,): its own differences next to those of all."""
     freedom_along: Mapping[str, np.ndarray]
     """By view, degrees of freedom of each axis's own differences (3,)."""
     prior: int
-    """Degrees of freedom for which the spread of all axes counts beside an axis's own."""
+    """Degrees of freedom for which the spread of all axes counts next to an axis's own."""
 
     def sizes(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
         """Return draws (D, 3) of the square of `along` over the true one, where all axes are alike.
@@ -95,7 +95,7 @@ class RotorSpread:
 def _moderated(
     pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, prior: int
 ) -> np.ndarray:
-    """Return an axis's variance by its own squares beside that of all (Smyth 2004)."""
+    """Return an axis's variance by its own squares and that of all (Smyth 2004)."""
     return (prior * pooled + square) / (prior + freedom)
 
 

@@ -3,7 +3,7 @@
 The vehicle file need not be right: what the reference flights leave of it, on average and with the
 velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too
 (`rotor_spread`); the reference flights' mean is off by it as well, for all others alike. A change
-is named where it is large beside that, for all candidates together (`chance`).
+is named where it is large compared with that, for all candidates together (`chance`).
 
 Where no mean has changed, each flight's own numbers of what shows in motion, as a drag, are two
 samples, whose means are compared by how flights differ within each (Welch 1947, doi
@@ -43,8 +43,8 @@ from suite.diagnose.search.search import search
 def flown_in(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
     """Return what the lack of a model may go with within a flight (M, 9), less its flights' means.
 
-    Velocity, speed times velocity, and what the model says at the numbers `theta` (P,): where it is
-    too lively, or late, the reference flights lack as much of it.
+    Velocity, speed times velocity, and what the model gives at the numbers `theta` (P,): where it
+    is too lively, or late, the reference flights lack as much of it.
     """
     motion = []
     for flight in task.flights:
@@ -58,7 +58,7 @@ def flown_in(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
 
 BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
 """By view, the effects that are fitted to the reference flights, one group after another, so that
-changes are looked for about a vehicle that is in balance as the real one was."""
+the search for changes starts from a vehicle that is in balance as the real one was."""
 
 
 def in_balance(reference: ViewEvidence) -> np.ndarray:
@@ -96,17 +96,17 @@ def changed_task(
 class ChangeEvidence(ViewEvidence):
     """What has changed since reference flights: means of flights, beyond how those differ.
 
-    Fits are weighed by `weights`, which doubt the vehicle file's gains.
+    Fits are weighed by `weights`, which allow for errors of the vehicle file's gains.
     """
 
     sure: Weights | None = None
-    """Without that doubt, by which the first name stands out: what is left beside it is no finding
+    """Without that, by which the first name stands out: what remains next to it is no finding
     where a gain may be off."""
     spread: RotorSpread | None = None
 
     @property
     def repeatability(self) -> np.ndarray:
-        """(3,) how flights' means differ, without that doubt."""
+        """(3,) how flights' means differ, without that."""
         return np.full(3, np.inf) if self.sure is None else self.sure.trim
 
     @property
@@ -175,15 +175,15 @@ def changed(
     weights = weights._replace(scatter=alone, memory=np.ones(3))
     trim = spread.along[task.view.name] * gain
     if task.view.in_world:
-        trim[:2] = np.inf  # an attitude's trim, of which few flights tell too little
+        trim[:2] = np.inf  # an attitude's trim, which few flights do not identify
     base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
     weights = weights._replace(trim=trim, base=base)
     away = np.abs(means_of(left.residual, left.flight).mean(axis=0))
-    doubted = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * away))
-    # Few means tell little: all that explains what stands out is an alternative.
+    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * away))
+    # Few means hold little: all that explains what stands out is an alternative.
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, limits, task.carried, True, doubted, weights, spread
+        task.view, task.model, flights, limits, task.carried, True, wide, weights, spread
     )
     return evidence, evidence.at(start)
 
@@ -267,8 +267,8 @@ def search_motion_change(
         if beyond > SLIGHT * np.linalg.norm(wanted - since) or at_bound(space, possible, candidate):
             continue  # that is no fit
         if flights_agree(gains) and share >= limits.least_view_share:
-            told = tuple(gains.tolist())
-            name = NamedEffect(candidate, p_value, sum(told), gains=told, share=share)
+            each = tuple(gains.tolist())
+            name = NamedEffect(candidate, p_value, sum(each), gains=each, share=share)
             tried.append((name, since, possible))
     if not tried:
         return None

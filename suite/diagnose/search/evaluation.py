@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
-from suite.diagnose.estimate.composites import acts_through, begin_of, lent_at
+from suite.diagnose.estimate.composites import acts_through, begin_of, inactive_at
 from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
@@ -35,7 +35,7 @@ class NamedEffect:
 
 
 class Evaluation(NamedTuple):
-    """What the evidence says at one estimate."""
+    """What the evidence gives at one estimate."""
 
     evidence: Evidence
     at: Estimate
@@ -48,10 +48,10 @@ def evaluated_at(
 ) -> Evaluation:
     """Return what evidence gives at an estimate, with columns of what acts through composites."""
     evidence, block = found
-    lent = lent_at(evidence.space, at.theta, among, block.acts())
-    if lent is not None:
-        numbers = lent.numbers
-        there = evidence.linearise(Estimate(lent.theta, at.free), numbers)
+    inactive = inactive_at(evidence.space, at.theta, among, block.acts())
+    if inactive is not None:
+        numbers = inactive.numbers
+        there = evidence.linearise(Estimate(inactive.theta, at.free), numbers)
         columns = [there.along.index(number) for number in numbers]
         block = replace(
             block,
@@ -62,35 +62,35 @@ def evaluated_at(
     return Evaluation(evidence, at, block, block.equations())
 
 
-def fit_beside(
-    here: Evaluation, beside: Sequence[int], candidate: Candidate
+def fit_with(
+    here: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[Estimate, Block]:
-    """Fit `candidate` and the numbers at `beside`, from where `here` was taken."""
+    """Fit `candidate` and the numbers at `others`, from where `here` was taken."""
     evidence, equations, limits = here.evidence, here.equations, here.evidence.limits
-    at, space, theta = sorted({*beside, *candidate.indices}), evidence.space, here.at.theta
-    lent = [number for number in equations.lent() if number in candidate.indices]
-    if not candidate.parts or not lent:
+    at, space, theta = sorted({*others, *candidate.indices}), evidence.space, here.at.theta
+    inactive = [number for number in equations.repeated() if number in candidate.indices]
+    if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
         return fit(evidence, here.at, at, rounds, here.block, limits)
-    change, told = asked_for(here, beside, candidate)
-    begin = begin_of(space, theta, candidate, lent, change, told)
+    change, informed = wanted_change(here, others, candidate)
+    begin = begin_of(space, theta, candidate, inactive, change, informed)
     return fit(evidence, Estimate(begin, here.at.free), at, limits.bilinear_rounds, None, limits)
 
 
-def asked_for(
-    here: Evaluation, beside: Sequence[int], candidate: Candidate
+def wanted_change(
+    here: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change (P,) of all numbers that slopes ask for, and what is told of each (P,).
+    """Return the change (P,) of all numbers by the slopes, and the information on each (P,).
 
-    Those of `candidate` and at `beside` are changed.
+    Those of `candidate` and at `others` are changed.
     """
     equations = here.equations
-    some = equations.take(sorted({*beside, *equations.columns_of(candidate)}))
+    some = equations.take(sorted({*others, *equations.columns_of(candidate)}))
     moved, _ = gauss_newton_step(some, here.at.theta, here.evidence.space)
-    change, told = np.zeros_like(here.at.theta), np.zeros_like(here.at.theta)
+    change, informed = np.zeros_like(here.at.theta), np.zeros_like(here.at.theta)
     numbers = list(some.numbers)
-    change[numbers], told[numbers] = moved, np.diag(some.sums()[0])
-    return change, told
+    change[numbers], informed[numbers] = moved, np.diag(some.sums()[0])
+    return change, informed
 
 
 def chi2_of(here: Evaluation, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
@@ -107,7 +107,7 @@ class SearchResult:
     start: Estimate
     """Where it began."""
     last: Evaluation
-    """At the fit of all names, weighed by the noise that was measured beside them."""
+    """At the fit of all names, weighed by the noise that was measured with them."""
     judged: Evaluation
     """The same, by which names, rivals and intervals were judged: where the model leaves more than
     noise, the noise is what it leaves."""

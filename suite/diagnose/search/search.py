@@ -1,7 +1,7 @@
 """The search: one effect after another, each against the null, then every name against its rivals.
 
 What is named must lower the error on stretches left out by more than the best of all candidates
-does by chance, and pass what its evidence asks for besides. A rival that explains the same is an
+does by chance, and pass the further tests of its evidence. A rival that explains the same is an
 alternative. The search is the same for every kind of evidence.
 """
 
@@ -24,7 +24,7 @@ from suite.diagnose.search.evaluation import (
     SearchResult,
     chi2_of,
     evaluated_at,
-    fit_beside,
+    fit_with,
 )
 from suite.diagnose.thresholds import Thresholds
 
@@ -50,7 +50,7 @@ def search(
 ) -> SearchResult:
     """Return which of `among` explain what the model leaves of the evidence at `start`.
 
-    `say` is told of each step in a line for people; `known` is the evidence weighed at `start`, to
+    `say` receives a line for people about each step; `known` is the evidence weighed at `start`, to
     save its calculation; `seed` is of the null's draws.
     """
     limits = evidence.limits
@@ -86,9 +86,9 @@ def search(
 
 
 def _scores(
-    task: SearchTask, here: Evaluation, beside: Sequence[int], among: Sequence[Candidate]
+    task: SearchTask, here: Evaluation, others: Sequence[int], among: Sequence[Candidate]
 ) -> list[CandidateScore]:
-    return here.evidence.scores(here.block, here.equations, here.at.theta, beside, among, task.seed)
+    return here.evidence.scores(here.block, here.equations, here.at.theta, others, among, task.seed)
 
 
 def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
@@ -111,15 +111,15 @@ def _next_name(
     known: Sequence[CandidateScore] | None = None,
     now: Candidate | None = None,
 ) -> tuple[NamedEffect, Estimate] | None:
-    """Return the best name beside `named`, and the fit with it; None where there is none.
+    """Return the best name next to `named`, and the fit with it; None where there is none.
 
     `known` are the scores there, to save their calculation. With `now`, a name that `here` is taken
     without, all that may stand in its place is tried.
     """
     limits, evidence, space = task.limits, here.evidence, here.evidence.space
-    beside = indices_of([n.candidate for n in named])
-    left = [c for c in among if not set(c.indices) & set(beside)]
-    scores = {s.candidate: s for s in known or _scores(task, here, beside, left)}
+    others = indices_of([n.candidate for n in named])
+    left = [c for c in among if not set(c.indices) & set(others)]
+    scores = {s.candidate: s for s in known or _scores(task, here, others, left)}
     near = list(scores)
     if now is None:
         most = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
@@ -129,7 +129,7 @@ def _next_name(
             if score.p_value <= evidence.name_p_value and score.gain >= most
         ]
     columns, theta = here.equations.columns_of, here.at.theta
-    fallen = {c: chi2_fall(here.equations, theta, space, [*beside, *columns(c)]) for c in near}
+    fallen = {c: chi2_fall(here.equations, theta, space, [*others, *columns(c)]) for c in near}
     near = [c for c in near if c == now or could_be_best(fallen, c, limits)]
     if now is None:
         single = [c for c in near if not c.parts][: limits.short_list]
@@ -137,14 +137,14 @@ def _next_name(
     begin, judge = here, evidence.compared()
     if judge is not evidence and near:
         begin = evaluated_at(judge.again(here.at), here.at, among)
-    before, tried = chi2_of(begin, begin.block, begin.at, beside), []
+    before, tried = chi2_of(begin, begin.block, begin.at, others), []
     for candidate in near:
-        at, block = fit_beside(begin, beside, candidate)
-        gains = before - chi2_of(begin, block, at, [*beside, *candidate.indices])
+        at, block = fit_with(begin, others, candidate)
+        gains = before - chi2_of(begin, block, at, [*others, *candidate.indices])
         share = judge.share(begin.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        told = "refused" if share is None else f"{begin.equations.chi2.sum() - chi2:.0f}"
-        task.say(f"{candidate.label}: {told}")
+        outcome = "refused" if share is None else f"{begin.equations.chi2.sum() - chi2:.0f}"
+        task.say(f"{candidate.label}: {outcome}")
         if share is not None:
             one = NamedEffect(
                 candidate, scores[candidate].p_value, scores[candidate].gain,
@@ -156,7 +156,7 @@ def _next_name(
         return None
     least = min(cost for cost, *_ in tried)
     total = float(begin.equations.chi2.sum())
-    explained = total - chi2_fall(begin.equations, theta, space, beside) - least
+    explained = total - chi2_fall(begin.equations, theta, space, others) - least
     slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
     sure = [one for one in alike if one[2][0].p_value <= evidence.name_p_value]
@@ -196,7 +196,7 @@ def _judged(
 def _without_idle_names(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], newest: bool
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are needed beside all others, each weighed against nothing.
+    """Return the names that are needed next to all others, each weighed against nothing.
 
     With `newest` the last one has just been weighed.
     """
@@ -232,7 +232,7 @@ def _settled(
 def could_be_best(
     fallen: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
 ) -> bool:
-    """Return whether `candidate` could be the best: slopes alone say too little of large effects.
+    """Return whether `candidate` could be the best: slopes alone do not decide on large effects.
 
     `fallen` holds the fall of chi-square to first order, by candidate. Several effects together
     have to explain more than each of them alone.

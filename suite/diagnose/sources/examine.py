@@ -57,7 +57,8 @@ def examine(
     explained = found, (before, after)
     found, after, sizes, small = relevant_part(source, found, (before, after))
     warnings += [f"{name}: left out, too small to matter: {size.words()}" for name, size in small]
-    # What is too small to matter explains what it explains.
+    if not source.small_explains:
+        explained = found, (before, after)
     remaining = source.remaining(*explained, seed)
     if remaining.wind and found.named and not source.worse(after, before):
         # Wind that lasts from one stretch to the next looks like many a steady number.

@@ -145,7 +145,7 @@ class RolloutSource(Source):
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in what `found` leaves, see `Source`.
 
-        A wind and a force that swings are looked for where there is some: no parameter that is
+        A wind and a force that swings are searched for where there is some: no parameter that is
         fitted repeats them.
         """
         structure, wind = self._structure(found, seed)

@@ -37,7 +37,7 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
     they were chosen by name.
 
     Raises:
-        ValueError: where no flight can be used, or not in the way that was asked for.
+        ValueError: where no flight can be used, or not in the way that was chosen.
     """
     logs, vehicle = given.logs, given.vehicle
     if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
@@ -108,6 +108,7 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
         start=start_estimate(model, windows),
         among=[*among, *composites(among)],
         limits=limits,
+        small_explains=True,
         rollouts=flown,
         flown=flown,
         coarser=take(rough, inside) if rough is not None and rotor_input else None,

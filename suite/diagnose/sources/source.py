@@ -105,6 +105,8 @@ class Source(ABC):
     limits: Thresholds
     keeps_small: bool = False
     """Whether a name stays however small its effect is: how flights differ judges a change."""
+    small_explains: bool = False
+    """Whether what is too small to matter counts in what remains: it explains what it explains."""
     otherwise: Source | None = None
     """What is tried where nothing is named."""
     rollouts: Rollouts | None = None
@@ -154,7 +156,7 @@ class Source(ABC):
         return {}
 
     def stepped(self, found: SearchResult) -> bool:
-        """Return whether the names of `found` look like the steps of a simulator."""
+        """Return whether the names of `found` are like the steps of a simulator."""
         del found
         return False
 
@@ -184,7 +186,7 @@ class Given:
     say: Callable[[str], None]
     limits: Thresholds
     chosen: bool
-    """Whether the source was asked for by name: it is refused with a reason, then, where it cannot
+    """Whether the source was chosen by name: it is refused with a reason, then, where it cannot
     be used."""
 
 

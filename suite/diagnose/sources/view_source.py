@@ -1,6 +1,6 @@
 """Force and torque as sources: what their names are worth next to what a black box closes.
 
-A regression without any physics, fitted to the same flights, tells how much of what a model leaves
+A regression without any physics, fitted to the same flights, shows how much of what a model leaves
 could be explained at all, and whether something is left beyond the names.
 """
 
@@ -214,7 +214,7 @@ class BlackBox(NamedTuple):
     """(K, 3)."""
 
     def predict(self, inputs: np.ndarray) -> np.ndarray:
-        """Return what it says (M, 3) for `inputs` (M, K)."""
+        """Return its prediction (M, 3) for `inputs` (M, K)."""
         return (inputs / self.spread) @ self.weight
 
 
@@ -226,7 +226,7 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
 def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> BlackBox:
     """Return the black box that explains `left` (M, 3) best on flights left out of its fit.
 
-    Means of flights are taken off both sides: they are trims. `flight` (M,) says whose each is;
+    Means of flights are taken off both sides: they are trims. `flight` (M,) numbers each's;
     a lone flight's thirds stand for flights.
     """
     units = units_of(flight)
@@ -248,7 +248,7 @@ def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> B
     best = np.argmin(errors, axis=0)
     every = np.ones(len(units), bool)
     columns = [solve(every, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
-    none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # better to say nothing at all
+    none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # better to predict nothing
     return BlackBox(spread, np.where(none, 0.0, np.stack(columns, axis=1)))
 
 

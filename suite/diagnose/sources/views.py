@@ -33,7 +33,7 @@ MEASURE = (
 
 
 def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
-    """Return flights, partial ones too, by force and torque; None where rollouts say all of it.
+    """Return flights, partial ones too, by force and torque; None where rollouts cover all of it.
 
     With reference flights the sources are those of what has changed since.
 

@@ -1,1 +1,1 @@
-"""What the numbers allow to be said."""
+"""The verdict: gaps, relevance, structure in the residual, actuators."""

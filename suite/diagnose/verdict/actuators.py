@@ -1,8 +1,8 @@
-"""Measured rotor speeds against those that the commands ask for: the actuators apart from the air.
+"""Measured rotor speeds against those by the commands: the actuators apart from the air.
 
 Flight controllers have integrators and filters that the nominal rate loop has not, so that a
 difference between commanded and measured rotor speeds is no missing physics of the air. Here the
-nominal rate loop and mixer are asked, row by row at the measured rates, for the rotor speeds of the
+nominal rate loop and mixer give, row by row at the measured rates, the rotor speeds of the
 logged commands, and the nominal lag follows them.
 """
 
@@ -29,7 +29,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class ActuatorMismatch(NamedTuple):
-    """How measured rotor speeds differ from what was asked for."""
+    """How measured rotor speeds differ from the commanded ones."""
 
     asked_by: str
     """"nominal rate loop" or "logged motor commands"."""
@@ -42,13 +42,13 @@ class ActuatorMismatch(NamedTuple):
     delay: float
     """Of the commands, before it [s]."""
     scale: tuple[float, ...]
-    """Measured over asked, by rotor, beside that lag and delay."""
+    """Measured over commanded, by rotor, with that lag and delay."""
     rms_fitted: float
     """Of what they leave [rad/s]."""
     rms_own: float
-    """The same with the vehicle file's lag, beside the delay that fits best with that [rad/s]."""
+    """The same with the vehicle file's lag, next to the delay that fits best with that [rad/s]."""
     thrust: tuple[float, float]
-    """Mean and spread of measured minus asked collective thrust, over nominal mass [m/s^2]."""
+    """Mean and spread of measured minus commanded collective thrust, over nominal mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
     """The same of the angular acceleration about x, y, z [rad/s^2]."""
 
@@ -59,7 +59,7 @@ class ActuatorMismatch(NamedTuple):
 
 
 Demand = Callable[[float], np.ndarray]
-"""Delay of the commands [s] -> (S, 4) rotor speeds that are asked for in each step [rad/s]."""
+"""Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
 
 
 class _Stretch(NamedTuple):
@@ -75,7 +75,7 @@ class _Stretch(NamedTuple):
 def actuator_mismatches(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> list[ActuatorMismatch]:
-    """Return how measured rotor speeds differ from what commands and logged motor commands ask.
+    """Return how measured rotor speeds differ from commands and logged motor commands.
 
     Logs without measured rotor speeds do not count, nor do the effects of `vehicle`. What the logs
     allow is one or both of them, or neither.
@@ -97,7 +97,7 @@ def actuator_mismatches(
 
 
 def rate_loop_demand(log: FlightLog, plant: Plant, at_s: np.ndarray) -> Demand | None:
-    """Return what the rate loop of `plant` asks for at the measured rates and at times `at_s` (S,).
+    """Return the speeds by the rate loop of `plant` at the measured rates and at times `at_s` (S,).
 
     None where the log has no commands.
     """
@@ -156,15 +156,15 @@ def _mismatch(
     dt, lag = step_s(vehicle), vehicle.rotors.time_constant
     measured = np.concatenate([part.measured for part in stretches])
 
-    def followed(asked: Sequence[np.ndarray], time_constant: float) -> np.ndarray:
-        parts = zip(asked, stretches, strict=True)
+    def followed(wanted: Sequence[np.ndarray], time_constant: float) -> np.ndarray:
+        parts = zip(wanted, stretches, strict=True)
         return np.concatenate([_follow(a, part.row, dt, time_constant) for a, part in parts])
 
     def scales(speed: np.ndarray) -> np.ndarray:
         return (speed * measured).sum(0) / np.maximum((speed**2).sum(0), 1e-9)
 
-    def left(asked: Sequence[np.ndarray], time_constant: float) -> float:
-        speed = followed(asked, time_constant)
+    def left(wanted: Sequence[np.ndarray], time_constant: float) -> float:
+        speed = followed(wanted, time_constant)
         return float(((measured - scales(speed) * speed) ** 2).mean())
 
     def best_lag(delay: float) -> tuple[float, float]:
@@ -208,20 +208,20 @@ def _least(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, f
     return (0.0, none) if none <= best else (float(refined.x), best)
 
 
-def _follow(asked: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
+def _follow(wanted: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
     """Return the rotor speeds (N, 4) at the rows after the lag."""
     # The speed at the end of step k is that at the start of step k + 1.
-    return np.concatenate([asked[:1], follow_lag(asked, dt, time_constant)])[row]
+    return np.concatenate([wanted[:1], follow_lag(wanted, dt, time_constant)])[row]
 
 
 def wrench_difference(
-    measured: np.ndarray, asked: np.ndarray, vehicle: Vehicle
+    measured: np.ndarray, wanted: np.ndarray, vehicle: Vehicle
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return thrust over mass (N,) and angular acceleration (N, 3) of measured minus asked."""
+    """Return thrust over mass (N,) and angular acceleration (N, 3) of measured minus commanded."""
     rotors = vehicle.rotors
     ratio = rotors.torque_coefficient / rotors.thrust_coefficient
     mixer = mixer_matrix(np.array(rotors.position), np.array(rotors.spin), ratio)
-    wrench = rotors.thrust_coefficient * (measured**2 - asked**2) @ mixer.T
+    wrench = rotors.thrust_coefficient * (measured**2 - wanted**2) @ mixer.T
     return wrench[:, 0] / vehicle.mass, wrench[:, 1:] / np.array(vehicle.inertia)
 
 
@@ -254,7 +254,7 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
 
 
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
-    """Return how the bodies of `logs` were moved: as was asked for, or as all their makers say.
+    """Return how the bodies of `logs` were moved: as chosen, or as all logs have it.
 
     Raises:
         ValueError: for an unknown `integrator`.
@@ -264,14 +264,14 @@ def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
     if integrator != "auto":
         allowed = ", ".join(("auto", *INTEGRATORS))
         raise ValueError(f"integrator = {integrator!r}; allowed: {allowed}")
-    told = {log.integrator for log in logs}
-    return "euler" if told == {"euler"} else "continuous"
+    used = {log.integrator for log in logs}
+    return "euler" if used == {"euler"} else "continuous"
 
 
 def another_controller(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> bool:
-    """Return whether the measured rotor speeds are not those that the nominal rate loop asks for.
+    """Return whether the measured rotor speeds are not those of the nominal rate loop.
 
     The loop is given the measured rates, so that nothing but the controller and the rotors is
     compared: what the air or a moved centre of mass does shows in the rates.
@@ -302,14 +302,14 @@ def _mean_speeds(
     if not np.isfinite(wanted).all():
         return nothing
     loop = follow_lag(wanted, dt, float(plant.constants.time_constant))
-    asked = np.stack([np.interp(log.time_s, time, column) for column in loop.T], axis=-1)
+    wanted = np.stack([np.interp(log.time_s, time, column) for column in loop.T], axis=-1)
     place = (passed / limits.speed_mean_s).astype(int)
     bins, inverse = np.unique(place[good], return_inverse=True)
     means = np.zeros((2, len(bins), 4))
-    for mean, values in zip(means, (log.rotor_speed[good], asked[good]), strict=True):
+    for mean, values in zip(means, (log.rotor_speed[good], wanted[good]), strict=True):
         np.add.at(mean, inverse, values)
-    measured, asked = means / np.bincount(inverse, minlength=len(bins))[:, None]
-    return measured - asked, measured - measured.mean(axis=0)
+    measured, wanted = means / np.bincount(inverse, minlength=len(bins))[:, None]
+    return measured - wanted, measured - measured.mean(axis=0)
 
 
 LAG = "motor_lag"
@@ -334,21 +334,21 @@ class RotorLag(NamedTuple):
 def another_lag(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> RotorLag | None:
-    """Return the rotors' lag where commands and measured rotor speeds say that it is another one.
+    """Return the rotors' lag where commands and measured rotor speeds show another one.
 
     Args:
         logs: flights; those do not count that are without commands or rotor speeds, or in which the
             nominal rate loop does not explain the speeds: a firmware's filters are no lag.
         vehicle: what a simulation uses.
-        limits: from where on flights tell it.
+        limits: from where on flights show it.
     """
     if remembers(vehicle):
         return None
     own = vehicle.effects.get(LAG)
     known = vehicle.rotors.time_constant if own is None else float(own.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
-    told = [_asked_by_loop(log, vehicle, limits) for log in logs]
-    found = [one for one in told if one is not None and _explains(one, limits)]
+    each = [_asked_by_loop(log, vehicle, limits) for log in logs]
+    found = [one for one in each if one is not None and _explains(one, limits)]
     if len(found) < limits.lag_least_flights:
         return None
     lags = np.array([one.time_constant for one in found])
@@ -371,7 +371,7 @@ def another_lag(
 
 
 def _asked_by_loop(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActuatorMismatch | None:
-    """Return how the rotors follow the nominal rate loop; None where the log cannot say."""
+    """Return how the rotors follow the nominal rate loop; None where the log does not show it."""
     if log.partial or log.rate_cmd_b is None or log.rotor_speed is None:
         return None
     found = actuator_mismatches([log], vehicle, limits)

@@ -1,6 +1,6 @@
 """What a report shows besides the names: logs and their consistency, the actuators, a black box.
 
-The attitude must turn as the gyro says, but for a bias of the gyro, and not later; the velocity
+The attitude must turn as the gyro has it, but for a bias of the gyro, and not later; the velocity
 must be the path's slope. Left alone these faults imitate physics.
 """
 
@@ -33,7 +33,7 @@ class Checks:
     kinematics: Kinematics | None
     actuators: list[ActuatorMismatch]
     black_box: BlackBoxComparisons | None = None
-    """Only where it was asked for: it takes minutes."""
+    """Only where it was chosen: it takes minutes."""
 
 
 def run_checks(flown: Rollouts) -> Checks:
@@ -47,7 +47,7 @@ def run_checks(flown: Rollouts) -> Checks:
 
 
 class Kinematics(NamedTuple):
-    """What pose and gyro say about each other."""
+    """How pose and gyro agree."""
 
     flights: int
     """That could be used."""
@@ -107,7 +107,7 @@ def facts_of(log: FlightLog) -> LogFacts:
 def check_kinematics(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> Kinematics | None:
-    """Return what pose and gyro of `logs` say about each other; None where too little is there."""
+    """Return how pose and gyro of `logs` agree; None where too little is there."""
     biases, late = [], []
     for log in logs:
         whole = on_every_row(log, limits)

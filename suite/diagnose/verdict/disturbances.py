@@ -8,7 +8,7 @@ without a peak on a smooth background.
 
 The wind at the knots of a window is a normal variable with the covariance of `gusts`; through the
 drag of the vehicle it adds a covariance to the residuals. Intensity and length are where the
-likelihood of the residuals is largest. Whether it is wind is asked by a rival that may push along
+likelihood of the residuals is largest. Whether it is wind is tested by a rival that may push along
 the body axes as it likes.
 """
 
@@ -38,13 +38,13 @@ from suite.diagnose.verdict.residual_structure import DisturbanceEquations
 STEP_HZ = 0.01
 """Between the frequencies that are tried [Hz]."""
 BAND_HZ = (0.15, 3.0)
-"""Of the spectra that are looked at [Hz]."""
+"""Of the spectra [Hz]."""
 CORNERS_HZ = (0.2, 0.5, 1.2)
 """Of the smooth backgrounds that fall with frequency [Hz]."""
 WIDTHS = (0.03, 0.1)
 """Half widths of a peak that are tried, over its frequency [1]."""
 HANN_BINS = 1.5
-"""Width of a Hann window's line, and how many bins tell as much as one that is independent."""
+"""Width of a Hann window's line, and its correlation length in bins."""
 ROUNDS = 60
 """Of the fits of a spectrum."""
 
@@ -67,7 +67,7 @@ class Swing(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return what is said of it, and what a vehicle file needs to fly with it."""
+        """Return the sentence on it, and what a vehicle file needs to fly with it."""
         low, high = self.ci95
         return (
             f"swings with {self.period_s:.2f} s period (95 % {low:.2f} to {high:.2f}), "
@@ -206,11 +206,11 @@ def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarr
     unit = shapes / scale
     weights = np.full(unit.shape[:2], float(power.mean()) / unit.shape[1])
     for _ in range(ROUNDS):
-        said = np.einsum("ct,ctj->cj", weights, unit)
-        up = np.einsum("ctj,cj->ct", unit, power / said**2)
-        weights = weights * np.sqrt(up / np.einsum("ctj,cj->ct", unit, 1.0 / said))
-    said = np.einsum("ct,ctj->cj", weights, unit)
-    likelihood = -(2.0 / HANN_BINS) * (np.log(said) + power / said).sum(axis=1)
+        model = np.einsum("ct,ctj->cj", weights, unit)
+        up = np.einsum("ctj,cj->ct", unit, power / model**2)
+        weights = weights * np.sqrt(up / np.einsum("ctj,cj->ct", unit, 1.0 / model))
+    model = np.einsum("ct,ctj->cj", weights, unit)
+    likelihood = -(2.0 / HANN_BINS) * (np.log(model) + power / model).sum(axis=1)
     return likelihood, weights / scale[..., 0]
 
 

@@ -39,7 +39,7 @@ class DisturbanceEquations(NamedTuple):
 
 
 class ShapeScore(NamedTuple):
-    """How much one shape explains of what is left over."""
+    """How much one shape explains of the residual."""
 
     label: str
     gain: float
@@ -48,7 +48,7 @@ class ShapeScore(NamedTuple):
 
 
 class ResidualStructure(NamedTuple):
-    """Structure in what is left over."""
+    """Structure in the residual."""
 
     shapes: list[ShapeScore]
     """Best first."""
@@ -78,7 +78,7 @@ def residual_structure(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
-    """Return the structure in what is left over; windows of one `fold` (W,) are left out together.
+    """Return the structure in the residual; windows of one `fold` (W,) are left out together.
 
     `seed` is of the permutation test's draws.
     """
@@ -108,7 +108,7 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Threshol
 
     Along the directions in which a disturbance of one colour is uncorrelated, before and after the
     data, z are the pulls over their noise. What one of size s adds is weighed as the likelihood
-    weighs it, by s^2 l / (1 + s^2 l) with l the information along the direction: a small s looks at
+    weighs it, by s^2 l / (1 + s^2 l) with l the information along the direction: a small s weighs
     slow ones, a large one at all. The sum of weighed squares is close to a gamma variable
     (Satterthwaite 1946).
     """

@@ -14,11 +14,11 @@ from suite.diagnose.estimate.composites import (
     carried,
     composites,
     in_words,
-    lent_at,
+    inactive_at,
     usual_size,
 )
 from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
-from suite.diagnose.search.evaluation import Evaluation, asked_for
+from suite.diagnose.search.evaluation import Evaluation, wanted_change
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
@@ -44,14 +44,14 @@ def test_a_composite_has_the_numbers_of_all_its_parts():
 
 def test_a_wind_is_lent_its_slopes_only_where_nothing_passes_it_on():
     theta, acts = SPACE.array("start"), np.ones(len(SPACE.entries), bool)
-    assert lent_at(SPACE, theta, [WIND], acts) is None
+    assert inactive_at(SPACE, theta, [WIND], acts) is None
     acts[places("constant_wind")] = False
-    lent = lent_at(SPACE, theta, [WIND], acts)
+    lent = inactive_at(SPACE, theta, [WIND], acts)
     assert lent is not None and list(lent.numbers) == places("constant_wind")
     np.testing.assert_allclose(lent.theta[places("linear_drag")], 0.35)
-    assert lent_at(SPACE, theta, SINGLE, acts) is None
+    assert inactive_at(SPACE, theta, SINGLE, acts) is None
     theta[places("constant_wind")[0]] = 1.0
-    assert lent_at(SPACE, theta, [WIND], acts) is None
+    assert inactive_at(SPACE, theta, [WIND], acts) is None
 
 
 def test_a_fit_begins_where_drag_times_wind_is_what_the_slopes_ask_for():
@@ -89,7 +89,7 @@ def test_lent_columns_come_last_and_are_a_composites_alone():
     evidence: Any = SimpleNamespace(space=SPACE)
     at: Any = SimpleNamespace(theta=SPACE.array("start"))
     block: Any = None
-    change, told = asked_for(Evaluation(evidence, at, block, made), [], WIND)
+    change, told = wanted_change(Evaluation(evidence, at, block, made), [], WIND)
     np.testing.assert_allclose(change[list(lent)], [1.0, -2.0, 0.5], atol=1e-3)
     assert (told[list(lent)] > 0.0).all() and told[places("frame_tilt")].max() == 0.0
 
