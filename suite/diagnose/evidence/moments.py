@@ -3,8 +3,8 @@
 The remaining error is the noise, and flights have trims of their own: an unchanged vehicle flies
 each time with a slightly other trim, so that each flight's mean of each axis is a draw of its own,
 a random effect (Laird and Ware 1982). Rows are made independent of it by taking off a share of
-their flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is off by
-a draw, too, which is the same for all: there a share of the mean of all goes.
+their flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is
+off by a draw, too, which is the same for all: there a share of the mean of all goes.
 """
 
 from __future__ import annotations
