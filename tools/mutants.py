@@ -1,0 +1,187 @@
+"""Change the core's code at random places, one at a time, and count the changes that tests notice.
+
+    python tools/mutants.py COUNT [--seed N] [--out FILE.json]
+
+A mutant has another operator (+ and -, * and /, < and <=, == and !=, and/or, & and |), a sign or
+a `not` less, or another number. Messages, annotations and ranges stay, and what has no right value:
+defaults of settings and the catalogue's bounds and usual sizes. AREAS says which files are
+changed and which tests run, in a copy of the files that git tracks, up to the first that fails.
+The same command goes on where it was stopped. Prints those that survive; exit 1 where they are more than 5 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import random
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from plant_faults import ROOT, copied, run_tests
+
+IMPORTERS = (
+    "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
+)
+AREAS = (
+    ("suite/train/losses.py", "suite/train/test_losses"),
+    ("tracks/geometry/field.py", "tracks/geometry/test_field"),
+    ("tracks/geometry/gates.py", "tracks/geometry tracks/families"),
+    ("eval/worlds/trial.py", "eval/worlds/test_trial eval/worlds/test_worlds"),
+    ("eval/judging/ages.py", "eval/judging/test_ages"),
+    ("eval/judging/guard.py", "eval/judging/test_guard eval/judging/test_actions"),
+    ("eval/judging/statistics.py", "eval/judging/test_statistics suite/judging/test_comparing"),
+    ("suite/delta/windows.py", "suite/delta/test_windows"),
+    ("suite/delta/fit.py", "suite/delta/test_fit"),
+    ("eval/effects/*.py", "effects/test_equations effects/test_effects quadrotor/test_rotors "
+     "effects/test_slung_load quadrotor/test_stepper"),
+    ("eval/importers/frames.py", IMPORTERS),
+    ("eval/importers/mapping*.py", IMPORTERS),
+    ("eval/importers/formats/*.py", f"{IMPORTERS} importers/test_damaged"),
+    ("policies/formats/c/templates/*.c", "policies/formats/c"),
+)  # fmt: skip
+"""Files, and the beginnings of the paths of their tests (eval/ where no package is named)."""
+PAIRS = "+ - * / < <= > >= == != and or & |".split()
+OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
+CHOICE = re.compile(r"(low|high|typical)=|\w+: [^#]* = ")
+"""Begins a line of a bound, a usual size or a default."""
+C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
+
+
+class Mutant(NamedTuple):
+    """One change: the bytes from `first` to `last` of a file become `new`."""
+
+    file: str
+    first: int
+    last: int
+    new: str
+    tests: str
+
+
+def other_number(text: str) -> str:
+    """Return another number than that of `text`, written alike."""
+    value = ast.literal_eval(text.rstrip("f"))
+    return f"({value + 1 if isinstance(value, int) else 1.25 * value or 1.0!r})"
+
+
+def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
+    """Yield (first, last, new text) of every change of a Python file."""
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+
+    def span(node: ast.expr) -> tuple[int, int]:
+        assert node.end_lineno and node.end_col_offset is not None
+        return (starts[node.lineno - 1] + node.col_offset,
+                starts[node.end_lineno - 1] + node.end_col_offset)  # fmt: skip
+
+    def visit(node: ast.AST) -> Iterator[tuple[int, int, str]]:
+        pairs: list[tuple[ast.expr, ast.expr]] = []
+        if isinstance(node, ast.BinOp):
+            pairs = [(node.left, node.right)]
+        elif isinstance(node, ast.Compare):
+            pairs = list(zip([node.left, *node.comparators], node.comparators, strict=False))
+        elif isinstance(node, ast.BoolOp):
+            pairs = list(zip(node.values, node.values[1:], strict=False))
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+            yield span(node)[0], span(node.operand)[0], ""
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            yield *span(node), other_number(repr(node.value))
+        for left, right in pairs:
+            first, last = span(left)[1], span(right)[0]
+            for found in re.finditer(rb"\*\*|[<>=!]=|[-+*/<>&|]|\b(and|or)\b", source[first:last]):
+                yield first + found.start(), first + found.end(), OTHER[found[0].decode()]
+        for name, value in ast.iter_fields(node):
+            left_out = name in ("annotation", "returns", "decorator_list", "slice")
+            if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert) or left_out:
+                continue
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from visit(child)
+
+    yield from visit(ast.parse(source))
+
+
+def mutants(copy: Path) -> list[list[Mutant]]:
+    """Return every mutant of each area."""
+    found = []
+    for pattern, tests in AREAS:
+        found.append([])
+        for path in sorted(copy.glob(pattern)):
+            source, file = path.read_bytes(), str(path.relative_to(copy))
+            if path.suffix == ".py":
+                spots = list(changes(source))
+            else:
+                text = C_TOKEN.finditer(source.decode("ascii"))
+                spots = [(m.start(), m.end(), OTHER.get(m[0]) or other_number(m[0].strip("&")))
+                         for m in text if m[0] != "&&"]  # fmt: skip
+            found[-1] += [Mutant(file, *spot, tests) for spot in spots]
+    return found
+
+
+def line_of(copy: Path, mutant: Mutant) -> tuple[int, str]:
+    """Return the number and the text of the line that a mutant changes."""
+    source = (copy / mutant.file).read_bytes()
+    line = source[: mutant.first].count(b"\n") + 1
+    return line, source.splitlines()[line - 1].decode().strip()
+
+
+def fail(copy: Path, tests: str) -> bool:
+    """Say whether tests fail.
+
+    Raises:
+        SystemExit: where they did not run.
+    """
+    names = [part if part.startswith(("suite", "tracks", "policies", "eval")) else f"eval/{part}"
+             for part in tests.split()]  # fmt: skip
+    paths = [f"tests/{name}" if (copy / "tests" / name).is_dir() else f"tests/{name}.py"
+             for name in names]  # fmt: skip
+    code, said = run_tests(copy, paths)
+    if code > 2:
+        raise SystemExit(f"{tests}: pytest ended with {code} ({said})")
+    return code != 0  # 2: with this mutant nothing can be imported
+
+
+def main() -> int:
+    """Make mutants, an equal share of each area, in an order drawn by the seed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("count", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
+    asked = parser.parse_args()
+    done = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    draw, survive = random.Random(asked.seed), []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        copied(ROOT, copy)
+        areas = [draw.sample(area, len(area)) for area in mutants(copy)]
+        most = max(map(len, areas))
+        order = [area[k] for k in range(most) for area in areas if k < len(area)]
+        order = [mutant for mutant in order if not CHOICE.match(line_of(copy, mutant)[1])]
+        for mutant in order[: asked.count]:
+            if mutant.tests not in done:
+                done[mutant.tests] = fail(copy, mutant.tests)
+            if done[mutant.tests]:
+                raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
+            path = copy / mutant.file
+            right = path.read_bytes()
+            old, (line, text) = right[mutant.first : mutant.last], line_of(copy, mutant)
+            name = f"{mutant.file}:{line}: {old.decode()!r} -> {mutant.new!r} in {text!r}"
+            if name not in done:
+                path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])
+                done[name] = fail(copy, mutant.tests)
+                path.write_bytes(right)
+                asked.out.write_text(json.dumps(done, indent=1), "utf-8")
+            if not done[name]:
+                survive.append(name)
+                print(name, flush=True)
+    print(f"{len(survive)} of {min(asked.count, len(order))} survive")
+    return int(len(survive) > 0.05 * asked.count)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
