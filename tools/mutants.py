@@ -6,7 +6,8 @@ A mutant has another operator (+ and -, * and /, < and <=, == and !=, and/or, & 
 a `not` less, or another number. Messages, annotations and ranges stay, and what has no right value:
 defaults of settings and the catalogue's bounds and usual sizes. AREAS says which files are
 changed and which tests run, in a copy of the files that git tracks, up to the first that fails.
-The same command goes on where it was stopped. Prints those that survive; exit 1 where they are more than 5 %.
+The same command goes on where it was stopped. Prints those that survive; exit 1 where they are more
+than 5 %.
 """
 
 from __future__ import annotations
