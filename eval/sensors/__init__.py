@@ -13,6 +13,7 @@ from typing import Any
 from eval.effects.interface import as_arrays
 from eval.sensors import (
     delay,
+    depth_cameras,
     gate_detection,
     gate_filter,
     gate_map,
@@ -20,10 +21,7 @@ from eval.sensors import (
     imu,
     intermittent,
     measured_state,
-    state_drift,
-    state_noise,
-    stereo,
-    tof,
+    state_errors,
 )
 from eval.sensors.interface import Draws, Moment, Sensor, View
 from tracks.common.names import Registry
@@ -47,15 +45,15 @@ def _wrong(name: str, sensor: Any) -> str | None:
 _OWN = (
     delay.SENSOR,
     gate_map.SENSOR,
-    state_drift.SENSOR,
-    state_noise.SENSOR,
+    state_errors.STATE_DRIFT,
+    state_errors.STATE_NOISE,
     measured_state.SENSOR,
     intermittent.STATE_LOSS,
     gate_detection.SENSOR,
     intermittent.WRONG_GATE,
     image_motion.SENSOR,
-    stereo.SENSOR,
-    tof.SENSOR,
+    depth_cameras.STEREO,
+    depth_cameras.TOF,
     intermittent.EXPOSURE,
     intermittent.FRAME_LOSS,
     imu.SENSOR,

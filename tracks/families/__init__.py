@@ -1,4 +1,4 @@
-"""Track families by name; each is a file with `make(d, rng) -> Layout` and an entry here.
+"""Track families by name; each is a function `make(d, rng) -> Layout` with an entry here.
 
 Another package adds one with an entry point of the group `diffracing_suite.tracks`, a program for
 its own process with `FAMILIES.register(name, make)`.
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tracks.common.names import Registry
-from tracks.families import circular, ellipse, random, zigzag
+from tracks.families import judged, random
 from tracks.families.layout import GATE_COUNT, Layout
 from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
@@ -26,9 +26,9 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
     "track family",
     "diffracing_suite.tracks",
     {
-        "zigzag": zigzag.make,
-        "circular": circular.make,
-        "ellipse": ellipse.make,
+        "zigzag": judged.zigzag,
+        "circular": judged.circular,
+        "ellipse": judged.ellipse,
         "random": random.make,
     },
     _wrong,
