@@ -78,8 +78,8 @@ def _pull(values: SlungLoad, flow: Flow) -> tuple[Array, Array]:
     along_w = line_w / length
     speed = xp.sum(along_w * vel_w, axis=-1, keepdims=True)
     stretch = xp.where(apart, length, 0.0) - per_axis(values.length) + flow.dt * speed
-    asked = STIFFNESS**2 * stretch + 2.0 * DAMPING * STIFFNESS * speed
-    return along_w, xp.where((stretch > 0.0) & (asked > 0.0), asked, 0.0) / _lag(flow)
+    wanted = STIFFNESS**2 * stretch + 2.0 * DAMPING * STIFFNESS * speed
+    return along_w, xp.where((stretch > 0.0) & (wanted > 0.0), wanted, 0.0) / _lag(flow)
 
 
 def _share(values: SlungLoad, flow: Flow) -> Array:

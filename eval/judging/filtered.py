@@ -127,10 +127,10 @@ class Filtered:
         """Return `seen` with the filters' position, velocity and attitude.
 
         Args:
-            seen: what the other sensors show.
-            truth: (N, ...) what there is; its depth is not looked at.
+            seen: the output of the other sensors.
+            truth: (N, ...) the true view; its depth is not used.
             fresh: (N,) bool, slots whose trial begins.
-            flying: (N,) bool, the slots that fly.
+            flying: (N,) bool, slots in flight.
         """
         new = fresh & flying
         if new.any():

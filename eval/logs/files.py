@@ -77,14 +77,14 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray], text: str) -> P
     if METADATA in columns:
         raise FlightLogError(str(path), METADATA, None, "this name is kept for the metadata")
     table = pa.table({name: pa.array(values) for name, values in columns.items()})
-    with replacing_file(path) as beside:
+    with replacing_file(path) as temporary:
         if kind == ".parquet":
             table = table.replace_schema_metadata({METADATA: text})
-            pyarrow.parquet.write_table(table, beside)
+            pyarrow.parquet.write_table(table, temporary)
         else:
             rows = [text if k == 0 else None for k in range(table.num_rows)]
             table = table.append_column(METADATA, pa.array(rows, pa.string()))
-            pyarrow.csv.write_csv(table, beside)
+            pyarrow.csv.write_csv(table, temporary)
     return path
 
 

@@ -84,9 +84,9 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     force = xp.minimum(xp.maximum(force_z, lowest), highest)
     without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
     room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
-    asked = xp.abs(yaw)
+    size = xp.abs(yaw)
     # The clip removes what exceeds the room by rounding alone.
-    beyond = asked > xp.maximum(room, NEGLIGIBLE)
-    share = xp.where(beyond, room / xp.where(beyond, asked, 1.0), 1.0)
+    beyond = size > xp.maximum(room, NEGLIGIBLE)
+    share = xp.where(beyond, room / xp.where(beyond, size, 1.0), 1.0)
     limited = without_yaw + least(share)[..., None] * yaw
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

@@ -175,8 +175,8 @@ def rotor_command(
 ) -> tuple[PlantState, Array]:
     """Return the state with `command` or `speed_cmd` stored, and the commanded rotor speeds."""
     if plant.delay_weight.shape[-1] > 0:
-        asked = command.packed if speed_cmd is None else speed_cmd
-        past, acting = delayed(plant.delay_weight, state.past_commands, asked)
+        wanted = command.packed if speed_cmd is None else speed_cmd
+        past, acting = delayed(plant.delay_weight, state.past_commands, wanted)
         state, command = state._replace(past_commands=past), unpacked(acting)
         speed_cmd = None if speed_cmd is None else acting
     if speed_cmd is not None:

@@ -1,4 +1,4 @@
-"""A short video of a trial from behind the drone, beside the depth image it saw.
+"""A short video of a trial from behind the drone, temporary the depth image it saw.
 
 The frames are painted by `scene3d.py` and encoded by `video_file.py`, so neither a display nor a
 GPU is needed.
@@ -98,11 +98,11 @@ def write_video(
     if len(flight.time_s) < 2:
         raise ValueError(f"{path}: a flight of {len(flight.time_s)} usable rows; two are needed")
     frames = video_frames(track, flight, result, options)
-    with replacing_file(path) as beside:
+    with replacing_file(path) as temporary:
         if kind == ".gif":
-            write_gif(beside, frames, options.fps, _swatches(), on_frame)
+            write_gif(temporary, frames, options.fps, _swatches(), on_frame)
         else:
-            write_mp4(beside, frames, options.size, options.fps, on_frame)
+            write_mp4(temporary, frames, options.size, options.fps, on_frame)
     return path
 
 
@@ -120,8 +120,8 @@ def video_frames(
     eye_w, target_w = _chase(flight, rot_w, options)
     decided = np.flatnonzero(flight.policy_step)
     seen = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
-    beside = 0 if seen is None else round(options.size[0] * SIDE_SHARE)
-    size = options.size[0] - beside, options.size[1]
+    side_width = 0 if seen is None else round(options.size[0] * SIDE_SHARE)
+    size = options.size[0] - side_width, options.size[1]
     for time in times:
         k = int(np.searchsorted(flight.time_s, time, side="right")) - 1
         pos, eye, target = (_at(flight, values, time) for values in (flight.pos_w, eye_w, target_w))
@@ -133,9 +133,9 @@ def video_frames(
         frame.paste(painted(scenery, drone, (eye, target), options.fov_deg, size, lines))
         if seen is not None:
             number = int(np.searchsorted(decided, k, side="right")) - 1
-            _paint_depth(frame, beside, seen[min(max(number, 0), len(seen) - 1)])
+            _paint_depth(frame, side_width, seen[min(max(number, 0), len(seen) - 1)])
         ended = time >= flight.time_s[-1]
-        _write_on(frame, beside, track, result, float(time), float(speed[k]), next_gate, ended)
+        _write_on(frame, side_width, track, result, float(time), float(speed[k]), next_gate, ended)
         yield frame
 
 
@@ -207,7 +207,7 @@ def _font_size(frame: Image.Image) -> int:
 
 def _write_on(
     image: Image.Image,
-    beside: int,
+    side_width: int,
     track: Track,
     result: TrialResult,
     time: float,
@@ -227,5 +227,5 @@ def _write_on(
     if ended:
         colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
         large = ImageFont.load_default(size=image.height // 14)
-        where = ((image.width - beside) / 2, image.height * 0.2)
+        where = ((image.width - side_width) / 2, image.height * 0.2)
         draw.text(where, result.ending, fill=colour, font=large, anchor="mm", **edge)

@@ -1,11 +1,10 @@
 """Collisions by distance (JAX): does the body's box touch a solid?
 
-All is looked at in the box's own axes. Boxes and triangles are apart where some axis parts them
-(separating axes: Gottschalk, Lin and Manocha 1996; Akenine-Moeller 2001); the distance of a capsule
-is convex along its axis and found by halving; a sphere's is that of its middle. To a cylinder a
-point of the box is moved there and back into the box in turn, with momentum (alternating
-projections, Cheney and Goldstein 1959; Beck and Teboulle 2009), until it is where the two are
-nearest to one another.
+All computations are in the box's axes. Boxes and triangles use separating axes (Gottschalk, Lin and
+Manocha 1996; Akenine-Moeller 2001). The distance to a capsule is convex along its axis and found by
+bisection; that to a sphere is the distance of its centre. For a cylinder, a point is projected to
+the cylinder and back to the box in turn, with momentum (alternating projections, Cheney and
+Goldstein 1959; Beck and Teboulle 2009), until it converges to the nearest pair of points.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The simulator `rotorpy`: RotorPy's multirotor flies the trials (Folk, Paulos and Kumar 2023).
 
-Policy, autopilot, rate loop and mixer are ours, since they are what a vehicle file describes, and
-so are scene, images, contacts and rules. From the rotor speeds that are asked for, all is RotorPy's
-batched multirotor: the rotors' lag, thrust, drag, air, rigid body, and its integrator. That is its
-fixed Runge-Kutta step of order 4, at the rate loop's frequency: the adaptive one chooses its steps
-by all rows at once, so that a trial would hang on those beside it.
+Policy, autopilot, rate loop and mixer are the suite's, since a vehicle file describes them; so are
+scene, images, contacts and rules. RotorPy's batched multirotor gets the commanded rotor speeds and
+simulates the rotors' lag, thrust, drag, air and rigid body. Its integrator is the fixed Runge-Kutta
+step of order 4 at the rate loop's frequency. The adaptive one chooses its steps by all rows
+together, so a trial would depend on the other trials.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ class RotorpyWorld(SceneSlots):
     ) -> tuple[AutopilotState, Push]:
         loops = attitude_step(self._autopilot, self._loops, motion, action_b, gate_w, step)
         plant = self._autopilot.plant
-        asked = speed_asked(self._autopilot, action_b)
-        state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b, asked)
+        commanded = speed_asked(self._autopilot, action_b)
+        state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b, commanded)
         winds, air_vel_w = winds_on(plant, state.wind, motion, noise)
         loops = loops._replace(plant=state._replace(wind=winds))
         return loops, Push(wanted, motion.vel_w - air_vel_w)
@@ -166,9 +166,9 @@ class Multirotor:
             "rotor_speeds": rotor_speed,
         }
         state = {name: torch.tensor(value) for name, value in state.items()}
-        asked = {"cmd_motor_speeds": torch.tensor(push.rotor_speed)}
+        commanded = {"cmd_motor_speeds": torch.tensor(push.rotor_speed)}
         with _in_doubles():
-            after = self._theirs.step(state, asked, self._dt, self._rows)
+            after = self._theirs.step(state, commanded, self._dt, self._rows)
         part = {name: value.numpy() for name, value in after.items()}
         qpos = np.concatenate([part["x"], part["q"][:, [3, 0, 1, 2]]], axis=-1)
         return qpos, np.concatenate([part["v"], part["w"]], axis=-1), part["rotor_speeds"]

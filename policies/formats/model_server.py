@@ -198,12 +198,12 @@ def _answer(source: IO[bytes], answers: IO[bytes], run: Run, answer_s: float) ->
 
     while True:
         try:
-            asked, data = read_frame(source)
+            request, data = read_frame(source)
         except EOFError:
             return
         signal.setitimer(signal.ITIMER_REAL, answer_s)
         feed, at = {}, 0
-        for name, shape in asked["arrays"]:
+        for name, shape in request["arrays"]:
             count = math.prod(shape)
             feed[name] = np.frombuffer(data, np.float32, count, at).reshape(shape)
             at += 4 * count

@@ -37,8 +37,8 @@ def git_commit() -> str | None:
 
 
 def _git(root: Path, *what: str) -> bytes:
-    asked = ["git", "-C", str(root), *what]
-    return subprocess.run(asked, capture_output=True, timeout=10, check=True).stdout
+    command = ["git", "-C", str(root), *what]
+    return subprocess.run(command, capture_output=True, timeout=10, check=True).stdout
 
 
 def stamp(schema: int, seed: int | None) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Tracks from TOML files: gates of any convex shape, every kind of solid, meshes, a start.
 
-`examples/` beside this file holds one with every key. Positions are in the world frame in metres,
-angles in degrees; relative mesh files are looked for beside the TOML file.
+`examples/` in this folder has one with every key. Positions are in the world frame in metres,
+angles in degrees; relative paths of mesh files start at the TOML file's folder.
 """
 
 from __future__ import annotations

@@ -65,9 +65,9 @@ def detect(path: Path, options: ImportOptions) -> str:
         FlightLogError: where the file cannot be read, or is of no known format.
     """
     head = read_head(path)
-    asked = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))
+    candidates = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))
     reason = "of no known format; name it with --format, and a table's columns with --map"
-    for name, format in asked:
+    for name, format in candidates:
         try:
             if format.detect(head, options):
                 return name

@@ -49,11 +49,11 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
     """Return the signals of the table at `path`, by the mapping at `map_path`; see `read`."""
-    described_by = None if map_path is None else read_map(map_path)
+    given_map = None if map_path is None else read_map(map_path)
     columns, text, warnings = read_columns(path)
-    mapping = described_by or own_map(columns)
+    mapping = given_map or own_map(columns)
     name, about = str(path), {}
-    if described_by is None:  # a flight log has metadata
+    if given_map is None:  # a flight log has metadata
         about, more = flight_metadata(text, name)
         warnings += more
     time_s = _time(columns, mapping, name, map_path is not None)
@@ -79,8 +79,8 @@ def _time(
         there = ", ".join(list(columns)[:12])
         reason = f"no column for the time; {hint}. There are: {there}"
         raise FlightLogError(name, "time", None, reason)
-    asked = mapping.columns["time"]
-    column = next((c for c in asked if c.names[0] in columns), asked[0])
+    alternatives = mapping.columns["time"]
+    column = next((c for c in alternatives if c.names[0] in columns), alternatives[0])
     values = numbers(columns, column.names[0], name)
     if len(values) and values.dtype.kind in "iu" and abs(int(values[0])) > 2**52:
         # Unix times in nanoseconds do not fit a float64: take the first away while whole.

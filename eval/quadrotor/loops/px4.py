@@ -155,8 +155,8 @@ def update(
     # The integral contains K, as in the firmware: its limit is a torque.
     added = state.integral + share * gain.k * gain.i * further * dt
     integral = xp.clip(added, -gain.i_limit, gain.i_limit)
-    asked = torque[..., 2:]
-    yaw = _alpha(pick(state.started, asked, state.yaw), asked, gain.yaw_cutoff_hz, dt)
+    wanted_yaw = torque[..., 2:]
+    yaw = _alpha(pick(state.started, wanted_yaw, state.yaw), wanted_yaw, gain.yaw_cutoff_hz, dt)
     torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
     thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
     given = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)

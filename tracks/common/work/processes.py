@@ -30,7 +30,7 @@ TRIES = 2
 
 
 @dataclass
-class _Asked:
+class _Pending:
     """A piece that is being processed."""
 
     number: int
@@ -90,22 +90,22 @@ def _collect(
 ) -> None:
     """Collect results from every process until all pieces are done."""
     waiting = iter(enumerate(pieces))
-    asked: dict[Future[tuple[bytes, bool]], tuple[_Process, _Asked]] = {}
+    pending: dict[Future[tuple[bytes, bool]], tuple[_Process, _Pending]] = {}
 
     def begin(process: _Process) -> None:
         for number, piece in waiting:
-            ask(process, _Asked(number, pack((work, piece))), anew=True)
+            submit(process, _Pending(number, pack((work, piece))), anew=True)
             return
 
-    def ask(process: _Process, entry: _Asked, anew: bool) -> None:
+    def submit(process: _Process, entry: _Pending, anew: bool) -> None:
         try:
             future = process.pool.submit(_work_on, *([entry.packed] if anew else []))
         except BrokenProcessPool:
             again(process, entry)
         else:
-            asked[future] = process, entry
+            pending[future] = process, entry
 
-    def again(process: _Process, entry: _Asked) -> None:
+    def again(process: _Process, entry: _Pending) -> None:
         code = process.end()
         if entry.tries == TRIES:
             raise WorkerDied(
@@ -114,13 +114,13 @@ def _collect(
             )
         process.begin()
         entry.tries += 1
-        ask(process, entry, anew=True)
+        submit(process, entry, anew=True)
 
     for process in processes:
         begin(process)
-    while asked:
-        for future in wait(asked, return_when=FIRST_COMPLETED).done:
-            process, entry = asked.pop(future)
+    while pending:
+        for future in wait(pending, return_when=FIRST_COMPLETED).done:
+            process, entry = pending.pop(future)
             try:
                 results, more = future.result()
             except BrokenProcessPool:
@@ -130,7 +130,7 @@ def _collect(
             if isinstance(found, Failure):
                 raise raised(found)
             if more:
-                ask(process, entry, anew=False)
+                submit(process, entry, anew=False)
             else:
                 begin(process)
             for result in found:

@@ -28,11 +28,11 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
         ValueError: where the variable is set to an invalid value.
     """
     values = os.environ if environment is None else environment
-    asked = values.setdefault(VARIABLE, str(_wanted()))
+    setting = values.setdefault(VARIABLE, str(_wanted()))
     # XLA would end the process without a useful message.
-    if not (asked.isascii() and asked.isdigit() and 1 <= int(asked[:5]) <= MOST):
+    if not (setting.isascii() and setting.isdigit() and 1 <= int(setting[:5]) <= MOST):
         raise ValueError(
-            f"{VARIABLE} is {asked[:40]!r} in the environment; allowed is 1 to {MOST}, threads of "
+            f"{VARIABLE} is {setting[:40]!r} in the environment; allowed is 1 to {MOST} threads of "
             "XLA: unset it, or give a number"
         )
 
