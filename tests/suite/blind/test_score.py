@@ -101,7 +101,7 @@ def test_the_table_counts_and_the_files_are_written(tmp_path):
     assert lines["single effects: named, nothing else"] == (1, 1)
     assert lines["nulls: something named"] == (1, 2)
     assert lines["outside the catalogue: `unknown` or `partly`"] == (1, 2)
-    assert lines["95 % intervals that hold the truth"] == (1, 1)
+    assert lines["95 % intervals that contain the true value"] == (1, 1)
     assert lines["gap after within 1.1 of the noise floor, where named"] == (0, 1)
     assert lines["diagnosis failed"] == (1, 5)
     half = next(s for s in shares(verdicts) if s.what == "nulls: something named")
