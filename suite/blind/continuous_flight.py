@@ -18,7 +18,7 @@ from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
-from suite.diagnose.plans.follow import Gains, check_flights, steer
+from suite.diagnose.plans.follow import PilotGains, check_flights, steer
 from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 
@@ -96,7 +96,7 @@ class _Pilot:
         since = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
         off = now.pos_w - seen.pos_w
         self._summed_w = np.clip(self._summed_w + since[:, None] * off, -1.0, 1.0)
-        given = steer(self._nominal, Gains(), now, motion, self._summed_w)
+        given = steer(self._nominal, PilotGains(), now, motion, self._summed_w)
         acting = given
         if self._extra is not None:
             acting = self._extra.command(given, float(seen.time_s[0]))

@@ -56,8 +56,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
         result = of_sensors.identify_sensors(config.flights, out, console)
-        of_sensors.say(result, console)
-        return result
+        _say_parameters(result, console)
+        of_sensors.say_held_out(result, console)
+        return _say_end(result, out, console)
     from suite.diagnose.identify.run import identify_files
 
     if not config.vehicle:
@@ -67,6 +68,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         config.flights, config.vehicle, out, config.leave, console, config.accept
     )
     console.say(f"driven by {DRIVEN[result['drive']]}")
+    _say_parameters(result, console)
+    for text in result["untold"]:
+        console.say(f"  not identifiable from these flights, {text}")
+    return _say_end(result, out, console)
+
+
+def _say_parameters(result: dict[str, Any], console: Console) -> None:
     for key, entry in result["parameters"].items():
         values, spans = entry["value"], entry["ci95"]
         if not isinstance(values, list):
@@ -78,8 +86,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
             for k, (v, s) in enumerate(zip(values, spans, strict=True))
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
-    for text in result["untold"]:
-        console.say(f"  not identifiable from these flights, {text}")
+
+
+def _say_end(result: dict[str, Any], out: Path, console: Console) -> dict[str, Any]:
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
     console.say(f"written: {out}")

@@ -1,6 +1,6 @@
 """The example's flights: made by MuJoCo from these numbers, logged with noise.
 
-`python -m suite.diagnose.example.flights` makes the files beside this one again.
+`python -m suite.diagnose.example.flights` makes the files next to this one again.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ def make_flights() -> list[FlightLog]:
         rounded: dict[str, Any] = {}
         for name, bits in FINEST.items():
             rounded[name] = np.round(getattr(log, name) * 2.0**bits) / 2.0**bits
-        told = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
-        logs.append(replace(log, **rounded, about={**log.about, **told}))
+        about = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
+        logs.append(replace(log, **rounded, about={**log.about, **about}))
     return logs
 
 
 def main() -> None:
-    """Write the flights beside this file."""
+    """Write the flights next to this file."""
     for log in make_flights():
         print(write_flight(FOLDER / f"{log.name}.parquet", log))
 

@@ -101,6 +101,17 @@ def as_json(numbers: Sequence[Number]) -> dict[str, Any]:
     return found
 
 
+def lines_of_numbers(numbers: Sequence[Number]) -> list[str]:
+    """Return a line with the interval of every identified component, for people."""
+    return [
+        f"{entry.key}{f'[{k}]' if len(entry.value) > 1 else ''} = {value:.4g}: "
+        f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
+        for entry in numbers
+        for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True))
+        if span is not None
+    ]
+
+
 WHY = {
     "thrust": "thrust: too little of the force along body z is explained",
     "curve": "curvature of the thrust curve: the motor commands hardly change",

@@ -16,7 +16,7 @@ from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.drive import unknown_to_the_fits
 from suite.diagnose.identify.identify import Identified, identify
-from suite.diagnose.identify.numbers import as_json
+from suite.diagnose.identify.numbers import as_json, lines_of_numbers
 
 SCHEMA = 1
 PARTS = ("drag", "motors", "inertia", "lag", "loop")
@@ -91,11 +91,6 @@ def _counted(flights: int) -> str:
 
 def _head(found: Identified, start: str) -> str:
     lines = [f"From {start} by {_counted(len(found.flights))} ({found.drive}); 95 % intervals:"]
-    for entry in found.numbers:
-        for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
-            part = f"[{k}]" if len(entry.value) > 1 else ""
-            if span is not None:
-                between = f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
-                lines.append(f"{entry.key}{part} = {value:.4g}: {between}")
+    lines += lines_of_numbers(found.numbers)
     lines += [f"not identifiable: {text}" for text in found.not_identified]
     return "\n".join(lines)

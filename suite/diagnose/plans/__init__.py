@@ -1,1 +1,1 @@
-"""Commanded trajectories, flown in simulation, and which of them tell which effects apart."""
+"""Commanded trajectories, flown in simulation, and which of them separate which effects."""

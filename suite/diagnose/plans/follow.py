@@ -99,7 +99,7 @@ def follow(
     wanted: Reference,
     period: int,
     dt: float,
-    gains: Gains | None = None,
+    gains: PilotGains | None = None,
 ) -> list[Recording]:
     """Fly `trajectories` side by side and return what happened.
 
@@ -117,7 +117,7 @@ def follow(
     """
     count = len(trajectories)
     steps = [round(way.duration_s / dt) for way in trajectories]
-    gains, summed_w = gains or Gains(), np.zeros((count, 3))
+    gains, summed_w = gains or PilotGains(), np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
     acc_b = np.zeros((count, 3)) + [0.0, 0.0, GRAVITY]
     rows = []
@@ -168,7 +168,7 @@ def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None
 
 
 @dataclass(frozen=True)
-class Gains:
+class PilotGains:
     """Of the loops around position; below them are the vehicle's own."""
 
     position: float = 5.0
@@ -182,7 +182,7 @@ class Gains:
 
 
 def corrected(
-    gains: Gains, acc_w: Array, off_w: Array, slow_w: Array, summed_w: Array | float = 0.0
+    gains: PilotGains, acc_w: Array, off_w: Array, slow_w: Array, summed_w: Array | float = 0.0
 ) -> Array:
     """Return the acceleration (..., 3) [m/s^2] that also brings a vehicle back to its path.
 
@@ -199,7 +199,7 @@ def corrected(
 
 
 def steer(
-    vehicle: Vehicle, gains: Gains, wanted: Reference, motion: Motion, summed_w: np.ndarray
+    vehicle: Vehicle, gains: PilotGains, wanted: Reference, motion: Motion, summed_w: np.ndarray
 ) -> Command:
     """Return the command that follows `wanted`; the pilot knows the nominal vehicle only.
 

@@ -1,7 +1,7 @@
-"""Flights that would tell apart what the data could not: which, as files, and flown in simulation.
+"""Flights that separate effects which the data could not: which, as files, and flown in simulation.
 
 `plan.json` holds the numbers that make each trajectory again; a CSV holds where to be, how fast,
-how accelerated and where to look at every hundredth of a second, for autopilots that follow set
+how accelerated and the heading at every hundredth of a second, for autopilots that follow set
 points.
 """
 
@@ -29,13 +29,13 @@ RATE_HZ = 100.0
 """Of set points, and of simulated logs, or the nearest rate below that divides the rate loop's."""
 TURNED = 2.1
 """By which the second flight of each trajectory is turned about z [rad]: one of the two may be
-held out, and both look elsewhere."""
+held out, and their headings differ."""
 FLIGHTS = "flights"
 """Folder of the simulated logs, within the plan's."""
 
 
 def sets_of(found: Mapping[str, Any]) -> list[set[str]]:
-    """Return the sets of names that a diagnosis (its JSON) could not tell apart."""
+    """Return the sets of names that a diagnosis (its JSON) could not separate."""
     return [
         {effect["name"], *effect["alternatives"]}
         for effect in found["effects"]
@@ -44,7 +44,7 @@ def sets_of(found: Mapping[str, Any]) -> list[set[str]]:
 
 
 def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
-    """Return the flights that split what `found` could not tell apart, and what to do in words."""
+    """Return the flights that separate what `found` could not, and what to do in words."""
     ways: list[Trajectory] = []
     words: list[str] = []
     for names in sets_of(found):
@@ -52,9 +52,9 @@ def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
         ways += plan_for(names)
         together = " from ".join(sorted(names))
         if not entries:
-            words.append(f"To tell {together}: fly fast, with changes of thrust and heading.")
+            words.append(f"To separate {together}: fly fast, with changes of thrust and heading.")
         for entry in entries:
-            words.append(f"To tell {' from '.join(entry.pair)}: {entry.words}.")
+            words.append(f"To separate {' from '.join(entry.pair)}: {entry.words}.")
             words += [_besides(what) for what in entry.measure]
     ways = list(dict.fromkeys(ways))
     twice = [turned for way in ways for turned in (way, replace(way, direction=TURNED))]
@@ -69,7 +69,7 @@ def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     remove_plan(folder)
     ways, words = ways_for(found)
     if not ways:
-        return {"flights": [], "words": ["Nothing is left to tell apart: no flight is planned."]}
+        return {"flights": [], "words": ["Nothing is left to separate: no flight is planned."]}
     return write_plan(folder, ways, words)
 
 
@@ -110,9 +110,9 @@ def fly_plan(
             continue
         name = f"{FLIGHTS}/plan_{number}_{way.kind}.parquet"
         log = log_of(recording, truth, sensors, rng, name)
-        told = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
+        about = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
         (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
-        write_flight(folder / name, replace(log, about={**log.about, **told}))
+        write_flight(folder / name, replace(log, about={**log.about, **about}))
         flights.append({**flight, "flown": name})
     plan = {**plan, "flights": flights}
     if flights:
@@ -121,12 +121,12 @@ def fly_plan(
 
 
 def _besides(what: str) -> str:
-    said = {
+    lines = {
         "motor": "Log the rotor speeds as well.",
         "voltage": "Log the battery's voltage as well.",
         "scale": "Better still: weigh the vehicle.",
     }
-    return said[what]
+    return lines[what]
 
 
 def _rate(vehicle: Vehicle) -> float:
@@ -135,13 +135,13 @@ def _rate(vehicle: Vehicle) -> float:
 
 
 def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
-    """Return sensors as noisy as the diagnosed logs; rotor speeds and voltage where asked for."""
+    """Return sensors as noisy as the diagnosed logs; rotor speeds and voltage as `words` want."""
 
     def noise(group: str) -> float:
         values = sigma[SLICES[group]]
         return float(np.sqrt(np.mean(values**2))) if np.isfinite(values).all() else 0.0
 
-    asked = " ".join(words)
+    wanted = " ".join(words)
     return Sensors(
         "as diagnosed",
         rate_hz,
@@ -150,8 +150,8 @@ def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
         gyro=noise("rates"),
         vel=noise("velocity"),
         acc=noise("accelerometer"),
-        rotor=noise("rotor speed") or (5.0 if "rotor speeds" in asked else 0.0),
-        voltage=0.02 if "voltage" in asked else 0.0,
+        rotor=noise("rotor speed") or (5.0 if "rotor speeds" in wanted else 0.0),
+        voltage=0.02 if "voltage" in wanted else 0.0,
     )
 
 
@@ -186,7 +186,7 @@ def remove_plan(folder: Path) -> None:
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
     """Write `ways`, one a flight, in `folder`; return what plan.json holds.
 
-    `words` say to people what the flights are for.
+    `words` are for people: what the flights are for.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flights = []
@@ -341,6 +341,6 @@ def plan_for(names: Iterable[str]) -> list[Trajectory]:
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line that says which flight separates `name` from `rival`."""
+    """Return a line on which flight separates `name` from `rival`."""
     known = separations_of((name, rival))
     return f"{name} from {rival}: {known[0].words if known else OTHERWISE}"

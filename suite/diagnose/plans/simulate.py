@@ -14,7 +14,7 @@ from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.follow import Gains, Recording, Step, follow, wanted_of
+from suite.diagnose.plans.follow import PilotGains, Recording, Step, follow, wanted_of
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import to_world
 
@@ -49,7 +49,7 @@ def fly(
     extra: Extra | None = None,
     rng: np.random.Generator | None = None,
     has_voltage: bool = False,
-    gains: Gains | None = None,
+    gains: PilotGains | None = None,
 ) -> list[Recording]:
     """Fly `trajectories` side by side and return what happened.
 

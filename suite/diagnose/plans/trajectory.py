@@ -1,4 +1,4 @@
-"""Commanded trajectories: where to be, how fast, and where to look, as functions of time."""
+"""Commanded trajectories: place, velocity and heading as functions of time."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Series(NamedTuple):
     value: np.ndarray
     """(T,) NaN where it is missing."""
     speed: np.ndarray
-    """(T,) [m/s]; zeros where no drift is looked for."""
+    """(T,) [m/s]; zeros where no drift is fitted."""
     step_s: float
 
     @property
@@ -127,7 +127,7 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
     drift = _drift(flights) if any(flight.speed.any() for flight in flights) else NOTHING
     best = _noise(flights, rows, 0.0)
     if acting(drift):
-        # A slow noise looks like a drift at long lags; one that lasts as long as these is a drift.
+        # A slow noise resembles a drift at long lags; one that lasts as long as these is a drift.
         if best.colour.lasts_s > LONG_S:
             best = _noise(flights, rows, drift.value**2)
         else:

@@ -20,7 +20,7 @@ SLOPE_ROWS = 15
 SETTLES_S = 2.0
 """So much after the first row and before the last is left out: the ground is near [s]."""
 LEAST_S = 8.0
-"""Shorter flights say too little of errors that last [s]."""
+"""Shorter flights show too little of errors that last [s]."""
 
 
 class Errors(NamedTuple):

@@ -21,7 +21,7 @@ COUNTS = 0.2
 
 
 class Fitted(NamedTuple):
-    """What the flights say of an estimate."""
+    """Errors of an estimate, as flights show them."""
 
     lateness: Lateness
     axes: Mapping[str, Coloured]
@@ -51,7 +51,7 @@ class HeldOut(NamedTuple):
 
 
 def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
-    """Return what flights say of the estimate.
+    """Return the errors of the estimate in flights.
 
     Raises:
         FlightLogError: for a log without an estimate or without a reference.

@@ -53,19 +53,19 @@ def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
 
 
 def _fitted(flights: Sequence[Errors], at_s: float) -> Lateness:
-    told, scale = (0, 1), Interval(0.0, 0.0, 0.0)
+    fitted, scale = (0, 1), Interval(0.0, 0.0, 0.0)
     channels = _equations(flights)
-    value, half = _solved(_summed(channels), told)
+    value, half = _solved(_summed(channels), fitted)
     if value[1]:
         scale = _interval(value[1], half[1])
         if not acting(scale):  # then it only makes the delay less sure
-            told = (0,)
-            value, half = _solved(_summed(channels), told)
+            fitted = (0,)
+            value, half = _solved(_summed(channels), fitted)
     by_part = {}
     for k, part in enumerate(PARTS):
         own = channels[3 * k : 3 * k + 3]
         if any(equations.hessian[:, 0, 0].any() for equations in own):
-            alone, width = _solved(_summed(own), told)
+            alone, width = _solved(_summed(own), fitted)
             by_part[part] = _interval(at_s + alone[0], width[0])
     return Lateness(_interval(at_s + value[0], half[0]), scale, by_part)
 
@@ -139,10 +139,10 @@ def _summed(channels: Sequence[NormalEquations]) -> NormalEquations:
     )
 
 
-def _solved(equations: NormalEquations, told: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return delay and scale (2,) and the half-widths (2,) of their intervals; 0 where untold."""
+def _solved(equations: NormalEquations, fitted: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return delay and scale (2,) and their intervals' half-widths (2,); 0 where not fitted."""
     hessian, gradient = equations.sums()
-    at = [k for k in told if hessian[k, k] > 1e-9]
+    at = [k for k in fitted if hessian[k, k] > 1e-9]
     value, half = np.zeros(2), np.zeros(2)
     if at:
         value[at] = np.linalg.solve(hessian[np.ix_(at, at)], gradient[at])

@@ -14,6 +14,7 @@ from eval.sensors.sensors_file import save_sensors, sensor_set
 from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
+from suite.diagnose.identify.numbers import Number, as_json, lines_of_numbers
 from suite.diagnose.sensors.errors import errors_of
 from suite.diagnose.sensors.identify import WITHIN, fit_sensors, held_out, parameters_of
 from suite.diagnose.sensors.lateness import acting
@@ -56,14 +57,15 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         )
     parameters = parameters_of(fitted)
     head = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
-    head += [_line(key, one, unit) for key, (one, unit) in parameters.items()]
+    numbers = [
+        Number(key, unit, [one.value], [(one.low, one.high)])
+        for key, (one, unit) in parameters.items()
+    ]
+    head += lines_of_numbers(numbers)
     save_sensors(sensor_set(_values(parameters), out.stem), out, "\n".join(head))
     return {
         "sensors": str(out),
-        "parameters": {
-            key: {"value": one.value, "ci95": [one.low, one.high], "unit": unit}
-            for key, (one, unit) in parameters.items()
-        },
+        "parameters": as_json(numbers),
         "delay_by_part": {k: list(one) for k, one in fitted.lateness.by_part.items()},
         "held_out": {
             axis: {**one._asdict(), "fits": one.fits, "within": WITHIN}
@@ -75,10 +77,8 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     }
 
 
-def say(result: Mapping[str, Any], console: Console) -> None:
-    """Print what was found for people."""
-    for key, entry in result["parameters"].items():
-        console.say(f"  {_line(key, Interval(entry['value'], *entry['ci95']), entry['unit'])}")
+def say_held_out(result: Mapping[str, Any], console: Console) -> None:
+    """Print how the model fits flights that it was not fitted to."""
     if result["held_out"]:
         console.say("autocorrelation up to 1 s on flights that the model was not fitted to:")
     for axis, one in result["held_out"].items():
@@ -87,13 +87,6 @@ def say(result: Mapping[str, Any], console: Console) -> None:
             f"  {axis} {fits}: {one['fitted']:.2f}, measured {one['measured']:.2f}, at a lag of "
             f"{one['lag_s']:.2f} s where they differ most (allowed {one['within']:g})"
         )
-    for warning in result["warnings"]:
-        console.say(f"warning: {warning}")
-    console.say(f"written: {result['sensors']}")
-
-
-def _line(key: str, one: Interval, unit: str) -> str:
-    return f"{key} = {one.value:.4g} ({one.low:.4g} to {one.high:.4g}) {unit}"
 
 
 def _values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:

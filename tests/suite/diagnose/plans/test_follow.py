@@ -7,6 +7,7 @@ from eval.quadrotor.plant import Command, Motion, Wrench
 from suite.diagnose.plans.follow import FlightFailed, Step, follow, wanted_of
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN
+from tests.support.ways import CIRCLE, EIGHT, bare_flights
 
 DT = 0.002
 WAYS = [Trajectory("circle", 0.4, speed=1.0), Trajectory("hover", 0.2)]
@@ -63,3 +64,9 @@ def test_a_specific_force_stands_with_the_step_after_the_one_that_had_it():
 def test_a_flight_away_from_its_trajectory_fails_with_its_number():
     with pytest.raises(FlightFailed, match=r"flight [12] failed at 0\.\d\d s, 4\.\d m off"):
         flown(off_m=20.0)
+
+
+def test_the_pilot_stays_on_the_trajectory():
+    for way, flight in zip((EIGHT, CIRCLE), bare_flights(), strict=True):
+        off = np.linalg.norm(way.reference(flight.time_s).pos_w - flight.motion.pos_w, axis=1)
+        assert off.max() < 0.5

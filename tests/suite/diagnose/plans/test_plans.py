@@ -6,16 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.plant import Motion
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.follow import Gains, steer
+from suite.diagnose.plans.follow import PilotGains, steer
 from suite.diagnose.plans.plan import (
     COLUMNS,
     OTHERWISE,
     SEPARATIONS,
     advice,
     fly_plan,
+    plan_for,
+    separations_of,
     sets_of,
     ways_for,
     write_plan,
@@ -134,9 +137,19 @@ def test_the_pilot_pushes_towards_where_it_should_be_and_never_turns_over():
     level = np.eye(3)[None]
     still = Motion(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)))
     wanted = Reference(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
-    hover = steer(LAGGED, Gains(), wanted, still, np.zeros((1, 3)))
+    hover = steer(LAGGED, PilotGains(), wanted, still, np.zeros((1, 3)))
     assert hover.thrust[0] == pytest.approx(9.81) and np.abs(hover.rate_b).max() < 1e-9
     ahead = wanted._replace(pos_w=np.array([[1.0, 0.0, 0.0]]))
-    assert steer(LAGGED, Gains(), ahead, still, np.zeros((1, 3))).rate_b[0, 1] > 0.1
+    assert steer(LAGGED, PilotGains(), ahead, still, np.zeros((1, 3))).rate_b[0, 1] > 0.1
     fall = wanted._replace(acc_w=np.array([[0.0, 0.0, -30.0]]))
-    assert steer(LAGGED, Gains(), fall, still, np.zeros((1, 3))).thrust[0] > 0.0
+    assert steer(LAGGED, PilotGains(), fall, still, np.zeros((1, 3))).thrust[0] > 0.0
+
+
+def test_plans_name_catalogue_effects_and_end_in_flights():
+    for entry in SEPARATIONS:
+        assert set(entry.pair) <= set(EFFECTS) and entry.pair[0] != entry.pair[1]
+        assert entry.separating and entry.blurred and entry.words
+    assert separations_of(["rotor_drag", "linear_drag"])[0].pair == ("linear_drag", "rotor_drag")
+    (wind,) = separations_of(["frame_tilt", "constant_wind + linear_drag"])
+    assert wind.pair == ("constant_wind", "frame_tilt") and "two headings" in wind.words
+    assert plan_for(["gusts", "inflow"]), "an unknown pair gets the flights that excite most"

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.plans.simulate import fly
 from suite.diagnose.plans.trajectory import KINDS, Trajectory
-from tests.support.ways import BARE, CIRCLE, EIGHT
+from tests.support.ways import CIRCLE
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -30,5 +29,3 @@ def test_unknown_words_are_refused():
         Trajectory("cirkle").reference(np.zeros(1))
     with pytest.raises(ValueError, match="turn"):
         Trajectory("hover", turn="swep").reference(np.zeros(1))
-    with pytest.raises(ValueError, match="rate_hz"):
-        fly(BARE, BARE, [EIGHT], rate_hz=120.0)
