@@ -37,7 +37,6 @@ from suite.diagnose.evidence.moments import (
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, chance_of, rotor_gain
 from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResult
-from suite.diagnose.search.search import search
 
 
 def flown_in(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
@@ -186,22 +185,6 @@ def changed(
         task.view, task.model, flights, limits, task.carried, True, wide, weights, spread
     )
     return evidence, evidence.at(start)
-
-
-def search_change(
-    reference: ViewEvidence,
-    flights: Sequence[SmoothedFlight],
-    spread: RotorSpread,
-    among: Sequence[Candidate],
-    seed: int = 0,
-) -> SearchResult:
-    """Return which of `among` explain what has changed since the flights of `reference`.
-
-    `seed` is of the draws of what chance does.
-    """
-    evidence, start = changed(reference, flights, spread)
-    known = evidence.again(start)
-    return search(evidence, start, view_candidates(among, known[1]), seed=seed, known=known)
 
 
 SLIGHT = 0.1

@@ -9,9 +9,10 @@ from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
-from suite.diagnose.evidence.views import ViewEvidence
+from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
-from suite.diagnose.search.change import search_change
+from suite.diagnose.search.change import changed
+from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 
@@ -30,8 +31,10 @@ def changes(logs, references):
     after = [task_of(logs, view) for view in (FORCE, TORQUE)]
     spread = rotor_spread([*before, *after])
     for reference, task in zip(before, after, strict=True):
-        search = search_change(reference, task.flights, spread, among)
-        found[task.view.name] = [name.candidate.label for name in search.named]
+        evidence, start = changed(reference, task.flights, spread)
+        known = evidence.again(start)
+        result = search(evidence, start, view_candidates(among, known[1]), known=known)
+        found[task.view.name] = [name.candidate.label for name in result.named]
     return found
 
 
