@@ -11,6 +11,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 import trimesh
@@ -32,7 +33,7 @@ from suite.judging.requests import Evaluation
 from suite.train.config import check
 from suite.train.overrides import override
 from suite.train.recipes import named_recipe, with_quadrotor
-from tests.support import foreign_logs
+from tests.support import foreign_logs, known_flight, raw_logs
 from tests.support.judged_cells import ROWS
 from tests.support.mutations import changes, mutated_bytes, mutated_json, mutated_toml
 from tracks.common.files import plain
@@ -44,7 +45,10 @@ KINDS = (
     *("set", "vehicle", "sensors", "track", "mapping", "checkpoint", "policy.onnx"),
     *("flight.parquet", "flight.csv", "run.json", "journal"),
 )
-FOREIGN = ("ulg", "mcap", "blackbox", "usd", "trials.parquet", "obj", "stl", "glb", "ply")
+FOREIGN = (
+    *("ulg", "mcap", "blackbox", "bbl", "bin", "usd"),
+    *("trials.parquet", "obj", "stl", "glb", "ply"),
+)
 """Formats that other programs write, or that others hand over."""
 EACH, EACH_FOREIGN = 1000, 10_000
 """Inputs of each kind at full size."""
@@ -108,6 +112,9 @@ def a_foreign_file(kind, folder):
         return foreign_logs.write_mcap(path, short).read_bytes()
     if kind == "blackbox":
         return foreign_logs.write_blackbox(path, short, rate=200.0).read_bytes()
+    if kind in ("bbl", "bin"):
+        write = {"bbl": raw_logs.write_raw, "bin": raw_logs.write_bin}[kind]
+        return write(path, known_flight.fly(np.arange(0.0, 1.2, 0.01))).read_bytes()
     if kind == "usd":
         return foreign_logs.write_usd(path, short).read_bytes()
     if kind == "trials.parquet":
@@ -125,7 +132,8 @@ def foreign_reader(kind):
         return lambda path: load_convex_parts([path])
     # Of a partial log more is read than of one whose first fault ends it.
     options = ImportOptions(partial=True, full_thrust=30.0)
-    name = {"ulg": "px4", "usd": "crazyflie", "blackbox": "betaflight"}.get(kind, kind)
+    names = {"ulg": "px4", "usd": "crazyflie", "bin": "ardupilot"}
+    name = "betaflight" if kind in ("blackbox", "bbl") else names.get(kind, kind)
     return lambda path: import_log(path, name, options)
 
 

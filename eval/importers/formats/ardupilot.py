@@ -69,7 +69,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         names = columns.split()
         for kind in kinds:
             rows = messages.get(kind, {})
-            if name not in parts and all(c in rows for c in names):
+            if name not in parts and all(c in rows for c in ("TimeUS", *names)):
                 value = np.stack([rows[c] for c in names], axis=1)
                 parts[name] = (rows["TimeUS"] * 1e-6, value * factor)
 
@@ -89,6 +89,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     if "pwm" in parts:
         low, high = (parameters.get(f"MOT_PWM_{end}") or default
                      for end, default in (("MIN", 1000.0), ("MAX", 2000.0)))  # fmt: skip
+        low, high = (low, high) if high > low else (1000.0, 2000.0)
         time_s, pulse = parts["pwm"]
         parts["pwm"] = (time_s, np.clip((pulse - low) / (high - low), 0.0, 1.0))
         findings.append(Finding("note", "motors", f"pulses of {low:g} to {high:g} us are 0 to 1"))
@@ -120,12 +121,13 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         ):
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
-    except Exception as error:
+        parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
+        texts = [str(one["Message"]) for one in table.pop("MSG")]
+        messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
+    except Exception as error:  # whatever a damaged file makes of the reader
         reason = f"an ArduPilot log that cannot be read ({type(error).__name__}: {error})"
         raise FlightLogError(str(path), None, None, reason) from None
-    parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
-    texts = [str(one["Message"]) for one in table.pop("MSG")]
-    messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
+    parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}
 
 
@@ -134,7 +136,7 @@ def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
     first = [r for r in rows if not r.get("I", r.get("C", 0))] if name != "ESC" else rows
     rows = first or rows
     numbers = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
-    return {k: np.array([r[k] for r in rows], dtype=np.float64) for k in numbers}
+    return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numbers}
 
 
 def _outputs(parameters: Mapping[str, float]) -> list[int]:
@@ -150,7 +152,7 @@ def _motors(esc: Rows, findings: list[Finding]) -> dict[str, tuple[np.ndarray, n
     name = "Instance" if "Instance" in esc else "I"
     numbers = sorted(set(esc.get(name, np.zeros(0)).tolist()))
     findings += check_count(len(numbers), "by the ESCs of the log")
-    if len(numbers) != 4 or "RPM" not in esc or not np.any(esc["RPM"]):
+    if len(numbers) != 4 or not {"RPM", "TimeUS"} <= set(esc) or not np.any(esc["RPM"]):
         return {}
     each = [esc[name] == k for k in numbers]
     time_s = esc["TimeUS"][each[0]] * 1e-6

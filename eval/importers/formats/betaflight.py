@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.formats.blackbox import MARKER, decode
+from eval.importers.formats.blackbox import ACC_1G, MARKER, decode
 from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
@@ -37,8 +37,6 @@ RAW_HEAD = 512
 """A raw log begins within so many bytes."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
 DEG = np.pi / 180.0
-ACC_1G = 2048.0
-"""Raw counts of accSmooth per g, on all boards of Betaflight 4."""
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
 _ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -80,6 +78,13 @@ class Blackbox:
             match = _UNIT.match(column)
             if match:
                 self._found[match["name"]] = (column, match["unit"] or "")
+
+    def settings(self, name: str, given: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the numbers of a setting of the header, or `given` where it has others or none."""
+        found = self.header.get(name)
+        found = found if isinstance(found, (list, tuple)) else (found,)
+        usable = tuple(one for one in found if isinstance(one, (int, float)) and np.isfinite(one))
+        return usable if len(usable) == len(found) == len(given) else given
 
     def has(self, *names: str) -> bool:
         """Return whether all the columns are there."""
@@ -136,7 +141,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     if box.has("vbatLatest"):
         unit = box.unit("vbatLatest")
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
-    poles = box.header.get("motor_poles", options.motor_poles)
+    poles = int(box.settings("motor_poles", (options.motor_poles,))[0])
     parts |= _motors(box, poles if options.motor_poles == 14 else options.motor_poles, findings)
     parts |= _outputs(box, findings)
     signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
@@ -167,7 +172,7 @@ def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
     if not box.has(*names):
         return {}
     raw = box.values(names, {"": 1.0})
-    low, high = box.header.get("motorOutput", PULSES if np.nanmin(raw) >= PULSES[0] else DSHOT)
+    low, high = box.settings("motorOutput", PULSES if np.nanmin(raw) >= PULSES[0] else DSHOT)
     if not high > low:
         return {}
     text = f"motor outputs from {low:g} to {high:g} are 0 to 1"

@@ -17,6 +17,8 @@ from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding
 
 MARKER = b"H Product:Blackbox"
+ACC_1G = 2048.0
+"""Raw counts of accSmooth per g, on all boards of Betaflight 4."""
 MISSING = (
     "a raw Blackbox log; pip install 'diffracing-suite[blackbox]' reads it, or decode it with "
     "blackbox_decode and import the CSV"
@@ -44,17 +46,22 @@ def decode(path: Path) -> Decoded:
     except ImportError:
         raise FlightLogError(str(path), None, None, MISSING) from None
     raw = path.read_bytes()
+    try:
+        return _longest(decoder, raw)
+    except Exception as error:  # whatever a damaged file makes of the decoder
+        reason = f"a Blackbox log that cannot be decoded ({type(error).__name__}: {error})"
+        raise FlightLogError(str(path), None, None, reason) from None
+
+
+def _longest(decoder: Any, raw: bytes) -> Decoded:
+    """Return the longest log of a file's bytes; damaged ones raise what they make the decoder."""
     parts = decoder.split_sessions(raw)
     number, (start, end) = max(enumerate(parts, start=1), key=lambda p: p[1][1] - p[1][0])
     parser = decoder.FlightLogParser(raw, start, end)
-    try:
-        parser.parse_header()
-        parser.parse_data()
-    except Exception as error:
-        reason = f"a Blackbox log that cannot be decoded ({type(error).__name__}: {error})"
-        raise FlightLogError(str(path), None, None, reason) from None
+    parser.parse_header()
+    parser.parse_data()
     if not parser.main_frames:
-        raise FlightLogError(str(path), None, None, "a Blackbox log without a frame; log again")
+        raise ValueError("it has no frame; log again")
     findings = []
     if len(parts) > 1:
         text = f"holds {len(parts)} logs; the longest, number {number}, is read"
@@ -76,7 +83,10 @@ def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[st
         if stem in ("gyroADC", "gyroUnfilt") or (stem == "setpoint" and name != "setpoint[3]"):
             out[name] = value / fine
         elif stem == "accSmooth":
-            out[f"{name} (g)"] = value / float(header.get("acc_1G") or 2048.0)
+            per_g = header.get("acc_1G")
+            out[f"{name} (g)"] = value / (
+                per_g if isinstance(per_g, (int, float)) and per_g > 0 else ACC_1G
+            )
         else:
             out[name] = value
     return out
