@@ -160,7 +160,7 @@ def gust_strength(
 ) -> float:
     """Return the size of random wind `name` at which the log-likelihood ratio is `THRESHOLD`.
 
-    The size s is its first parameter, to which the wind is proportional; the others are neutral.
+    Beyond the bound of its first parameter, the size s, it is infinite; the others are neutral.
     It adds a covariance to the noise; with lambda its whitened eigenvalues for s = 1, a stretch
     adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
     """
@@ -177,7 +177,7 @@ def gust_strength(
         raised = np.exp(2.0 * log_size) * eigenvalues
         return float(0.5 * (raised - np.log1p(raised)).sum()) - THRESHOLD
 
-    ends = np.log((1e-4, 100.0))
+    ends = np.log((1e-4, at(EFFECTS[name].parameters[0].high, nominal)))
     return float(np.exp(root_scalar(beyond, bracket=ends).root)) if beyond(ends[1]) > 0 else np.inf
 
 
