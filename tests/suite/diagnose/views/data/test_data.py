@@ -177,7 +177,7 @@ def test_logs_too_slow_for_the_torque_are_looked_at_by_their_force():
     assert np.diff(slow[0].time_s)[0] == pytest.approx(0.04)
     found = ready(slow, VEHICLE)
     assert found.views == (FORCE,) and set(found.smoothed) == {FORCE.name}
-    assert found.notes[0].startswith("torque: not looked at, as") and "log faster" in found.notes[0]
+    assert found.notes[0].startswith("torque: not examined, as") and "log faster" in found.notes[0]
 
 
 def test_the_row_nearest_to_a_bump_takes_no_memory_by_the_square_of_a_flight():
