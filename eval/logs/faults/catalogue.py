@@ -44,6 +44,10 @@ FAULTS: dict[str, tuple[str, str]] = {
     "rate_curve": ("the firmware maps sticks by another curve", STICKS),
     "command_delay": ("commands act too late", STICKS),
     "controller_rate": ("the controller runs at another rate", FASTER),
+    "thrust_command_unit": (
+        "the thrust command is not in m/s^2 along body z",
+        "hover for two seconds",
+    ),
     "throttle_range": ("the throttle is not from 0 to 1", "hover for two seconds"),
     "thrust_scale": ("thrust is not what the vehicle file says", "hover for two seconds"),
     "voltage": ("the battery's voltage is impossible", "log the battery that drives the motors"),

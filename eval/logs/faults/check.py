@@ -11,7 +11,12 @@ import numpy as np
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS, manoeuvre
 from eval.logs.faults.clock import check_clock, check_time
-from eval.logs.faults.commands import check_controller_rate, check_rate_command, check_throttle
+from eval.logs.faults.commands import (
+    check_controller_rate,
+    check_rate_command,
+    check_throttle,
+    check_thrust_command,
+)
 from eval.logs.faults.finding import Finding, findings_of, line
 from eval.logs.faults.motors import check_lift, check_motors
 from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
@@ -51,6 +56,7 @@ DRIVE: tuple[Check, ...] = (
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle),
     lambda rows, _: check_throttle(rows),
+    lambda rows, against: check_thrust_command(rows, against.vehicle),
     lambda rows, against: check_rate_command(rows, against.vehicle),
     lambda rows, _: check_accelerometer_bias(rows),
     lambda rows, _: check_barometer(rows),

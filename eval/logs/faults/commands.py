@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.motors import over_force
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
@@ -33,6 +34,10 @@ RANGES = (
     ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
 """Range of a throttle, its span, its usual median in flight, and the step to 0 to 1."""
+THRUST_FITS, THRUST_EFFECT = 1.35, 2.0
+"""A ratio within the first factor of a unit's is that unit. One within the second factor of 1 may
+be a physical effect or a wrong mass."""
+STANDARD_GRAVITY = 9.80665
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -59,6 +64,39 @@ def check_throttle(rows: Rows) -> list[Finding]:
         found.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
                              option((name, steps))))  # fmt: skip
     return found
+
+
+def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return a wrong unit or sign of the commanded thrust, by the force that the path needs."""
+    subject, value = "thrust command", rows.get("cmd_thrust")
+    if value is None or not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
+        return []
+    thrust = value[:, 0]
+    known = thrust[np.isfinite(thrust)]
+    sign = -1.0 if len(known) and np.median(known) < 0.0 else 1.0
+    ratio = over_force(rows, sign * thrust)
+    if ratio <= 0.0:
+        return []
+    figures = f"it is {sign * ratio:.3g} times the force per mass that the path needs"
+    units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / STANDARD_GRAVITY}
+    if vehicle is not None:
+        units["in newtons"] = vehicle.mass
+    near = [name for name, unit in units.items() if abs(np.log(ratio / unit)) < np.log(THRUST_FITS)]
+    name = near[0] if near and (len(near) == 1 or near[0] == "in m/s^2") else ""
+    if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
+        text = f"{figures}: an effect, or a mass that is off"
+        return [Finding("note", subject, text, "thrust_scale", ratio, 0.9)]
+    if not name:
+        text = f"{figures}: another unit, a share of full thrust, or a mass that is far off"
+        fix = "the unit of cmd_thrust in the mapping"
+        return [Finding("doubt", subject, text, "thrust_command_unit", ratio, 0.95, fix)]
+    factor = sign / units[name]
+    if factor == 1.0:
+        return [Finding("ok", subject, figures)]
+    turned = ", and down is positive" if sign < 0.0 else ""
+    fix = option(("cmd_thrust", f"{factor:.10g}"))
+    text = f"{figures}: it is {name}{turned}, not in m/s^2 with up positive"
+    return [Finding("corrected", subject, text, "thrust_command_unit", 1.0 / factor, 0.97, fix)]
 
 
 def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:

@@ -188,7 +188,7 @@ def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
         text = "not checked against the weight; --vehicle makes it possible"
         return [Finding("note", "rotor speeds", text)]
     thrust = vehicle.rotors.thrust_coefficient * np.sum(rows["motor"] ** 2, axis=1)
-    lift = _lift(rows, thrust) / vehicle.mass
+    lift = over_force(rows, thrust) / vehicle.mass
     if not lift > 0.0:
         return []
     factor = float(np.sqrt(lift))
@@ -234,8 +234,11 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
     return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.9, fix)
 
 
-def _lift(rows: Rows, thrust: np.ndarray) -> float:
-    """Return thrust divided by the path's specific force along body z [kg], drag removed."""
+def over_force(rows: Rows, thrust: np.ndarray) -> float:
+    """Return thrust (T,) over the path's specific force along body z, drag removed; 0: unknown.
+
+    A thrust in newtons gives a mass [kg], one in m/s^2 a ratio [1].
+    """
     time_s = rows["time"]
     drag = np.zeros((len(time_s), 0))
     need = np.full(len(time_s), GRAVITY)
