@@ -94,6 +94,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         for one in sorted(components(effect), key=lambda one: not one.found):
             shown, between = one.shown()
             console.say(f"    {one.label}: {shown}" + (f", 95 %: {between}" if between else ""))
+    if result["warnings"]:
+        console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")
     for step in next_steps(result):
         console.say(f"next: {step}")
     for line in result["separate_with"]:

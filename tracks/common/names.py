@@ -112,7 +112,8 @@ class Registry(Mapping[str, T]):
             ValueError: for an unknown name, with the closest one.
         """
         if name not in self:
-            raise unknown_name(self._kind, str(name), self)
+            error = unknown_name(self._kind, str(name), self)
+            raise ValueError(f"{error} Another one comes with its package: install that first.")
         return self[name]
 
     def __getitem__(self, name: str) -> T:

@@ -50,8 +50,8 @@ def make_track(family: str, level: int, seed: int) -> Track:
         seed: 0 or more.
 
     Raises:
-        ValueError: where the family is unknown, the level out of range or the seed negative, or
-            where the track has more solids than the simulators' scenes hold.
+        ValueError: where the family is unknown or returns no layout, the level is out of range or
+            the seed negative, or where the track has more solids than the simulators' scenes hold.
     """
     check_family(family)
     if level not in LEVELS:
@@ -61,7 +61,13 @@ def make_track(family: str, level: int, seed: int) -> Track:
     level, seed = int(level), int(seed)
     rng = np.random.default_rng(np.random.SeedSequence([seed, level, *family.encode()]))
     d = (level + rng.random()) / 10
-    track = Track(family, level, seed, d, *FAMILIES[family](d, rng))
+    layout = FAMILIES[family](d, rng)
+    if not isinstance(layout, Layout):
+        raise ValueError(
+            f"track family {family!r} returns {type(layout).__name__}, must return a Layout; "
+            "tracks.families.layout.build makes one"
+        )
+    track = Track(family, level, seed, d, *layout)
     _check_size(track)
     return track
 

@@ -22,6 +22,10 @@ SIZES = ("force", "torque", "drift")
 distance after a second [m], as RMS over the flights."""
 
 
+LEAST_SHOWN = 0.001
+"""Smaller gaps are printed as less than this, in units of the noise, m/s^2 or rad/s^2."""
+
+
 def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
     """Return what diagnosis.json has of the names and of the gap."""
     main, control = found.main, found.main.control
@@ -149,13 +153,18 @@ def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:
     if found.named:
         source = main.source
         words.append(
-            f"The {source.subject} on held-out flights is {main.after.rms:.3g} instead of "
-            f"{main.before.rms:.3g} {source.unit}."
+            f"The {source.subject} on held-out flights is {_figure(main.after.rms)} instead of "
+            f"{_figure(main.before.rms)} {source.unit}."
         )
     words += [one.words or f"Named: {one.name}." for one in found.tested]
     if found.verdict.where:
         words.append(f"Unexplained: {found.verdict.where}.")
     return " ".join(words)
+
+
+def _figure(value: float) -> str:
+    """Return a gap for people; noise-free logs give some of 1e-10."""
+    return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
 def checks_json(checks: Checks, seed: int) -> dict[str, Any]:

@@ -83,7 +83,6 @@ def page(
         residual_section(found),
         evidence_section(diagnosis, found, checks),
         agreement_section(diagnosis),
-        *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
     ]
     return Report(
         title=f"Diagnosis: {found['verdict']}",
@@ -92,6 +91,7 @@ def page(
         sections=[
             *_measured(diagnosis),
             Section("What to do next", [Steps(next_steps(found))]),
+            *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
             *_findings(found.get("findings", ())),
             Section("The answer in numbers", _answer(found)),
             _written(found, toml, files),

@@ -83,8 +83,8 @@ class ViewSource(Source):
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
         axis = max(self.view.axes, key=lambda k: float(shares.left[k] * shares.variance[k]))
         where = (
-            f"{self.name} along body {'xyz'[axis]}: a black box closes another "
-            f"{100 * max(float(shares.left[axis]), 0.0):.0f} % of its variance"
+            f"{self.name} along body {'xyz'[axis]}, of which a regression without physics explains "
+            f"a further {100 * max(float(shares.left[axis]), 0.0):.0f} %"
         )
         closed, explainable = shares.whole(shares.closed), shares.whole(shares.explainable)
         swing = None if self.every is None else swing_left(self.every, found.estimate.theta)

@@ -286,3 +286,11 @@ def test_the_first_gates_of_a_track(count):
 def test_more_gates_than_there_are_or_none(count):
     with pytest.raises(ValueError, match=f"{count} gates of a track that has 8"):
         first_gates(make_track("random", 0, 0), count)
+
+
+def test_a_family_that_returns_no_layout_is_refused_by_name(monkeypatch):
+    monkeypatch.setitem(FAMILIES._entries, "hole", lambda d, rng: None)
+    with pytest.raises(ValueError, match="'hole' returns NoneType, must return a Layout"):
+        make_track("hole", 0, 0)
+    with pytest.raises(ValueError, match="Another one comes with its package"):
+        make_track("holes", 0, 0)
