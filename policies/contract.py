@@ -1,7 +1,7 @@
 """The contract of a policy: names, units, frames and scales of inputs and outputs, and a digest.
 
 The contract is one JSON object. It is made from a `PolicySpec` and stored in policy files,
-checkpoints and environments. The judge reads it and refuses anything that it cannot provide.
+checkpoints and environments. The judge reads it and refuses inputs that it cannot provide.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from tracks.input.ranges import shown
 from tracks.input.reading import InputError, parse_json
 
 KEY = "contract"
-"""Name of the metadata entry in ONNX, of the extra file in torch, and of the key in JSON files."""
+"""Name of the contract: as metadata entry in ONNX, extra file in torch, and key in JSON files."""
 VERSION = 1
-"""Of the contract's layout."""
+"""Version of the contract's layout."""
 BODY = "body: x forward, y left, z up"
 
 
@@ -64,12 +64,12 @@ class Image:
     pitch_deg: float
     fov_deg: tuple[float, float]
     rays: int
-    """Across and down a pixel."""
+    """Number of rays across and down a pixel."""
 
 
 @dataclass(frozen=True)
 class Action:
-    """The output; output * scale + offset is in `unit`."""
+    """The policy's output; output * scale + offset is in `unit`."""
 
     kind: str
     names: tuple[str, ...]
@@ -78,7 +78,7 @@ class Action:
     scale: tuple[float, ...]
     offset: tuple[float, ...]
     clip: float
-    """Outputs are clipped to plus and minus this before scaling; 0: no clipping."""
+    """Outputs are clipped to -clip to clip before scaling; 0: no clipping."""
     limit: str
     """Limits in SI units, as text."""
 
@@ -92,9 +92,9 @@ class Contract:
     image: Image
     action: Action
     memory: tuple[int, ...] | None = None
-    """Shape of a row's hidden state; None where unknown."""
+    """Shape of the hidden state of one policy; None if unknown."""
     speed: float = 1.0
-    """Default of the state's entry `speed`."""
+    """Default of the state entry `speed_input`."""
     version: int = VERSION
 
     @functools.cached_property
@@ -149,12 +149,12 @@ def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Cont
     output = Action(action.kind, names, units, frame, scale, offset, action.clip, limit)
     speed = spec.speed if spec.speed_input else 1.0
     made = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
-    # Through the reader, so that 30 and 30.0 have one digest.
+    # The reader converts numbers, so that 30 and 30.0 give the same digest.
     return Table("", "", dataclasses.asdict(made)).read(Contract)
 
 
 def spec_of(contract: Contract, where: str) -> PolicySpec:
-    """Return the spec with which the suite fulfils a contract.
+    """Return the spec that has this contract; `where` names its source in messages.
 
     Raises:
         PolicyError: naming the first part that the suite cannot provide, and the alternatives.
@@ -195,17 +195,17 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     provided = contract_of(spec, contract.memory)
     for name, theirs, ours in _differences(contract, provided):
         raise PolicyError(
-            f"{where}: {name} is {shown(theirs)}, the suite provides {shown(ours)}; convert inside "
-            "the policy's own module, and export it with the contract of the environment"
+            f"{where}: {name} is {shown(theirs)}, the suite provides {shown(ours)}; convert it "
+            "inside the policy's module, and export that with the contract of the environment"
         )
     return spec
 
 
 def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract:
-    """Return the contract that a JSON text or its object holds.
+    """Return the contract in a JSON text, or in the object of that text.
 
     Raises:
-        PolicyError: where it is no contract of this version, or its digest is another's.
+        PolicyError: if it is not a contract of this version, or its digest does not match.
     """
     try:
         data = parse_json(text, where) if isinstance(text, str | bytes) else dict(text)
@@ -217,18 +217,18 @@ def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract
         found = Table("", "", data).read(Contract)
     except (InputError, TypeError, ValueError) as error:
         raise PolicyError(
-            f"{where}: no contract ({error}); take the text of env.unwrapped.contract"
+            f"{where}: not a contract ({error}); use the text of env.unwrapped.contract"
         ) from None
     if digest not in (None, found.digest):
         raise PolicyError(
-            f"{where}: its digest is {shown(digest)}, the contract's is {found.digest[:12]}…; it "
-            "was changed by hand: make it from a PolicySpec or take the environment's"
+            f"{where}: its digest is {shown(digest)}, but its contents give {found.digest[:12]}…; "
+            "it was changed by hand: make it from a PolicySpec or use the environment's"
         )
     return found
 
 
 def refuse_other(contract: Contract, other: Contract, where: str, whose: str) -> None:
-    """Refuse a contract that contradicts `other`, which belongs to `whose`.
+    """Refuse a contract that differs from `other`; `whose` names the owner of `other`.
 
     Raises:
         PolicyError: naming the first part that differs.
@@ -237,7 +237,7 @@ def refuse_other(contract: Contract, other: Contract, where: str, whose: str) ->
         contract, other = (dataclasses.replace(one, memory=None) for one in (contract, other))
     for name, theirs, ours in _differences(contract, other):
         raise PolicyError(
-            f"{where}: its contract says {name} {shown(theirs)}, {whose} {shown(ours)}; export the "
+            f"{where}: its contract has {name} {shown(theirs)}, {whose} {shown(ours)}; export the "
             "policy again with the contract that it was trained under"
         )
 
@@ -245,13 +245,13 @@ def refuse_other(contract: Contract, other: Contract, where: str, whose: str) ->
 def summary(contract: Contract) -> str:
     """Return the contract in one line."""
     image, action = contract.image, contract.action
-    low_far = "" if image.dtype == "float32" else ", 0 to 255"
+    levels = "" if image.dtype == "float32" else ", 0 to 255"
     size = sum(entry.size for entry in contract.state)
     scaled = "unscaled" if set(action.scale) == {1.0} and set(action.offset) == {0.0} else "scaled"
     return (
         f"{contract.rate_hz:g} Hz; state of {size} numbers in SI units; image "
         f"{' x '.join(map(str, image.shape))}, camera {image.pitch_deg:g} deg up, "
-        f"{image.scale_m:g}/depth - {image.offset:g}{low_far}; action {action.kind} "
+        f"{image.scale_m:g}/depth - {image.offset:g}{levels}; action {action.kind} "
         f"[{', '.join(dict.fromkeys(action.unit))}], {scaled}, {action.frame}"
     )
 
@@ -265,7 +265,7 @@ def _short(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield (path, value, other value) of the differences of two trees of the same class."""
+    """Yield (path, value, other value) for each field in which two dataclasses differ."""
     for key in (entry.name for entry in dataclasses.fields(one)):
         a, b, path = getattr(one, key), getattr(other, key), f"{name}{key}"
         if dataclasses.is_dataclass(a):

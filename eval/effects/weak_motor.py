@@ -1,4 +1,4 @@
-"""One or several rotors that give less than the others: worn motor, chipped propeller."""
+"""One or several rotors with less thrust and torque: worn motor, chipped propeller."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from tracks.input.ranges import is_number, shown
 
 
 class WeakMotor(NamedTuple):
-    """Values of `weak_motor`; the file has `index` (from 1) and `scale`, numbers or lists."""
+    """Values of `weak_motor`; the vehicle file has keys `index` (from 1) and `scale` instead."""
 
     scale: Array
-    """(..., 4) true thrust and torque of each rotor over nominal [1]."""
+    """(..., 4) thrust and torque of each rotor, divided by nominal [1]."""
 
 
 def constants_of(values: WeakMotor, constants: Constants) -> Constants:
@@ -28,7 +28,7 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     """Read `index` and `scale` from a vehicle file's table.
 
     Raises:
-        ValueError: with the key, the value and what is allowed.
+        ValueError: naming the key, its value and what is allowed.
     """
     for key in table:
         if key not in ("index", "scale"):
@@ -39,11 +39,11 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     index, scale = table["index"], table["scale"]
     given = f"index = {shown(index)}, scale = {shown(scale)}"
     if isinstance(index, list) != isinstance(scale, list):
-        raise ValueError(f"{given}: both numbers or both lists")
+        raise ValueError(f"{given}: must be both numbers or both lists")
     if not isinstance(index, list):
         index, scale = [index], [scale]
     if len(index) != len(scale) or not index:
-        raise ValueError(f"{given}: one scale for each index")
+        raise ValueError(f"{given}: needed is one scale for each index")
     each = [1.0] * 4
     for number, factor in zip(index, scale, strict=True):
         if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
@@ -66,9 +66,9 @@ def write(values: WeakMotor) -> dict[str, Any]:
 
 WEAK_MOTOR = Effect(
     name="weak_motor",
-    summary="One or several rotors give less than the others",
-    equation="rotor index: thrust and torque x scale",
-    source="fault model of one actuator's effectiveness",
+    summary="One or several rotors give less thrust and torque than nominal",
+    equation="thrust and torque of rotor index = scale x nominal",
+    source="loss-of-effectiveness fault model of an actuator",
     values=WeakMotor,
     parameters=(
         Parameter(

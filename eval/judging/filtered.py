@@ -1,7 +1,7 @@
-"""The estimator in the loop of a judge: it follows each flight and gives the policy its state.
+"""The state estimator in the judge: one Kalman filter per slot gives the policy its state.
 
-After every physics step the IMU measures what the step did; frames of gate corners are taken at
-their rate and reach the filter one delay later. Everything random is drawn from the trial's seed.
+After each physics step an IMU measurement is simulated. Gate corners are detected at the frame rate
+and reach the filter after a delay. All random numbers come from the trial's seed.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from tracks.geometry.rotation import exp_rot, to_local, to_world
 from tracks.geometry.scene import Gates
 
 NEAR_M = 0.2
-"""Corners nearer than this are not found [m]."""
+"""Corners nearer than this are not detected [m]."""
 
 
 class Pending(NamedTuple):
-    """A frame of each slot on its way to the filter."""
+    """One frame per slot that has not reached the filter yet, with K corners."""
 
     image: np.ndarray
-    """(N, K, 2) tangents."""
+    """(N, K, 2) corners in the image, as tangents."""
     seen: np.ndarray
-    """(N, K) bool."""
+    """(N, K) bool, whether a corner was detected."""
     due: np.ndarray
     """(N,) physics step at which it arrives; -1 for none."""
 
 
 class Filtered:
-    """The filters of N slots, with the IMU and the detections of the trial in each."""
+    """The Kalman filters of N slots, with their simulated IMU and corner detections."""
 
     def __init__(
         self, wanted: SensorSet, slots: int, dt: float, camera: Camera, corners: int
@@ -59,19 +59,19 @@ class Filtered:
         """Make the filters.
 
         Args:
-            wanted: the sensors, with an estimator among them.
-            slots: how many trials fly at once.
+            wanted: the sensors; one of them is the estimator.
+            slots: number of trials that fly at once.
             dt: length of a physics step, at which the IMU measures [s].
-            camera: the policy's; the gates are seen by one that looks alike.
-            corners: room for as many of a track's gates.
+            camera: the policy's; corners are detected with the same pitch and field of view.
+            corners: largest number of gate corners of a track.
 
         Raises:
-            ValueError: where the state is late besides.
+            ValueError: if the sensors file also delays the state.
         """
         if wanted.ages.state_s:
             raise ValueError(
-                f"sensors {wanted.name!r}: delay.state is {wanted.ages.state_s:g} s next to an "
-                "estimator, which has a delay of its own: leave it out"
+                f"sensors {wanted.name!r}: delay.state is {wanted.ages.state_s:g} s, but the "
+                "estimator has its own delay: leave delay.state out"
             )
         settings: FilterSettings = wanted.estimator
         self._settings, self._dt, self._camera = settings, dt, camera
@@ -89,8 +89,8 @@ class Filtered:
         pitch = np.deg2rad(camera.pitch_deg)
         cos, sin = np.cos(pitch), np.sin(pitch)
         self._camera_b = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
-        nobody = np.random.default_rng(0)
-        self._frame_draws, self._imu_draws = [nobody] * slots, [nobody] * slots
+        unused = np.random.default_rng(0)
+        self._frame_draws, self._imu_draws = [unused] * slots, [unused] * slots
         self._corner_w = np.zeros((slots, corners, 3))
         self._real = np.zeros((slots, corners), bool)
         self._steps, self._frame = np.zeros(slots, int), np.zeros(slots, int)
@@ -105,10 +105,10 @@ class Filtered:
         self._memory: dict[str, Any] | None = None
         self._truth: View | None = None
         self.filters: Delayed | None = None
-        """Of all slots; contents of empty slots are undefined."""
+        """The filters of all slots; values in empty slots are undefined."""
 
     def start(self, slot: int, trial: TrialSpec, gates: Gates) -> None:
-        """Begin `trial`, on a track with these gates, in `slot`."""
+        """Start `trial` in `slot`, on a track with these gates."""
         own = generator_of(trial, SENSED, "gate_filter")
         self._error[slot] = own.standard_normal(SIZE) * self._settings.start_sigma
         self._lost[slot] = own.random() < self._settings.dropout
@@ -124,12 +124,12 @@ class Filtered:
             pending.due[slot] = -1
 
     def see(self, seen: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return `seen` with the filters' position, velocity and attitude.
+        """Return `seen` with position, velocity and attitude replaced by the estimates.
 
         Args:
-            seen: the output of the other sensors.
+            seen: the view after the other sensors.
             truth: (N, ...) the true view; its depth is not used.
-            fresh: (N,) bool, slots whose trial begins.
+            fresh: (N,) bool, slots whose trial starts now.
             flying: (N,) bool, slots in flight.
         """
         new = fresh & flying
@@ -146,14 +146,14 @@ class Filtered:
         kept = View(*truth[:3], *(np.zeros(len(new)),) * 4)
         self._truth = kept if self._truth is None else select(new, kept, self._truth)
         error, sigma = self._error, self._settings.start_sigma
-        # The truth is off the estimate by the error, in the estimate's axes.
-        guess = start(
+        # Truth = estimate + error; the attitude error is in the body axes of the estimate.
+        initial = start(
             kept.pos_w - error[:, :3],
             kept.vel_w - error[:, 3:6],
             np.matmul(kept.rot_w, exp_rot(-error[:, 6:9])),
             sigma,
         )
-        begun = wait(guess, self._late)
+        begun = wait(initial, self._late)
         filters = begun if self.filters is None else select(new, begun, self.filters)
         self.filters = packed(filters)
         memory = {
@@ -165,15 +165,15 @@ class Filtered:
         self._memory = memory if self._memory is None else select(new, memory, self._memory)
 
     def follow(self, view: View, flew: np.ndarray) -> None:
-        """Let the filters go on by a physics step.
+        """Advance the filters by one physics step.
 
         Args:
-            view: the truth after it.
-            flew: (N,) bool, the slots that flew it.
+            view: the true view after the step.
+            flew: (N,) bool, slots that made the step.
         """
         assert self._truth is not None and self.filters is not None and self._memory is not None
         before, dt = self._truth, np.full(len(flew), self._dt)
-        with np.errstate(invalid="ignore", over="ignore"):  # of slots that hold no flight
+        with np.errstate(invalid="ignore", over="ignore"):  # in empty slots
             sample = inertial(before, view, self._dt)
             for name, values in self._imu.items():
                 measure = SENSORS[name].measure
@@ -192,7 +192,7 @@ class Filtered:
         self._look(flew & (self._steps == np.rint(self._frame * self._period)))
 
     def _look(self, due: np.ndarray) -> None:
-        """Take a frame in the slots where one is `due`."""
+        """Detect the corners in the slots in which a frame is `due`."""
         rows, settings = np.flatnonzero(due), self._settings
         if not len(rows):
             return
@@ -220,7 +220,7 @@ class Filtered:
             self._arrive(due)
 
     def _arrive(self, flew: np.ndarray) -> None:
-        """Give the filters the frames that have come to them."""
+        """Update the filters with the frames whose delay has passed."""
         assert self.filters is not None
         for pending in self._pending:
             rows = np.flatnonzero(flew & (pending.due == self._steps) & pending.seen.any(1))
@@ -236,19 +236,19 @@ class Filtered:
 
 
 def _with_rows(whole: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Return a copy of `whole` with `new` in some rows: arrays of a state may be shared."""
+    """Return a copy of `whole` with `new` at `rows`; other states may share the original."""
     changed = whole.copy()
     changed[rows] = new
     return changed
 
 
 def single_steps(steps: np.ndarray) -> list[np.ndarray]:
-    """Return each slot's steps (N,) one by one."""
+    """Split the numbers of steps (N,) into single steps: 1 in slots with steps left, else 0."""
     return [(steps > done).astype(int) for done in range(int(steps.max(initial=0)))]
 
 
 def corners_of(gates: Gates) -> np.ndarray:
-    """Return the corners (K, 3) of all openings in the world, each once [m]."""
+    """Return the corners (K, 3) of all gate openings in the world, without repeats [m]."""
     opening = np.asarray(gates.opening_g)
     corner_g = np.concatenate([np.zeros((*opening.shape[:2], 1)), opening], axis=-1)
     corner_w = gates.center_w[:, None] + to_world(gates.rot_w[:, None], corner_g)
@@ -258,7 +258,7 @@ def corners_of(gates: Gates) -> np.ndarray:
 
 
 def inertial(before: View, after: View, dt: float) -> Inertial:
-    """Return an ideal IMU's measurement of a step: means in body axes at its middle."""
+    """Return an ideal IMU's means over a step, in the body axes at its middle."""
     sine_b = turned_by(after.rot_w, before.rot_w)
     size = np.sqrt((sine_b**2).sum(-1))[..., None]
     turn_b = sine_b * np.where(size > 1e-9, np.arcsin(np.minimum(size, 1.0)) / (size + 1e-300), 1.0)

@@ -1,8 +1,8 @@
-"""Checks of a policy's outputs for usual mistakes of unit, scale and frame.
+"""Checks of a policy's outputs for common errors of unit, scale and frame.
 
-A policy with outputs in a wrong unit flies badly, like an untrained one. The size of its outputs
-and their mean vertical component identify the usual mistakes. So do a few synthetic observations of
-level flight towards a gate to one side, towards which a correct policy accelerates.
+A policy with a wrong output unit flies as badly as an untrained one. Two checks find common errors:
+the size and mean vertical component of its outputs in flight, and its outputs for a few synthetic
+observations with a gate to one side, towards which a correct policy accelerates.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ LIMITED_MOST = 0.05
 UNIT = 1.0 + 1e-6
 """Largest output of a policy whose action space is -1 to 1."""
 UP_MOST = 6.0
-"""A mean vertical acceleration above this contains gravity [m/s^2], since the mean over a flight is
-small otherwise."""
+"""A mean vertical acceleration above this contains gravity [m/s^2]: without gravity the mean over a
+flight is small."""
 
 
 LIFT = 3.0
 """A vertical acceleration above this, even towards a gate below, contains gravity [m/s^2]."""
 CLEAR = 0.5
-"""Least difference of an output between two sides that is used [m/s^2]."""
+"""Smallest difference of an output between gates on opposite sides that counts [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
 TIMES, ALIKE = 1.5, 1e-3
-"""Factor on a test image, and the largest relative change of the output that counts as none."""
+"""Factor on a test image, and the largest relative change of output that counts as no change."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
-"""Distances of the test gate [m], speed towards it [m/s], and number of steps."""
+"""Distances of the test gate to the side and ahead [m], forward speed [m/s], number of steps."""
 
 
 class Outputs:
-    """Statistics of the outputs in N slots, until each trial ends."""
+    """Statistics of the outputs of the current trial in each of N slots."""
 
     def __init__(self, slots: int, action: ActionSpec) -> None:
         self._is_acceleration = action.kind == "acceleration"
@@ -46,7 +46,7 @@ class Outputs:
         self._largest, self._up = np.zeros(slots), np.zeros(slots)
 
     def start(self, slot: int) -> None:
-        """Begin a trial in `slot`."""
+        """Reset the statistics of `slot` for a new trial."""
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
 
     def add(self, guarded: Guarded, state: np.ndarray) -> None:
@@ -68,7 +68,7 @@ class Outputs:
 
 
 def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return the statistics of one policy's outputs: shares, and warnings with a fix."""
+    """Return shares of limited and invalid actions of one policy, and warnings with a fix."""
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}
@@ -95,11 +95,11 @@ def _warnings(
         seen = f"{limited:.0%} of its actions were limited"
         found.append(Note("action_limited", seen, UNIT_FIX + _twice(action)))
     if bad:
-        seen = f"{bad:.1%} of its actions were not finite and the last good one was flown"
+        seen = f"{bad:.1%} of its actions were not finite; the last valid one was used"
         found.append(Note("action_not_finite", seen, "check its weights and its normalisation"))
     if plain and 0.0 < max(largest) <= UNIT:
-        seen = "its outputs are always within -1 to 1 m/s^2 and look unscaled"
-        fix = "export it with the contract of its environment, or give action.scale"
+        seen = "all its outputs are within -1 to 1 m/s^2 and are probably unscaled"
+        fix = "export it with the contract of its environment, or set action.scale"
         found.append(Note("action_scale", seen, fix))
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
@@ -111,13 +111,13 @@ def _warnings(
 
 @runtime_checkable
 class FromFile(Protocol):
-    """A policy from a file."""
+    """A policy that was loaded from a file."""
 
     notes: tuple[Note, ...]
 
 
 def notes_of(policy: Policy) -> tuple[Note, ...]:
-    """Return the assumptions about a policy's file, and the probable faults of its outputs."""
+    """Return the assumptions made about a policy's file, and probable faults of its outputs."""
     return (*policy.notes, *probable_faults(policy)) if isinstance(policy, FromFile) else ()
 
 
@@ -129,42 +129,42 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
     action, output = probed(policy)
     left, right, above, below, _ = action
     if not np.isfinite(action).all():
-        seen = f"{name}: answers NaN or infinity in level flight towards a gate"
+        seen = f"{name}: outputs NaN or infinity in level flight towards a gate"
         return (Note("action_not_finite", seen, "check its weights and its normalisation"),)
     largest = float(np.linalg.norm(action, axis=-1).max())
     if largest > ActionLimits().size:
-        seen = f"{name}: wants up to {largest:.0f} m/s^2 in level flight, more than the limit"
+        seen = f"{name}: commands up to {largest:.0f} m/s^2 in level flight, more than the limit"
         return (Note("action_limited", seen, UNIT_FIX + _twice(policy.spec.action)),)
     found = []
     aside, up = left[1] - right[1], above[2] - below[2]
     if aside < -CLEAR and up < -CLEAR:
         seen = (
-            f"{name}: accelerates away from gates to its left and above, as if its action were FRD"
+            f"{name}: accelerates away from gates to the left and above, as if its action were FRD"
         )
-        found.append(Note("action_frame", seen, "the suite's is FLU: negate y and z"))
+        found.append(Note("action_frame", seen, "the suite uses FLU: negate y and z"))
     elif min(aside, up) < -CLEAR:
         axis, side = ("y", "left") if aside < up else ("z", "up")
-        seen = f"{name}: accelerates away from a gate aside along {axis}, as if {axis} were negated"
+        seen = f"{name}: accelerates away from gates offset in {axis}, as if {axis} were negated"
         found.append(Note("action_frame", seen, f"the suite's {axis} points {side}: negate it"))
     if action[:, 2].min() > LIFT:
         seen = (
-            f"{name}: wants {action[:, 2].min():.1f} m/s^2 upwards and more in level flight, as if "
+            f"{name}: commands at least {action[:, 2].min():.1f} m/s^2 up in level flight, as if "
         )
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
         found.append(Note("action_gravity", seen + "its action contained gravity", fix))
     if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
-        seen = f"{name}: answers within -1 to 1 m/s^2 to gates far aside, as if unscaled"
-        fix = "export it with the contract of its environment, or give action.scale"
+        seen = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
+        fix = "export it with the contract of its environment, or set action.scale"
         found.append(Note("action_scale", seen, fix))
     if _divides_images(policy):
-        seen = f"{name}: answers alike to an image and to {TIMES:g} times that image"
-        fix = "without its scale an image says nothing of distance: do not divide by its maximum"
+        seen = f"{name}: has the same output for an image and for {TIMES:g} times that image"
+        fix = "an image without scale contains no distances: do not divide it by its maximum"
         found.append(Note("image_scale", seen, fix))
     return tuple(found)
 
 
 def _divides_images(policy: Policy) -> bool:
-    """Return whether a policy ignores the scale of an image, but uses its contents."""
+    """Return whether a policy ignores the scale of an image but uses its contents."""
     spec = policy.spec
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
@@ -177,7 +177,7 @@ def _divides_images(policy: Policy) -> bool:
 def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     """Return the last actions (5, 3) [m/s^2] and all outputs (STEPS, 5, 3) that led to them.
 
-    The rows are gates to the left, to the right, above, below and straight ahead.
+    The five test gates are to the left, to the right, above, below and straight ahead.
     """
     spec = policy.spec
     aside = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
@@ -187,7 +187,7 @@ def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
-    """Return states of level flight towards gates that are `aside` (N, 2): to the left, up [m]."""
+    """Return states of level flight with a gate ahead, offset by `aside` (N, 2): left, up [m]."""
     state = np.zeros((len(aside), spec.state_size), np.float32)
     state[:, 0], state[:, 5] = SPEED, 1.0
     state[:, 6], state[:, 7:9] = AHEAD_M, aside
@@ -204,7 +204,7 @@ def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
 
 
 def _answers(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last actions (N, 3) [m/s^2] and all outputs (STEPS, N, 3), as of `probed`."""
+    """Return the last actions (N, 3) [m/s^2] and all outputs (STEPS, N, 3), see `probed`."""
     spec = policy.spec
     hidden, outputs, action = policy.start(len(state)), [], state[:, 9:12]
     for step in range(STEPS):

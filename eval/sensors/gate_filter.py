@@ -1,8 +1,8 @@
 """A state estimator in the loop: a Kalman filter on the IMU and the corners of known gates.
 
-The policy is given what the filter makes of them (`eval/sensors/filter/`), and no true state. The
-gates stand where the map says; corners are seen where they are in the field of view and in range,
-through whatever stands between.
+The policy gets the state that the filter (`eval/sensors/filter/`) estimates, never the true state.
+The filter's map of the gates is exact. A corner is detected if it is in the field of view and in
+range; obstacles do not hide it.
 """
 
 from __future__ import annotations
@@ -20,26 +20,35 @@ class GateFilter(NamedTuple):
     """Values of `gate_filter`."""
 
     pixel: Array
+    """Noise of a corner in the image, standard deviation [pixels]."""
     width: Array
+    """Pixels across the camera's field of view."""
     rate: Array
+    """Frames per second [Hz]."""
     dropout: Array
+    """Share of the frames without a detection [1]."""
     dropout_length: Array
+    """Mean duration of a dropout [s]."""
     delay: Array
+    """Time from a frame to its use in the filter [s]."""
     range: Array
+    """Corners further away are not detected [m]."""
     position: Array
+    """Standard deviations of the error at the start: this and the next four."""
     velocity: Array
     attitude: Array
     acc_bias: Array
     gyro_bias: Array
     acc_noise: Array
+    """IMU errors that the filter assumes: noise densities, then random walks of the biases."""
     gyro_noise: Array
     acc_walk: Array
     gyro_walk: Array
 
 
 def estimate(values: GateFilter) -> FilterSettings:
-    """Return the settings of the filter and of the detections."""
-    start = (values.position, values.velocity, values.attitude, values.acc_bias, values.gyro_bias)
+    """Return the settings of the filter and of the corner detections."""
+    sigmas = (values.position, values.velocity, values.attitude, values.acc_bias, values.gyro_bias)
     return FilterSettings(
         corner_sigma=float(values.pixel),
         width=float(values.width),
@@ -48,7 +57,7 @@ def estimate(values: GateFilter) -> FilterSettings:
         dropout_s=float(values.dropout_length),
         delay_s=float(values.delay),
         range_m=float(values.range),
-        start_sigma=np.repeat(np.array(start, float), 3),
+        start_sigma=np.repeat(np.array(sigmas, float), 3),
         imu=ImuNoise(values.acc_noise, values.gyro_noise, values.acc_walk, values.gyro_walk),
     )
 
@@ -56,12 +65,12 @@ def estimate(values: GateFilter) -> FilterSettings:
 SENSOR = Sensor(
     name="gate_filter",
     stage="state",
-    summary="The state is what a Kalman filter makes of the IMU and of gate corners seen late",
-    equation="error-state Kalman filter (eval/sensors/filter/kalman.py); corners (u, v) + s n, of "
-    "frames `delay` ago, none in `dropout` of them",
-    source="Solà 2017 (filter); corners to a pixel: Foehn et al. 2022 (AlphaPilot, gate corners "
-    "by a network); noise densities and walks: ten times those of a MEMS data sheet (ICM-20689), "
-    "as vibration asks for",
+    summary="A Kalman filter estimates the state from the IMU and from delayed gate corners",
+    equation="error-state Kalman filter (eval/sensors/filter/kalman.py); corners (u, v) + s n "
+    "arrive `delay` late; a share `dropout` of the frames has none",
+    source="Solà 2017 (filter); noise of a pixel: Foehn et al. 2022 (AlphaPilot, gate corners "
+    "by a network); noise densities and walks: ten times a MEMS data sheet (ICM-20689), "
+    "to allow for vibration",
     values=GateFilter,
     parameters=(
         Parameter("pixel", "1", 0.05, 0.05, 50.0, (0.5, 3.0), required=False),

@@ -1,4 +1,4 @@
-"""The simulator `mujoco`: many trials at once in MuJoCo's C engine (`mujoco.batch`)."""
+"""The simulator `mujoco`, the default: MuJoCo's C engine steps many trials at once."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tracks.geometry.rotation import to_world
 
 
 class MujocoWorld(SceneSlots):
-    """MuJoCo's C engine, the default.
+    """The simulator: the quadrotor model gives force and torque, MuJoCo integrates the motion.
 
-    It moves the bodies under the plant's force and torque; a step starts from the contacts.
+    Each step also computes the contacts at the new state, for the judge and for the next step.
     """
 
     name = "mujoco"
@@ -31,9 +31,9 @@ class MujocoWorld(SceneSlots):
         return autopilot_step(self._autopilot, self._loops, motion, action_b, gate_w, step, noise)
 
     def _move(self, flying: np.ndarray, motion: Motion, push: Wrench) -> np.ndarray:
-        bad = ~is_wrench(self._rules, push)
-        go = flying & ~bad
+        invalid = ~is_wrench(self._rules, push)
+        moving = flying & ~invalid
         self._applied[:, :3] = to_world(motion.rot_w, push.force_b)
         self._applied[:, 3:] = push.torque_b
-        self._batch.step(np.flatnonzero(go).astype(np.int32), stage=TO_CONTACTS)
-        return bad
+        self._batch.step(np.flatnonzero(moving).astype(np.int32), stage=TO_CONTACTS)
+        return invalid

@@ -1,4 +1,4 @@
-"""Our network as a torch module, for export and for people who deploy with torch."""
+"""The policy network as a torch module, for export and for deployment with torch."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ LINEAR = ("state", "action")
 
 
 class TorchTwin(nn.Module):
-    """The CNN-GRU of `policies.networks.network` with torch's layers and layouts."""
+    """The CNN-GRU of `policies.networks.network`, built from torch's layers."""
 
     def __init__(self, spec: PolicySpec) -> None:
-        """Make the layers; `load_params` fills them."""
+        """Create the layers; `torch_twin` loads their parameters."""
         super().__init__()
         first, second, third = spec.channels
         self.pool = nn.MaxPool2d(2)
@@ -36,7 +36,7 @@ class TorchTwin(nn.Module):
     def forward(
         self, state: torch.Tensor, image: torch.Tensor, hidden: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (action_b (N, 3) [m/s^2], hidden' (N, hidden)); see `network.step`."""
+        """Return the output (N, action size) and the next hidden state; see `network.step`."""
         x = self.pool(image.unsqueeze(1))
         x = self.leak(self.conv1(x))
         x = self.leak(self.conv2(x))
@@ -47,7 +47,7 @@ class TorchTwin(nn.Module):
 
 
 def torch_twin(params: Mapping[str, np.ndarray], spec: PolicySpec) -> TorchTwin:
-    """Return the module with the network's parameters in it, in evaluation mode."""
+    """Return the module with `params` loaded, in evaluation mode and without gradients."""
     arrays = {f"{name}.weight": kernel_oihw(params[f"{name}.weight"]) for name in CONVOLUTIONS}
     arrays |= {f"{name}.weight": rows_are_outputs(params[f"{name}.weight"]) for name in LINEAR}
     arrays |= {

@@ -18,7 +18,7 @@ class Config:
     """List the physical effects that a vehicle file may hold, or describe one."""
 
     name: tyro.conf.Positional[str] = ""
-    """Which effect; without it, all are listed."""
+    """Name of an effect; without it, all are listed."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -47,10 +47,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         count = f" x {parameter.size}" if parameter.size else ""
         low, high = parameter.typical
         neutral = at(parameter.neutral, vehicle)
-        off = f" off {neutral:g}" if neutral and not parameter.whole else ""
+        off = f" away from {neutral:g}" if neutral and not parameter.whole else ""
         by_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
-        whose = f" (vehicle {vehicle.name})" if by_vehicle else ""
-        given = "" if parameter.required else "; may be left out"
+        whose = f" (for vehicle {vehicle.name})" if by_vehicle else ""
+        given = "" if parameter.required else "; optional"
         least, most = at(parameter.low, vehicle), at(parameter.high, vehicle)
         console.say(
             f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{off}; "

@@ -1,8 +1,8 @@
-"""Recorded actions flown again in the trainer's quadrotor, corrected or not.
+"""Replay of recorded actions in the trainer's quadrotor, with or without corrections.
 
-A window starts from everything that was measured, rotor speeds and the commands on their way
-among it, and goes along the rows of the log, which are the steps of the attitude loop. The
-commanded yaw rate follows the record: where the nose points is not the action's to say.
+A window starts from the measured state, with rotor speeds and commands that are still delayed. Each
+row of the log is one step of the attitude loop. The commanded yaw rate is the recorded one, because
+an action does not set the heading.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from suite.train.dynamics.quadrotor import (
 from tracks.geometry.rotation import to_local
 
 LEAST_PHYSICS_HZ = 250.0
-"""Records are flown again at about this rate even where training steps are longer [Hz]."""
+"""Lowest physics rate of a replay, about, even if training steps are longer [Hz]."""
 
 
 class QuadrotorWindows(NamedTuple):
@@ -52,29 +52,29 @@ class QuadrotorWindows(NamedTuple):
     rate_b: np.ndarray
     """(N, 3) measured at the start [rad/s]."""
     rotor_speed: np.ndarray
-    """(N, 4) measured at the start [rad/s]; NaN where it was not."""
+    """(N, 4) measured at the start [rad/s]; NaN if not measured."""
     past: np.ndarray
-    """(N, L, 4) thrust and rates commanded in the physics steps before, newest first."""
+    """(N, L, 4) thrust and rates commanded in the L physics steps before it, newest first."""
     start_s: np.ndarray
     """(N,) since the flight's start [s]."""
     action_b: np.ndarray
-    """(N, T, 3) the action in use [m/s^2]."""
+    """(N, T, 3) the action that holds in each row [m/s^2]."""
     decides: np.ndarray
     """(N, T) 1 where a new action begins."""
     yaw_rate: np.ndarray
     """(N, T) commanded about body z [rad/s]."""
     burn_in: BurnIn
-    """What the network saw before each window."""
+    """Inputs of the network before each window."""
 
 
 def row_substeps(config: QuadrotorConfig, row_s: float) -> Substeps:
-    """Return how a row's period is cut: one step of the attitude loop."""
+    """Return the physics steps of one row, which is one step of the attitude loop."""
     physics = whole_steps(row_s * max(config.physics_hz, LEAST_PHYSICS_HZ))
     return Substeps(1, physics, row_s / physics)
 
 
 def row_period(logs: Sequence[FlightLog]) -> float:
-    """Return the time between rows, the median over all of `logs` [s]."""
+    """Return the median time between rows of all `logs` [s]."""
     return float(np.median(np.concatenate([np.diff(log.time_s) for log in logs])))
 
 
@@ -85,13 +85,13 @@ def cut_quadrotor_windows(
     stride_s: float,
     row_s: float | None = None,
 ) -> tuple[QuadrotorWindows, Substeps]:
-    """Return windows of `duration_s`, about one every `stride_s` of every flight, and their grid.
+    """Return windows of `duration_s`, about one per `stride_s` of each flight, and `row_substeps`.
 
-    A window with a missing value or a row of another length than `row_s` is left out; `row_s` [s]
-    is these logs' own where it is not given.
+    A window is left out if a value is missing or a row is not `row_s` long. `row_s` [s] is by
+    default `row_period` of these logs.
 
     Raises:
-        ValueError: where a log has no actions, or no flight is as long as a window.
+        ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     for log in logs:
         if log.action_b is None or log.policy_step is None or log.rate_cmd_b is None:
@@ -165,10 +165,10 @@ def replay_quadrotor(
     """Return pos_w, vel_w (N, T, 3) after every row, and the corrections (N, T, 3).
 
     Args:
-        config: the vehicle, without anything that varies.
-        cut: the grid of a row.
-        windows: the record.
-        delta: parameters of the Delta Action network; None leaves the actions as they are.
+        config: the vehicle; its randomisation is not used.
+        cut: physics steps of one row.
+        windows: the recorded flights.
+        delta: parameters of the Delta Action network; None for no correction.
     """
     plant = plant_of(config, {}, cut.dt, varies=False)
     count = windows.pos_w.shape[0]

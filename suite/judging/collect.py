@@ -1,4 +1,4 @@
-"""Record flights as logs: one Parquet file each, and a list of them."""
+"""Record flights as logs: one Parquet file per flight, and a list of them."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
 JOURNAL = "journal.jsonl"
-"""Name of the file there that each flight is noted in as it ends, until the list is whole."""
+"""Name of the file there that gets a line when a flight ends; deleted when the list is written."""
 
 
 def collect(
     collection: Collection, out: Path, console: Console, workers: Workers | None = None
 ) -> dict[str, Any]:
-    """Fly and write a log a flight into `out`; the same call after an interruption goes on.
+    """Fly, and write one log per flight into `out`; the same call resumes an interrupted one.
 
     Returns:
-        What flights.json holds: the stamp, what was collected, and the flights as rows of results
-        with their `file` (null for a flight that is no log: under one second, or refused with a
-        warning because its numbers break a rule of flight logs).
+        The contents of flights.json: the stamp, the settings, and the flights as rows of results
+        with their `file` (null for a flight without a log: it is shorter than one second, or its
+        values break a rule of flight logs, with a warning).
 
     Raises:
-        ValueError: for anything in `collection` that cannot be used, or where `out` holds the
-            flights of another collection.
+        ValueError: if a setting of `collection` cannot be used, or `out` holds the flights of
+            another collection.
     """
     from eval.judging.judge import check_records
     from eval.judging.results import Journal
@@ -72,9 +72,9 @@ def collect(
         "tracks": course.tracks,
         "git_commit": git_commit(),
     }
-    same = by_content(about)
-    rows = _rows_there(out, same)
-    with Journal(out / JOURNAL, same) as journal:
+    identity = by_content(about)
+    rows = _rows_there(out, identity)
+    with Journal(out / JOURNAL, identity) as journal:
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
         _fly_missing(collection, course, policy, out, rows, journal, console, workers)
         found = _write_list(out, about, course, rows)
@@ -105,7 +105,7 @@ def _fly_missing(
     console: Console,
     workers: Workers | None,
 ) -> None:
-    """Fly what `rows` lacks; write each log and note the flight as it ends."""
+    """Fly the trials that `rows` lacks; write the log and the journal when a flight ends."""
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.worlds.trial import Rules
 
@@ -151,7 +151,7 @@ def _write_list(
 
 
 def _row(out: Path, result: TrialResult) -> Row | None:
-    """Return the row of a flight that was noted; None where its log is not there."""
+    """Return the row of a flight in the journal; None if its log is missing."""
     name = None
     if result.time_s >= DURATION_MIN:
         name = log_name(result.track, result.difficulty, result.seed)
@@ -161,7 +161,7 @@ def _row(out: Path, result: TrialResult) -> Row | None:
 
 
 def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console) -> str | None:
-    """Return the name of the log that was written, None with a warning where it is refused."""
+    """Write a log and return its name; None, with a warning, if the log is refused."""
     from eval.logs.columns import FlightLogError
     from eval.logs.flight_log import log_from_flight, write_flight
 
@@ -175,7 +175,7 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
 
 
 def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
-    """Return the rows of an earlier call of the same collection, as `by_content` identifies it."""
+    """Return the rows of an earlier call; refuse those of another collection (`by_content`)."""
     from eval.worlds.trial import TrialSpec
 
     path = out / LIST
@@ -191,7 +191,7 @@ def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
         raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
     if not same:
         raise ValueError(
-            f"{path}: of another collection, or of another version of the code; give another --out "
+            f"{path}: is of another collection or another version of the code; give another --out "
             "or move it away"
         )
     return {

@@ -1,7 +1,7 @@
-"""Evaluations side by side: paired where trials are the same, refused where they differ.
+"""Comparison of evaluations on the same trials; evaluations on different trials are refused.
 
-`suite eval` with several policies flies them on the same trials itself; this is for runs that were
-made apart, and for several training seeds of one method.
+`suite eval` with several policies flies all of them on the same trials. This module compares
+evaluations that were run separately, and several training seeds of one method.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.input.reading import read_json
 
 CONDITIONS = ("world", "time_limit_s", "deadline_s")
-"""Settings of an evaluation that set outcomes, besides its trials and the files it read."""
+"""Settings that affect the outcome of a trial, besides the trial itself and the input files."""
 
 
 class Run(NamedTuple):
     """One policy of one evaluation."""
 
     name: str
-    """What to call it: the folder, and the policy where the folder holds several."""
+    """Label in messages: the folder, and the policy if the folder holds several."""
     rows: dict[TrialSpec, TrialResult]
-    """By trial."""
+    """The result of each trial."""
     conditions: dict[str, Any]
-    """What must be the same for a comparison."""
+    """Settings and input files that must be the same for a comparison."""
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Return the policies of an evaluation's folder.
+    """Return one run for each policy in an evaluation's folder.
 
     Raises:
-        ValueError: where it holds none, or not what an evaluation writes.
+        ValueError: if the folder has no evaluation, or files that `suite eval` did not write.
     """
     path = folder / "trials.parquet"
     if not path.is_file():
-        raise ValueError(f"{folder}: holds no trials.parquet; give the --out of a suite eval")
+        raise ValueError(f"{folder}: holds no trials.parquet; give the --out folder of suite eval")
     results, summary = read_trials(path), read_json(folder / "summary.json", judged=dict)
     if len({(row.trial, row.policy) for row in results}) < len(results):
         raise ValueError(f"{path}: holds a trial twice; run suite eval again")
@@ -58,7 +58,7 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def refuse_other_conditions(first: Run, other: Run) -> None:
-    """Refuse runs that were judged otherwise or on other trials.
+    """Refuse runs that were judged under other conditions or on other trials.
 
     Raises:
         ValueError: naming what differs and what to do.
@@ -76,17 +76,17 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
     if only:
         trial = min(only)
         raise ValueError(
-            f"{first.name} and {other.name}: {len(only)} trials were flown by one alone, such as "
-            f"{trial.track}, level {trial.difficulty}, seed {trial.seed}; give both suite eval the "
-            "same --track, --difficulty, --trials and --seed"
+            f"{first.name} and {other.name}: {len(only)} trials are in only one of them, such as "
+            f"{trial.track}, level {trial.difficulty}, seed {trial.seed}; run suite eval for both "
+            "with the same --track, --difficulty, --trials and --seed"
         )
 
 
 def paired(first: Run, other: Run) -> dict[str, Any]:
-    """Return how two runs on the same trials differ, and a sentence that says so.
+    """Return the difference of two runs on the same trials, as numbers and as a sentence.
 
     Raises:
-        ValueError: where conditions or trials differ.
+        ValueError: if conditions or trials differ.
     """
     refuse_other_conditions(first, other)
     trials = list(first.rows)
@@ -114,14 +114,14 @@ def paired_sentence(first: str, second: str, one: np.ndarray, two: np.ndarray) -
 
 
 def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
-    """Return mean, spread and interval over training seeds and trials, of one method or of two.
+    """Return mean, spread and interval of the success rate over training seeds and trials.
 
     Args:
-        runs: a method's training seeds, all judged on the same trials.
-        others: another method's, to be subtracted.
+        runs: the training seeds of a method, all judged on the same trials.
+        others: those of a second method; its rate is subtracted.
 
     Raises:
-        ValueError: where conditions or trials differ, or there is one seed alone.
+        ValueError: if conditions or trials differ, or a method has only one seed.
     """
     for run in (*runs[1:], *others):
         refuse_other_conditions(runs[0], run)
@@ -132,11 +132,11 @@ def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
         if group
     ]
     found, how = over_seeds(groups[0], groups[1] if others else None), "hierarchical bootstrap"
-    if found.low == found.high:  # Where nothing differs, draws do not either.
+    if found.low == found.high:  # Equal results give a bootstrap interval of no width.
         one, *two = (group[0] > 0.5 for group in groups)
-        found, how = wilson(int(one.sum()), len(one)), "over trials alone: Wilson"
+        found, how = wilson(int(one.sum()), len(one)), "over trials only: Wilson"
         if two:
-            found, how = Interval(*paired_success(one, two[0])[:3]), "over trials alone: Newcombe"
+            found, how = Interval(*paired_success(one, two[0])[:3]), "over trials only: Newcombe"
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
         "trials": len(trials),

@@ -85,7 +85,7 @@ def test_names_that_are_not_utf8_are_refused_before_work(tmp_path, monkeypatch, 
         assert cli.main(line) == 2
         said = capsys.readouterr().err
         assert r"'a\udcff' is not UTF-8" in said and len(said.splitlines()) == 1
-    with pytest.raises(InputError, match="half a character"):
+    with pytest.raises(InputError, match="surrogate pair"):
         parse_json('{"name": "\\uDCFF"}', "policy.json")
     assert parse_json('{"name": "\\ud83d\\ude00"}', "it") == {"name": "\U0001f600"}
 

@@ -1,10 +1,10 @@
-"""Planar depth images of many cameras at once (numpy): equal to MuJoCo's rays, but faster.
+"""Planar depth images of many cameras at once (numpy): equal to MuJoCo's ray casting, but faster.
 
-The image is divided into tiles of a few rays, and rays are tested only against the few solids that
-reach into their tile. The planes between tiles pass through the camera, so a solid's support along
-their normals determines on which sides it lies. Depths agree with MuJoCo's rays to rounding
-(1e-9 m), except for rays that graze an edge. All operations are elementwise in double precision, so
-an image depends only on its own camera and scene.
+The image is divided into tiles of a few rays, and a ray is tested only against the solids visible
+in its tile. The planes between tiles pass through the camera, so the extent of a solid along their
+normals gives its tiles. Depths agree with MuJoCo's to rounding (1e-9 m), except for rays that graze
+an edge. All operations are elementwise in double precision, so an image depends only on its own
+camera and scene.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Boxes, Rods, Scene
 
 TILE = 6
-"""Least rays across and down a tile; a pixel with more rays is one tile."""
+"""Most rays across and down a tile; a pixel with more rays is a tile of its own."""
 PAIRS_AT_ONCE = 1024
-"""Pairs of solid and tile that are processed together, so that they fit the processor's cache."""
+"""Most pairs of solid and tile that are processed together, so that they fit the CPU cache."""
 RAYS_AT_ONCE = 1 << 20
-"""Rays of the images that are processed together, to bound the memory."""
+"""Most rays of the images that are processed together, to limit memory."""
 _TINY, _FAR = 1e-200, 1e290
 """Offset that avoids division by zero, and a depth larger than any other."""
 
@@ -38,35 +38,35 @@ class Tiles(NamedTuple):
     axes_b: np.ndarray
     """(3, 3) columns: the optical axis, left and up, in body axes."""
     left: np.ndarray
-    """(T, columns of tiles) of the T rays across a tile."""
+    """(T, columns of tiles) left components of the T rays across each tile."""
     up: np.ndarray
-    """(T, rows of tiles) of the T rays down a tile."""
+    """(T, rows of tiles) up components of the T rays down each tile."""
     left_edges: np.ndarray
-    """(columns of tiles + 1,) between the tiles."""
+    """(columns of tiles + 1,) left components of the borders between tiles."""
     up_edges: np.ndarray
-    """(rows of tiles + 1,)."""
+    """(rows of tiles + 1,) up components of the borders between tiles."""
 
 
 class _Shape(NamedTuple):
-    """Convex solids of one kind in the axes of their camera, one in each column."""
+    """V convex solids of one kind, each in the axes of its camera."""
 
     center: np.ndarray
-    """(3, V)."""
+    """(3, V) centres."""
     axes: tuple[np.ndarray, ...]
-    """Of the sides or the rod, (3, V) each."""
+    """(3, V) each: the directions of a box's sides or of a rod; none for spheres."""
     halves: tuple[np.ndarray, ...]
-    """(V,) how far the solid reaches along each."""
+    """(V,) each: the half lengths along `axes`."""
     radius: np.ndarray
-    """(V,) around that; 0 of boxes."""
+    """(V,) of the sphere or the rod; 0 for boxes."""
 
     def take(self, index: np.ndarray) -> _Shape:
         return take(self, (..., index))
 
 
 Linear = Callable[[np.ndarray], np.ndarray]
-"""Vectors (3, P) to their products (T, T, P) with the rays of P tiles."""
+"""Maps vectors (3, P) to their dot products (T, T, P) with the rays of P tiles."""
 Cast = Callable[[_Shape, Linear, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(solids, products, squares of the rays) to the depths (T, T, P) of entry and exit."""
+"""Maps (solids, dot products, squared ray lengths) to the depths (T, T, P) of entry and exit."""
 
 
 def make_tiles(camera: Camera) -> Tiles:
@@ -106,7 +106,7 @@ def depth_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
 def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
     camera, side = tiles.camera, len(tiles.up)
     rows, columns = tiles.up.shape[1], tiles.left.shape[1]
-    # Axes of each camera in the world, (N, 3, 3), written out: see `tracks.geometry.rotation`.
+    # Axes of each camera in the world, (N, 3, 3); why no matmul: `tracks.geometry.rotation`.
     axes_w = (rot_w[:, :, :, None] * tiles.axes_b).sum(-2)
     depth = np.full((len(pos_w) * rows * columns, side * side), camera.range_m)
     for (name, ball), cast in zip(bounds(scene), (_box, _cylinder, _capsule, _sphere), strict=True):
@@ -116,7 +116,7 @@ def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
         across, down = _tiles_met(tiles, shape, flat=name == "cylinders")
         which, row, column = np.nonzero(down[:, :, None] & across[:, None, :])
         tile = (frame[which] * rows + row) * columns + column
-        # Solids of one rank belong to different images, so no tile occurs twice in a stretch.
+        # Solids of one rank belong to different images, so a tile occurs once between two stops.
         stops = np.flatnonzero(np.diff(rank[which], append=-1)) + 1
         for low in range(0, len(which), PAIRS_AT_ONCE):
             high = min(low + PAIRS_AT_ONCE, len(which))
@@ -140,7 +140,7 @@ def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
 
 
 def _ground(tiles: Tiles, pos_w: np.ndarray, axes_w: np.ndarray) -> np.ndarray:
-    """Return the depths (N, rays down, rays across) of the ground, which is seen from above."""
+    """Return the depths (N, rays down, rays across) of the ground; infinite from below it."""
     axis, left, up = axes_w[:, 2].T[..., None]
     down = -(axis + up * tiles.up.T.ravel())[:, :, None] - (left * tiles.left.T.ravel())[:, None]
     height = np.where(pos_w[:, 2] < 0, np.inf, pos_w[:, 2])
@@ -150,9 +150,9 @@ def _ground(tiles: Tiles, pos_w: np.ndarray, axes_w: np.ndarray) -> np.ndarray:
 def _in_view(
     tiles: Tiles, ball: Bounds, pos_w: np.ndarray, axes_w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (V,) frame, number and rank in its frame of the solids whose `ball` is in view.
+    """Return image, number and rank (V,) of the solids whose bounding `ball` is in view.
 
-    In the order of the ranks.
+    The rank counts the visible solids of an image from 0; the arrays are sorted by rank.
     """
     away = ball.center_w - pos_w[:, None]
     depth, left, up = np.moveaxis(to_local(axes_w[:, None], away), -1, 0)
@@ -169,7 +169,7 @@ def _in_view(
 
 
 def _shape(solids: Any, pos_w: np.ndarray, axes_w: np.ndarray) -> _Shape:
-    """Return solids (V, ...) in the axes (V, 3, 3) of cameras at pos_w (V, 3)."""
+    """Return V solids in the axes (V, 3, 3) of the cameras at pos_w (V, 3)."""
 
     def turned(vector_w: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(to_local(axes_w, vector_w).T)
@@ -184,12 +184,15 @@ def _shape(solids: Any, pos_w: np.ndarray, axes_w: np.ndarray) -> _Shape:
 
 
 def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns (V, columns) and rows (V, rows) of tiles that each solid reaches."""
+    """Return which columns (V, columns) and rows (V, rows) of tiles each solid reaches.
+
+    `flat` solids are cylinders: their ends are flat, so the radius acts only across the axis.
+    """
     met = []
     for side, edges in ((1, tiles.left_edges), (2, tiles.up_edges)):
 
         def along(vector: np.ndarray, side: int = side, edges: np.ndarray = edges) -> np.ndarray:
-            """Return the product (V, edges) with the normals of the planes through the edges."""
+            """Return the dot product (V, edges) with the normals of the planes between tiles."""
             return vector[side, :, None] - edges * vector[0, :, None]
 
         square = 1 + edges * edges
@@ -205,7 +208,7 @@ def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.
 
 
 def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear, np.ndarray]:
-    """Return a function that multiplies vectors with the rays of P tiles, and the squared rays."""
+    """Return the dot product with the rays of P tiles, and the squared ray lengths."""
     left, up = tiles.left[:, column], tiles.up[:, row]
 
     def linear(vector: np.ndarray) -> np.ndarray:
@@ -216,7 +219,7 @@ def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear
 
 
 def _first(enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
-    """Return the depth of the first hit, 0 from inside."""
+    """Return the depth of the first hit: 0 from inside a solid, `_FAR` or more without a hit."""
     missed = enter > leave
     missed |= leave <= 0
     return np.maximum(enter, missed * _FAR, out=enter)  # many times faster than `numpy.where`
@@ -273,7 +276,7 @@ def _cylinder(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.nda
 
 
 def _capsule(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The parts overlap, so the interval is from the first entry to the last exit."""
+    """Join a cylinder and two spheres, which overlap: from the first entry to the last exit."""
     (axis,), (half,) = shape.axes, shape.halves
     parts = [_cylinder(shape, linear, square)]
     parts += [

@@ -1,8 +1,7 @@
-"""Safe readers of untrusted files: check kind and size first, then parse JSON or TOML.
+"""Safe readers of untrusted files: kind and size are checked before JSON or TOML is parsed.
 
-A pipe or a device may never end, a file of gigabytes would fill the memory, and numbers of
-thousands of digits or deeply nested tables make the parsers fail in other ways. All these raise an
-`InputError` that names the file.
+These raise an `InputError` that names the file: a pipe or device, which may never end; a file that
+would fill the memory; numbers with thousands of digits; and tables that are nested too deeply.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from typing import Any
 TEXT_BYTES = 64 * 2**20
 """Largest JSON or TOML file."""
 MODEL_BYTES = 512 * 2**20
-"""Largest foreign policy file, with its external data."""
+"""Largest ONNX, torch or C policy file, with its external data."""
 WEIGHTS_BYTES = 2 * 2**30
-"""Largest arrays of a checkpoint: the widest network with its optimiser's state."""
+"""Largest arrays of a checkpoint; the widest network with its optimiser state fits."""
 LOG_BYTES = 2 * 2**30
 """Largest flight log of any format."""
 MESH_BYTES = 256 * 2**20
@@ -36,27 +35,29 @@ _KINDS = {
 
 
 class InputError(ValueError):
-    """A file cannot be used; the message names it and says what is allowed."""
+    """A file cannot be used; the message has its name and what is allowed."""
 
 
 def check_file(path: str | os.PathLike[str], most_bytes: int) -> None:
-    """Refuse anything but a plain file (links are followed) of allowed size, before it is opened.
+    """Refuse a path that is not a regular file, or a file that is too large, before it is opened.
+
+    Symbolic links are followed.
 
     Raises:
-        InputError: naming the file, what it is and what is allowed.
-        OSError: where there is none.
+        InputError: with the file, its kind or size, and what is allowed.
+        OSError: if the file does not exist.
     """
     _check(os.fspath(path), os.stat(path), most_bytes)
 
 
 def read_bytes(path: str | os.PathLike[str], most_bytes: int = TEXT_BYTES) -> bytes:
-    """Return the contents of a plain file.
+    """Return the contents of a regular file.
 
     Raises:
-        InputError: where it is no plain file or too large.
-        OSError: where it cannot be read.
+        InputError: if it is not a regular file or is too large.
+        OSError: if it cannot be read.
     """
-    # Non-blocking, because opening a pipe without a writer would wait.
+    # Non-blocking, because opening a pipe without a writer would block.
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         _check(os.fspath(path), os.fstat(handle), most_bytes)
@@ -77,8 +78,8 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
         keys: required keys, with the types of their values.
 
     Raises:
-        InputError: where it is no plain file, too large, no JSON, or not as required.
-        OSError: where it cannot be read.
+        InputError: if it is not a regular file, is too large, is not JSON, or lacks a required key.
+        OSError: if it cannot be read.
     """
     value = parse_json(read_bytes(path), os.fspath(path))
     if not isinstance(value, dict):
@@ -86,8 +87,8 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
     for key, kind in keys.items():
         if not isinstance(value.get(key), kind):
             raise InputError(
-                f"{os.fspath(path)}: {key!r} is no {kind.__name__}; it was changed or cut: make "
-                "the file again"
+                f"{os.fspath(path)}: {key!r} is missing or not a {kind.__name__}; the file was "
+                "edited or is incomplete: create it again"
             )
     return value
 
@@ -96,7 +97,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
     """Return the value of a JSON text; `where` names its source in messages.
 
     Raises:
-        InputError: where it is no JSON, or nested too deeply.
+        InputError: if it is not JSON or is nested too deeply.
     """
     try:
         value = json.loads(text)
@@ -105,7 +106,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
     except RecursionError:
         raise _too_deep(where) from None
     except UnicodeEncodeError:
-        raise InputError(f"{where}: holds half a character, which no file can name") from None
+        raise InputError(f"{where}: has half of a surrogate pair, not valid text") from None
     except ValueError as error:
         raise InputError(f"{where}: not JSON ({error})") from None
     _check_depth(value, where)
@@ -116,8 +117,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the table of a TOML file.
 
     Raises:
-        InputError: where it is no plain file, too large or no TOML.
-        OSError: where it cannot be read.
+        InputError: if it is not a regular file, is too large or is not TOML.
+        OSError: if it cannot be read.
     """
     where = os.fspath(path)
     try:
@@ -126,7 +127,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise _too_deep(where) from None
     except InputError:
         raise
-    except ValueError as error:  # also a number of thousands of digits, also what is not UTF-8
+    except ValueError as error:  # also numbers with thousands of digits, or not UTF-8
         raise InputError(f"{where}: is not TOML: {error}") from None
     _check_depth(table, where)
     return table
@@ -140,7 +141,7 @@ def reason(error: OSError) -> str:
 def _check(path: str, found: os.stat_result, most_bytes: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         kind = _KINDS.get(stat.S_IFMT(found.st_mode), "of an unknown kind")
-        raise InputError(f"{path}: cannot be read: it is {kind}, allowed is a plain file")
+        raise InputError(f"{path}: cannot be read: it is {kind}, not a regular file")
     if found.st_size > most_bytes:
         raise _too_large(path, str(found.st_size), most_bytes)
 

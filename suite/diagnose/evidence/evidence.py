@@ -1,6 +1,7 @@
-"""What a source of information is, for the search: one class a source.
+"""Base class of evidence, the interface between a source of residuals and the search.
 
-It makes blocks, and knows its noise. All else has a default.
+Each source, such as rollouts or forces, is one subclass. It linearises its residuals in blocks and
+estimates their noise; the other methods have defaults. A number is a parameter of the model.
 """
 
 from __future__ import annotations
@@ -16,57 +17,57 @@ from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 NOTHING = 1e-9
-"""Squared error in units of the noise below which there is nothing to explain."""
+"""Smallest squared error that a share is computed of, in units of the noise variance."""
 
 
 class Evidence(ABC):
-    """A source of information on the numbers of a space."""
+    """A source of whitened residuals, with information on the numbers of a space."""
 
     limits: Thresholds = THRESHOLDS
-    """Of every step."""
+    """Thresholds of all steps of the diagnosis."""
     off: bool = False
-    """Whether all that the model leaves is taken for noise."""
+    """Whether the model is wrong, so that its whole residual counts as noise."""
 
     @property
     @abstractmethod
     def space(self) -> ParameterSpace:
-        """The numbers."""
+        """The numbers, with their starts and bounds."""
 
     @abstractmethod
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return what it gives at an estimate, along the numbers at `indices` or along all."""
+        """Return residuals and slopes at an estimate, along the numbers `indices` or along all."""
 
     @abstractmethod
     def weighed(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this with the noise that the model leaves at an estimate, and its block there.
+        """Return this with its noise estimated from the residuals at `at`, and its block there.
 
-        The block is along all numbers.
+        The block has slopes along all numbers.
         """
 
     def again(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return the same with the noise that it has."""
+        """Return this with its noise unchanged, and its block at `at`."""
         return self, self.linearise(at)
 
     def misfit(self, at: Estimate, block: Block) -> tuple[Evidence, Block] | None:
-        """Return the same with what the best model leaves as its noise; None where that is noise.
+        """Return this with the whole residual of the best model as its noise, and its block.
 
-        `block` is that of the best model.
+        None if that residual is measurement noise only. `at` and `block` are of the best model.
         """
         del at, block
         return None
 
     def compared(self) -> Evidence:
-        """Return the evidence by which fits of several candidates are compared."""
+        """Return the evidence with which the search compares the fits of candidates."""
         return self
 
     @property
     def draws(self) -> float:
-        """Chance below which flights are the draws of an interval, as `intervals95` takes it."""
+        """`differ_p` of `intervals95`: 1 if each flight is one random draw, 0 if not."""
         return 1.0
 
     @property
     def name_p_value(self) -> float:
-        """Chance of a false name at each step of the search."""
+        """Probability that a step of the search names an effect falsely."""
         return self.limits.name_p_value
 
     def scores(
@@ -78,43 +79,46 @@ class Evidence(ABC):
         among: Sequence[Candidate],
         seed: int,
     ) -> list[CandidateScore]:
-        """Return the scores of `among` next to the numbers `named` at `theta` (P,), best first."""
+        """Return the scores of `among` when fitted with the numbers `named`, best first.
+
+        `equations` are those of `block`, at the numbers `theta` (P,); `seed` is of random draws.
+        """
         fold = self.folds(block)
         return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
 
     def folds(self, block: Block) -> np.ndarray:
-        """Return what is left out together (B,)."""
+        """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
         return folds_of(block.flight, block.start_s, self.limits.folds)
 
     def parts(self, block: Block) -> np.ndarray:
-        """Return the number (B,) of what may agree or not, as of each stretch's flight."""
+        """Return the group (B,) of each stretch, by default its flight; `share` compares them."""
         return block.flight
 
     def share(
         self, now: Block, at: Estimate, then: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return the share of the squared error that a fitted candidate takes; None if refused.
+        """Return the share of the squared error that a candidate explains; None if refused.
 
         Args:
-            now: without it.
-            at: with it.
-            then: with it.
-            candidate: what was fitted.
-            gains: (G,) fall of the squared error of each part by the others' fit.
+            now: block without the candidate.
+            at: estimate with the candidate.
+            then: block with the candidate.
+            candidate: the fitted one.
+            gains: (G,) fall of the squared error of each group, fitted on the other groups.
         """
         del at, candidate, gains
         return 1.0 - float((then.residual**2).sum() / max((now.residual**2).sum(), NOTHING))
 
     def order(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
-        """Return by what those that fit alike are ordered, before how well they fit."""
+        """Return the sort key of candidates that fit about equally well; the smallest wins."""
         del at, candidate
         return ()
 
 
 def flights_agree(gains: np.ndarray) -> bool:
-    """Return whether all flights but one gain (G,), and together without the one that gains most.
+    """Return whether all flights, or all but one, have positive `gains` (G,).
 
-    Two flights or one do not show it.
+    Their sum without the largest must be positive, too. Fewer than three flights always agree.
     """
     if len(gains) < 3:
         return True

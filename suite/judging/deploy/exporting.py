@@ -1,4 +1,4 @@
-"""What `suite export` does: the files, and for C a card of what they are worth on this machine."""
+"""`suite export`: write the files, and for C a card with parity and time per step measured here."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tracks.common.provenance import VERSION, stamp
 from tracks.input.reading import read_json
 
 NOTE = "exports.json"
-"""Name of the file in the output folder that says which policy each export there is of."""
+"""Name of the file in the output folder that records the source policy of each export."""
 
 
 def export(
     policy: str, out: Path, formats: Sequence[str], dtype: str, console: Console
 ) -> dict[str, Any]:
-    """Write a policy of ours in `formats`; C with a card of its parity and its time a step.
+    """Export a policy of the suite in `formats`; C with a card of parity and time per step.
 
     Raises:
-        ValueError: where the policy is not ours, a format or type is unknown, or another policy's
-            export would be written over.
+        ValueError: if the policy is not the suite's, a format or type is unknown, or an export of
+            another policy would be overwritten.
     """
     from policies.formats.export import (
         check_formats,
@@ -59,9 +59,10 @@ def export(
 
 
 def _claim(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
-    """Note that `files` in `out` are of `policy`, or refuse to write over another's.
+    """Record `policy` as the source of `files`, or refuse to overwrite those of another policy.
 
-    A checkpoint is called by its folder, which is policy/ in every training, and C by no name.
+    File names do not show the policy: every training calls its checkpoint policy/, and the names of
+    C files are fixed.
 
     Raises:
         ValueError: naming the file and what to do.
@@ -71,10 +72,10 @@ def _claim(policy: str, out: Path, files: Sequence[str], seed: int | None) -> No
     for file in files:
         was = noted.get(file, {})
         if (out / file).exists() and source != was.get("source") and digest != was.get("sha256"):
-            whose = was.get("source", "a policy that is not noted")
+            whose = was.get("source", "an unrecorded policy")
             raise ValueError(
-                f"--out {out}: {file} there is of {whose} and would be written over by that of "
-                f"{policy}; give another --out, or move the file away"
+                f"--out {out}: {file} there was exported from {whose} and would be overwritten by "
+                f"that of {policy}; give another --out, or move the file away"
             )
         noted[file] = {"source": source, "sha256": digest}
     write_json(out / NOTE, {**stamp(1, seed), "files": noted})
@@ -86,13 +87,11 @@ def _noted(path: Path) -> dict[str, dict[str, str]]:
     try:
         return {file: dict(entry) for file, entry in read_json(path)["files"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a note of exports ({error}); move it away") from error
+        raise ValueError(f"{path}: not a record of exports ({error}); move it away") from error
 
 
 CARD = "card.md"
-_LICENCE = (
-    "Apache-2.0, as diffracing-suite; the checkpoint's maker may say otherwise of the weights"
-)
+_LICENCE = "Apache-2.0, as diffracing-suite; the weights may have another licence from their author"
 
 
 def card_text(
@@ -101,11 +100,11 @@ def card_text(
     """Return the card of an export as Markdown.
 
     Args:
-        given: the policy as it was asked for.
-        name: what it is called.
-        checkpoint: where it came from.
-        dtype: of the weights.
-        found: how near it is, and its time a step.
+        given: the policy as the user named it.
+        name: the name of the export.
+        checkpoint: the source of the export.
+        dtype: type of the weights.
+        found: parity with the checkpoint, and time per step.
     """
     spec = checkpoint.spec
     timing = "not measured"
@@ -120,9 +119,9 @@ def card_text(
         ("made by", f"diffracing-suite {VERSION}, training seed {seed}"),
         ("rate", f"{spec.rate_hz:g} Hz"),
         ("parity", found.sentence),
-        ("a step here", timing),
-        ("multiply-adds a step", str(multiply_adds(spec))),
-        ("memory of the caller", f"{memory_bytes(spec, dtype == 'int8')} bytes"),
+        ("time per step here", timing),
+        ("multiply-adds per step", str(multiply_adds(spec))),
+        ("memory that the caller provides", f"{memory_bytes(spec, dtype == 'int8')} bytes"),
         ("licence", _LICENCE),
     )
     table = "\n".join(f"| {key} | {markdown_cell(value)} |" for key, value in rows)
@@ -131,18 +130,18 @@ def card_text(
 
 
 def _success(given: str) -> str:
-    """Return what the policy's own card says of its success, or that nothing is known."""
+    """Return the success rates in the policy's own card, or a line that they are unknown."""
     path = shipped.locate(given) / "card.md"
     text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
     lines = [line for line in text.splitlines() if line.startswith("|") and "success" in line]
     if not lines:
-        return "Success: not known; `suite eval --policy . --trust` flies it in the judge.\n"
+        return "Success rate: unknown; `suite eval --policy . --trust` measures it.\n"
     whole = text.splitlines()
     first = whole.index(lines[0])
     last = next((k for k in range(first, len(whole)) if not whole[k].startswith("|")), len(whole))
     table = "\n".join(whole[first:last])
     spans = " with 95 % intervals" if re.search(r"\[\d", table) else ""
     return (
-        f"Success of the policy that it came from, by its card{spans} "
-        f"(`suite eval --policy . --trust` flies the export):\n\n{table}\n"
+        f"Success rate of the original policy, from its card{spans} "
+        f"(`suite eval --policy . --trust` measures that of the export):\n\n{table}\n"
     )

@@ -113,5 +113,5 @@ def test_what_has_no_estimator_refuses_it(monkeypatch):
         fly(Pursuit(spec=SPEC), TRIALS[:1], VEHICLE, "reference", JudgeOptions(sensors=wanted))
     models = {name: values._asdict() for name, values in wanted.models.items()}
     late = sensor_set({**models, "delay": {"state": 0.02}})
-    with pytest.raises(ValueError, match=r"delay.state is 0.02 s next to an estimator"):
+    with pytest.raises(ValueError, match=r"delay.state is 0.02 s, but the estimator"):
         flown(late, TRIALS[:1], monkeypatch)

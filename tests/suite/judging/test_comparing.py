@@ -89,7 +89,7 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)
     with pytest.raises(ValueError, match=r"another time_limit_s \(20.0 and 10.0\)"):
         paired(*read_runs(a), *read_runs(apart))
-    with pytest.raises(ValueError, match="10 trials were flown by one alone"):
+    with pytest.raises(ValueError, match="10 trials are in only one of them"):
         paired(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
     for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
         with pytest.raises(ValueError, match=said):
@@ -98,7 +98,11 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
 
 @pytest.mark.parametrize(
     ("summary", "said"),
-    [("[1]", "holds a list"), ('{"judged": [1]}', "'judged' is no dict"), ("{", "not JSON")],
+    [
+        ("[1]", "holds a list"),
+        ('{"judged": [1]}', "'judged' is missing or not a dict"),
+        ("{", "not JSON"),
+    ],
 )
 def test_a_summary_that_is_none_is_refused(tmp_path, summary, said):
     run_of(tmp_path, [True])

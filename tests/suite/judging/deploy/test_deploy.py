@@ -42,7 +42,7 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
     assert {path.name for path in tmp_path.iterdir()} == {*names, exporting.NOTE}
     text = (tmp_path / exporting.CARD).read_text()
     digest = json.loads((folder / "config.json").read_text())["weights"]["sha256"]
-    for said in ("| policy | tiny |", digest, "| licence | Apache-2.0", "Success: not known"):
+    for said in ("| policy | tiny |", digest, "| licence | Apache-2.0", "Success rate: unknown"):
         assert said in text
 
 
@@ -88,7 +88,9 @@ def test_an_export_of_another_policy_is_not_written_over(
     capsys.readouterr()
     assert export(other) == 2
     said = capsys.readouterr().err
-    assert f"{file} there is of {one} and would be written over by that of {other}" in said
+    assert (
+        f"{file} there was exported from {one} and would be overwritten by that of {other}" in said
+    )
     assert (out / file).read_bytes() == kept
     shutil.rmtree(one)
     shutil.copytree(other, one)
@@ -96,10 +98,10 @@ def test_an_export_of_another_policy_is_not_written_over(
     assert export(other) == 0, "and now that of its content, too"
     (out / exporting.NOTE).unlink()
     assert export(other) == 2
-    assert f"{file} there is of a policy that is not noted" in capsys.readouterr().err
+    assert f"{file} there was exported from an unrecorded policy" in capsys.readouterr().err
     (out / exporting.NOTE).write_text("[]")
     assert export(other) == 2
-    assert "not a note of exports" in capsys.readouterr().err
+    assert "not a record of exports" in capsys.readouterr().err
 
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
