@@ -91,5 +91,5 @@ def test_a_damaged_one_is_refused(text, said):
 
 def test_a_contract_and_a_spec_that_contradict_are_refused():
     other = labels(replace(SPEC, rate_hz=50.0), "tiny", 7)
-    with pytest.raises(PolicyError, match="contract says rate_hz 50.0, the spec in policy.json 33"):
+    with pytest.raises(PolicyError, match="contract has rate_hz 50.0, the spec in policy.json 33"):
         extract({KEY: embed(SPEC, "tiny", 7), "contract": other["contract"]}, "here")
