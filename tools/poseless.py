@@ -145,10 +145,10 @@ def main() -> None:
         outcomes[outcome] += 1
         words = [" or ".join([e["name"], *e["alternatives"]]) for e in effects]
         own = [e for e in effects if e["name"] == name]
-        beside = list(errors(truth, own[0])) if own else []
-        off += beside
+        scaled = list(errors(truth, own[0])) if own else []
+        off += scaled
         print(f"{number:3d} {name or 'nothing':16} {outcome:18} {'; '.join(words)}  "
-              f"{' '.join(f'{e:+.2f}' for e in beside)}", flush=True)  # fmt: skip
+              f"{' '.join(f'{e:+.2f}' for e in scaled)}", flush=True)  # fmt: skip
     clean = outcomes["clean"] + outcomes["accused"]
     print(share("named, and nothing else", outcomes["named alone"], cases - clean))
     print(share("clean vehicles accused", outcomes["accused"], clean))

@@ -69,14 +69,14 @@ def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
 
 
 class Kind(NamedTuple):
-    """Things of one kind; what only the line about one needs is loaded when it is asked for."""
+    """Entries of one kind; what only an entry's text needs is loaded when that text is printed."""
 
     names: Callable[[], Iterable[str]]
     about: Callable[[str], str]
 
 
 def _of(module: str) -> Any:
-    """Return a module, which is loaded when a list asks for it."""
+    """Return a module, imported at the first list that needs it."""
     return importlib.import_module(module)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.motors import over_force
+from eval.logs.faults.motors import over_force, within
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
@@ -81,7 +81,7 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / STANDARD_GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
-    near = [name for name, unit in units.items() if abs(np.log(ratio / unit)) < np.log(THRUST_FITS)]
+    near = within(units, THRUST_FITS, ratio)
     name = near[0] if near and (len(near) == 1 or near[0] == "in m/s^2") else ""
     if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
         text = f"{figures}: an effect, or a mass that is off"

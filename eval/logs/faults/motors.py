@@ -203,8 +203,8 @@ def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
 
 def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
     """Return the finding for rotor speeds whose lift is `factor`^2 times the weight."""
-    near = _within(UNITS, NEAR, factor)
-    clear = _within(UNITS, ALONE, factor)
+    near = within(UNITS, NEAR, factor)
+    clear = within(UNITS, ALONE, factor)
     names = [n for n in ("motor", "motor_cmd") if n in rows]
     if len(clear) == 1:
         (words,) = clear
@@ -218,7 +218,7 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
         text = f"{figures}: they are {factor:.3g} times too large, which may be {' or '.join(near)}"
         fix = option(*((n, f"{1.0 / factor:.4g}") for n in names))
         return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.95, fix)
-    poles = sorted(_within(POLES, 1.05, factor), key=lambda n: abs(np.log(factor / POLES[n])))
+    poles = sorted(within(POLES, 1.05, factor), key=lambda n: abs(np.log(factor / POLES[n])))
     whole = [n for n in range(2, 9) if abs(np.log(factor**-2 / n)) < np.log(1.1)]
     if whole:
         text = f"{figures}: {vehicle.mass:g} kg may be the mass of {whole[0]} links, entered each"
@@ -258,6 +258,6 @@ def over_force(rows: Rows, thrust: np.ndarray) -> float:
     return 1.0 / share if share > 0.0 else 0.0
 
 
-def _within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
+def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
     """Return the entries of `table` within the ratio `limit` of the measured `factor`."""
     return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]
