@@ -42,9 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except BrokenPipeError:
         # The reader of our output has left: nothing to say, and no one to say it to.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _output_fails()
         return FAILED
     except Exception as error:
+        if _output_fails() and isinstance(error, OSError) and error.filename is None:
+            error.filename = "standard output"
         known = explain(error)
         if known is None:
             traceback.print_exc()
@@ -53,6 +55,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         code, message = known
         _complain(message)
         return code
+
+
+def _output_fails() -> bool:
+    """Say whether standard output takes nothing more; what it holds goes to the null device."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _dispatch(args: list[str]) -> int:

@@ -1,7 +1,7 @@
 """Odd inputs of every kind: each is used, or refused in a line; no traceback, no wait.
 
 At a small size with all tests; `pytest -m slow tests/test_fuzz.py` tries 1,000 of each kind of our
-own files and 10,000 of each foreign format.
+own files and 10,000 of each foreign format, in parts that draw from seeds of their own.
 """
 
 import json
@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, seed, settings
 
 from eval.importers import import_log
 from eval.importers.formats.table import read_map
@@ -50,8 +50,13 @@ FOREIGN = (
     *("trials.parquet", "obj", "stl", "glb", "ply"),
 )
 """Formats that other programs write, or that others hand over."""
-EACH, EACH_FOREIGN = 1000, 10_000
-"""Inputs of each kind at full size."""
+EACH, PARTS_FOREIGN = 1000, 10
+"""Inputs of each kind at full size, and how many times as many of a foreign one."""
+FULL = [
+    *((kind, 0) for kind in KINDS),
+    *((kind, part) for kind in FOREIGN for part in range(PARTS_FOREIGN)),
+]
+"""Each (kind, part) at full size."""
 MEMORY_BYTES = 2 * 2**30
 """This process never has more; that which reads meshes has a limit of its own."""
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
@@ -185,9 +190,10 @@ def drawn_and_used(kind, folder):
     return mutated_bytes(line), filed(lambda path: Journal(path, {"a": 1}).close())
 
 
-def fuzz(kind, folder, count):
+def fuzz(kind, folder, count, part=0):
     inputs, use = drawn_and_used(kind, folder)
 
+    @seed(part)
     @settings(max_examples=count, deadline=None, suppress_health_check=SLOW)
     @given(inputs)
     def each(given_input):
@@ -202,7 +208,7 @@ def test_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", (*KINDS, *FOREIGN))
-def test_many_odd_inputs_are_used_or_refused_in_a_line(kind, tmp_path):
-    fuzz(kind, tmp_path, EACH_FOREIGN if kind in FOREIGN else EACH)
+@pytest.mark.parametrize(("kind", "part"), FULL)
+def test_many_odd_inputs_are_used_or_refused_in_a_line(kind, part, tmp_path):
+    fuzz(kind, tmp_path, EACH, part)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 < MEMORY_BYTES

@@ -47,8 +47,8 @@ AREAS = (
 """Files, and the beginnings of the paths of their tests (eval/ where no package is named)."""
 PAIRS = "+ - * / < <= > >= == != and or & |".split()
 OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
-CHOICE = re.compile(r"(low|high|typical)=|\w+: [^#]* = ")
-"""Begins a line of a bound, a usual size or a default."""
+CHOICE = re.compile(r"\w+: [^#]* = |(.*\W)?(low|high|typical)=[^=]*$")
+"""What stands before a default, a bound or a usual size in its line."""
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
 
 
@@ -123,11 +123,12 @@ def mutants(copy: Path) -> list[list[Mutant]]:
     return found
 
 
-def line_of(copy: Path, mutant: Mutant) -> tuple[int, str]:
-    """Return the number and the text of the line that a mutant changes."""
+def line_of(copy: Path, mutant: Mutant) -> tuple[int, str, str]:
+    """Return the number of the line that a mutant changes, its text and that before the change."""
     source = (copy / mutant.file).read_bytes()
     line = source[: mutant.first].count(b"\n") + 1
-    return line, source.splitlines()[line - 1].decode().strip()
+    before = source[: mutant.first].splitlines()[-1].decode().lstrip()
+    return line, source.splitlines()[line - 1].decode().strip(), before
 
 
 def fail(copy: Path, tests: str) -> bool:
@@ -162,7 +163,7 @@ def main() -> int:
         areas = [draw.sample(area, len(area)) for area in mutants(copy)]
         most = max(map(len, areas))
         order = [area[k] for k in range(most) for area in areas if k < len(area)]
-        order = [mutant for mutant in order if not CHOICE.match(line_of(copy, mutant)[1])]
+        order = [mutant for mutant in order if not CHOICE.match(line_of(copy, mutant)[2])]
         for mutant in order[: asked.count]:
             if mutant.tests not in done:
                 done[mutant.tests] = fail(copy, mutant.tests)
@@ -170,7 +171,7 @@ def main() -> int:
                 raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
             path = copy / mutant.file
             right = path.read_bytes()
-            old, (line, text) = right[mutant.first : mutant.last], line_of(copy, mutant)
+            old, (line, text, _) = right[mutant.first : mutant.last], line_of(copy, mutant)
             name = f"{mutant.file}:{line}: {old.decode()!r} -> {mutant.new!r} in {text!r}"
             if name not in done:
                 path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])

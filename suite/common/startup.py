@@ -7,12 +7,14 @@ that takes the number of a closed stream would get what is printed.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import platform
 import sys
 import warnings
 from collections.abc import Iterable, MutableMapping
 from pathlib import Path
+from typing import Any
 
 from tracks.common.files import user_cache
 
@@ -27,12 +29,26 @@ SWITCHES = (
     "JAX_DISABLE_MOST_OPTIMIZATIONS",
 )
 """Those for people who look for a mistake; 0 or 1."""
+UNKEPT = tuple(f"Error {what} persistent compilation cache" for what in ("reading", "writing"))
+"""Beginnings of what JAX says where it cannot keep a program: it compiles that anew."""
+
+
+class _Unfailing(io.FileIO):
+    """Standard error on a full disk or without a reader: a line is lost, and no work with it."""
+
+    def write(self, data: Any) -> int:
+        with contextlib.suppress(OSError):
+            written = super().write(data)
+            if written is not None:
+                return written
+        return len(memoryview(data).cast("B"))
 
 
 def open_streams() -> None:
     """Give a process without standard input, output or error the null device in its place.
 
-    What cannot be printed in the terminal's encoding is printed as an escape.
+    What cannot be printed in the terminal's encoding is printed as an escape; what cannot be
+    written to standard error is lost.
     """
     for number in range(3):
         try:
@@ -41,7 +57,9 @@ def open_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
     sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)
     sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
-    sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)
+    encoding = sys.stderr.encoding if sys.stderr else "utf-8"
+    unfailing = io.BufferedWriter(_Unfailing(2, "w", closefd=False))
+    sys.stderr = io.TextIOWrapper(unfailing, encoding, line_buffering=True)
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)  # a test's own stream has none
         if reconfigure is not None:
@@ -49,10 +67,16 @@ def open_streams() -> None:
 
 
 def hush() -> None:
-    """Leave numpy's warnings out, here and in processes of ours: errors have lines of their own."""
+    """Leave warnings out that are not for people, here and in processes of ours.
+
+    They are numpy's, as errors have lines of their own, and JAX's of a cache that is full or cut.
+    """
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
         warnings.simplefilter("ignore", RuntimeWarning)
-        os.environ["PYTHONWARNINGS"] = "ignore::RuntimeWarning"
+        for cache in UNKEPT:
+            warnings.filterwarnings("ignore", cache, UserWarning)
+        found = ["ignore::RuntimeWarning", *(f"ignore:{cache}:UserWarning" for cache in UNKEPT)]
+        os.environ["PYTHONWARNINGS"] = ",".join(found)
 
 
 def check_names(args: Iterable[str]) -> None:

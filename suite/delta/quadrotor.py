@@ -22,6 +22,7 @@ from suite.delta.windows import (
     BurnIn,
     burn_in_before,
     decision_period,
+    decisions_of,
     refuse_none,
     stacked,
     state_after,
@@ -94,10 +95,11 @@ def cut_quadrotor_windows(
         ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     for log in logs:
-        if log.action_b is None or log.policy_step is None or log.rate_cmd_b is None:
+        decisions_of(log)
+        if log.rate_cmd_b is None or log.thrust_cmd is None:
             raise ValueError(
-                f"{log.name}: columns action_x, action_y, action_z, policy_step and cmd_* are "
-                "needed to fit the Delta Action Model; record flights with suite collect"
+                f"{log.name}: columns cmd_thrust and cmd_rate_x, cmd_rate_y, cmd_rate_z are needed "
+                "to fit the Delta Action Model of a quadrotor; record flights with suite collect"
             )
     row_s = row_period(logs) if row_s is None else row_s
     cut = row_substeps(config, row_s)
@@ -115,9 +117,8 @@ def cut_quadrotor_windows(
 def _flight_windows(
     log: FlightLog, cut: Substeps, length: int, row_s: float, duration_s: float, stride_s: float
 ) -> list[QuadrotorWindows]:
-    action, decides = log.action_b, log.policy_step
-    assert action is not None and decides is not None and log.rate_cmd_b is not None
-    assert log.thrust_cmd is not None
+    action, decides = decisions_of(log)
+    assert log.rate_cmd_b is not None and log.thrust_cmd is not None
     rows, time = round(duration_s / row_s), log.time_s
     rot_w = log.rot_w
     commanded = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)

@@ -117,6 +117,20 @@ def stacked(windows: Sequence[T]) -> T:
     return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *alike)
 
 
+def decisions_of(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
+    """Return a log's actions (T, 3) [m/s^2] and the rows (T,) in which the policy decided.
+
+    Raises:
+        ValueError: where it has none.
+    """
+    if log.action_b is None or log.policy_step is None:
+        raise ValueError(
+            f"{log.name}: columns action_x, action_y, action_z and policy_step are needed to fit "
+            "the Delta Action Model; record flights with suite collect"
+        )
+    return log.action_b, log.policy_step
+
+
 def decision_period(time_s: np.ndarray, row_s: float) -> float:
     """Return the time between a policy's decisions [s], NaN where there are fewer than two.
 
@@ -137,14 +151,19 @@ def decision_rate(logs: Sequence[FlightLog]) -> float:
     """Return how often the policy decided in flights with its decisions, their median [Hz].
 
     Raises:
-        ValueError: where they differ: the network remembers from one decision to the next.
+        ValueError: where they differ, as the network remembers from one decision to the next, or
+            a log has none.
     """
     found = []
     for log in logs:
-        assert log.policy_step is not None
-        at = np.flatnonzero(log.policy_step & log.whole)
+        at = np.flatnonzero(decisions_of(log)[1] & log.whole)
         row_s = float(np.median(np.diff(log.time_s)))
         found.append(1.0 / decision_period(log.time_s[at], row_s))
+    if np.isnan(found).all():
+        raise ValueError(
+            f"{logs[0].name}: column policy_step marks no two decisions, nor does that of another "
+            "flight; record longer flights with suite collect"
+        )
     median = float(np.nanmedian(found))
     for log, rate in zip(logs, found, strict=True):
         if abs(rate - median) > RATE_SHARE * median:
@@ -161,12 +180,7 @@ def _longest_gap(period_s: float, row_s: float) -> float:
 
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
-    action, decides = log.action_b, log.policy_step
-    if action is None or decides is None:
-        raise ValueError(
-            f"{log.name}: columns action_x, action_y, action_z and policy_step are needed to fit "
-            "the Delta Action Model; record flights with suite collect"
-        )
+    action, decides = decisions_of(log)
     at = np.flatnonzero(decides & log.whole)
     at = at[at + 1 < len(log.time_s)]
     time, rot = log.time_s[at], quat_to_rot(log.quat_wxyz[at])

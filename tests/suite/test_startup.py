@@ -72,11 +72,20 @@ def test_a_command_runs_without_home_passwd_entry_and_streams(root, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("closed", "line", "code"), [("<&- >&- 2>&-", "eval --trials 0", 2), (">&-", "effects", 0)]
+    ("closed", "line", "code", "said"),
+    [
+        ("<&- >&- 2>&-", "eval --trials 0", 2, b""),
+        (">&-", "effects", 0, b""),
+        ("2>/dev/full", "eval --trials 0", 2, b""),
+        (">/dev/full", "effects", 1, b"the disk is full: standard output;"),
+    ],
 )
-def test_closed_streams_are_the_null_device(root, closed, line, code):
+def test_closed_and_full_streams_end_no_work_but_where_the_result_goes(
+    root, closed, line, code, said
+):
     done = suite(root, line.split(), closed=closed)
     assert done.returncode == code and b"Traceback" not in done.stderr
+    assert said in done.stderr and len(done.stderr.splitlines()) == bool(said)
 
 
 def test_names_that_are_not_utf8_are_refused_before_work(tmp_path, monkeypatch, capsys):
@@ -199,6 +208,17 @@ def test_a_vehicle_is_written_so_that_it_can_be_read(tmp_path):
     (tmp_path / "it.toml").write_text(text)
     with pytest.raises(ValueError, match="a printable text"):
         load_vehicle(tmp_path / "it.toml")
+
+
+def test_a_cache_that_is_full_or_cut_costs_time_and_no_words(root):
+    words = ["Error writing persistent compilation cache entry for 'f'", "Error reading persistent "
+             "compilation cache entry for 'f'"]  # fmt: skip
+    warn = f"import warnings\nfor words in {words!r}: warnings.warn(words)"
+    code = f"import os, sys\nfrom suite.common.startup import hush\nhush()\n{warn}\n"
+    code += f"os.execl(sys.executable, 'python', '-c', {warn!r})"  # as in a process of ours
+    env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, timeout=60)
+    assert done.returncode == 0 and not done.stderr, done.stderr
 
 
 def test_warnings_of_numbers_are_not_for_people(root, tmp_path):

@@ -42,6 +42,23 @@ def test_logs_become_a_checkpoint_with_its_report(tmp_path):
     assert len(flight_files(twice)) == 3, "a flight that is named twice counts once"
 
 
+@pytest.mark.parametrize("dynamics", [PHYSICS, QuadrotorConfig(load_vehicle("reference"))])
+@pytest.mark.parametrize("missing", ["action_y", "policy_step", "decisions", "cmd_thrust"])
+def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missing):
+    if missing == "cmd_thrust" and dynamics is PHYSICS:
+        pytest.skip("the point mass needs no commands")
+    for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
+        extra = {name: column for name, column in log.extra.items() if name != missing}
+        if missing == "decisions":
+            extra["policy_step"] = np.zeros(len(log.time_s))
+        speeds = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
+        commands = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        given = speeds if missing == "cmd_thrust" else commands
+        write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, **given))
+    with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
+        fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console())
+
+
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.99])
 def test_a_split_has_no_overlap_and_leaves_nobody_out(share):
     logs = fly(nominal_model(PointMassConfig()), 7, seconds=1.5)
