@@ -13,17 +13,16 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import is_dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
 from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
-from suite.common.usage import COMMANDS, description, overview, renamed, spread_lists
+from suite.common.usage import COMMANDS, description, overview, renamed, split_lists, spread_lists
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -95,30 +94,24 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
         ValueError: for an option that is given twice, and for a word that belongs to none.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
-    import tyro
+    from suite.common.options import options_within, read_options
 
     command = importlib.import_module(f"suite.commands.{name}")
-    plain_flags = (tyro.conf.FlagCreatePairsOff,)
-    options = command.config_type(args) if hasattr(command, "config_type") else command.Config
-    repeated = set(_marked(options, tyro.conf.UseAppendAction))
+    kind = command.config_type(args) if hasattr(command, "config_type") else command.Config
+    found = list(options_within(kind))
+    repeated = {option.flag for option in found if option.repeated}
+    args = split_lists(args, {option.flag for option in found if option.listed})
     # Behind the options of a command with positional words, a word may be one of those.
-    if not list(_marked(options, tyro.conf.Positional)):
+    if not any(option.positional and option.about for option in found):
         args = spread_lists(args, repeated)
     _refuse_twice(args, repeated)
     about = description(name, command.Config.__doc__ or "")
-    config, left = tyro.cli(
-        options,
-        prog=f"suite {name}",
-        description=about,
-        args=args,
-        config=plain_flags,
-        return_unknown_args=True,
-    )
+    config, left = read_options(kind, f"suite {name}", about, args)
     if left and not any(word.startswith("-") for word in left):
         raise ValueError(f"{left[0]!r} belongs to no option; suite {name} --help lists them")
     if left:
         # Once more, and it ends by saying which options were meant.
-        tyro.cli(options, prog=f"suite {name}", args=args, config=plain_flags)
+        read_options(kind, f"suite {name}", about, args, all_known=True)
     return command, config
 
 
@@ -128,20 +121,6 @@ def _refuse_twice(args: Sequence[str], repeated: set[str]) -> None:
     twice = {flag for flag in flags if flags.count(flag) > 1}
     for flag in sorted(twice - repeated):
         raise ValueError(f"{flag} is given twice; give it once, with all its values behind it")
-
-
-def _marked(options: Any, marker: Any) -> Iterator[str]:
-    """Yield those of `options`, a type as tyro reads it, that have a mark of `tyro.conf`."""
-    for part in get_args(options):
-        yield from _marked(part, marker)
-    made = get_origin(options) or options
-    if isinstance(made, type) and is_dataclass(made):
-        for name, kind in get_type_hints(made, include_extras=True).items():
-            extras = getattr(kind, "__metadata__", ())
-            if marker in extras:
-                named = next((x.name for x in extras if getattr(x, "name", None)), name)
-                yield f"--{named.replace('_', '-')}"
-            yield from _marked(kind, marker)
 
 
 def _run(name: str, args: list[str]) -> int:

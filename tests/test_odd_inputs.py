@@ -123,7 +123,7 @@ WRITERS = {
     "train": "train --recipe quick --iterations 1",
     "collect": "collect --trials 1",
     "tracks": "tracks zigzag",
-    "export": "export race-paper --formats onnx",
+    "export": "export race-paper --format onnx",
     "delta": f"delta {EXAMPLE}",
     "diagnose": f"diagnose {EXAMPLE} --vehicle reference",
     "loop": "loop",

@@ -6,6 +6,7 @@ page is not what the code says.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 import sys
@@ -18,7 +19,7 @@ from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
-from suite.common.settings import options, settings
+from suite.common.options import SILENT, Option, options, settings
 from suite.common.usage import EXAMPLES, GROUPS
 from suite.train.recipes import named_recipe
 
@@ -40,15 +41,24 @@ def commands() -> str:
             module = importlib.import_module(f"suite.commands.{name}")
             parts.append(f"### suite {name}\n\n{summary[0].upper()}{summary[1:]}.\n")
             parts.append("```sh\n" + "\n".join(EXAMPLES[name]) + "\n```\n")
+            found = [one for one in options(module.Config) if one.flag != "--json"]
             rows = [
-                f"| `{one.path}` | {cell(one.default)} | {cell(one.about)} |"
-                for one in options(module.Config)
-                if one.path != "--json"
+                f"| `{one.flag}` | {_default(one)} | {cell(one.about)} |"
+                for one in sorted(found, key=lambda one: one.advanced)
             ]
             if rows:
                 parts.append("\n".join(["| option | default | meaning |", "|---|---|---|", *rows]))
                 parts.append("")
     return "\n".join(parts)
+
+
+def _default(option: Option) -> str:
+    """Return an option's default as a cell; empty where the text says what happens without it."""
+    value = option.default
+    if value is dataclasses.MISSING:
+        return "required"
+    text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return "" if text in SILENT else cell(text)
 
 
 def python() -> str:

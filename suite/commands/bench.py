@@ -20,10 +20,10 @@ class Config:
     """Time a hot path against a plain implementation of the same; without a name, list them."""
 
     name: tyro.conf.Positional[str] = ""
-    """Which benchmark."""
+    """Which benchmark. Without it all are listed."""
     policy: str | None = None
-    """Of the benchmark `policy`: a shipped policy's name or a checkpoint's folder; by default the
-    shipped policy."""
+    """For the benchmark `policy`: a shipped policy's name or a checkpoint's folder. Without it the
+    policy race."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -21,25 +21,25 @@ class Config:
     """Make cases with hidden effects, run the diagnosis on them, score it against the answers."""
 
     what: tyro.conf.Positional[Literal["make", "run", "score", "strengths", "plan"]]
-    """Make a set, run `suite diagnose` on it, score it; make the table of strengths anew; or say
-    which flights separate --effects."""
+    """make a set, run `suite diagnose` on it, score the answers; strengths: make the table of
+    detectable strengths again; plan: print which flights separate --effects."""
     out: Path = Path("runs/blind")
-    """Folder of the set; the same command again goes on where it stopped."""
+    """Folder of the set; the same command again continues where it stopped."""
     set: Literal["tuning", "published"] = "tuning"
-    """Which seeds: the published ones are run once."""
+    """Which seeds: tuning ones for development, published ones for the results page."""
     seed: Seed | None = None
     """Seed of a set of your own, in place of --set."""
     count: Annotated[int, Range(1, 100_000)] | None = None
-    """About how many cases, every kind with its share, at least one; if not given all 244, or 60 of
-    another simulator."""
+    """About how many cases, at least one of every kind. Without it all 244, or 60 with another
+    simulator."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
-    """What simulates the cases: rotorpy (pip install diffracing-suite[rotorpy]) and continuous, an
-    engine in continuous time that shares no code with the fitted model, make 60."""
+    """What simulates the cases: mujoco, rotorpy (needs pip install 'diffracing-suite[rotorpy]'), or
+    continuous, an engine in continuous time that shares no code with the fitted model."""
     effects: tuple[str, ...] = ()
     """For plan: effects that your flights do not separate."""
     workers: WorkersOption = None
-    """For make and run, who shares the cases: N processes of this machine, or ADDRESS, a cluster's.
-    Without it they are done one after the other."""
+    """For make and run: share the cases among N processes of this machine, or on the cluster at
+    HOST:PORT. Without it one case follows the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.input.ranges import Range
 
 
@@ -19,17 +20,18 @@ class Config:
     flights: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Flight logs, or folders of them; `suite import` makes them of other programs' logs."""
     vehicle: str = ""
-    """The vehicle file that the flights are held against, or a shipped vehicle's name."""
+    """Compare the flights with this vehicle: a vehicle file or a shipped name. Without it the
+    flights are checked alone."""
     policy: str = ""
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file."""
+    """Check this policy: a shipped name, a checkpoint's folder, or a file (.onnx, .pt2, .c)."""
     fix: bool = False
-    """Write the flights, with what is safe and unambiguous put right, into --out."""
+    """Write the flights into --out, with what is certain and unambiguous corrected."""
     out: Path = Path("checked")
     """Folder for the flights of --fix."""
-    trials: Annotated[int, Range(0, 1000)] = 4
-    """Short flights on easy tracks, by which the size of the policy's actions is judged."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
+    trials: Advanced[Annotated[int, Range(0, 1000)]] = 4
+    """Short flights of --policy on easy tracks, which show the size of its actions."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

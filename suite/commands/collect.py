@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from suite.common.console import Console
 from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Collection
@@ -17,13 +15,13 @@ from suite.judging.requests import Collection
 class Config:
     """Fly a policy and record every flight as a log (Parquet)."""
 
-    flown: tyro.conf.OmitArgPrefixes[Collection] = Collection()
+    flown: Collection = Collection()
     """What is flown."""
     out: Path = Path("runs/flights")
     """Folder for the flights, and for flights.json, which lists them."""
     workers: WorkersOption = None
-    """Who shares the trials: N processes of this machine, or ADDRESS, a cluster's.
-    By default as many cores as are worth it."""
+    """Share the flights among N processes of this machine, or on the cluster at HOST:PORT. Without
+    it as many cores are used as give a gain."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -20,11 +20,11 @@ class Config:
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Folders of evaluations."""
+    """Folders (--out) of suite eval, two or more."""
     against: tuple[Path, ...] = ()
-    """Folders of another method's training seeds, which are subtracted."""
+    """Folders with training seeds of another method; the differences are to it."""
     seeds: bool = False
-    """Whether the runs are training seeds of one method: print mean, spread and interval."""
+    """Take the runs as training seeds of one method: print mean, spread and interval."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -56,7 +56,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 def options_of(name: str) -> list[str]:
     """Return the options of a command, such as --track."""
-    from suite.common.settings import options
+    from suite.common.options import options
 
     command = importlib.import_module(f"suite.commands.{name}")
-    return sorted({"--help", *(o.path for o in options(command.Config) if o.path[0] == "-")})
+    return sorted({"--help", *(o.flag for o in options(command.Config) if not o.positional)})

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.input.ranges import Iterations, Range, Seed
 
 
@@ -20,13 +21,13 @@ class Config:
     """Flight logs, or folders of them, as `suite collect` writes them."""
     out: Path = Path("runs/delta")
     """Folder for the checkpoint delta/, delta.json and table.md."""
-    recipe: str = "race"
+    recipe: Advanced[str] = "race"
     """The training recipe whose point mass is corrected."""
     model: Literal["point", "quad"] = "point"
     """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""
     vehicle: str | None = None
-    """With --model quad: a shipped vehicle's name or a vehicle file (.toml)."""
-    held_out: Annotated[float, Range(0.0, 1.0, above=True, below=True)] = 0.25
+    """The vehicle of --model quad: a shipped name or a vehicle file (.toml)."""
+    held_out: Advanced[Annotated[float, Range(0.0, 1.0, above=True, below=True)]] = 0.25
     """Share of the flights that take no part in the fit."""
     iterations: Iterations = 1500
     """Gradient steps."""

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.common.files import check_no_input
 from tracks.input.ranges import Range, Seed
 
@@ -22,29 +23,31 @@ class Config:
     vehicle: str
     """The vehicle file that the simulation used, or a shipped vehicle's name."""
     reference: tuple[Path, ...] = ()
-    """Earlier flights of the same vehicle, or folders of them: name what has changed since, beyond
-    the differences between unchanged flights."""
+    """Earlier flights of the same vehicle, or folders of them: name what has changed since.
+    Without it: name what the vehicle file lacks."""
     out: Path = Path("runs/diagnosis")
     """Folder for diagnosis.json, vehicle.toml, report.html and recording.rrd."""
-    drive: Literal["auto", "commands", "motors"] = "auto"
-    """What drives the model: logged commands, measured rotor speeds, or what the logs allow."""
-    integrator: Literal["auto", "continuous", "euler"] = "auto"
-    """How the flights were integrated: in continuous time, as every real one; by MuJoCo's Euler
-    steps of the rate loop's period; or as the logs say."""
-    relevance: Annotated[tuple[float, float, float], Range(0.0, 1e6)] = (0.05, 0.5, 0.025)
+    drive: Advanced[Literal["auto", "commands", "motors"]] = "auto"
+    """Input of the model: logged commands or measured rotor speeds. auto takes measured speeds
+    where real logs have them."""
+    integrator: Advanced[Literal["auto", "continuous", "euler"]] = "auto"
+    """How the flights were made: continuous (every real flight) or euler (MuJoCo's steps of the
+    rate loop's period); auto reads it from the logs."""
+    relevance: Advanced[Annotated[tuple[float, float, float], Range(0.0, 1e6)]] = (0.05, 0.5, 0.025)
     """Thresholds of practical relevance: force [m/s^2], torque over inertia [rad/s^2], drift after
     a second [m]. An effect below all three is left out. 0 0 0 reports everything significant."""
-    compare_delta: bool = False
-    """Fit a Delta Action Model to the same flights and compare it; takes minutes."""
+    compare_delta: Advanced[bool] = False
+    """Also fit a Delta Action Model to the same flights, for comparison; takes minutes."""
     plan: bool = False
-    """Write flights that separate the effects which these do not, in OUT/plan."""
-    fly: str | None = None
-    """Fly the plan in simulation with this vehicle (a file or a shipped name); write its logs."""
-    no_recording: bool = False
-    """Do not write recording.rrd, the held-out flights measured and simulated, for rerun."""
-    accept: tuple[str, ...] = ()
-    """Known faults of the log's interface (names of suite check) that do not stop the command."""
-    seed: Seed = 0
+    """Also plan flights that separate the effects which these flights do not; in OUT/plan."""
+    fly: Advanced[str | None] = None
+    """With --plan: fly the plan in simulation with this vehicle (a file or a shipped name)."""
+    no_recording: Advanced[bool] = False
+    """Do not write recording.rrd (for rerun): the held-out flights, measured and simulated."""
+    accept: Advanced[tuple[str, ...]] = ()
+    """Faults of the logs (names that suite check prints) which you know, and which then do not stop
+    the command."""
+    seed: Advanced[Seed] = 0
     """Seed of the permutation test, the intervals and simulated noise."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""

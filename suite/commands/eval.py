@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from suite.common.console import Console
+from suite.common.options import Advanced
 from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Evaluation
 from tracks.common.files import check_place
@@ -18,15 +17,15 @@ from tracks.common.files import check_place
 class Config:
     """Fly trials and write the result tables; two policies or more are compared in pairs."""
 
-    flown: tyro.conf.OmitArgPrefixes[Evaluation] = Evaluation()
+    flown: Evaluation = Evaluation()
     """What is flown."""
     out: Path = Path("runs/eval")
     """Folder for trials.parquet, table.md, summary.json and run.json."""
-    rerun: Path | None = None
-    """Also write a rerun recording (.rrd) of the first trial of every track and level."""
+    rerun: Advanced[Path | None] = None
+    """Also write this recording (.rrd, for rerun) of the first trial of every track and level."""
     workers: WorkersOption = None
-    """Who shares the trials: N processes of this machine, or ADDRESS, a cluster's.
-    By default as many cores as are worth it."""
+    """Share the trials among N processes of this machine, or on the cluster at HOST:PORT. Without
+    it as many cores are used as give a gain."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

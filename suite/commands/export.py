@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from suite.common.console import Console, size
+from suite.common.options import Advanced
 
 
 @dataclass(frozen=True)
@@ -16,16 +17,13 @@ class Config:
     """Write a policy of ours as torch program (.pt2), ONNX (.onnx) and C (policy.h, policy.c)."""
 
     name: tyro.conf.Positional[str] = ""
-    """A shipped policy's name or a checkpoint's folder; by default the shipped policy."""
+    """A shipped policy's name or a checkpoint's folder. Without it the policy race."""
     policy: str = ""
-    """The same as an option."""
-    formats: Annotated[tuple[str, ...], tyro.conf.arg(name="format", aliases=["--formats"])] = (
-        "torch",
-        "onnx",
-    )
+    """The same as NAME."""
+    formats: Annotated[tuple[str, ...], tyro.conf.arg(name="format")] = ("torch", "onnx")
     """Which of torch, onnx and c."""
-    dtype: str = "float32"
-    """Of the weights in C: float32 or int8."""
+    dtype: Advanced[str] = "float32"
+    """Type of the weights in C: float32 or int8."""
     out: Path = Path("runs/export")
     """Folder for the files."""
     json: bool = False

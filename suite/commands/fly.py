@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
 from suite.common.console import Console
+from suite.common.options import Advanced
 from suite.judging.link.watchdog import Limits
 from suite.judging.requests import Evaluation, TimeLimit
 from tracks.input.ranges import Range, Seed, Trials
@@ -19,8 +18,8 @@ class Config:
     """Fly a policy in real time over MAVLink; without --link against a simulated vehicle."""
 
     policy: str = ""
-    """A shipped policy's name, a checkpoint's folder, or a policy file; by default the shipped
-    policy."""
+    """A shipped policy's name, a checkpoint's folder, or a policy file. Without it the policy race
+    flies."""
     track: str = "zigzag"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0"
@@ -31,25 +30,24 @@ class Config:
     """Seed of the first trial."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
-    time_limit_s: TimeLimit = 20.0
+    time_limit_s: Advanced[TimeLimit] = 20.0
     """A simulated flight ends at this time [s]."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
-    """How fast a policy that takes it as an input is asked to fly, 0 (careful) to 1 (a race);
-    without it as its card says."""
+    """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     monitor: bool = False
     """Fly with the safety monitor of `suite eval --monitor` around the policy."""
     link: str = ""
-    """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle that speaks MAVLink; one flight. Without it
-    the vehicle is simulated in real time, on this machine's loopback."""
+    """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle with MAVLink, for one flight. Without it a
+    vehicle is simulated in real time on this machine."""
     signing_key: Path | None = None
-    """File of the link's passphrase: with --link, messages are signed as MAVLink 2 says, and those
-    of the vehicle must be. Without it whoever reaches the link can speak for the vehicle."""
+    """With --link: file with a passphrase; messages are signed (MAVLink 2), and unsigned ones from
+    the vehicle are ignored. Without it whoever reaches the link can steer the vehicle."""
     confirm: bool = False
-    """I have read docs/fly.md and did what it asks for: with --link, set points leave."""
-    limits: tyro.conf.OmitArgPrefixes[Limits] = Limits()
-    """When the policy hands over."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
+    """Required with --link: you have done the checks of docs/fly.md. Set points are sent."""
+    limits: Advanced[Limits] = Limits()
+    """Beyond any of these the policy hands over to the autopilot."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
     out: Path = Path("runs/fly")
     """Folder for the flight logs and fly.json."""
     json: bool = False

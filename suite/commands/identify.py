@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.common.files import check_no_input
 
 
@@ -22,16 +23,18 @@ class Config:
     flights: tyro.conf.Positional[tuple[Path, ...]]
     """Flight logs of one vehicle, or folders of them."""
     vehicle: str = ""
-    """The vehicle file to start from (or a shipped vehicle's name): mass, arms, what stays."""
+    """Start from this vehicle file or shipped vehicle: it gives the mass, the arms and all that
+    flights do not show. Required without --sensors."""
     sensors: bool = False
-    """Fit the errors of an on-board estimate against the logs' reference instead, without a
-    vehicle, and write a sensors file."""
+    """Write a sensors file instead: the errors of an on-board estimate against the reference in
+    the logs."""
     out: Path | None = None
-    """The file to write; vehicle.toml by default, with --sensors sensors.toml."""
-    leave: tuple[str, ...] = ()
-    """What to leave as it is: any of drag, motors, inertia, lag, loop."""
-    accept: tuple[str, ...] = ()
-    """Known faults of the log's interface (names of suite check) that do not stop the command."""
+    """The file to write. Without it vehicle.toml, with --sensors sensors.toml."""
+    leave: Advanced[tuple[str, ...]] = ()
+    """Keep these as they are in --vehicle: any of drag, motors, inertia, lag, loop."""
+    accept: Advanced[tuple[str, ...]] = ()
+    """Faults of the logs (names that suite check prints) which you know, and which then do not stop
+    the command."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.common.files import check_no_input
 from tracks.input.ranges import Range
 
@@ -18,44 +19,48 @@ class Config:
     """Read and check a log of PX4, ArduPilot, Betaflight, a Crazyflie, ROS 2 or a table."""
 
     file: tyro.conf.Positional[Path]
-    """The log."""
+    """The log to read."""
     format: str = ""
-    """px4, betaflight, ardupilot, crazyflie, table or mcap; by default the file's first bytes
+    """px4, betaflight, ardupilot, crazyflie, table or mcap. Without it the file's first bytes
     decide."""
     out: Path = Path("flight.parquet")
     """The flight log to write (.parquet or .csv)."""
     map: Path | None = None
-    """Mapping file (TOML), or nanobench, crazypad, crazyswarm2 or crazyflie, which are shipped:
-    columns, units and frames of a table or a Crazyflie's log; topics of an MCAP file."""
-    source: Literal["", "mocap", "estimate"] = ""
-    """Take the pose from here, where the file holds raw motion capture and an estimate."""
+    """Columns, units and frames of a table or a Crazyflie's log, or topics of an MCAP file: a
+    mapping file (TOML), or nanobench, crazypad, crazyswarm2 or crazyflie."""
+    source: Advanced[Literal["mocap", "estimate"] | None] = None
+    """Where the file holds raw motion capture and an estimate: take the pose from this one.
+    Without it in the mapping's order."""
     pose: Path | None = None
-    """CSV or Parquet with position and attitude from elsewhere; its clock is aligned by itself."""
-    pose_map: Path | None = None
+    """CSV or Parquet with position and attitude from elsewhere, such as motion capture; its clock
+    is aligned with the log's."""
+    pose_map: Advanced[Path | None] = None
     """Mapping file (TOML) of --pose."""
     vehicle: str = ""
-    """A shipped vehicle's name or a vehicle file: order of the motors, full thrust."""
+    """A shipped vehicle's name or a vehicle file, for the order of the motors and the full
+    thrust."""
     full_thrust: Annotated[float, Range(0.0, 1000.0, above=True, below=True)] | None = None
-    """Thrust per mass at full throttle [m/s^2], where the log has normalised thrust."""
+    """Thrust per mass at full throttle [m/s^2], for a log with normalised thrust; else that of
+    --vehicle."""
     mass: Annotated[float, Range(0.0, 10_000.0, above=True)] | None = None
-    """Nominal mass [kg], where the log has a thrust in N."""
-    motor_poles: Annotated[int, Range(2, 1000)] = 14
-    """Magnets on a motor's bell (Betaflight's eRPM)."""
-    rate: Annotated[float, Range(1.0, 10_000.0)] = 250.0
+    """Nominal mass [kg], for a log with thrust in N; else that of --vehicle."""
+    motor_poles: Advanced[Annotated[int, Range(2, 1000)]] = 14
+    """Number of magnets in a motor, for Betaflight's eRPM."""
+    rate: Advanced[Annotated[float, Range(1.0, 10_000.0)]] = 250.0
     """At most this many rows a second."""
-    start: Annotated[float, Range(0.0, 1e9)] = 0.0
-    """Leave out what is earlier [s after the file's first sample, on the ground or not]."""
-    end: Annotated[float, Range(0.0, 1e9)] | None = None
-    """Leave out what is later [s after the file's first sample, on the ground or not]."""
-    keep_ground: bool = False
+    start: Advanced[Annotated[float, Range(0.0, 1e9)]] = 0.0
+    """Leave out what is earlier [s after the file's first sample]."""
+    end: Advanced[Annotated[float, Range(0.0, 1e9)] | None] = None
+    """Leave out what is later [s after the file's first sample]. Without it nothing."""
+    keep_ground: Advanced[bool] = False
     """Keep the time before take-off and after landing."""
     partial: bool = False
-    """Take a log that lacks position, attitude, rates or commands, and keep what is there."""
+    """Accept a log without position, attitude, rates or commands, and keep what is there."""
     read: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Read a signal in another way, SIGNAL=STEPS as rate=x,-y,-z+0.0610352, quat=xyzw, time=ms or
-    motor=2,1,4,3; may be given several times. What suite check prints as a fix."""
-    no_fix: bool = False
-    """Say what looks wrong, but correct nothing."""
+    """Read a signal differently, as suite check prints it as a fix: rate=x,-y,-z+0.0610352,
+    quat=xyzw, time=ms or motor=2,1,4,3; may be given several times."""
+    no_fix: Advanced[bool] = False
+    """Print what looks wrong, but correct nothing."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -84,7 +89,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         rate_hz=config.rate,
         start_s=config.start,
         end_s=config.end,
-        source=config.source,
+        source=config.source or "",
         mass=config.mass,
         trim=not config.keep_ground,
         partial=config.partial,

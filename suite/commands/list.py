@@ -24,9 +24,9 @@ class Config:
     """
 
     kind: tyro.conf.Positional[str] = ""
-    """Which kind; without it, all but the settings, by their names."""
+    """Which kind. Without it the names of all kinds but the settings."""
     recipe: str = "race"
-    """The recipe whose settings are listed."""
+    """For the kind settings: of which recipe."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
@@ -58,7 +58,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
     """Print every setting of a recipe with its value, range and meaning, and return them."""
-    from suite.common.settings import settings
+    from suite.common.options import settings
     from suite.train.recipes import named_recipe
 
     found = list(settings(named_recipe(recipe)))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from suite.common.work import WorkersOption, workers_given
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
@@ -15,12 +16,12 @@ from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 class Config:
     """Close the loop and show what the Delta Action Model changes, on the same seeds.
 
-    The same command again goes on where it was stopped.
+    The same command again continues where it was stopped.
     """
 
     recipe: str | None = None
-    """The recipe: race, race-small, race-paper, quick, gpu or paper. By default that of the policy
-    to start from, or race."""
+    """The recipe: race, race-small, race-paper, quick, gpu or paper. Without it the recipe of
+    --policy, or race."""
     policy: str | None = None
     """Start from this policy instead of training one: a shipped name or a checkpoint's folder."""
     track: str = "all"
@@ -28,41 +29,41 @@ class Config:
     difficulty: str = "0,3"
     """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials | None = None
-    """Trials of each policy on every track at every level; by default 50, or 20 with quick; with
-    a hidden vehicle 25, or 20."""
+    """Trials of each policy on every track at every level. Without it 50, with quick 20; with a
+    hidden vehicle 25, with quick 20."""
     flights: Trials | None = None
-    """Recorded flights on every track at every level; by default 20, or 8 with quick; with a hidden
+    """Recorded flights on every track at every level. Without it 20, with quick 8; with a hidden
     vehicle 3."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     hidden_vehicle: str | None = None
     """A vehicle file with an effect that --vehicle lacks: fly it, name the effect, fine-tune
-    through the corrected quadrotor. Without --policy the shipped one flies."""
+    through the corrected quadrotor. Without it flights of --vehicle are recorded."""
     simulator: str = "mujoco"
-    """What flies the hidden vehicle. With another simulator than mujoco (such as rotorpy) and no
-    --hidden-vehicle, what that simulator does otherwise with --vehicle is what is hidden."""
-    sensors: str = "perfect"
-    """What policies see of the truth, in every flight: shipped sensors' name or a sensors file."""
+    """What simulates the hidden vehicle. With another simulator than mujoco (such as rotorpy) and
+    no --hidden-vehicle, the hidden difference is that between the simulators."""
+    sensors: Advanced[str] = "perfect"
+    """Errors in what the policies see, in every flight: a shipped name or a sensors file."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
     """Seed of the training and of the first trial; recorded flights begin 100,000 above."""
-    iterations: Iterations | None = None
+    iterations: Advanced[Iterations | None] = None
     """Gradient steps of the training, instead of the recipe's."""
-    finetune_iterations: Iterations | None = None
-    """Gradient steps of each fine-tuning; by default a quarter of the recipe's; with a hidden
-    vehicle 60, or 100 with quick."""
-    fit_iterations: Iterations | None = None
-    """Gradient steps of the Delta Action Model's fit; by default 1500, or 500 with quick; with
-    a hidden vehicle 200."""
-    no_delta: bool = False
-    """Leave out the Delta Action Models and the fine-tunings under them, which take half the time;
-    with a hidden vehicle."""
-    set: tuple[str, ...] = ()
+    finetune_iterations: Advanced[Iterations | None] = None
+    """Gradient steps of each fine-tuning. Without it a quarter of the recipe's; with a hidden
+    vehicle 60, with quick 100."""
+    fit_iterations: Advanced[Iterations | None] = None
+    """Gradient steps of the Delta Action Model's fit. Without it 1500, with quick 500; with a
+    hidden vehicle 200."""
+    no_delta: Advanced[bool] = False
+    """With a hidden vehicle: leave out the Delta Action Models and the fine-tunings under them,
+    which take half the time."""
+    set: Advanced[tuple[str, ...]] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
-    """Folder of the loop; a loop that stands there is gone on with."""
+    """Folder of the loop; a loop that is there already continues."""
     workers: WorkersOption = None
-    """Who shares the flights and the fine-tunings: N processes of this machine, or ADDRESS, a
-    cluster's. Without it as many processes fly as are worth it, and one fine-tunes."""
+    """Share flights and fine-tunings among N processes of this machine, or on the cluster at
+    HOST:PORT. Without it flights use as many cores as give a gain, and one process fine-tunes."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

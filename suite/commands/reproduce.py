@@ -25,7 +25,7 @@ class Unread:
 
 @dataclass(frozen=True)
 class Config(Generic[Experiment]):
-    """Make one of the documents of docs/results; the same command again goes on where it stopped.
+    """Make one of the documents of docs/results; the same command again continues where it stopped.
 
     NAME.json with the numbers, charts and NAME.md with the tables go to --out. Of a NAME.md that is
     there, what stands between its two comments is replaced.
@@ -38,8 +38,8 @@ class Config(Generic[Experiment]):
     cache: Path = Path("runs/reproduce/cache")
     """Folder of finished trials and trainings, shared by all documents."""
     workers: WorkersOption = None
-    """Trainings and flights at once: N processes of this machine, each with its own share of the
-    cores, or ADDRESS, a cluster's. Without it one training after the other."""
+    """Share trainings and flights among N processes of this machine, each with its share of the
+    cores, or on the cluster at HOST:PORT. Without it one training follows the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
-
 from suite.commands.list import list_settings
 from suite.common.console import Console
 from suite.common.curve import tensorboard
+from suite.common.options import Advanced
 from suite.common.running.hosts import Joined, join, member
 from suite.common.startup import use_device
 from suite.common.work import Silent
@@ -32,49 +31,49 @@ class Config:
     """Train a policy; the same command again resumes where it was stopped."""
 
     recipe: str = "race"
-    """The settings: race (the default policy's, through quadrotors, two hours on one core),
-    race-small (the same for a small network), race-paper (the paper's 12 numbers, through the point
-    mass), quick (minutes), paper (as printed) or gpu."""
+    """The settings to start from: race (makes the default policy, two hours on one core),
+    race-small (a small network), race-paper (the paper's 12 state inputs, through the point mass),
+    quick (6 minutes), paper (the paper's settings, days) or gpu (2,048 environments)."""
     model: Literal["point", "quad"] | None = None
-    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects; the
-    recipe's own if not given."""
+    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects.
+    Without it the recipe decides."""
     vehicle: str | None = None
-    """What the training's quadrotors are drawn around: a shipped vehicle's name or a vehicle file
-    (.toml); with --model quad, or with a recipe that trains through quadrotors."""
+    """Train around this vehicle: a shipped name or a vehicle file (.toml). Without it around
+    racer5. A recipe through the point mass (quick) needs --model quad as well."""
     sensors: str | None = None
-    """Train through sensor models: a shipped name (vio, gate-relative, stereo-depth, all, ...) or a
-    sensors file (.toml). Each world draws every model's magnitude evenly from 0 to 1
-    (--set sensors.magnitude=(0,1.5): to more)."""
+    """Train with sensor errors: a shipped name (vio, gate-relative, stereo-depth, all, ...) or a
+    sensors file (.toml). Without it sensors are perfect. Each environment draws the magnitude of
+    every error evenly from 0 to 1; --set sensors.magnitude=(0,1.5) draws it up to 1.5."""
     out: Path = Path("runs/train")
-    """Folder of the run; a run that stands there is resumed."""
+    """Folder of the run; a run that is there already is resumed."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
     iterations: Iterations | None = None
     """Gradient steps, instead of the recipe's."""
     num_envs: Annotated[int, Range(1, 10**6)] | None = None
-    """Worlds per gradient step, instead of the recipe's; --set episode.batch is the same."""
+    """Environments per gradient step, instead of the recipe's; the same as --set episode.batch."""
     lr: Annotated[float, Range(0.0, 10.0)] | None = None
-    """Peak learning rate of every phase, instead of the recipe's; --set optimizer.rate is the
-    same."""
+    """Peak learning rate of every phase, instead of the recipe's; the same as --set
+    optimizer.rate."""
     device: Literal["cpu", "gpu"] | None = None
-    """What computes; without it a GPU where JAX finds one, else the CPU."""
+    """Where to compute. Without it on a GPU if JAX finds one, else on the CPU."""
     init_from: str | None = None
-    """Start from this policy instead of fresh parameters: a checkpoint's folder or a shipped
+    """Start from this policy instead of random weights: a checkpoint's folder or a shipped
     policy's name."""
     finetune: bool = False
     """Fine-tune the policy of --init-from: the recipe's last phase alone, a quarter of its gradient
     steps, 0.3 times its learning rate."""
-    delta: Path | None = None
+    delta: Advanced[Path | None] = None
     """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
     on: phases.2.loss.progress=0.4."""
-    tensorboard: bool = False
+    tensorboard: Advanced[bool] = False
     """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
     """Print every setting that --set takes, with value, range and meaning, and train nothing."""
-    joined: tyro.conf.OmitArgPrefixes[Joined] = Joined()
-    """Several processes, for devices of several hosts."""
+    joined: Advanced[Joined] = Joined()
+    """Which of several processes this one is."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

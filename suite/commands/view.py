@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from tracks.common.files import check_place
 from tracks.input.ranges import Range, Seed
 
@@ -23,33 +24,33 @@ class Config:
     """Fly trials of a run again and write a rerun recording, pictures and a video of them."""
 
     run: tyro.conf.Positional[str]
-    """The --out of a suite eval, a shipped policy's name, a checkpoint's folder, or a policy
+    """The folder (--out) of a suite eval, or a policy: a shipped name, a checkpoint's folder or a
     file."""
     pick: Literal["first", "failed", "passed"] = "first"
     """Which trials of the run: the first ones, or the first that failed or passed."""
     count: Annotated[int, Range(1, 1000)] = 3
     """How many trials at most."""
     track: str = "all"
-    """For a policy: the tracks, as in suite eval."""
+    """For a policy: zigzag, circular, ellipse, all of these, a track file, or several."""
     difficulty: str = "3"
-    """For a policy: the levels, as in suite eval."""
+    """For a policy: level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     vehicle: str = "reference"
     """For a policy: a shipped vehicle's name or a vehicle file (.toml)."""
     seed: Seed = 0
     """For a policy: the trials' seed."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
-    """For a policy that takes it as an input: how fast it is asked to fly, as in suite eval."""
+    """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     out: Path = Path("runs/view")
     """Folder for the pictures (PNG), the video and the GIF."""
-    rerun: Path | None = None
-    """The recording (.rrd); by default trials.rrd in the folder."""
+    rerun: Advanced[Path | None] = None
+    """The recording (.rrd). Without it trials.rrd in the folder."""
     video: bool = False
     """Also write a video (MP4) of the first trial; takes about its length."""
     gif: bool = False
     """Also write a small GIF of the first trial, for a page."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine; a run's own, too, are not loaded
-    without."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c), those of a run
+    included."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -60,10 +60,13 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "suite collect --track circular --difficulty 0 --trials 4 --out runs/flights",
         "suite collect --policy mine.onnx --vehicle mine.toml",
     ),
-    "fly": ("suite fly", "suite fly --link udp:127.0.0.1:14540 --policy race"),
+    "fly": (
+        "suite fly --track zigzag --trials 20",
+        "suite fly --link udpin:0.0.0.0:14540 --track course.toml --vehicle mine.toml --confirm",
+    ),
     "train": (
         "suite train --out runs/mine",
-        "suite train --recipe quick --vehicle mine.toml --model quad --out runs/quick",
+        "suite train --recipe quick --iterations 100 --out runs/quick",
     ),
     "delta": (
         "suite delta runs/collect --out runs/delta",
@@ -148,6 +151,22 @@ def description(name: str, about: str) -> str:
     return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
 
 
+def split_lists(args: Sequence[str], listed: Container[str]) -> list[str]:
+    """Return `args` with commas between the values of a `listed` option as spaces.
+
+    A word with "=" stays as it is: its commas are within a value, as in `--set fov_deg=87,58`.
+    """
+    out, option = list[str](), ""
+    for word in args:
+        flag, equal, value = word.partition("=")
+        if word.startswith("--"):
+            option = flag
+            out += [flag, *value.split(",")] if equal and option in listed else [word]
+        else:
+            out += word.split(",") if option in listed and not equal else [word]
+    return out
+
+
 def spread_lists(args: Sequence[str], repeated: Container[str]) -> list[str]:
     """Return `args` with the words of a list behind an option as the option takes them.
 
@@ -187,6 +206,7 @@ RENAMED: dict[str, dict[str, Callable[[str], list[str]]]] = {
     "collect": {"--world": _simulator},
     "reproduce": {"--world": _simulator},
     "loop": {"--world": _hidden},
+    "export": {"--formats": lambda value: ["--format", value]},
 }
 """Command -> option of an earlier version -> what it means now; they go with version 0.2."""
 

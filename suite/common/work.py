@@ -11,18 +11,15 @@ import tyro
 
 from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
+from suite.common.options import Advanced
 from suite.common.running.apart import Job, do_apart, fill, parcels
 from tracks.common.work import WorkerDied, Workers, read_workers, usable_cores, work_off
 from tracks.common.work.threads import share_threads
 
 Result = TypeVar("Result")
 
-WorkersOption = Annotated[
-    str | None,
-    tyro.conf.arg(
-        metavar="N|ADDRESS",
-        help_behavior_hint="(a cluster's owner can run code here: name your own)",
-    ),
+WorkersOption = Advanced[
+    Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint="")]
 ]
 """As a command's option; `workers_given` reads it."""
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from policies.spec import PolicyError
+from suite.common.options import Advanced
 from tracks.input.ranges import Range, Seed, Trials
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ class Evaluation:
     policies: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
     ] = ()
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; several may
-    be given. Without it the shipped policy flies."""
+    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; may be
+    given several times. Without it the policy race flies."""
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0,3"
@@ -42,23 +43,23 @@ class Evaluation:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     simulator: str = "mujoco"
-    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (another
-    simulator; pip install diffracing-suite[rotorpy]), or one of an installed package."""
+    """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (needs
+    pip install 'diffracing-suite[rotorpy]'), or the simulator of an installed package."""
     sensors: str = "perfect"
-    """What the policy sees of the truth: shipped sensors' name (perfect, vio, stereo-depth, ...) or
-    a sensors file (.toml)."""
-    time_limit_s: TimeLimit = 20.0
-    """A trial ends at this time; a long course of your own needs more than the tables' 20 [s]."""
-    deadline_s: Annotated[float, Range(0.0, 3600.0, above=True)] | None = None
-    """An answer of the policy that takes longer ends the trials that it was for (up to 128, which
-    it is asked about at once), as out of time [s]."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
-    monitor: bool = False
-    """Fly every policy a second time with the safety monitor around it, on the same trials."""
+    """Errors in what the policy sees: a shipped name (perfect, vio, stereo-depth, ...) or a sensors
+    file (.toml)."""
     speed: Annotated[tuple[float, ...], Range(0.0, 1.0)] = ()
-    """How fast policies that take it as an input are asked to fly, 0 (careful) to 1 (a race); with
-    several, all fly the same trials at each. Without it as their cards say."""
+    """For policies with a speed input: 0 (careful) to 1 (a race); with several values all trials
+    are flown at each. Without it each policy flies at its own default speed."""
+    time_limit_s: Advanced[TimeLimit] = 20.0
+    """A trial ends at this time [s]; a long course of your own needs more than the tables' 20."""
+    deadline_s: Advanced[Annotated[float, Range(0.0, 3600.0, above=True)] | None] = None
+    """A policy that takes longer than this for an answer ends the trials of that answer (up to 128,
+    in one batch) as timed out [s]. Without it a policy may take any time."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
+    monitor: Advanced[bool] = False
+    """Fly every policy a second time with the safety monitor around it, on the same trials."""
 
 
 @dataclass(frozen=True)
@@ -66,28 +67,28 @@ class Collection:
     """Which flights are recorded; `suite collect` has these as options."""
 
     policy: str = ""
-    """A shipped policy's name, a checkpoint's folder, or a policy file; by default the shipped
-    policy."""
+    """A shipped policy's name, a checkpoint's folder, or a policy file. Without it the policy race
+    flies."""
     track: str = "all"
-    """As in suite eval."""
+    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0,3"
-    """As in suite eval."""
+    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 5
     """Flights on every track at every level."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     simulator: str = "mujoco"
-    """As in suite eval."""
+    """What simulates the flight, as in suite eval."""
     sensors: str = "perfect"
-    """As in suite eval; the logs hold the truth, not what the policy sees."""
-    time_limit_s: TimeLimit = 20.0
-    """As in suite eval."""
+    """Errors in what the policy sees, as in suite eval; the logs hold the true state."""
+    time_limit_s: Advanced[TimeLimit] = 20.0
+    """A flight ends at this time [s]."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
-    """As in suite eval."""
+    """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     seed: Seed = 100_000
     """Seed of the first trial; by default far from those that suite eval flies."""
-    trust: bool = False
-    """Also load policy files that can run code on this machine."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
 
 @dataclass(frozen=True)

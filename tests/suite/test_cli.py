@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import pytest
 
 from suite import cli
+from suite.common.options import options_within
 from tracks.common.provenance import VERSION
 
 
@@ -71,7 +72,12 @@ def test_every_command_has_help_for_every_option(name, capsys):
     assert f"suite {name}" in text and "--json" in text
     module = sys.modules[f"suite.commands.{name}"]
     assert module.Config.__dataclass_params__.frozen
-    assert "(default: " in text
+    assert text.index("Examples:\n  suite ") < text.index("--help ") and "None" not in text
+    for option in options_within(module.Config):
+        assert option.about and (option.positional or option.flag in text), option
+    rare = [option.flag for option in options_within(module.Config) if option.advanced]
+    if name != "reproduce":  # whose subcommands have groups of their own
+        assert all(flag in text.partition("advanced options")[2] for flag in rare)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +109,20 @@ def test_a_wrong_command_or_option_is_code_2(command, capsys, line, words):
 def test_a_list_may_have_commas_or_spaces(line, track, levels):
     _, config = cli.parse("eval", line.split())
     assert (config.flown.track, config.flown.difficulty) == (track, levels)
+
+
+def test_every_list_may_have_commas_but_within_a_value():
+    assert cli.parse("eval", ["--speed", "0.3,1"])[1].flown.speed == (0.3, 1.0)
+    assert cli.parse("export", ["--format=c,onnx"])[1].formats == ("c", "onnx")
+    training = cli.parse("train", ["--set", "spec.camera.fov_deg=87,58", "loss.progress=2"])[1]
+    assert training.set == ("spec.camera.fov_deg=87,58", "loss.progress=2")
+    line = "a,b.parquet --vehicle x --reference c,d.parquet --relevance 0,0,0"
+    config = cli.parse("diagnose", line.split())[1]
+    assert [str(path) for path in config.flights + config.reference] == [
+        "a,b.parquet",
+        "c,d.parquet",
+    ]
+    assert config.relevance == (0.0, 0.0, 0.0)
 
 
 def test_a_word_behind_a_list_may_be_a_positional_one():

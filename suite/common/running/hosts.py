@@ -34,11 +34,12 @@ class Joined:
     """Which of several processes this one is; srun of SLURM and mpirun of Open MPI say it."""
 
     coordinator: str | None = None
-    """HOST:PORT of the first process, free there, where all others reach it."""
+    """For a training on several hosts: HOST:PORT at which the others reach the first process."""
     processes: Annotated[int, Range(1, MOST)] | None = None
-    """How many processes; 1 is this one alone, whatever a scheduler's environment says."""
+    """For a training on several hosts: how many processes. Without it the scheduler (SLURM, Open
+    MPI) decides; 1 is this one alone."""
     process: Annotated[int, Range(0, MOST)] | None = None
-    """Which one this is, from 0."""
+    """For a training on several hosts: the number of this process, from 0."""
 
 
 class Member(NamedTuple):

@@ -1,7 +1,7 @@
 """When a policy must hand over: limits of the vehicle's states and of the link, and the reasons.
 
-It looks at what arrives. What a policy answers is held to its limits by the judge's own guard and,
-where asked for, by the safety monitor (`eval/judging/monitor.py`).
+Only what arrives is checked here. The judge's own guard limits the policy's actions, and with
+`--monitor` the safety monitor does too (`eval/judging/monitor.py`).
 """
 
 from __future__ import annotations
@@ -25,23 +25,24 @@ class Limits:
     """Beyond any of these the companion hands over."""
 
     silence_s: Annotated[float, Range(0.01, 10.0)] = 0.1
-    """Longest time without a state [s]."""
+    """Hand over to the autopilot after this time without a state [s]."""
     image_age_s: Annotated[float, Range(0.01, 10.0)] = 0.5
-    """Longest time without a depth image [s]."""
+    """Hand over after this time without a depth image [s]."""
     tilt_deg: Annotated[float, Range(1.0, 180.0)] = 85.0
-    """Largest angle between body z and the vertical [deg]."""
+    """Hand over beyond this angle between body z and the vertical [deg]."""
     margin_m: Annotated[float, Range(0.0, 1000.0)] = 10.0
-    """The box reaches this far beyond the gates and the start, on every side [m]."""
+    """Hand over outside a box that reaches this far beyond the gates and the start [m]."""
     floor_m: Annotated[float, Range(-1000.0, 1000.0)] = -0.5
-    """The bottom of the box, world z [m]."""
+    """World z of the bottom of that box [m]."""
     deadline_s: Annotated[float, Range(1e-4, 1.0)] = 0.02
-    """From a state's arrival to its set point; a policy's answer that is later is not flown [s]."""
+    """Latest set point after its state's arrival [s]; a later one is not sent."""
     late_most: Annotated[int, Range(1, 1000)] = 5
-    """So many late answers in a row."""
+    """Hand over after this many late answers in a row."""
     clock_jump_s: Annotated[float, Range(0.01, 100.0)] = 0.2
-    """Largest step of the vehicle's clock against ours, and how late states may become [s]."""
+    """Hand over if the vehicle's clock jumps by more than this relative to ours, or if its states
+    come later than this [s]."""
     jump_m: Annotated[float, Range(0.01, 100.0)] = 0.5
-    """Farthest that a state may lie off where the one before it leads at its speed [m]."""
+    """Hand over if the position jumps by more than this beyond what the speed explains [m]."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,257 @@
+"""A command's options and a training's settings: the leaves of a configuration, and their texts.
+
+Rare options are annotated `Advanced[...]` and stand at the end of the help. A nested dataclass
+only groups options in the code: its fields are options of the command like all others.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+
+import tyro
+
+from tracks.input.ranges import ranged
+
+T = TypeVar("T")
+GROUP = "advanced"
+"""Title of the rare options, and the mark of each."""
+Advanced = Annotated[T, GROUP]
+"""A rare option."""
+VALUES = {str: "STR", int: "INT", float: "FLOAT", Path: "PATH"}
+"""Type -> what help calls a value of it."""
+SILENT = ("", "''", "None", "False")
+"""Defaults that help does not print: its text says what happens without the option."""
+
+
+class Option(NamedTuple):
+    """One option of a command."""
+
+    field: str
+    """The name of its field in the configuration."""
+    kind: Any
+    """The type of the field, with annotations."""
+    default: Any
+    """Its default; `dataclasses.MISSING` where it is required."""
+    about: str
+    """What it means."""
+    advanced: bool
+    """Whether it is rare."""
+
+    @property
+    def notes(self) -> tuple[Any, ...]:
+        """Return the annotations of its type."""
+        return getattr(self.kind, "__metadata__", ())
+
+    @property
+    def bare(self) -> Any:
+        """Return its type without annotations."""
+        return _bare(self.kind)
+
+    @property
+    def repeated(self) -> bool:
+        """Return whether it is given again for each value."""
+        return tyro.conf.UseAppendAction in self.notes
+
+    @property
+    def listed(self) -> bool:
+        """Return whether it takes several values at once, none of them a path."""
+        return (
+            get_origin(self.bare) is tuple
+            and not self.repeated
+            and not any(_bare(part) is Path for part in get_args(self.bare))
+        )
+
+    @property
+    def positional(self) -> bool:
+        """Return whether it is given without a name; a type variable stands for subcommands."""
+        return tyro.conf.Positional in self.notes or isinstance(self.kind, TypeVar)
+
+    @property
+    def flag(self) -> str:
+        """Return how it is given, such as --track; what has no name is a word in capitals."""
+        if self.positional:
+            return self.field.upper()
+        named = next((note.name for note in self.notes if getattr(note, "name", None)), self.field)
+        return f"--{named.replace('_', '-')}"
+
+
+def _bare(kind: Any) -> Any:
+    return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
+
+
+def options(command: type, default: Any = None, advanced: bool = False) -> Iterator[Option]:
+    """Yield the options of a command's configuration and of the dataclasses within.
+
+    Args:
+        command: the dataclass.
+        default: an instance with the defaults, in place of those of `command`.
+        advanced: whether all of them are rare.
+    """
+    hints, texts = get_type_hints(command, include_extras=True), texts_of(command)
+    for field in dataclasses.fields(command):
+        kind = hints[field.name]
+        rare = advanced or GROUP in getattr(kind, "__metadata__", ())
+        value = field.default if default is None else getattr(default, field.name)
+        if _within(value):
+            yield from options(type(value), value, rare)
+        else:
+            yield Option(field.name, kind, value, texts.get(field.name, ""), rare)
+
+
+def options_within(kind: Any) -> Iterator[Option]:
+    """Yield the options of `kind`, a type as tyro reads it, those of its subcommands included."""
+    for part in get_args(kind):
+        yield from options_within(part)
+    made = get_origin(kind) or kind
+    if isinstance(made, type) and dataclasses.is_dataclass(made):
+        yield from options(made)
+
+
+def read_options(
+    kind: Any, prog: str, about: str, args: Sequence[str], all_known: bool = False
+) -> tuple[Any, list[str]]:
+    """Return the configuration that `args` give, and the words that belong to no option.
+
+    Args:
+        kind: the type of the configuration.
+        prog: what help calls the program.
+        about: the head of its help.
+        args: the words behind it.
+        all_known: end with a list of similar options where a word belongs to none.
+
+    Raises:
+        SystemExit: after --help (code 0), and for options that cannot be read (code 2).
+    """
+    registry = tyro.constructors.ConstructorRegistry()
+    registry.struct_rule(_read)
+    marks = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+    with registry:
+        if all_known:
+            return tyro.cli(kind, prog=prog, description=about, args=args, config=marks), []
+        return tyro.cli(
+            kind, prog=prog, description=about, args=args, config=marks, return_unknown_args=True
+        )
+
+
+def _within(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def _read(
+    info: tyro.constructors.StructTypeInfo,
+) -> tyro.constructors.StructConstructorSpec | None:
+    """Return a configuration as tyro reads it, with the rare options in a group of their own."""
+    command: Any = get_origin(info.type) or info.type
+    if not hasattr(command, "__dataclass_fields__") or command.__name__ == GROUP:
+        return None
+    found = list(options(command))
+    if any(isinstance(option.kind, TypeVar) for option in found):
+        return None  # what it stands for is tyro's affair
+    fields = [_field(option) for option in found if not option.advanced]
+    rare = [_field(option) for option in found if option.advanced]
+    if rare:
+        parts = list[Any]()
+        for one in rare:
+            field = dataclasses.field(default=one.default, metadata={"help": one.helptext})
+            parts.append((one.name, one.type, field))
+        group = dataclasses.make_dataclass(GROUP, parts, namespace={"__doc__": "Seldom needed."})
+        kind = tyro.conf.OmitArgPrefixes[group]
+        fields.append(tyro.constructors.StructFieldSpec(GROUP, kind, group()))
+
+    def build(**values: Any) -> Any:
+        return _built(command, {**values, **(vars(values[GROUP]) if rare else {})})
+
+    return tyro.constructors.StructConstructorSpec(build, tuple(fields))
+
+
+def _built(command: Any, values: dict[str, Any]) -> Any:
+    """Return an instance of `command`, and of the dataclasses within, by their fields' names."""
+    return command(
+        **{
+            field.name: _built(type(field.default), values)
+            if _within(field.default)
+            else values[field.name]
+            for field in dataclasses.fields(command)
+        }
+    )
+
+
+def _field(option: Option) -> tyro.constructors.StructFieldSpec:
+    """Return an option as tyro reads it, with what help calls its values and its default."""
+    required, metavar = option.default is dataclasses.MISSING, None
+    part = get_args(option.bare)[:1]
+    many = part and get_origin(option.bare) is tuple and get_args(option.bare)[-1] is Ellipsis
+    if tyro.conf.Positional in option.notes:
+        metavar = f"{option.flag} ..." if many else option.flag
+        metavar = metavar if required else f"[{metavar}]"
+    elif many and not option.repeated:
+        metavar = f"{VALUES[_bare(part[0])]} ..."
+    shown = tyro.conf.arg(
+        metavar=metavar,
+        help_behavior_hint=lambda default: "" if default in SILENT else f"(default: {default})",
+    )
+    default = tyro.MISSING if required else option.default
+    kind: Any = Annotated[option.kind, shown]
+    return tyro.constructors.StructFieldSpec(option.field, kind, default, option.about)
+
+
+class Setting(NamedTuple):
+    """One setting."""
+
+    path: str
+    """As `--set` takes it, such as loss.progress."""
+    default: Any
+    """Its value in the configuration at hand."""
+    allowed: str
+    """Its range; "" where its type alone limits it."""
+    about: str
+    """What it means, with its unit."""
+
+
+def settings(config: Any) -> Iterator[Setting]:
+    """Yield every setting of a dataclass and of the dataclasses within, in their order."""
+    allowed = {".".join(path): str(limits) for path, _, limits in ranged(config)}
+    yield from _settings(config, "", allowed)
+
+
+def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
+    texts = texts_of(type(config))
+    for field in dataclasses.fields(config):
+        path, value = f"{prefix}{field.name}", getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _settings(value, f"{path}.", allowed)
+        else:
+            yield Setting(path, value, allowed.get(path, ""), texts.get(field.name, ""))
+
+
+@functools.cache
+def texts_of(cls: type) -> dict[str, str]:
+    """Return the text under each field of a dataclass, which Python itself does not keep."""
+    found = dict[str, str]()
+    for base in reversed(cls.__mro__):
+        if dataclasses.is_dataclass(base):
+            found.update(_own_texts(base))
+    return found
+
+
+def _own_texts(cls: type) -> dict[str, str]:
+    try:
+        source = inspect.getsource(cls)
+    except OSError:
+        return {}  # a class that was made while the program runs
+    (body,) = ast.parse(textwrap.dedent(source)).body
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for field, after in zip(body.body, body.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            text = after.value if isinstance(after, ast.Expr) else None
+            if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                found[field.target.id] = " ".join(text.value.split())
+    return found
