@@ -22,9 +22,8 @@ LIMITED_MOST = 0.05
 UNIT = 1.0 + 1e-6
 """Largest output of a policy whose action space is -1 to 1."""
 UP_MOST = 6.0
-"""A mean vertical acceleration above this contains gravity [m/s^2]: without gravity the mean over a
-flight is small."""
-
+"""A mean vertical acceleration above this contains gravity [m/s^2]. It counts as 0 where a vehicle
+does not climb: a correct policy commands upwards if a weak vehicle sinks."""
 
 LIFT = 3.0
 """A vertical acceleration above this, even towards a gate below, contains gravity [m/s^2]."""
@@ -54,7 +53,8 @@ class Outputs:
         self._count += ~guarded.late
         self._largest = np.fmax(self._largest, guarded.largest)
         if self._is_acceleration:
-            self._up += (state[:, 3:6] * guarded.action_b).sum(-1)
+            climbs = (state[:, 3:6] * state[:, 0:3]).sum(-1) > 0.0
+            self._up += climbs * (state[:, 3:6] * guarded.action_b).sum(-1)
 
     def columns(self, slot: int) -> dict[str, Any]:
         """Return the fields of `TrialResult` for the outputs in `slot`."""
@@ -103,7 +103,7 @@ def _warnings(
         found.append(Note("action_scale", seen, fix))
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
-        seen = f"its outputs contain gravity: {up:.1f} m/s^2 upwards on average"
+        seen = f"its outputs contain gravity: {up:.1f} m/s^2 upwards while it climbs"
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
         found.append(Note("action_gravity", seen, fix))
     return found

@@ -75,7 +75,8 @@ class TrialResult(NamedTuple):
     output_max: float = 0.0
     """Largest absolute component of the policy's raw output; 0 for none."""
     action_up: float = 0.0
-    """Mean vertical component of wanted net accelerations [m/s^2]; 0 for other actions."""
+    """Mean vertical component of wanted net accelerations [m/s^2], counted as 0 where the vehicle
+    does not climb; 0 for other actions."""
 
     @property
     def trial(self) -> TrialSpec:

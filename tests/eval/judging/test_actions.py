@@ -138,6 +138,15 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
         assert found["limited"] > 0.5
 
 
+def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
+    heavy, track = replace(VEHICLE, mass=2.7 * VEHICLE.mass), straight()
+    options = JudgeOptions(slots=1, workers=1, rules=Rules(time_limit_s=3.0))
+    trials, tracks = [TrialSpec(track.family, 0, 0)], {track.family: track}
+    result = fly(Pursuit(), trials, heavy, "mujoco", options, tracks=tracks)[0]
+    assert result.pos_z < 1.0 and result.output_max > 6.0, result
+    assert actions_of([result], ActionSpec())["warnings"] == []
+
+
 def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
     found = actions_of([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
     assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
