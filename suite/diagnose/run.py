@@ -17,6 +17,7 @@ from suite.delta.run import flight_files
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
+from suite.diagnose.identify.run import is_identified
 from suite.diagnose.plans.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
@@ -122,6 +123,7 @@ def diagnose_files(
             write_rollouts(out / "recording.rrd", flown, fitted)
             files.add("recording.rrd")
     found["findings"], found["not_examined"] = findings, not_examined(logs)
+    found["identified"] = is_identified(vehicle_name)
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
     write_report(out / "report.html", page(result, found, checks, toml, files))

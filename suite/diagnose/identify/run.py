@@ -21,6 +21,8 @@ from suite.diagnose.identify.numbers import as_json, lines_of_numbers
 SCHEMA = 1
 PARTS = ("drag", "motors", "inertia", "lag", "loop")
 """What `--leave` may name."""
+MADE = "by suite identify"
+"""In the first line of a vehicle file that this command wrote."""
 
 
 def identify_files(
@@ -89,8 +91,18 @@ def _counted(flights: int) -> str:
     return "1 flight" if flights == 1 else f"{flights} flights"
 
 
+def is_identified(vehicle: str) -> bool:
+    """Return whether `vehicle` is a file that suite identify wrote."""
+    path = Path(vehicle)
+    if not path.is_file():
+        return False
+    first = path.read_text(encoding="utf-8").partition("\n")[0]
+    return first.startswith("#") and MADE in first
+
+
 def _head(found: Identified, start: str) -> str:
-    lines = [f"From {start} by {_counted(len(found.flights))} ({found.drive}); 95 % intervals:"]
+    flights = _counted(len(found.flights))
+    lines = [f"From {start} {MADE}, {flights} ({found.drive}); 95 % intervals:"]
     lines += lines_of_numbers(found.numbers)
     lines += [f"not identifiable: {text}" for text in found.not_identified]
     return "\n".join(lines)

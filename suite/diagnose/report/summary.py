@@ -99,7 +99,10 @@ def _partly(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
     yield CHECK
-    yield "Run suite identify if the numbers of the vehicle file were never estimated."
+    if found["identified"]:
+        yield "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
+    else:
+        yield "Run suite identify if the numbers of the vehicle file were never estimated."
     yield from _unexplained(found)
     yield "Otherwise add an effect to the catalogue, or fit a correction with suite delta."
 

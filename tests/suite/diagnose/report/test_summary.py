@@ -2,6 +2,7 @@
 
 import pytest
 
+from suite.diagnose.identify.run import is_identified
 from suite.diagnose.report.summary import answer, next_steps
 
 DRAG = {
@@ -20,7 +21,8 @@ DRAG = {
 
 def found(verdict, effects=(), where=None, **more):
     base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
-    return {**base, "unexplained": {"where": where}, "not_examined": [], **more}
+    base |= {"unexplained": {"where": where}, "not_examined": [], "identified": False}
+    return {**base, **more}
 
 
 def test_an_answer_has_the_effect_its_values_and_its_size():
@@ -55,3 +57,13 @@ def test_every_verdict_says_what_to_do_next(verdict, words):
     effects = [] if verdict == "unknown" else [DRAG]
     steps = next_steps(found(verdict, effects, where="a swing at 1 Hz"))
     assert all(word in step for word, step in zip(words, steps, strict=True))
+
+
+def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):
+    path, written = tmp_path / "mine.toml", "# From racer5 by suite identify, 2 flights (motors)\n"
+    path.write_text(written + 'name = "mine"\n')
+    assert is_identified(str(path)) and not is_identified("racer5")
+    path.write_text('name = "by suite identify"\n')
+    assert not is_identified(str(path))
+    steps = next_steps(found("unknown", identified=True))
+    assert "repeat it if the vehicle has changed" in steps[1]
