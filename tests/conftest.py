@@ -1,5 +1,6 @@
 """What every test runs under: JAX on the CPU with compiled code kept, hypothesis repeatable."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -31,6 +32,9 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "agg")
+
+# Tracing makes millions of small objects; collected this seldom they cost a tenth of the time less.
+gc.set_threshold(100_000, 20, 100)
 
 settings.register_profile(
     "suite",

@@ -8,17 +8,21 @@ import json
 import re
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+import suite
 from eval.effects import EFFECTS
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds.trial import Rules
 from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
 from suite.train.overrides import override
+from tests.support.short import cut_short
 
 RECIPE, DIAGNOSE = train_command.named_recipe, diagnose_run.diagnose_files
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,6 +42,12 @@ EXAMPLES = {
     "quadrotor_gradient": (["3"], r"0\.06000 kg; the truth is 0\.06 kg", []),
 }
 """Name: arguments, what it must say (an expression), files that it must write."""
+IN_SHORT = {
+    "fly_and_plot": r"\d gates, timeout",
+    "own_track": r"\d gates, \w+",
+    "own_effect": r"0\.0 N/m: \d gates, timeout\n(.*\n)*0\.4 N/m: \d gates",
+}
+"""What these say where trials end after a second."""
 
 
 def source(name):
@@ -66,9 +76,15 @@ def as_a_program(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_example_runs(name, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("short", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
     """In this process, where jax and what is compiled are there already; warnings are errors."""
     args, said, written = EXAMPLES[name]
+    if short:
+        cut_short(monkeypatch, 1.0)
+        made = partial(suite.make_env, rules=Rules(time_limit_s=1.0))
+        monkeypatch.setattr(suite, "make_env", made)
+        said = IN_SHORT.get(name, said).replace("[1-8] gates", r"\d gates")
     program = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [program, *args])
     if name == "diagnose_a_log":

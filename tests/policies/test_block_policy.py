@@ -25,7 +25,7 @@ def observe(seed, n):
     return rng.uniform(-1, 1, (n, 64)).astype(np.float32), state, image
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 150), data=st.data())
 def test_neither_place_nor_neighbours_nor_number_matter(policy, seed, n, data):
     hidden, state, image = observe(seed, 150)

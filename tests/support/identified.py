@@ -9,6 +9,7 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
+from suite.diagnose.identify.identify import identify
 from suite.diagnose.plans.simulate import Sensors
 from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import Fleet, logs_of, recordings_of
@@ -64,3 +65,9 @@ def logs(drive, seed, ways=WAYS):
     """Their logs with noise, with what `drive` needs and no other drive."""
     fleet = Fleet(truth(), ways)
     return logs_of(fleet, recordings(ways), drive, np.random.default_rng(seed), sensors=SENSORS)
+
+
+@cache
+def found(drive, count=None):
+    """What `start` is identified as from the logs with seed 0, or from the first so many."""
+    return identify(logs(drive, 0)[:count], start())

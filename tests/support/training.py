@@ -113,10 +113,12 @@ def straight_worlds(worlds: Worlds, speed: float, wall_x: float = 50.0) -> World
 
 
 def doubled(tree):
-    """Return a tree with its float arrays as float64; call where JAX has 64 bits enabled."""
-    return jax.tree.map(
-        lambda x: jnp.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, tree
-    )
+    """Return a tree with its float arrays as float64, for where JAX has 64 bits enabled."""
+
+    def longer(x):
+        return np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x
+
+    return jax.tree.map(longer, tree)
 
 
 def fresh_params(spec: PolicySpec = SPEC, seed: int = 0, lively: float = 1.0):

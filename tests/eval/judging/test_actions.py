@@ -44,16 +44,16 @@ def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
 )
 def test_worlds_agree_and_rotorpy_flies_commands_too(kind, single):
     action = ActionSpec(kind)
-    tilt = first_action(action, VEHICLE) + ([0.5, 0.3, 0.2, 0.0] if kind == "ctbr" else [0.02] * 4)
-    policy = Steady(tuple(tilt), PolicySpec(action=action))
+    tilt = first_action(action, VEHICLE) + ([0.5, 0.3, 0.2, 0.0] if kind == "ctbr" else [0.05] * 4)
+    policy, rules = Steady(tuple(tilt), PolicySpec(action=action)), Rules(time_limit_s=0.6)
     ends = {}
     for world in ("mujoco", "reference", "rotorpy", *single):
-        result = flown(policy, world, straight(height=30.0))
+        result = flown(policy, world, straight(height=30.0), rules)
         ends[world] = np.array([result.pos_x, result.pos_y, result.pos_z, result.v_max])
     assert (ends["mujoco"] == ends["reference"]).all()
     for world in single:
-        np.testing.assert_allclose(ends[world], ends["mujoco"], atol=5e-3)
-    np.testing.assert_allclose(ends["rotorpy"], ends["mujoco"], atol=0.3)
+        np.testing.assert_allclose(ends[world], ends["mujoco"], atol=1e-3)
+    np.testing.assert_allclose(ends["rotorpy"], ends["mujoco"], atol=0.05)
     assert ends["mujoco"][3] > 0.5
 
 

@@ -17,8 +17,6 @@ VEHICLE = load_vehicle("reference")
 
 TRIALS = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
 
-RULES = Rules(time_limit_s=1.5)
-
 SPEC = PolicySpec(rate_hz=25.0)
 
 DT, PERIOD_S = 0.002, 0.066
@@ -116,14 +114,14 @@ class Watcher:
         return action_b, hidden
 
 
-def watched(pilot, sensors, trials=TRIALS[:1], slots=1, rules=RULES):
+def watched(pilot, sensors, trials, slots, rules):
     watcher = Watcher(pilot)
     options = JudgeOptions(slots=slots, workers=1, rules=rules, sensors=sensors)
     return fly(watcher, trials, VEHICLE, options=options), watcher
 
 
 def given(sensors, trials=TRIALS[:1], slots=1):
-    results, watcher = watched(Pursuit(spec=SPEC), sensors, trials, slots)
+    results, watcher = watched(Pursuit(spec=SPEC), sensors, trials, slots, Rules(time_limit_s=0.5))
     return results, watcher.given
 
 
@@ -140,13 +138,13 @@ def test_in_the_judge_an_age_of_a_period_shows_the_decision_before():
 
 
 def test_an_old_state_has_the_misplaced_gate_that_was_next_then():
-    rules = Rules(time_limit_s=4.0)
-    (result,), watcher = watched(Pursuit(spec=SPEC), PERFECT, rules=rules)
+    trial = TRIALS[:1], 1, Rules(time_limit_s=2.4)
+    (result,), watcher = watched(Pursuit(7.0, spec=SPEC), PERFECT, *trial)
     assert result.gates_passed >= 2, "the flight is to pass gates"
     moved = {"gate_map": {"moved": 0.3}}
     same = Scripted(np.array(watcher.answers_b), spec=SPEC)
     prompt, late = (
-        np.stack([state[0, :9] for state, _ in watched(same, sensors, rules=rules)[1].given])
+        np.stack([state[0, :9] for state, _ in watched(same, sensors, *trial)[1].given])
         for sensors in (sensor_set(moved), sensor_set(moved | {"delay": {"state": 0.12}}))
     )
     assert np.array_equal(late[3:], prompt[:-3])

@@ -39,7 +39,7 @@ def flown(
     trials: list[TrialSpec],
     monkeypatch: Any,
     slots: int = 40,
-    seconds: float = 2.0,
+    seconds: float = 1.6,
 ) -> tuple[list[TrialResult], np.ndarray]:
     """Return the results, and the NEES (T, N) of position, velocity and attitude."""
     found: list[np.ndarray] = []

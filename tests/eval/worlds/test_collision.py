@@ -5,14 +5,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.collision import NEAR, box_distances, near_solids
 from tests.support.courses import straight
 from tracks.families import MAX_COUNTS
 from tracks.geometry.rotation import exp_rot
 from tracks.geometry.scene import Boxes, Rods, Spheres, counts, stack
 
-VEHICLE = load_vehicle("reference")
+distances = jax.jit(box_distances)
+nearest = jax.jit(near_solids)
 
 
 # The box's front face, and its front edge once it is turned by 45 degrees.
@@ -21,7 +21,7 @@ def test_distance_to_a_wall_and_to_the_ground_by_hand(turn, reach):
     scene = stack([straight(wall_at=3.0).scene], MAX_COUNTS)
     pos_w, rot_w = np.array([[0.0, 0.0, 1.5]]), exp_rot(np.array([[0.0, 0.0, turn]]))
     half_size, middle_b = np.array([0.1, 0.05, 0.02]), np.array([0.0, 0.0, -0.01])
-    found = np.asarray(box_distances(scene, pos_w, rot_w, half_size, middle_b))[0]
+    found = np.asarray(distances(scene, pos_w, rot_w, half_size, middle_b))[0]
     assert found[0] == pytest.approx(2.95 - reach, abs=1e-3)
     assert found[-1] == pytest.approx(1.5 - 0.01 - 0.02)
 
@@ -32,7 +32,7 @@ def test_long_walls_far_away_do_not_hide_a_box_near_by():
     half_size = np.array([*[[100.0, 0.1, 5.0]] * NEAR.boxes, [0.1, 0.1, 0.1]])
     turned = np.tile(np.eye(3), (len(center_w), 1, 1))
     scene = straight().scene._replace(boxes=Boxes(center_w, turned, half_size))
-    near = near_solids(stack([scene], MAX_COUNTS), np.array([[0.0, 0.0, 1.0]]))
+    near = nearest(stack([scene], MAX_COUNTS), np.array([[0.0, 0.0, 1.0]]))
     assert near.boxes.center_w.shape == (1, NEAR.boxes, 3)
     np.testing.assert_allclose(near.boxes.center_w[0, 0], center_w[-1])
 
@@ -40,7 +40,7 @@ def test_long_walls_far_away_do_not_hide_a_box_near_by():
 def test_every_triangle_of_a_mesh_is_near():
     triangles = np.arange(5 * 9.0).reshape(5, 3, 3)
     scene = straight().scene._replace(triangles=triangles)
-    near = near_solids(stack([scene], MAX_COUNTS._replace(triangles=5)), np.zeros((1, 3)))
+    near = nearest(stack([scene], MAX_COUNTS._replace(triangles=5)), np.zeros((1, 3)))
     np.testing.assert_array_equal(near.triangles, triangles[None])
 
 
@@ -117,7 +117,7 @@ def test_no_contact_is_missed_and_none_made_up(name):
     scene = alone(geom, size)
     batch = jax.tree.map(lambda a: np.repeat(a, n, 0), stack([scene], counts(scene)))
     found = np.asarray(
-        jax.jit(box_distances)(*jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))))
+        distances(*jax.tree.map(np.float32, (batch, pos, rot, half_size, np.zeros(3))))
     )
     found = found[:, :-1].min(-1)
     met = found <= 0.0

@@ -1,5 +1,7 @@
 """A set of two cases with one short flight each."""
 
+import shutil
+
 import pytest
 
 from suite.blind import build as build_module
@@ -10,19 +12,32 @@ from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.blind import NULL, SINGLE
 
 
-@pytest.fixture
-def short_flights(monkeypatch):
-    """Every ordinary flight is one short figure eight."""
+def shorten(monkeypatch):
+    """Make every ordinary flight one short figure eight, and a set's cases two."""
 
     def flights(rng):
         return [Trajectory("figure_eight", 2.0, speed=float(rng.uniform(3, 5)), size=2.0)]
 
+    cases = {"case_001": SINGLE, "case_002": NULL}
     monkeypatch.setattr(build_module, "ordinary_flights", flights)
+    monkeypatch.setitem(make_module.DRAWERS, "mujoco", lambda seed, count: cases)
 
 
 @pytest.fixture
-def small_set(tmp_path, monkeypatch, short_flights):
-    cases = {"case_001": SINGLE, "case_002": NULL}
-    monkeypatch.setitem(make_module.DRAWERS, "mujoco", lambda seed, count: cases)
-    make_set(tmp_path, 5, None, Console())
-    return tmp_path
+def short_flights(monkeypatch):
+    shorten(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def made_set(tmp_path_factory):
+    """Return the folder of a set that no test changes."""
+    folder = tmp_path_factory.mktemp("blind")
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch)
+        make_set(folder, 5, None, Console())
+    return folder
+
+
+@pytest.fixture
+def small_set(made_set, tmp_path, short_flights):
+    return shutil.copytree(made_set, tmp_path / "set")

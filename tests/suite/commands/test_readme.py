@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from suite import cli
+from tests.support.short import cut_short
 
 ROOT = Path(__file__).resolve().parents[3]
 ARCHIVE = sorted((ROOT / "docs/archive").glob("*.md"))
@@ -118,6 +119,7 @@ def test_what_does_not_exist_is_found():
 @pytest.mark.parametrize("where", [where for where, (marked, _) in BLOCKS.items() if marked])
 def test_marked_commands_run(where, tmp_path, monkeypatch, capfd):
     """One after the other in this process, where what the first compiles the next one has."""
+    cut_short(monkeypatch, 1.5)
     monkeypatch.chdir(tmp_path)
     for program, *words in _commands(BLOCKS[where][1]):
         assert program == "suite" and cli.main(words) == 0, (words, capfd.readouterr().err)

@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from functools import cache
 
 import jax
 import numpy as np
@@ -16,26 +15,21 @@ from policies.networks import delta_network
 from suite.common import curve
 from suite.common.console import Console
 from suite.train import run, training_loop
+from tests.support.canonical import NOISY, update_of
 from tests.support.training import boxes_worlds, fresh_params, small_config
 
-CONFIG = small_config(physics={"depth_noise": 0.02})
 make_update = run.make_update
 
 
-@cache
-def compiled_update(config):
-    return make_update(config)
-
-
-def update_of(config, delta=None, begin=0):
+def compiled_update(config, delta=None, begin=0):
     """Return the trainer's update, compiled once for all tests."""
-    return compiled_update(config) if delta is None else make_update(config, delta, begin)
+    return update_of(config) if delta is None else make_update(config, delta, begin)
 
 
 @pytest.fixture(autouse=True)
 def _small_scenes(monkeypatch):
     monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
-    monkeypatch.setattr(run, "make_update", update_of)
+    monkeypatch.setattr(run, "make_update", compiled_update)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +38,8 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "sample_worlds", boxes_worlds)
-        patch.setattr(run, "make_update", update_of)
-        run.train(CONFIG, folder, Console())
+        patch.setattr(run, "make_update", compiled_update)
+        run.train(NOISY, folder, Console())
     return folder
 
 
@@ -85,20 +79,20 @@ def test_a_run_leaves_its_policy_its_curve_and_what_it_was(whole):
     assert np.all(np.isfinite(losses)) and np.ptp(losses) > 0
     assert json.loads((whole / "run.json").read_text())["config"]["episode"]["batch"] == 4
     policy = load_policy_checkpoint(whole / "policy")
-    assert policy.spec == CONFIG.spec
+    assert policy.spec == NOISY.spec
     assert policy.config["training"]["iteration"] == 6
-    fresh = run.start_state(CONFIG).params
+    fresh = run.start_state(NOISY).params
     assert all(np.any(policy.params[name] != np.array(value)) for name, value in fresh.items())
 
 
 def test_a_stopped_run_resumes_exactly(whole, tmp_path, monkeypatch):
     go_on = stop_at(monkeypatch, 4)
     with pytest.raises(KeyboardInterrupt):
-        run.train(CONFIG, tmp_path, Console())
+        run.train(NOISY, tmp_path, Console())
     assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
     assert read_config(tmp_path / "state")["training"]["iteration"] == 3
     go_on()
-    assert run.train(CONFIG, tmp_path, Console()).iterations == 6
+    assert run.train(NOISY, tmp_path, Console()).iterations == 6
     assert_same_run(tmp_path, whole)
 
 
@@ -122,13 +116,13 @@ def test_a_kill_in_the_middle_of_saving_leaves_a_run_that_resumes(
 
     monkeypatch.setattr(owner, dies_in, dying)
     with pytest.raises(Killed):
-        run.train(CONFIG, tmp_path, Console())
+        run.train(NOISY, tmp_path, Console())
     assert read_config(tmp_path / "state")["training"]["iteration"] == 2
     load_policy_checkpoint(tmp_path / "policy")
     with (tmp_path / curve.CURVE).open("a") as file:
         file.write('{"iteration": 2, "lo')
     monkeypatch.setattr(owner, dies_in, real)
-    run.train(CONFIG, tmp_path, Console())
+    run.train(NOISY, tmp_path, Console())
     assert_same_run(tmp_path, whole)
 
 
@@ -143,6 +137,7 @@ from pathlib import Path
 import tracks.common.files
 from suite.common.console import Console
 from suite.train import run, training_loop
+from tests.support.canonical import NOISY, update_of
 from tests.support.training import boxes_worlds, small_config
 run.sample_worlds, training_loop.SAVE_PERIOD_S = boxes_worlds, 0.0
 real, renamed = os.replace, []
@@ -163,26 +158,26 @@ def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole,
     )
     assert done.returncode == 9, done.stderr
     assert not (tmp_path / "state").exists()
-    run.train(CONFIG, tmp_path, Console())
+    run.train(NOISY, tmp_path, Console())
     assert_same_run(tmp_path, whole)
 
 
 def test_a_folder_with_another_run_is_refused(whole):
-    other = replace(CONFIG, episode=replace(CONFIG.episode, rest_share=0.5))
+    other = replace(NOISY, episode=replace(NOISY.episode, rest_share=0.5))
     with pytest.raises(ValueError, match=r"episode\.rest_share is 0\.3 there, 0\.5 here"):
         run.train(other, whole, Console())
     with pytest.raises(ValueError, match="another --from; another --delta"):
         delta = delta_network.init(jax.random.key(0))
-        run.train(CONFIG, whole, Console(), fresh_params(), delta)
+        run.train(NOISY, whole, Console(), fresh_params(), delta)
     with pytest.raises(ValueError, match="remove the folder"):
-        run.train(replace(CONFIG, seed=1), whole, Console())
+        run.train(replace(NOISY, seed=1), whole, Console())
 
 
 def test_a_delta_action_stays_as_it_is_while_the_policy_is_trained_under_it(whole, tmp_path):
     delta = delta_network.init(jax.random.key(1))
     delta["output.weight"] += 0.3
     before = {name: np.array(value) for name, value in delta.items()}
-    run.train(CONFIG, tmp_path, Console(), None, delta)
+    run.train(NOISY, tmp_path, Console(), None, delta)
     for name, value in before.items():
         np.testing.assert_array_equal(delta[name], value)
     assert rows(tmp_path)[0]["loss"] != rows(whole)[0]["loss"]

@@ -89,12 +89,12 @@ def test_magnitudes_are_drawn_per_world_and_model_from_the_range():
 def test_an_old_view_lies_between_two_decisions():
     worlds = boxes_worlds(SMALL)
     state = make_dynamics(SMALL).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    now = view_in(worlds, state, jnp.asarray(worlds.target))
-    now = now._replace(depth_m=jnp.ones((BATCH, 2, 2)))
+    now = jax.jit(view_in)(worlds, state, worlds.target)
+    now = jax.tree.map(np.asarray, now._replace(depth_m=np.ones((BATCH, 2, 2))))
     before = now._replace(pos_w=now.pos_w - 1.0, gate_w=now.gate_w + 5.0, depth_m=now.depth_m * 2)
     first = before._replace(pos_w=now.pos_w - 3.0, depth_m=now.depth_m * 3)
-    age = jnp.linspace(0.0, 2.0, BATCH)  # 0, 0.4, 0.8, 1.2, 1.6, 2
-    old = older((now, before, first), age, jnp.round(age))
+    age = np.linspace(0.0, 2.0, BATCH)  # 0, 0.4, 0.8, 1.2, 1.6, 2
+    old = jax.jit(older)((now, before, first), age, np.round(age))
     away = np.array(now.pos_w - old.pos_w)[:, 0]
     assert away == pytest.approx([0.0, 0.4, 0.8, 1.4, 2.2, 3.0], abs=1e-5)
     assert np.array_equal(old.gate_w != now.gate_w, np.repeat(age[:, None] > 0.5, 3, 1))

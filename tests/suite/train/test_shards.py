@@ -12,7 +12,7 @@ from suite.train import shards
 from suite.train.config import check
 from suite.train.shards import check_processes, curve_numbers, flight_numbers, sample_hidden
 from suite.train.update import make_update, start_state
-from tests.support.canonical import NOISY, gradient_of
+from tests.support.canonical import NOISY, gradient_of, update_of
 from tests.support.training import (
     boxes_worlds,
     fresh_params,
@@ -35,48 +35,52 @@ def test_several_processes_divide_the_shards(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def noisy():
-    """Return (config of four shards, state and numbers after three updates on one thread)."""
+def sharded():
+    """Return a configuration of four shards, and its update for two cores."""
     config = replace(NOISY, episode=replace(NOISY.episode, shards=4))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "usable_cores", lambda: 1)
-        return config, updated(config)
+        patch.setattr(shards, "usable_cores", lambda: 2)
+        return config, make_update(config)
 
 
-def updated(config):
+def updated(config, update):
     """Return state and numbers after three updates; the first one's rate is 0."""
-    update, state = make_update(config), start_state(config)
+    state = start_state(config)
     for number in range(3):
         state, numbers = update(state, boxes_worlds(config, number))
     return state, numbers
 
 
-def test_shards_have_the_gradient_of_the_whole_batch(noisy):
-    """The sums run in another order; noise is a world's own, whichever shard it is in."""
-    _, (state, numbers) = noisy
-    expected, curve = updated(NOISY)
-    assert largest_difference(state.params, expected.params) < 1e-3
-    assert largest_difference(state.hidden, expected.hidden) < 1e-3
-    assert largest_difference(numbers, curve) < 1e-3
+def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(sharded, monkeypatch):
+    """Each thread waits for the other, so that one after the other would never end.
 
-
-def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(noisy, monkeypatch):
-    """Each thread waits for the other, so that one after the other would never end."""
-    monkeypatch.setattr(shards, "usable_cores", lambda: 2)
-    config, expected = noisy
+    The first update is computed one shard after the other, so that each is compiled once.
+    """
+    config, update = sharded
     both, names = threading.Barrier(2, timeout=60), list[str]()
     real = shards.jax.block_until_ready
 
     def met(found):
         names.append(threading.current_thread().name)
-        if len(names) > config.episode.shards:  # the first are computed one by one
+        if len(names) > config.episode.shards:
             both.wait()
         return real(found)
 
     monkeypatch.setattr(shards.jax, "block_until_ready", met)
-    found = updated(config)
+    state, worlds = start_state(config), boxes_worlds(config)
+    alone, together = update(state, worlds), update(state, worlds)
+    assert len(set(names[: config.episode.shards])) == 1
     assert len(set(names[config.episode.shards :])) == 2
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    jax.tree.map(np.testing.assert_array_equal, together, alone)
+
+
+def test_shards_have_the_gradient_of_the_whole_batch(sharded):
+    """The sums run in another order; noise is a world's own, whichever shard it is in."""
+    state, numbers = updated(*sharded)
+    expected, curve = updated(NOISY, update_of(NOISY))
+    assert largest_difference(state.params, expected.params) < 1e-3
+    assert largest_difference(state.hidden, expected.hidden) < 1e-3
+    assert largest_difference(numbers, curve) < 1e-3
 
 
 def test_the_curve_is_of_steps_that_count():

@@ -1,5 +1,7 @@
 """Every kind of fault is named, its fix restores the flight, and good flights stay as they are."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -19,6 +21,11 @@ NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "mo
 
 def good(seed=0, end=16.0):
     """A flight as a logger has it: noise, commands that hold, and a body that follows in 50 ms."""
+    return {name: part.copy() for name, part in logged(seed, end).items()}
+
+
+@cache
+def logged(seed, end):
     truth = known_flight.fly(np.arange(0.0, end, 1.0 / HZ))
     held = (np.floor(truth.time * POLICY_HZ) / POLICY_HZ * HZ).astype(int)
     wanted = known_flight.fly(truth.time + 0.05).cmd_rate[held]

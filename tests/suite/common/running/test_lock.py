@@ -99,7 +99,7 @@ def test_of_many_that_come_and_go_one_is_inside(tmp_path):
     inside, twice, done, foreign = [], [], [], []
 
     def come_and_go():
-        while len(done) < 300 and not twice:
+        while len(done) < 100 and not twice:
             try:
                 with one_writer(tmp_path):
                     inside.append(1)

@@ -47,7 +47,7 @@ def pulls(found):
     ("drive", "least"), [("rates", 9), ("pwm", 7), ("rotors", 7), ("torques", 6)]
 )
 def test_what_flights_tell_is_near_the_truth(drive, least):
-    found = identify(known.logs(drive, 0), known.start())
+    found = known.found(drive)
     off = pulls(found)
     assert found.drive == drive
     assert len(off) >= least
@@ -219,7 +219,7 @@ def motor_pulls(found):
 
 
 def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
-    found = identify(known.logs("pwm", 0), known.start())
+    found = known.found("pwm")
     assert "effects.command_delay.delay" not in as_json(found.numbers)
     # Their sum is identified, and the file has it, however its lag shares it.
     rest = found.vehicle.effects["command_delay"].delay
@@ -244,7 +244,7 @@ def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column,
 def test_a_flight_whose_commands_stop_early_takes_nothing_from_the_others():
     logs = known.logs("pwm", 0)
     found = as_json(identify([*logs[:3], *cut(logs[3:], "pwm")], known.start()).numbers)
-    alone = as_json(identify(logs[:3], known.start()).numbers)
+    alone = as_json(known.found("pwm", 3).numbers)
     assert set(found) == set(alone)
     for key, entry in found.items():
         np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
@@ -298,7 +298,7 @@ def test_flights_without_a_voltage_leave_the_motors_to_those_that_have_one():
     assert np.max(np.abs(list(off.values()))) < 2.5
     (note,) = found.notes
     assert note.startswith("no voltage in flight_3: ")
-    alone = as_json(identify(logs[:3], known.start()).numbers)
+    alone = as_json(known.found("pwm", 3).numbers)
     for key, entry in as_json(found.numbers).items():
         np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
 

@@ -67,23 +67,20 @@ def fly_trainer(config, actions, rate_hz):
     batch = actions.shape[1]
     effects = quadrotor.draw_effects(config, batch, np.random.default_rng(0))
     constants = QuadrotorParams(np.full(batch, 1 / rate_hz), doubled(effects))
-    towards = jnp.tile(jnp.asarray([1.0, 0.0, 0.0]), (batch, 1))
-    still = jnp.zeros((batch, 3))
-    body = start(constants, still + jnp.asarray([0.0, 0.0, 10.0]), still, towards)
-    keys, target = (
-        jax.random.split(jax.random.key(0), batch),
-        jnp.tile(jnp.asarray(FAR_W), (batch, 1)),
-    )
+    towards, target = (np.tile(x, (batch, 1)) for x in ([1.0, 0.0, 0.0], FAR_W))
+    still, keys = np.zeros((batch, 3)), jax.random.split(jax.random.key(0), batch)
 
     @jax.jit
-    def fly(body, actions):
+    def fly(constants, actions):
+        body = start(constants, still + np.array([0.0, 0.0, 10.0]), still, towards)
+
         def one(body, action):
             body = step(body, constants, action, target, keys)
             return body, (body.pos_w, body.rot_w, body.vel_w)
 
         return jax.lax.scan(one, body, actions)[1]
 
-    return [np.asarray(x) for x in fly(body, jnp.asarray(actions))]
+    return [np.asarray(x) for x in fly(constants, actions)]
 
 
 def fly_judge(vehicle, actions, rate_hz):

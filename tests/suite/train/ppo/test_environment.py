@@ -30,15 +30,18 @@ def worlds():
 def test_mapped_it_flies_what_the_batch_of_the_trainers_ppo_flies(worlds):
     seen, state = reset(KEYS, worlds)
     assert seen.state.shape == (3, 12) and seen.image.shape == (3, 20, 20)
-    action = jnp.asarray([[0.1, 0.2, -0.1], [0.5, 0.0, 0.3], [-3.0, 0.0, 0.0]])
+    action = np.array([[0.1, 0.2, -0.1], [0.5, 0.0, 0.3], [-3.0, 0.0, 0.0]], np.float32)
     _, after, reward, done, info = step(KEYS, state, action, worlds)
     assert not done.any() and not info["truncated"].any()
 
     race = ENV._race
-    own = jax.tree.map(lambda leaf: leaf[state.world], worlds)
-    flown = jax.jit(race.fly)(
-        own, race.start(own), 20.0 * jnp.clip(action, -1, 1), world_keys(KEYS[0], own)
-    )
+
+    @jax.jit
+    def fly(worlds, wanted):
+        own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[state.world], worlds)
+        return race.fly(own, race.start(own), wanted, world_keys(KEYS[0], own))
+
+    flown = fly(worlds, 20.0 * np.clip(action, -1, 1))
     np.testing.assert_allclose(
         after.episode.state.vel_w[:, 0], flown[0].state.vel_w, rtol=1e-4, atol=1e-4
     )

@@ -57,8 +57,7 @@ def test_it_makes_no_difference_how_the_start_says_a_number(drive):
         inertia=tuple(np.divide(plain.inertia, (0.9, 1.1, 1.0)).tolist()),
         controller=replace(plain.controller, rate_gain=gain),
     )
-    logs = known.logs(drive, 0)
-    one, other = identify(logs, plain).vehicle, identify(logs, said).vehicle
+    one, other = known.found(drive).vehicle, identify(known.logs(drive, 0), said).vehicle
     assert set(one.effects) == set(other.effects)
     np.testing.assert_allclose(other.inertia, one.inertia, rtol=1e-6)
     np.testing.assert_allclose(other.controller.rate_gain, one.controller.rate_gain, rtol=1e-6)
