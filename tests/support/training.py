@@ -113,10 +113,11 @@ def straight_worlds(worlds: Worlds, speed: float, wall_x: float = 50.0) -> World
 
 
 def doubled(tree):
-    """Return a tree with its float arrays as float64, for where JAX has 64 bits enabled."""
+    """Return a tree whose float arrays are as long as JAX has them: float64 where that is on."""
+    kind = jax.dtypes.canonicalize_dtype(float)
 
     def longer(x):
-        return np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x
+        return np.asarray(x, kind) if np.asarray(x).dtype.kind == "f" else x
 
     return jax.tree.map(longer, tree)
 

@@ -67,12 +67,13 @@ def fly_trainer(config, actions, rate_hz):
     batch = actions.shape[1]
     effects = quadrotor.draw_effects(config, batch, np.random.default_rng(0))
     constants = QuadrotorParams(np.full(batch, 1 / rate_hz), doubled(effects))
-    towards, target = (np.tile(x, (batch, 1)) for x in ([1.0, 0.0, 0.0], FAR_W))
-    still, keys = np.zeros((batch, 3)), jax.random.split(jax.random.key(0), batch)
+    places = ([1.0, 0.0, 0.0], FAR_W, [0.0, 0.0, 0.0], [0.0, 0.0, 10.0])
+    towards, target, still, high = doubled([np.tile(place, (batch, 1)) for place in places])
+    keys = jax.random.split(jax.random.key(0), batch)
 
     @jax.jit
     def fly(constants, actions):
-        body = start(constants, still + np.array([0.0, 0.0, 10.0]), still, towards)
+        body = start(constants, high, still, towards)
 
         def one(body, action):
             body = step(body, constants, action, target, keys)
