@@ -101,8 +101,6 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")
     for step in next_steps(result):
         console.say(f"next: {step}")
-    for line in result["separate_with"]:
-        console.say(f"to separate {line}")
     for side in ("held_out", "outside"):
         compared = (result.get("black_box") or {}).get(side)
         if compared:

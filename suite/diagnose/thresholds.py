@@ -166,6 +166,11 @@ class Thresholds:
     view_left_share: float = 0.1
     """Share of a view's squared error that a black box may close beyond what was named, before
     something is missing [1]."""
+    unexplained_trim: float = 1.5
+    """A force that nothing explains counts beyond so many times the flights' own constant offsets:
+    attitude and thrust of a log are known no better than these show [1]."""
+    unexplained_force: float = 0.5
+    """But from here on in any case: an attitude off by 3 degrees, or 5 % of the weight [m/s^2]."""
     least_rotor_gain: float = 0.01
     """Share of the largest gain below which rotors do nothing along an axis [1]."""
     carried_ridge: float = 0.01

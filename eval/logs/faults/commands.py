@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.motors import over_force, within
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
@@ -37,7 +38,6 @@ RANGES = (
 THRUST_FITS, THRUST_EFFECT = 1.35, 2.0
 """A ratio within the first factor of a unit's is that unit. One within the second factor of 1 may
 be a physical effect or a wrong mass."""
-STANDARD_GRAVITY = 9.80665
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -78,7 +78,7 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     if ratio <= 0.0:
         return []
     figures = f"it is {sign * ratio:.3g} times the force per mass that the path needs"
-    units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / STANDARD_GRAVITY}
+    units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
     near = within(units, THRUST_FITS, ratio)

@@ -24,7 +24,13 @@ from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import LONGEST_S, interpolate, on_every_row, with_fewer_rows
+from suite.diagnose.data.sampling import (
+    LONGEST_S,
+    interpolate,
+    on_every_row,
+    torque_between_rows,
+    with_fewer_rows,
+)
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,
@@ -142,23 +148,9 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
     _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
     _, noisy = wrench_difference(speed + noise, speed, vehicle)
     flight = calibrated(flight, turned, noisy)
-    return flight._replace(credible=flight.credible * _between_rows(flight, vehicle))
-
-
-def _between_rows(flight: SmoothedFlight, vehicle: Vehicle) -> np.ndarray:
-    """Return how much larger (3,) angular accelerations are than straight lines between rows say.
-
-    A rate loop that looks more often than the log has rows asks for less as the body turns: the
-    slope of an acceleration `a` falls by `gain * step * a / lag` from a row to the next, and the
-    trapezoid misses `step / 12` of that fall (Euler and Maclaurin). Of a firmware's loop, whose
-    settings are no gain, it is taken that it is as fast as the rotors.
-    """
-    lag, loop = vehicle.rotors.time_constant, vehicle.controller
-    step = float(np.median(np.diff(flight.rows.time_s)))
-    if step <= 1.0 / loop.frequency or step >= lag:
-        return np.ones(3)
-    gain = np.array(loop.rate_gain) if loop.kind == "p" else np.full(3, 1.0 / lag)
-    return 1.0 + gain * step**2 / (12.0 * lag)
+    step_s = float(np.median(np.diff(flight.rows.time_s)))
+    between = 1.0 + torque_between_rows(vehicle, step_s)
+    return flight._replace(credible=flight.credible * between)
 
 
 def parted(

@@ -21,6 +21,7 @@ from scipy.signal import lfilter
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
+from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
@@ -268,6 +269,12 @@ def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray,
     return filled_s, command[before] + share[:, None] * (command[after] - command[before])
 
 
+def integral_of_held(time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Return the integral (K, 4) of a held `command` (K, 4) from the first of `time` (K,) on."""
+    span = np.diff(np.where(np.isfinite(time), time, time[np.isfinite(time)].max()))
+    return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
+
+
 def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
     """Return `grid` with steps of no length, which move nothing, up to `count` steps."""
     missing = count - len(grid.look_s)
@@ -318,6 +325,45 @@ def rotors_at(
         share = (1.0 - np.exp(-passed / lag)) / (1.0 - np.exp(-span / lag))
         columns.append(column[before] + share * (column[after] - column[before]))
     return np.stack(columns, axis=1)
+
+
+def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
+    """Return the share (3,) of the rotors' torque that rows `step_s` [s] apart do not show.
+
+    A rate loop that samples more often than the log has rows asks for less as the body turns: the
+    slope of an angular acceleration `a` falls by `gain * step * a / lag` from a row to the next,
+    and the trapezoid misses `step / 12` of that fall (Euler and Maclaurin). Where rows are further
+    apart than the lag, rotors settle between them: without any lag half of the fall is missed.
+    Settings of a firmware's loop are no gain; it is assumed to be as fast as the rotors.
+    """
+    lag, loop = vehicle.rotors.time_constant, vehicle.controller
+    if step_s <= 1.0 / loop.frequency:
+        return np.zeros(3)
+    gain = np.array(loop.rate_gain) if loop.kind == "p" else np.full(3, 1.0 / max(lag, step_s))
+    settled = 2.0 * step_s if step_s >= lag else 0.0
+    return gain * step_s**2 / (12.0 * lag + settled)
+
+
+def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
+    """Return whether rotor speeds `step_s` [s] apart converge to what the rotors did in between.
+
+    A smooth curve does for a firmware's loop; else the lag has to be longer than the step.
+    """
+    return vehicle.controller.kind != "p" or step_s <= vehicle.rotors.time_constant
+
+
+def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:
+    """Return rotor speeds (S, 4) from rows `step_s` [s] apart with the torque that these hide.
+
+    They are as they were where rows show the torque: fewer of them show the error then.
+    """
+    if rows_show_torque(vehicle, step_s):
+        return speed
+    rotors, share = vehicle.rotors, torque_between_rows(vehicle, step_s)
+    ratio = rotors.torque_coefficient / rotors.thrust_coefficient
+    mixer = mixer_matrix(np.array(rotors.position), np.array(rotors.spin), ratio)
+    more = np.linalg.inv(mixer) @ (np.append(0.0, share)[:, None] * mixer)
+    return speed + (speed - speed.mean(axis=0)) @ more.T
 
 
 def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) -> float:

@@ -18,14 +18,17 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import (
     LONGEST_S,
     StepGrid,
+    integral_of_held,
     interpolate,
     longest_gap_s,
     on_every_row,
+    own_spacing_s,
     padded_grid,
     rotors_at,
     start_rotor_error,
     step_grid,
     thinned,
+    with_hidden_torque,
     with_lost_rows,
 )
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -152,7 +155,8 @@ def cut(
         stride_s: from the start of a window to the next's [s]; by default no row counts twice.
         limits: the longest hole in a window.
         integrator: whose steps they are; those of "euler" are the rate loop's periods.
-        coarser: the same windows, for steps twice as long and every second rotor speed.
+        coarser: the same windows, for steps twice as long, every second rotor speed, and what
+            `with_hidden_torque` adds.
         only: places of the flights that count; all if not given.
     """
     places, warnings = list[tuple[int, int]](), list[str]()
@@ -338,6 +342,8 @@ def _window(
     if log.rotor_speed is not None and rotor_input:
         smooth = remembers(vehicle)
         speed = rotors_at(middle, time, log.rotor_speed, vehicle, smooth, every)
+        if every > 1:
+            speed = with_hidden_torque(speed, vehicle, own_spacing_s(time, log.rotor_speed))
     drop = np.zeros(len(middle))
     if log.voltage is not None and np.isfinite(log.voltage).any():
         first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
@@ -371,7 +377,7 @@ def _window(
         np.concatenate([before.lead_s, window.lead_s]),
         drive.command_s,
         drive.command,
-        _integral(drive.command_s, drive.command),
+        integral_of_held(drive.command_s, drive.command),
         rates,
         speed,
         drop,
@@ -385,12 +391,6 @@ def _window(
         rotor_seen=turning,
         start_rotor_error=np.asarray(0.0 if rotor_input else _start_error(state, begin, vehicle)),
     )
-
-
-def _integral(time: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Return the integral (K, 4) of a held `command` (K, 4) from the first of `time` (K,) on."""
-    span = np.diff(np.where(np.isfinite(time), time, time[np.isfinite(time)].max()))
-    return np.concatenate([np.zeros((1, 4)), np.cumsum(span[:, None] * command[:-1], axis=0)])
 
 
 def _start_error(log: FlightLog, begin: float, vehicle: Vehicle) -> float:

@@ -39,9 +39,11 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
             for name, size in one.negligible
         ],
         "relevance": dict(zip(SIZES, limits.relevance, strict=True)),
-        "separate_with": [
-            advice(name.candidate.name, rival) for _, name in found.named for rival in name.rivals
-        ],
+        "separate_with": list(
+            dict.fromkeys(
+                advice(one.candidate.name, rival) for _, one in found.named for rival in one.rivals
+            )
+        ),
         "driven_by": found.flights.driven_by,
         "seconds": found.seconds,
         "warnings": found.warnings,

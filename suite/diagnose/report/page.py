@@ -175,8 +175,7 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
     note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
-    words.append(grid("", headers, rows, note))
-    return [*words, *(f"To separate {line}." for line in found["separate_with"])]
+    return [*words, grid("", headers, rows, note)]
 
 
 def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:

@@ -205,8 +205,6 @@ def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         parts.append("Nothing was named, so that nothing has a rival.")
     elif not found["separate_with"]:
         parts.append("No other name explains the same flights as well.")
-    if found["separate_with"]:
-        parts.append("suite diagnose --plan writes such flights as commanded trajectories.")
     return Section("What could stand in its place", parts)
 
 

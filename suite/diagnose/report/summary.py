@@ -78,9 +78,12 @@ def _separate(found: Mapping[str, Any]) -> Iterator[str]:
     for effect in found["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
+            start = f"{effect['name']} from "
+            flights = [line for line in found["separate_with"] if line.startswith(start)]
             yield (
                 f"These flights do not separate {names}. Decide by what you know of the vehicle, "
-                "or fly what suite diagnose --plan writes."
+                f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
+                "flights."
             )
 
 

@@ -143,8 +143,11 @@ def _next_name(
         gains = before - chi2_of(begin, block, at, [*others, *candidate.indices])
         share = judge.share(begin.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        outcome = "refused" if share is None else f"{begin.equations.chi2.sum() - chi2:.0f}"
-        task.say(f"{candidate.label}: {outcome}")
+        fall = float(begin.equations.chi2.sum()) - chi2
+        outcome = f"lowers the squared error by {fall:,.0f} times the noise variance"
+        if share is None:
+            outcome = "rejected: flights disagree, or a value is implausible or explains too little"
+        task.say(f"fitted {candidate.label}: {outcome}")
         if share is not None:
             one = NamedEffect(
                 candidate, scores[candidate].p_value, scores[candidate].gain,

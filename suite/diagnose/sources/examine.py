@@ -56,7 +56,9 @@ def examine(
     warnings += [f"{label}: withdrawn, held-out flights are no better for it" for label in gone]
     explained = found, (before, after)
     found, after, sizes, small = relevant_part(source, found, (before, after))
-    warnings += [f"{name}: left out, too small to matter: {size.words()}" for name, size in small]
+    for name, size in small:
+        own = "no larger than the model's own error" if size.relevant(source.limits) else ""
+        warnings.append(f"{name}: left out, {own or 'too small to matter'}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
     remaining = source.remaining(*explained, seed)

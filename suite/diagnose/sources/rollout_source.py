@@ -70,6 +70,8 @@ class RolloutSource(Source):
     flown: Rollouts
     coarser: FlightWindows | None = None
     """The fitted windows with every second rotor speed, where measured ones are the input."""
+    coarser_share: float = 0.5
+    """Share of what that changes an effect by which is the model's own error [1]."""
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
@@ -118,7 +120,8 @@ class RolloutSource(Source):
         Where measured rotor speeds drive, what the model's own error makes of an effect does not
         count at the upper end: half of what every second rotor speed alone changes it by, where an
         error of second order would make a third (step doubling; Hairer, Norsett & Wanner 1993,
-        Sec. II.4).
+        Sec. II.4). Where rows are further apart than the rotors' lag, the change is the torque that
+        the rows are estimated not to show, which is known to a factor of two: twice it counts.
         """
         model, estimate, indices = self.flown.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
@@ -129,7 +132,8 @@ class RolloutSource(Source):
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
             how = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
             equations = weighed_by(model, self.coarser, linear, *how)[1].equations()
-            own = 0.5 * np.abs(gauss_newton_step(equations, estimate.theta, model.space)[0])
+            moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
+            own = self.coarser_share * np.abs(moved)
 
         def size_of(moved: np.ndarray) -> EffectSize:
             return rollout_size(moved, windows)

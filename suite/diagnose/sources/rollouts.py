@@ -9,6 +9,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import choose_held_out
+from suite.diagnose.data.sampling import own_spacing_s, rows_show_torque
 from suite.diagnose.data.whitening import Linearisation
 from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, remembers, take
 from suite.diagnose.estimate.composites import composites
@@ -96,6 +97,11 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
     held = _held_out(given, rotor_input, apart, limits, integrator)
     lone = bool(np.isin(held.flight, windows.flight).any())
     since_s = float(np.min(held.start_s)) if lone else 0.0
+    dense = all(
+        log.rotor_speed is None
+        or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
+        for log in logs
+    )
     flown = Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits)
     source = RolloutSource(
         name="whole",
@@ -112,6 +118,7 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
         rollouts=flown,
         flown=flown,
         coarser=take(rough, inside) if rough is not None and rotor_input else None,
+        coarser_share=0.5 if dense else 2.0,
     )
     driven_by = "measured rotor speeds" if rotor_input else "commands"
     return Sources((source,), names, driven_by, tuple(warnings))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
-from suite.diagnose.evidence.moments import centred, units_of
+from suite.diagnose.evidence.moments import centred, means_of, units_of
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
@@ -74,10 +74,9 @@ class ViewSource(Source):
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return what a black box closes beyond the names, see `Source`."""
-        del gaps, seed
         shares = self._shares(found)
         by_axis = shares.left if found.named else shares.explainable
-        share = shares.whole(by_axis)
+        share, left = shares.whole(by_axis), shares.whole(shares.left)
         rms = float(np.sqrt(share * shares.variance.sum()))
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
@@ -86,17 +85,47 @@ class ViewSource(Source):
             f"{self.name} along body {'xyz'[axis]}, of which a regression without physics explains "
             f"a further {100 * max(float(shares.left[axis]), 0.0):.0f} %"
         )
+        swing = None
+        if self.every is not None:
+            swing = swing_left(self.every, found.estimate.theta)
+            force = self._unexplained(found.estimate.theta, gaps[1], seed)
+            if force and not structured:
+                structured, left = True, max(left, share_of_energy(*gaps, self._noise))
+                where = (
+                    f"a force of {force:.2g} m/s^2 beyond the noise, which goes with nothing that "
+                    "was flown"
+                )
         closed, explainable = shares.whole(shares.closed), shares.whole(shares.explainable)
-        swing = None if self.every is None else swing_left(self.every, found.estimate.theta)
         return Remaining(
             structured,
-            shares.whole(shares.left),
+            left,
             where,
             explainable,
             swing=swing,
             gap_details={"closed": closed, "explainable": explainable},
             channels={self.name: {"xyz"[k]: shares.along(k) for k in self.view.axes}},
         )
+
+    @property
+    def _noise(self) -> float:
+        """Mean square that measurement noise gives along the axes that are compared."""
+        return float((self.floor[list(self.view.axes)] ** 2).sum())
+
+    def _unexplained(self, theta: np.ndarray, left: Gap, seed: int) -> float:
+        """Return the force [m/s^2] that remains within held-out flights, 0 where it is no finding.
+
+        It has to exceed the noise surely, and both the threshold of relevance and what the flights'
+        constant offsets show attitude and thrust to be known to. The torque has no such test: noise
+        of the rotor speeds is most of what remains of it. `left` is the gap at `theta` (P,).
+        """
+        assert self.every is not None
+        data, limits = self.every.left(theta), self.limits
+        offset = means_of(data.residual, data.flight)
+        trim = limits.unexplained_trim * float(np.sqrt((offset**2).sum(axis=1).mean()))
+        least = max(limits.relevance[0], min(trim, limits.unexplained_force))
+        if left.least_energy(seed, limits) < self._noise + least**2:
+            return 0.0
+        return float(np.sqrt(left.energy.mean() - self._noise))
 
     def _shares(self, found: SearchResult) -> Shares:
         """Return which share of the error the names close, and a black box."""
@@ -195,6 +224,12 @@ class Shares(NamedTuple):
         return {
             key: float(one[axis]) if np.isfinite(one[axis]) else None for key, one in values.items()
         }
+
+
+def share_of_energy(before: Gap, after: Gap, noise: float) -> float:
+    """Return the share of the mean energy of `before`, less that of `noise`, that `after` has."""
+    left = max(float(after.energy.mean()) - noise, 0.0)
+    return left / max(float(before.energy.mean()) - noise, left, 1e-12)
 
 
 def _rms(residual: np.ndarray) -> np.ndarray:

@@ -47,6 +47,11 @@ class Gap(NamedTuple):
         low, high = np.quantile(drawn, [0.025, 0.975])
         return float(low), float(high)
 
+    def least_energy(self, seed: int, limits: Thresholds = THRESHOLDS) -> float:
+        """Return the lower end of the 95 % interval of the mean `energy`."""
+        drawn = self.energy[_blocks(len(self.energy), seed, limits)].mean(axis=1)
+        return float(np.quantile(drawn, 0.025))
+
     def above(self, before: Gap, weight: float, seed: int, limits: Thresholds) -> bool:
         """Return whether this is above the gap `before` on the same stretches by more than chance.
 

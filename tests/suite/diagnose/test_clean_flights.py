@@ -8,7 +8,7 @@ import pytest
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.diagnosis_flights import fly_all
-from tests.support.vehicles import PLAIN, with_lag
+from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.03)
 
@@ -40,3 +40,13 @@ def test_how_rotor_speeds_run_between_rows_is_no_finding():
     found = diagnosis_json(diagnose(logs, LAGGED, drive="motors"))
     assert (found["verdict"], found["effects"]) == ("no_gap", [])
     assert [one["name"] for one in found["negligible"]] == ["inertia_scale"]
+
+
+@pytest.mark.slow
+def test_what_a_rate_loop_does_between_rows_is_no_inertia_beside_a_drag():
+    """Without a lag rows of 100 Hz look like 8 % less inertia, on three stretches."""
+    true = with_effects(PLAIN, linear_drag=((0.3, 0.3, 0.1),))
+    (log,) = fly_all([true], [0], duration_s=6.0, noise=0.1, motors=True)
+    found = diagnose([replace(log, thrust_cmd=None, rate_cmd_b=None)], PLAIN)
+    assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
+    assert any("no larger than the model's own error" in line for line in found.warnings)

@@ -24,10 +24,10 @@ def test_a_command_near_the_force_is_fine(factor):
 @pytest.mark.parametrize(
     ("factor", "words", "fix"),
     [
-        (1.0 / 9.80665, "multiples of gravity", "9.80665"),
-        (0.92 / 9.80665, "multiples of gravity", "9.80665"),
+        (1.0 / 9.81, "multiples of gravity", "9.81"),
+        (0.92 / 9.81, "multiples of gravity", "9.81"),
         (-1.0, "down is positive", "-1"),
-        (-1.0 / 9.80665, "down is positive", "-9.80665"),
+        (-1.0 / 9.81, "down is positive", "-9.81"),
     ],
 )
 def test_a_unit_or_a_sign_is_corrected(factor, words, fix):

@@ -22,6 +22,8 @@ DRAG = {
 def found(verdict, effects=(), where=None, **more):
     base = {"verdict": verdict, "effects": list(effects), "reference": [], "negligible": []}
     base |= {"unexplained": {"where": where}, "not_examined": [], "identified": False}
+    advice = ["linear_drag from rotor_drag: bob up and down on a circle"]
+    base["separate_with"] = advice if effects else []
     return {**base, **more}
 
 
@@ -57,6 +59,7 @@ def test_every_verdict_says_what_to_do_next(verdict, words):
     effects = [] if verdict == "unknown" else [DRAG]
     steps = next_steps(found(verdict, effects, where="a swing at 1 Hz"))
     assert all(word in step for word, step in zip(words, steps, strict=True))
+    assert " ".join(steps).count("bob up and down") == len(effects)
 
 
 def test_a_file_of_suite_identify_is_not_sent_back_to_it(tmp_path):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from suite.diagnose.diagnose import diagnose
@@ -53,6 +54,22 @@ def test_a_hysteresis_outside_the_catalogue_is_no_thrust_alone():
     label, names, found = found_in(pushed(stuck, 40, 12.0))
     assert label in ("partly", "unknown"), names
     assert found.verdict.where is not None
+
+
+def up_and_down(motion, t):
+    return (1.5 if motion.vel_w[2] > 0.0 else -1.5) * motion.rot_w[:, 2]
+
+
+def by_place(motion, t):
+    return 1.5 * np.array([np.sin(1.5 * motion.pos_w[0]), np.cos(1.5 * motion.pos_w[1]), 0.0])
+
+
+@pytest.mark.parametrize(("extra", "seed"), [(up_and_down, 40), (by_place, 20)])
+def test_a_force_that_nothing_explains_is_not_no_gap(extra, seed):
+    """Three flights of 6 s are too few to fit a regression to it, and the search finds nothing."""
+    label, names, found = found_in(pushed(extra, seed))
+    assert (label, names) == ("unknown", {})
+    assert found.verdict.share_left > 0.9 and "m/s^2 beyond the noise" in found.verdict.where
 
 
 @pytest.mark.parametrize(
