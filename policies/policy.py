@@ -84,7 +84,9 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
     if path.is_dir():
         from policies.native import load_native
 
-        return load_native(path, path.resolve().name)
+        own = path.resolve()
+        # Trainings write a folder policy/ each; their runs have the names.
+        return load_native(path, own.parent.name if own.name == "policy" else own.name)
     if not path.exists():
         raise _missing(text, path)
     if path.suffix == ".onnx":

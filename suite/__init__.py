@@ -93,6 +93,11 @@ def evaluate_policy(
     from suite.common.choices import parse_levels, parse_tracks
 
     flown = load_policy(policy) if isinstance(policy, str | Path) else policy
+    if lacking := [name for name in ("name", "spec", "start", "act") if not hasattr(flown, name)]:
+        raise ValueError(
+            f"policy {flown!r} has no {', '.join(lacking)}; a policy object has name, spec, "
+            "start(n) and act(hidden, state, image, fresh): docs/policies.md"
+        )
     body = load_vehicle(vehicle) if isinstance(vehicle, str | Path) else vehicle
     seeds, own = range(seed, seed + trials), {}
     if isinstance(track, str):

@@ -38,10 +38,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     names = sorted(copied)
     console.say(f"wrote {', '.join(names)} to {config.out}")
     if config.real:
-        console.say(f"now: what {config.out / 'README.md'} says, or docs/measure.md's tutorial")
+        console.say(f"next: follow {config.out / 'README.md'} or the tutorial of docs/measure.md")
     else:
         vehicle = config.out / "vehicle.toml"
-        console.say(f"now: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
+        console.say(f"next: suite diagnose {config.out} --vehicle {vehicle} --out runs/example")
     return {"folder": str(config.out), "files": names}
 
 

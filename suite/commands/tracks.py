@@ -85,4 +85,5 @@ def family_text(name: str) -> str:
     make = FAMILIES.find(name)
     # A file of its own is described at its head, a function among others in its docstring.
     alone = getattr(make, "__name__", "") == "make"
-    return first_paragraph((sys.modules[make.__module__] if alone else make).__doc__)
+    text = first_paragraph((sys.modules[make.__module__] if alone else make).__doc__)
+    return text.removeprefix("Return ").removeprefix("Random: ")

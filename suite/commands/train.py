@@ -153,4 +153,5 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         f"{last['collided']:.0%} collided, {last['speed']:.1f} m/s"
     )
     console.say(f"policy: {outcome.policy}")
+    console.say(f"next: suite eval --policy {outcome.policy} --difficulty 0")
     return plain(outcome)

@@ -73,7 +73,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.judging.replay import fly_again
 
     refuse_one_name({trial.track for trial in trials})
-    console.note(f"flying {len(trials)} trials again")
+    console.note(f"flying {len(trials)} trial{'s' * (len(trials) != 1)} again")
     rollouts, drone = fly_again(evaluation, trials, judged=judged)
     write_recording(recording, rollouts, drone)
     written = [recording]

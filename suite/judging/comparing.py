@@ -107,9 +107,10 @@ def paired_sentence(first: str, second: str, one: np.ndarray, two: np.ndarray) -
     found = paired_success(one, two)
     value, low, high = (100 * number for number in (found.value, found.low, found.high))
     return (
-        f"{first} succeeded in {one.mean():.1%} and {second} in {two.mean():.1%} of the same "
-        f"{len(one)} trials: a paired difference of {value:+.1f} percentage points (95 % interval "
-        f"{low:+.1f} to {high:+.1f}, Newcombe 1998; exact McNemar test, p = {found.p_value:.2g})."
+        f"{first} succeeded in {100 * one.mean():.1f} % and {second} in {100 * two.mean():.1f} % "
+        f"of the same {len(one)} trials: {first} minus {second} is {value:+.1f} percentage points "
+        f"(paired, 95 % interval {low:+.1f} to {high:+.1f}, Newcombe 1998; exact McNemar test, "
+        f"p = {found.p_value:.2g})."
     )
 
 

@@ -124,9 +124,14 @@ def evaluate(
         console.say(sentence)
     for one in (one for one in over if one.finished):
         whose = f"{one.policy}: " if len(over) > 1 else ""
-        tracks = f"{one.finished} planned track{'s' * (one.finished != 1)}"
-        console.say(f"{whose}lap over plan: median {with_interval(one.ratio)} over {tracks}")
+        tracks = f"{one.finished} track{'s' * (one.finished != 1)}"
+        console.say(
+            f"{whose}laps take {with_interval(one.ratio)} times a planned lap (median of {tracks}; "
+            "a plan knows the whole track)"
+        )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
+    if not all(row.success for row in results if row.policy == results[0].policy):
+        console.say(f"next: suite view {out} --pick failed shows what went wrong")
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 
@@ -141,7 +146,7 @@ def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]
 
 
 def _sentences(results: Sequence[TrialResult]) -> list[str]:
-    """Return how the first policy differs from each other one over all trials, to be quoted."""
+    """Return how each other policy differs from the first one over all trials, to be quoted."""
     import numpy as np
 
     from suite.judging.comparing import paired_sentence
@@ -151,7 +156,7 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
         flown.setdefault(row.policy, {})[row.trial] = row.success
     (first, one), *others = flown.items()
     return [
-        paired_sentence(first, name, *(np.array([each[t] for t in one]) for each in (one, other)))
+        paired_sentence(name, first, *(np.array([each[t] for t in one]) for each in (other, one)))
         for name, other in others
     ]
 
@@ -164,7 +169,8 @@ def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> 
     found = actions_of(rows, entry.policy.spec.action)
     if found["decisions"]:
         console.say(
-            f"{entry.label}: {found['limited']:.1%} of {found['decisions']} actions were limited"
+            f"{entry.label}: {found['limited']:.1%} of {found['decisions']} actions exceeded the "
+            "limits and were reduced"
         )
     for warning in found["warnings"]:
         console.note(f"warning: {entry.label}: {warning}")

@@ -307,8 +307,9 @@ def _resume(run: Run, fresh: Any) -> Any:
     changes = options + differences(theirs["config"], origin["config"])
     if changes:
         raise ValueError(
-            f"{folder} holds another run ({first_of(changes)}); give another --out, or remove the "
-            "folder to start over"
+            f"{folder} holds another run ({first_of(changes)}); repeat its options to resume it, "
+            f"give another --out (with --init-from {folder / 'policy'} to train its policy on), or "
+            "remove the folder to start over"
         )
     before, now = theirs.get("threads", threads()), threads()
     if (before == 1) != (now == 1):

@@ -45,9 +45,9 @@ class Parity(NamedTuple):
         if not self.steps or self.timing is None:
             return "not compiled and not compared here: no C compiler (cc, or what CC names)"
         return (
-            f"beside the JAX policy over {self.steps} steps with memory ({self.given}): "
-            f"{self.worst:.2g} m/s^2 off at most, {self.median:.2g} in the middle; a step takes "
-            f"{1e6 * self.timing.median_s:.0f} us here"
+            f"compared with the JAX policy over {self.steps} steps with memory ({self.given}): "
+            f"largest difference {self.worst:.2g} m/s^2, median {self.median:.2g}; a step takes "
+            f"{1e6 * self.timing.median_s:.0f} us on this machine"
         )
 
 

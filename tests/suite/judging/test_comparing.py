@@ -83,7 +83,7 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     b = run_of(tmp_path / "b", rng.random(40) < 0.5)
     found = paired(*read_runs(a), *read_runs(b))
     assert found["trials"] == 40 and found["difference"].value > 0
-    assert "paired difference of +" in found["sentence"] and "McNemar" in found["sentence"]
+    assert " minus " in found["sentence"] and "McNemar" in found["sentence"]
     answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
     assert "2 training seeds" in answer["comparisons"][0]["sentence"]
     apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)

@@ -45,9 +45,9 @@ def test_laps_are_compared_with_the_plans_of_their_tracks(pilots, tmp_path, capf
     (found,) = json.loads((tmp_path / "out" / "summary.json").read_text())["over_plan"]
     ratio = found["ratio"]
     assert found["planned"] == found["finished"] == 1 and 1.0 < ratio["value"] < 6.0
-    assert f"lap over plan: median {ratio['value']:.2f}" in said and "over 1 planned track" in said
+    assert f"laps take {ratio['value']:.2f}" in said and "lap (median of 1 track;" in said
     assert _eval(tmp_path / "racer5", *asked, "--vehicle", "racer5", "--time-limit-s", "1") == 0
-    assert "lap over plan" not in capfd.readouterr().out
+    assert "planned lap" not in capfd.readouterr().out
     assert json.loads((tmp_path / "racer5" / "summary.json").read_text())["over_plan"] == []
 
 

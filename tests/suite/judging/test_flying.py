@@ -1,14 +1,18 @@
 """Who flies which trials, in what manner, in how many processes, and its digest."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+import suite
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from policies import shipped
 from policies.policy import load_policy
 from policies.spec import PolicyError
 from suite import cli
@@ -39,6 +43,16 @@ def test_policies_of_one_name_are_told_apart_and_none_flies_twice():
     assert labels(["a/last", "b/last", "c"], ["last", "last", "c"]) == ["a/last", "b/last", "c"]
     with pytest.raises(ValueError, match="given twice"):
         labels(["a", "a"], ["a", "a"])
+
+
+def test_a_trained_policy_has_the_name_of_its_run(tmp_path):
+    shutil.copytree(shipped.folder("race-small"), tmp_path / "mine" / "policy")
+    assert load_policy(tmp_path / "mine" / "policy").name == "mine"
+
+
+def test_a_policy_object_that_lacks_a_method_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"has no name, start, act; a policy object has"):
+        suite.evaluate_policy(SimpleNamespace(spec=None))  # type: ignore[arg-type]
 
 
 def test_a_track_file_is_flown_once_a_seed(pilots, tmp_path):
