@@ -48,11 +48,6 @@ class Thresholds:
     """Share of the flights that is held out, at least one [1]."""
     lone_fitted_share: float = 0.7
     """Share of a lone flight that is fitted; the end is held out [1]."""
-    turn_block_s: float = 1.0
-    """Gyro less the attitude's turn is averaged over so long; such means are independent [s]."""
-    clock_resolution_s: float = 0.002
-    """Offsets below are left unsaid: sampling and a simulator's steps shift pose and gyro so far
-    against each other [s]."""
     noise_rows: int = 20
     """Rows that a polynomial is taken off: a model's error in 0.2 s is negligible then."""
     rotor_noise_rows: int = 8

@@ -13,7 +13,7 @@ from suite.diagnose.report.summary import answer
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks, Kinematics
+from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap
 
@@ -173,7 +173,6 @@ def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
     """Return the entries that `checks` add to diagnosis.json; `seed` is of the intervals' draws."""
     black_box = checks.black_box
     return {
-        "kinematics": checks.kinematics and _kinematics(checks.kinematics),
         "actuators": [{**one._asdict(), "followed": one.followed} for one in checks.actuators],
         "black_box": black_box
         and {
@@ -182,19 +181,6 @@ def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
             "split_m_s": black_box.split_m_s,
             "seconds": black_box.seconds,
         },
-    }
-
-
-def _kinematics(found: Kinematics) -> dict[str, Any]:
-    known = np.isfinite(found.offset_ci)
-    return {
-        "gyro_bias": {"value": found.bias, "half_width95": found.bias_ci, "unit": "rad/s"},
-        "clock_offset": {
-            "value": found.offset if known else None,
-            "half_width95": found.offset_ci if known else None,
-            "unit": "s",
-        },
-        "velocity_over_path": found.velocity_scale,
     }
 
 

@@ -76,7 +76,7 @@ def page(
         facts["reference"] = f"{len(diagnosis.references)} flights"
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
-        *([logs_section(diagnosis, checks), noise_section(diagnosis)] if checks else []),
+        *([logs_section(checks), noise_section(diagnosis)] if checks else []),
         *(actuators_section(checks, flights.driven_by) if checks else []),
         candidates_section(diagnosis),
         rivals_section(diagnosis, found),

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from eval.effects import EFFECTS
 from suite.common.report import Details, Part, Picture, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.report.charts import (
@@ -23,7 +22,7 @@ from suite.diagnose.report.parameters_json import cells, grid, short_name
 from suite.diagnose.sources.rollout_source import of_rollouts
 from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks, Kinematics
+from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap
 from tracks.common.grid import Cell, Grid
@@ -32,8 +31,8 @@ SHOWN = 12
 """Logs in the table."""
 
 
-def logs_section(diagnosis: Diagnosis, checks: Checks) -> Section:
-    """Return what the logs hold, and how pose and gyro agree."""
+def logs_section(checks: Checks) -> Section:
+    """Return what the logs hold."""
     rows = [
         (
             short_name(fact.name),
@@ -50,52 +49,7 @@ def logs_section(diagnosis: Diagnosis, checks: Checks) -> Section:
     headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
     more = len(checks.facts) - SHOWN
     parts: list[Part] = [grid("", headers, rows, f"And {more} more." if more > 0 else "")]
-    if checks.kinematics is None:
-        parts.append("Too little of pose and gyro is there to hold them against each other.")
-    else:
-        parts.append(_kinematics(checks.kinematics, diagnosis.limits.clock_resolution_s))
-    parts.append(_faults(diagnosis))
-    return Section("The logs and their faults", parts)
-
-
-def _kinematics(found: Kinematics, resolution_s: float) -> Grid:
-    bias = ", ".join(
-        f"{1e3 * b:.2f} ± {1e3 * h:.2f}" for b, h in zip(found.bias, found.bias_ci, strict=True)
-    )
-    sure = bool((np.abs(found.bias) > found.bias_ci).any())
-    rows = [("gyro less the attitude's turn", f"{bias} mrad/s", "not zero" if sure else "")]
-    late, note_ = "rates change too little", ""
-    if np.isfinite(found.offset_ci):
-        late = f"{1e3 * found.offset:.2f} ± {1e3 * found.offset_ci:.2f} ms"
-        note_ = "not zero" if abs(found.offset) > max(found.offset_ci, resolution_s) else ""
-    rows.append(("pose later than gyro", late, note_))
-    if found.velocity_scale is not None:
-        rows.append(("velocity over the path's slope", f"{found.velocity_scale:.4f}", ""))
-    note = (
-        "From pose and gyro alone, without any model of forces, 95 %. Faults of a log imitate "
-        "physics, so that they come first."
-    )
-    return grid("Pose, gyro and path among themselves", ["", "value", ""], rows, note)
-
-
-def _faults(diagnosis: Diagnosis) -> Grid:
-    search = diagnosis.main.search
-    named = {candidate.name for candidate in search.candidates}
-    rows = [
-        (
-            s.candidate.label,
-            f"{s.gain:.1f}",
-            f"{s.p_value:.4f}",
-            "named" if s.candidate.name in named else "not named",
-        )
-        for s in search.first
-        if all(EFFECTS[name].of_log for name in s.candidate.effects)
-    ]
-    note = (
-        "In the search they compete with the physics that they imitate, in one model; the gain "
-        "alone is not the verdict."
-    )
-    return grid("As candidates, alone", ["fault", "gain", "p", "verdict"], rows, note)
+    return Section("The logs", parts)
 
 
 def noise_section(diagnosis: Diagnosis) -> Section:

@@ -16,7 +16,7 @@ from tests.support.recordings import columns
 from tests.support.vehicles import PLAIN, with_effects
 
 STEPS = (
-    "The logs and their faults",
+    "The logs",
     "The measurement noise",
     "The candidates",
     "What could stand in its place",
@@ -56,7 +56,6 @@ def test_the_numbers_beside_the_names_are_in_the_json(written):
     found = json.loads((written / "diagnosis.json").read_text(encoding="utf-8"))
     assert found["seed"] == 3 and found["black_box"] is None
     assert found["actuators"][0]["followed"] > 0.9
-    assert abs(found["kinematics"]["gyro_bias"]["value"][0]) < 0.01
     effect = found["effects"][0]
     assert found["plan"]["flights"] == [] or effect["alternatives"]
 

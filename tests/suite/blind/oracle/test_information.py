@@ -1,11 +1,13 @@
 """How much flights tell of each number of the catalogue, and the table of strengths made of it."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from eval.effects import nameable_effects
+from suite.blind.oracle import information as oracle
 from suite.blind.oracle import strength
 from suite.blind.oracle.information import (
     Column,
@@ -63,15 +65,33 @@ def test_every_effect_has_columns_but_what_cannot_be_told():
 
 
 @pytest.mark.slow
-def test_the_committed_table_is_what_is_worked_out():
-    stored = json.loads(strength.TABLE.read_text())["vehicles"]["dragged"]["full"]
-    found = strengths("dragged", "full", ["rotor_drag", "clock_offset", "weak_motor", "gusts"])
-    for name, entry in found.items():
-        assert entry["columns"] == stored[name]["columns"]
-        for key in ("matrix", "detectable"):
-            if key in entry:
-                np.testing.assert_allclose(entry[key], stored[name][key], rtol=1e-6)
+@pytest.mark.parametrize(
+    ("vehicle", "sensors", "names"),
+    [
+        ("dragged", "full", ["rotor_drag", "clock_offset", "weak_motor", "gusts"]),
+        ("bare", "capture", ["constant_wind", "gusts"]),
+    ],
+)
+def test_the_committed_table_is_what_is_worked_out(vehicle, sensors, names):
+    stored = json.loads(strength.TABLE.read_text())["vehicles"][vehicle][sensors]
     assert list(stored) and set(stored) == set(nameable_effects())
+    for name, entry in strengths(vehicle, sensors, names).items():
+        assert entry["columns"] == stored[name]["columns"]
+        if "matrix" in entry:
+            np.testing.assert_allclose(entry["matrix"], stored[name]["matrix"], rtol=1e-6)
+        else:
+            kept = np.inf if stored[name]["detectable"] is None else stored[name]["detectable"]
+            assert entry["detectable"] == pytest.approx(kept, rel=1e-6)
+
+
+@pytest.mark.parametrize(("size", "strong"), [(0.0, False), (0.02, False), (1.0, True)])
+def test_a_wind_beyond_its_bound_is_never_detectable(monkeypatch, size, strong):
+    """What rotors in forward flight pass on of a wind would show a gust of 30 m/s."""
+    rows = np.random.default_rng(0).standard_normal((40 * oracle.GUST_DRAWS, 30))
+    monkeypatch.setattr(oracle, "fly", lambda *_, **__: [])
+    monkeypatch.setattr(oracle, "linearised", lambda *_: SimpleNamespace(residual=size * rows))
+    found = oracle.gust_strength(BARE, (), SENSORS["capture"], "gusts", np.random.default_rng(0))
+    assert np.isfinite(found) == strong and (not strong or found < 8.0)
 
 
 def test_an_effect_that_is_not_in_the_table_is_worked_out(monkeypatch):
