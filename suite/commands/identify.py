@@ -72,7 +72,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     console.say(f"driven by {DRIVEN[result['drive']]}")
     _say_parameters(result, console)
-    for text in result["untold"]:
+    for text in result["not_identified"]:
         console.say(f"  not identifiable from these flights, {text}")
     return _say_end(result, out, console)
 

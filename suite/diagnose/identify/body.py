@@ -72,24 +72,24 @@ def fit_force(
     return fit(together([_force(flight, driven) for flight in flights], unknowns, fixed), unknowns)
 
 
-Misses = Callable[[Mapping[str, float]], Rows]
+Residuals = Callable[[Mapping[str, float]], Rows]
 """From all numbers to the residuals of one flight."""
 
 
 def together(
-    misses: Sequence[Misses], unknowns: Sequence[Unknown], fixed: Mapping[str, float]
+    residuals: Sequence[Residuals], unknowns: Sequence[Unknown], fixed: Mapping[str, float]
 ) -> Callable[[np.ndarray], list[Rows]]:
     """Return the residuals of all flights by the values of `unknowns`, with the numbers `fixed`."""
     names = [unknown.name for unknown in unknowns]
 
     def of(value: np.ndarray) -> list[Rows]:
         numbers = {**fixed, **dict(zip(names, value, strict=True))}
-        return [one(numbers) for one in misses]
+        return [one(numbers) for one in residuals]
 
     return of
 
 
-def _force(flight: FlightGrid, driven: Driven) -> Misses:
+def _force(flight: FlightGrid, driven: Driven) -> Residuals:
     pushes = PUSHES.get(driven.drive, "thrust_cmd")
     moved = next(name for name in (FELT, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
@@ -104,12 +104,12 @@ def _force(flight: FlightGrid, driven: Driven) -> Misses:
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
     axes = slice(2 if leaning else 0, 3)
 
-    def misses(numbers: Mapping[str, float]) -> Rows:
+    def residuals(numbers: Mapping[str, float]) -> Rows:
         acc_w, _ = driven.acting(flight, rows, numbers)
         away = (to_body @ (measured - form.mean @ acc_w)[..., None])[..., 0]
         return Rows(away[:, axes], block_of(form), LEVEL[axes])
 
-    return misses
+    return residuals
 
 
 def block_of(form: WeakForm) -> np.ndarray:
@@ -193,12 +193,12 @@ def fit_torque(
         u._replace(floor=float(np.hypot(u.floor, Z95 * unsure.get(u.name, 0.0)))) for u in unknowns
     ]
     parts = zip(flights, forms, strict=True)
-    misses = together([_torque(*part, driven, credible) for part in parts], unknowns, fixed)
+    residuals = together([_torque(*part, driven, credible) for part in parts], unknowns, fixed)
     if any(unknown.name == "late" for unknown in unknowns):
-        best = _likeliest(unknowns, misses, forms, flights)
+        best = _likeliest(unknowns, residuals, forms, flights)
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
     while True:
-        found = fit(misses, unknowns, held, known)
+        found = fit(residuals, unknowns, held, known)
         value = dict(zip((u.name for u in unknowns), found.value, strict=True))
         beyond = [
             u.name
@@ -210,17 +210,17 @@ def fit_torque(
         held += beyond
 
 
-def _torque(flight: FlightGrid, form: WeakForm, driven: Driven, credible: np.ndarray) -> Misses:
+def _torque(flight: FlightGrid, form: WeakForm, driven: Driven, credible: np.ndarray) -> Residuals:
     turned, rows = _turned(flight, form), flight.rows(turned=False)
 
-    def misses(numbers: Mapping[str, float]) -> Rows:
+    def residuals(numbers: Mapping[str, float]) -> Rows:
         _, turn_b = driven.acting(flight, rows, numbers)
         if (credible < 1.0).any():
             _, alone_b = driven.acting(flight, rows, numbers, powered=False)
             turn_b = alone_b + credible * (turn_b - alone_b)
         return Rows(turned - BAND * (form.mean @ turn_b), block_of(form), STILL)
 
-    return misses
+    return residuals
 
 
 def _turned(flight: FlightGrid, form: WeakForm) -> np.ndarray:
@@ -252,7 +252,7 @@ def _credible(
 
 def _likeliest(
     unknowns: Sequence[Unknown],
-    misses: Callable[[np.ndarray], list[Rows]],
+    residuals: Callable[[np.ndarray], list[Rows]],
     forms: Sequence[WeakForm],
     flights: Sequence[FlightGrid],
 ) -> float:
@@ -264,7 +264,7 @@ def _likeliest(
     scores = np.zeros(len(trials))
     for k, trial in enumerate(trials):
         value[late] = max(trial, 0.0)
-        for rows, turned in zip(misses(value), measured, strict=True):
+        for rows, turned in zip(residuals(value), measured, strict=True):
             if len(turned):
                 model, turned = (one - np.median(one, 0) for one in (turned - rows.value, turned))
                 size = np.sqrt((model**2).sum(axis=0) * (turned**2).sum(axis=0))

@@ -1,6 +1,6 @@
-"""Least squares on misses of flights, with what is not identifiable left as it was.
+"""Least squares on residuals of flights, with what is not identifiable left as it was.
 
-Misses are evidence: Gauss and Newton with Huber's weights, intervals by stretches and flights.
+Residuals are evidence: Gauss and Newton with Huber's weights, intervals by stretches and flights.
 What another fit has estimated keeps that fit's covariance (Murphy and Topel 1985). A number that
 is not identifiable is left as it was, the worst first, and the others are fitted again.
 """
@@ -61,7 +61,7 @@ class Rows(NamedTuple):
     """(C,) bool: a constant of the flight is free in these channels."""
 
 
-Misses = Callable[[np.ndarray], Sequence[Rows]]
+Residuals = Callable[[np.ndarray], Sequence[Rows]]
 """From all numbers to the residuals of every flight."""
 
 
@@ -108,10 +108,10 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class MissEvidence:
-    """Misses of flights as evidence on the numbers that are fitted."""
+class ResidualEvidence:
+    """Residuals of flights as evidence on the numbers that are fitted."""
 
-    misses: Misses
+    residuals: Residuals
     unknowns: tuple[Unknown, ...]
     weights: tuple[np.ndarray, ...] = ()
     """By flight, (N, C)."""
@@ -128,9 +128,9 @@ class MissEvidence:
         """Return the estimate with the numbers `value` (P,): nothing else is free."""
         return Estimate(value, np.zeros((0, 0)))
 
-    def weighed(self, at: Estimate) -> MissEvidence:
+    def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this weighed by a channel's noise, and less for what is wild (Huber)."""
-        rows = self.misses(at.theta)
+        rows = self.residuals(at.theta)
         off = np.concatenate([np.abs(_levelled(row)) for row in rows])
         sigma = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
         far = (np.maximum(np.abs(_levelled(row)) / sigma, 1e-9) for row in rows)
@@ -138,15 +138,15 @@ class MissEvidence:
         return replace(self, weights=weights)
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the misses and their slopes, by finite differences away from the nearer limit."""
+        """Return the residuals and their slopes, by finite differences away from the nearer limit."""
         along = range(len(self.unknowns)) if indices is None else indices
-        here, columns = self.misses(at.theta), []
+        here, columns = self.residuals(at.theta), []
         for k in along:
             near_top = self.unknowns[k].high - at.theta[k] < self.unknowns[k].step
             step = -self.unknowns[k].step if near_top else self.unknowns[k].step
             there = at.theta.copy()
             there[k] += step
-            pairs = zip(self.misses(there), here, strict=True)
+            pairs = zip(self.residuals(there), here, strict=True)
             columns.append([(a.value - b.value) / step for a, b in pairs])
         values, slopes, numbers = [], [], []
         for flight, (row, weight) in enumerate(zip(here, self.weights, strict=True)):
@@ -162,17 +162,17 @@ class MissEvidence:
 
 
 def fit(
-    misses: Misses,
+    residuals: Residuals,
     unknowns: Sequence[Unknown],
     held: Sequence[str] = (),
     known: Known | None = None,
 ) -> Fitted:
-    """Return the numbers that make `misses` least, with intervals.
+    """Return the numbers that make `residuals` least, with intervals.
 
     What is left as it was may be wrong by its `room`; that is part of the others' intervals.
 
     Args:
-        misses: the residuals.
+        residuals: the residuals.
         unknowns: the numbers.
         held: those that are left as they are from the first.
         known: those of `unknowns` that another fit has identified.
@@ -181,9 +181,9 @@ def fit(
         NothingWhole: where there is not one window.
     """
     not_identified, known = list(held), known or Known()
-    evidence = MissEvidence(misses, tuple(unknowns))
+    evidence = ResidualEvidence(residuals, tuple(unknowns))
     at = evidence.at(np.array([unknown.start for unknown in unknowns]))
-    if not sum(len(rows.value) for rows in misses(at.theta)):
+    if not sum(len(rows.value) for rows in residuals(at.theta)):
         raise NothingWhole("no stretch of these flights is whole enough to compare anything in")
     while True:
         left = (*not_identified, *known.names)
@@ -200,7 +200,7 @@ def fit(
         worst = free[int(np.argmax(ratio))]
         not_identified.append(unknowns[worst].name)
         at.theta[worst] = unknowns[worst].start
-    misfit = np.concatenate([_levelled(row) for row in misses(at.theta)])
+    misfit = np.concatenate([_levelled(row) for row in residuals(at.theta)])
     rms = np.sqrt(np.mean(misfit**2, axis=0))
     return Fitted(
         evidence.unknowns, at.theta, half, covariance, tuple(not_identified), rms, known.names
@@ -220,7 +220,7 @@ def _freed(values: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndar
 
 
 def _errors(
-    evidence: MissEvidence, at: Estimate, free: Sequence[int], known: Known
+    evidence: ResidualEvidence, at: Estimate, free: Sequence[int], known: Known
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance (P, P) and the half-widths (P,) of what is `free`."""
     unknowns = evidence.unknowns

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.body import Misses, block_of, together
+from suite.diagnose.identify.body import Residuals, block_of, together
 from suite.diagnose.identify.drive import behind, delayed, filled, lagged
 from suite.diagnose.identify.fit import Fitted, Known, Rows, Unknown, fit
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
@@ -69,12 +69,12 @@ def fit_loop(
         known: those of `unknowns` that another fit has identified.
     """
 
-    def misses(flight: FlightGrid) -> Misses:
+    def residuals(flight: FlightGrid) -> Residuals:
         form = flight.form(LOOP_WIDTH_S, ("rate_b", "rate_cmd_b"))
         rates, block = form.mean @ np.nan_to_num(flight.known["rate_b"]), block_of(form)
         return lambda n: Rows(rates - form.mean @ followed(flight, vehicle, n), block, FREE)
 
-    every = together([misses(flight) for flight in flights], unknowns, fixed)
+    every = together([residuals(flight) for flight in flights], unknowns, fixed)
     return fit(every, unknowns, known=known)
 
 
@@ -84,14 +84,14 @@ SPEED_WIDTH_S = 0.16
 def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) -> Fitted:
     """Return lag and delay of measured rotor speeds behind commanded ones."""
 
-    def misses(flight: FlightGrid) -> Misses:
+    def residuals(flight: FlightGrid) -> Residuals:
         form = flight.form(SPEED_WIDTH_S, ("rotor_speed", "rotor_speed_cmd"))
         mean, level = form.mean, np.ones(4, dtype=bool)
         measured, block = mean @ np.nan_to_num(flight.known["rotor_speed"]), block_of(form)
         wanted = flight.known["rotor_speed_cmd"]
         return lambda n: Rows(measured - mean @ np.nan_to_num(behind(wanted, n)), block, level)
 
-    return fit(together([misses(flight) for flight in flights], unknowns, {}), unknowns)
+    return fit(together([residuals(flight) for flight in flights], unknowns, {}), unknowns)
 
 
 def followed(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:

@@ -78,7 +78,7 @@ def identify_files(
         "start": vehicle,
         "drive": found.drive,
         "parameters": as_json(found.numbers),
-        "untold": list(found.not_identified),
+        "not_identified": list(found.not_identified),
         "left": found.left,
         "flights": list(found.flights),
         "findings": findings,

@@ -95,7 +95,7 @@ def _mismatch(found: ActuatorMismatch) -> Grid:
         ("turning more than commanded, x y z", f"{turn} rad/s²"),
     ]
     note = "± is the spread over the flights."
-    return grid(f"Against the {found.asked_by}", ["", ""], rows, note)
+    return grid(f"Against the {found.commanded_by}", ["", ""], rows, note)
 
 
 HORIZON = "0.5 s"

@@ -31,7 +31,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 class ActuatorMismatch(NamedTuple):
     """How measured rotor speeds differ from the commanded ones."""
 
-    asked_by: str
+    commanded_by: str
     """"nominal rate loop" or "logged motor commands"."""
     rms: float
     """Of the difference with the vehicle file's lag [rad/s]."""
@@ -82,7 +82,7 @@ def actuator_mismatches(
     """
     plant = make_plant(vehicle, step_s(vehicle), {})
     found = []
-    for asked_by, demand_of in (
+    for commanded_by, demand_of in (
         ("nominal rate loop", lambda log, at_s: rate_loop_demand(log, plant, at_s)),
         ("logged motor commands", _logged_demand),
     ):
@@ -92,7 +92,7 @@ def actuator_mismatches(
             if rows * step_s(vehicle) < limits.actuator_flight_s:
                 stretches += _stretches(log, vehicle, demand_of, limits)
         if stretches:
-            found.append(_mismatch(asked_by, stretches, vehicle, limits))
+            found.append(_mismatch(commanded_by, stretches, vehicle, limits))
     return found
 
 
@@ -151,7 +151,7 @@ def _stretches(
 
 
 def _mismatch(
-    asked_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle, limits: Thresholds
+    commanded_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle, limits: Thresholds
 ) -> ActuatorMismatch:
     dt, lag = step_s(vehicle), vehicle.rotors.time_constant
     measured = np.concatenate([part.measured for part in stretches])
@@ -184,7 +184,7 @@ def _mismatch(
     scale = scales(fitted)
     thrust, turn = wrench_difference(measured, nominal, vehicle)
     return ActuatorMismatch(
-        asked_by=asked_by,
+        commanded_by=commanded_by,
         rms=_rms(measured - nominal),
         spread=_rms(measured - measured.mean(axis=0)),
         time_constant=time_constant,
@@ -347,7 +347,7 @@ def another_lag(
     own = vehicle.effects.get(LAG)
     known = vehicle.rotors.time_constant if own is None else float(own.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
-    each = [_asked_by_loop(log, vehicle, limits) for log in logs]
+    each = [_loop_mismatch(log, vehicle, limits) for log in logs]
     found = [one for one in each if one is not None and _explains(one, limits)]
     if len(found) < limits.lag_least_flights:
         return None
@@ -370,12 +370,12 @@ def another_lag(
     )
 
 
-def _asked_by_loop(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActuatorMismatch | None:
+def _loop_mismatch(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActuatorMismatch | None:
     """Return how the rotors follow the nominal rate loop; None where the log does not show it."""
     if log.partial or log.rate_cmd_b is None or log.rotor_speed is None:
         return None
     found = actuator_mismatches([log], vehicle, limits)
-    return next((one for one in found if one.asked_by == "nominal rate loop"), None)
+    return next((one for one in found if one.commanded_by == "nominal rate loop"), None)
 
 
 def _explains(one: ActuatorMismatch, limits: Thresholds) -> bool:

@@ -50,7 +50,7 @@ def test_an_inertia_that_was_not_told_is_as_it_was_but_for_what_goes_with_the_ot
     found = {
         "drive": "pwm",
         "parameters": {"inertia": inertia, "effects.linear_drag.coefficient": drag},
-        "untold": [],
+        "not_identified": [],
         "warnings": ["of a note"],
     }
     monkeypatch.setattr("suite.diagnose.identify.run.identify_files", lambda *_: found)

@@ -100,7 +100,7 @@ def test_a_real_log_imports_at_the_first_try_and_tells_a_vehicle(tmp_path, capsy
     found = json.loads(capsys.readouterr().out)
     drag = found["parameters"]["effects.linear_drag.coefficient"]["value"]
     assert 0.3 < drag[0] < 0.6 and 0.3 < drag[1] < 0.6
-    assert any("a crazyflie loop are not fitted" in text for text in found["untold"])
+    assert any("a crazyflie loop are not fitted" in text for text in found["not_identified"])
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ def apart(truth, given=LAGGED):
 
 def test_the_nominal_loop_leaves_noise_only():
     found = apart(LAGGED)
-    assert found.asked_by == "nominal rate loop" and found.followed > 0.99
+    assert found.commanded_by == "nominal rate loop" and found.followed > 0.99
     assert found.rms < 1.3 * NOISE["motor"]
     assert found.time_constant == pytest.approx(0.03, abs=1e-3)
     assert found.delay == pytest.approx(0.0, abs=1e-3)
@@ -56,7 +56,10 @@ def test_logged_motor_commands_are_held_against_the_speeds_too():
     assert log.rotor_speed is not None
     asked = replace(log, rotor_speed_cmd=log.rotor_speed / 0.9)
     loop, logged = actuator_mismatches([asked], with_lag(PLAIN, 0.0))
-    assert (loop.asked_by, logged.asked_by) == ("nominal rate loop", "logged motor commands")
+    assert (loop.commanded_by, logged.commanded_by) == (
+        "nominal rate loop",
+        "logged motor commands",
+    )
     np.testing.assert_allclose(logged.scale, 0.9, atol=5e-3)
 
 

@@ -18,10 +18,10 @@ def flights(slopes, noise=0.1, count=200, seed=0):
         x = rng.normal(size=count)
         made.append((x, slope * x + noise * rng.normal(size=count), np.arange(count) // 10))
 
-    def misses(value):
+    def residuals(value):
         return [Rows((y - value[0] * x)[:, None], block, NONE) for x, y, block in made]
 
-    return misses
+    return residuals
 
 
 def test_a_slope_within_its_interval():
@@ -54,14 +54,14 @@ def test_intervals_hold_the_truth_nineteen_times_in_twenty():
 
 def test_what_is_known_widens_what_depends_on_it():
     """`y = (slope + other) x`: the slope is off by as much as the other, and by no less."""
-    misses = flights([2.0] * 4)
+    residuals = flights([2.0] * 4)
 
     def both(value):
-        return misses(np.array([value[0] + value[1]]))
+        return residuals(np.array([value[0] + value[1]]))
 
     known = Known(("other",), np.array([[0.1**2]]))
     found = fit(both, [SLOPE, Unknown("other", 0.5, -9.0, 9.0, 1.0, 1e-3)], known=known)
-    alone = fit(misses, [SLOPE])
+    alone = fit(residuals, [SLOPE])
     np.testing.assert_allclose(found.value, [1.5, 0.5], atol=0.02)
     wanted = np.hypot(alone.half_width[0], 1.96 * 0.1)
     np.testing.assert_allclose(found.half_width[0], wanted, rtol=1e-6)
@@ -77,11 +77,11 @@ def test_the_methods_own_errors_do_not_go_out_of_a_difference():
         made.append((x, near, 2.0 * x - 1.0 * near + 0.01 * rng.normal(size=200)))
     block = np.arange(200) // 10
 
-    def misses(value):
+    def residuals(value):
         return [Rows((y - value[0] * x - value[1] * n)[:, None], block, NONE) for x, n, y in made]
 
     numbers = [SLOPE._replace(floor=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
-    found = fit(misses, numbers)
+    found = fit(residuals, numbers)
     both = found.covariance
     assert both[0, 1] < 0.0 < both[0, 0] and np.sqrt(both[0, 0]) == pytest.approx(
         0.5 / 1.96, rel=0.01

@@ -141,7 +141,7 @@ def test_without_an_attitude_the_thrust_is_told_and_the_drag_is_said_to_need_one
     assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
 
 
-def test_without_attitude_and_rates_what_turns_is_said_to_be_untold():
+def test_without_attitude_and_rates_what_turns_is_listed_as_not_identified():
     logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz", "rate_b")
     found = identify(logs, known.start())
     assert "motors.thrust" in as_json(found.numbers)

@@ -106,7 +106,7 @@ def test_a_weak_motor_says_which_and_how_surely():
 
 
 def test_sections_show_the_numbers(drag, drag_checks, found):
-    logs = logs_section(drag, drag_checks)
+    logs = logs_section(drag_checks)
     assert isinstance(logs.parts[0], Grid) and len(logs.parts[0].rows) == 3
     noise = noise_section(drag).parts[1]
     assert isinstance(noise, Grid) and [row[0] for row in texts(noise)][0] == "position [m]"
