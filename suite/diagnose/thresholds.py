@@ -1,4 +1,4 @@
-"""Every number that the diagnosis judges by, in one place."""
+"""All thresholds of a diagnosis and of the fits that it shares, with unit and reason."""
 
 from __future__ import annotations
 
@@ -7,76 +7,76 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What counts as enough, near, sure or beyond noise, in the order of the diagnosis's steps."""
+    """Limits of every step, in the order of the steps."""
 
     most_windows: int = 200
-    """Stretches of a second that are flown at most: more take longer and add little."""
+    """Largest number of simulated stretches of 1 s: more take longer and add little."""
     most_rotor_windows: int = 100
-    """The same where measured rotor speeds drive: their errors along a stretch are estimated too,
-    which takes twice as long."""
+    """The same where measured rotor speeds are the input: their errors along a stretch are
+    estimated too, which takes twice as long."""
     most_rows: int = 100_000
-    """Rows of all flights together that force and torque use at most; of more each so many-th."""
+    """Largest number of rows of all flights that force and torque use; longer logs are thinned."""
     longest_hole_s: float = 0.1
     """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5
-    """Rotor speeds that the nominal rate loop misses by more than this share of how they change
-    are another controller's: they are the input then [1]."""
+    """Residual of the nominal rate loop's rotor speeds, as a share of how the measured ones change.
+    Above it another controller flew, and the measured rotor speeds are the input [1]."""
     speed_mean_s: float = 0.1
-    """Rotor speeds are compared with the loop's as means over this time, to be rid of noise [s]."""
+    """Rotor speeds are compared with the loop's as means over this time, to average noise [s]."""
     still_speed: float = 10.0
-    """Rotor speeds that change by less, or are off by less, do not count [rad/s]."""
+    """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
     loop_settled_s: float = 0.3
-    """After the first row, until the rotors' lag has forgotten how they began [s]."""
+    """Left out after the first row, until the initial rotor speeds have decayed [s]."""
     lag_settled_s: float = 0.2
-    """Left out after each hole where lags are fitted, for the same reason [s]."""
+    """Left out after each hole in the log where lags are fitted, for the same reason [s]."""
     longest_lag_s: float = 0.15
-    """Slowest motors that are thought of [s]."""
+    """Longest time constant of the rotors that is tried [s]."""
     lag_followed_share: float = 0.99
-    """Commands show the rotors' lag where they give this share of how the speeds change, with it:
-    where speeds change little, noise of the rates in the commanded speeds looks like a lag [1]."""
+    """Least share of the rotor speeds' variance that commands and a lag explain before it counts.
+    Where speeds change little, noise of the rates in the commanded speeds resembles a lag [1]."""
     lag_closed_share: float = 0.25
-    """And where it closes this share of the squared error that the vehicle's lag leaves [1]."""
+    """Least share of the squared error under the vehicle's own lag that another lag removes [1]."""
     lag_least_flights: int = 3
-    """Flights that show it must be as many."""
+    """Least number of flights that show it."""
     longest_delay_s: float = 0.06
-    """Latest commands that are thought of [s]."""
+    """Longest delay of commands that is tried [s]."""
     delays_tried: int = 9
     """Delays up to the longest that are tried before the best is refined."""
     actuator_flight_s: float = 60.0
-    """Flight that is enough to compare rotor speeds; what is logged beyond does not count [s]."""
+    """Longest flight time that is used to compare rotor speeds [s]."""
     held_out_share: float = 0.2
     """Share of the flights that is held out, at least one [1]."""
     lone_fitted_share: float = 0.7
     """Share of a lone flight that is fitted; the end is held out [1]."""
     noise_rows: int = 20
-    """Rows that a polynomial is taken off: a model's error in 0.2 s is negligible then."""
+    """Rows to which a polynomial is fitted; its residual is noise, as a model's error is smooth."""
     rotor_noise_rows: int = 8
     """The same for rotor speeds that are an input, which change faster."""
     noise_degree: int = 3
     """Degree of that polynomial."""
     colour_degree: int = 3
-    """Degree of the polynomial that is taken off a second before its noise gets a colour: what
-    errors of its start make of it."""
+    """Degree of the polynomial that is subtracted from 1 s before noise is modelled as coloured:
+    errors of the start state look like it."""
     colour_gain: float = 3.0
-    """Rise of the log-likelihood below which noise is taken for white [1]."""
+    """Rise of the log-likelihood from which noise is modelled as coloured, not white [1]."""
     drift_gain: float = 3.0
-    """Rise of the log-likelihood below which there is no error of the model besides noise [1]."""
+    """Rise of the log-likelihood from which an error of the model is assumed besides noise [1]."""
     colour_aside: float = 3.0
-    """Rows up to which a stretch's rows may be off the others' times."""
+    """Largest difference of row times between stretches that are compared, in rows."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
-    """Noise below is rounding and the model's steps; pose [m, rad], velocity [m/s], rates [rad/s],
-    accelerometer [m/s^2], rotor speed [rad/s]."""
+    """Lower limit of the noise (rounding, the model's steps) of position [m], attitude [rad],
+    velocity [m/s], rates [rad/s], accelerometer [m/s^2] and rotor speed [rad/s]."""
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
-    """What does less is no finding: a force [m/s^2], 0.5 % of the weight; a torque over the inertia
-    [rad/s^2]; and a drift after a second [m], which is that of such a force."""
+    """An effect that does less is not reported: force per mass [m/s^2] (0.5 % of the weight),
+    angular acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
 
     slow_degree: int = 5
-    """Degree of the polynomials in which a model's error of a window would show."""
+    """Degree of the polynomials over a window on which a model's error is measured."""
     rotor_knot_excess: float = 1.5
-    """Errors of rotor speeds may be this much larger, for what happens between the knots [1]."""
+    """Factor on the errors of rotor speeds, for what happens between the knots [1]."""
     singular: float = 1e-5
-    """A column with less than this of its own next to the others needs Householder's way [1]."""
+    """Smallest independent share of a column; below it Householder's QR is used [1]."""
     fit_rounds: int = 3
     """Gauss-Newton steps of a fit, where no other number of them is given."""
     converged: float = 0.05
@@ -86,7 +86,7 @@ class Thresholds:
     folds: int = 5
     """Parts into which windows are dealt; each is left out once."""
     loud_gain: float = 50.0
-    """A gain that noise never has: what else explains as much as the best is no chance either."""
+    """Gain that noise never reaches: candidates nearly as good as the best are then real, too."""
     alike_share: float = 0.5
     """Share of the best gain from which a group of columns explains about as much [1]."""
     few_windows: int = 10
@@ -96,141 +96,145 @@ class Thresholds:
     most_names: int = 4
     """Effects that are named at most."""
     least_name_share: float = 0.003
-    """An effect with less than this share of the first one's gain is not named: the fit of the
-    first, which is not exact, leaves so much [1]."""
+    """Least gain of a further effect as a share of the first one's: the fit of the first is not
+    exact and leaves a residual of this size [1]."""
     short_list: int = 5
-    """Candidates that are fitted through the whole model at a step."""
+    """Candidates that are fitted with the nonlinear model at a step."""
     near_share: float = 0.5
-    """Candidates whose linear gain is less than this share of the best are not fitted so [1]."""
+    """Least linear gain of these candidates as a share of the best one's [1]."""
     rival_chi2: float = 9.0
-    """A rival less than this above a name's chi-square (three sigma) cannot be ruled out."""
+    """A candidate whose chi-square is less than this above the named one's (three sigma) is an
+    alternative."""
     rival_share: float = 0.25
-    """Nor can one that leaves less than this share of what the name explains, where that is
-    little [1]."""
+    """So is one that leaves less than this share of what the name explains, where this is less
+    [1]."""
     settle_rounds: int = 3
-    """Times that names and rivals are weighed anew."""
+    """Rounds in which names and alternatives are compared again."""
     trusted_horizons_s: tuple[float, ...] = (1.0, 0.5, 0.25)
-    """Lengths of a window, of which the longest is taken whose slopes can be trusted [s]."""
+    """Lengths of a window; the longest over which the linearisation holds is used [s]."""
     trusted_m: float = 0.15
-    """Error of position up to which slopes are trusted [m]."""
+    """Position error up to which the linearisation holds [m]."""
     trusted_height_share: float = 0.25
     """The same for height, as a share of it: near the ground the air changes with it [1]."""
     trusted_rad: float = 0.25
     """The same for attitude [rad]."""
     bilinear_rounds: int = 6
-    """Gauss-Newton steps of a fit of effects of which one acts through another."""
+    """Gauss-Newton steps of a fit of two effects of which one acts through the other."""
     last_rounds: int = 10
     """Gauss-Newton steps of the last fit of all names: some effects saturate."""
     first_order_chi2: float = 25.0
-    """A candidate that is worse than the best by more to first order is not fitted."""
+    """A candidate whose linear chi-square exceeds the best one's by more is not fitted."""
     first_order_share: float = 0.1
-    """Nor one that is worse by more than this share besides: large effects are not linear [1]."""
+    """Further allowance, as a share of the best gain: large effects are not linear [1]."""
     diverged_m: float = 50.0
-    """A simulated window that ends this far from the flight does not count [m]."""
+    """A simulated window that ends this far from the flight has diverged and is left out [m]."""
     least_windows: int = 2
-    """Windows to fit without which nothing can be left out."""
+    """Least number of windows to fit: some are left out in cross-validation."""
     integrator_share: float = 0.6
-    """Share of a physics step up to which pose and rates may be apart by integration alone [1]."""
+    """Offset between pose and rates, as a share of a physics step, that an integrator explains
+    [1]."""
 
     ground_thrust: float = 0.3
-    """Share of the weight below which rotors carry nothing: what stands still then stands on the
-    ground [1]."""
+    """Thrust as a share of the weight; below it a vehicle that does not move is on the ground
+    [1]."""
     ground_speed: float = 0.3
     """Speed below which a vehicle stands still [m/s]."""
     ground_margin_s: float = 1.0
     """Time before and after standing on the ground in which it takes off or lands [s]."""
     least_flights: int = 3
-    """Flights from which their means show how trims differ between flights."""
+    """Least number of flights from which the spread of trims between flights is estimated."""
     longest_memory: int = 40
-    """Neighbouring moments of a view up to which errors may hang together."""
+    """Longest lag of the autocorrelation of a view's errors, in means."""
     least_fast_share: float = 0.5
-    """Fast changes that surely show less than this share of a name speak against it [1]."""
+    """An effect is rejected where fast changes significantly give less than this share of it
+    [1]."""
     least_view_share: float = 0.03
-    """An effect that takes less than this share of a view's squared error is not named [1]."""
+    """Least share of a view's squared error that a named effect explains [1]."""
     least_inertial_share: float = 0.06
-    """The same in flights without a position: what is not known of their pose makes as much [1]."""
+    """The same in flights without a position: the uncertainty of their pose has this size [1]."""
     implausible_times: float = 3.0
     """Beyond so many times its usual size an effect is implausible [1]."""
     hopeless_chi2: float = 10.0
-    """Squared error a row, in units of the noise, that all numbers of the catalogue together leave:
-    beyond it flights are not judged by rollouts of a second, but by their views."""
+    """Squared error a row, in units of the noise variance, after a fit of all effects together.
+    Above it flights are judged by force and torque, not by rollouts of 1 s."""
     hopeless_windows: int = 16
-    """Stretches to which all numbers are fitted where by slopes alone so much remains."""
+    """Stretches of that fit, where the linear one alone exceeds the limit."""
     hopeless_rounds: int = 6
     """Steps of that fit."""
     view_left_share: float = 0.1
-    """Share of a view's squared error that a black box may close beyond what was named, before
-    something is missing [1]."""
+    """Share of a view's squared error that a black box explains beyond the named effects, above
+    which an effect is missing [1]."""
     unexplained_trim: float = 1.5
     """A force that nothing explains counts beyond so many times the flights' own constant offsets:
     attitude and thrust of a log are known no better than these show [1]."""
     unexplained_force: float = 0.5
     """But from here on in any case: an attitude off by 3 degrees, or 5 % of the weight [m/s^2]."""
     least_rotor_gain: float = 0.01
-    """Share of the largest gain below which rotors do nothing along an axis [1]."""
+    """Rotors are taken to have no influence along an axis below this share of the largest gain
+    [1]."""
     carried_ridge: float = 0.01
-    """How strongly what reference flights lack within a flight is held to none, a moment [1]."""
+    """Ridge weight, for each mean, of the regression of the reference flights' residual [1]."""
     carried_least: float = 0.1
-    """Velocities [m/s] and accelerations [m/s^2, rad/s^2] that vary by less do not count."""
+    """Least standard deviation of that regression's inputs [m/s, m/s^2, rad/s^2]."""
     gain_doubt: float = 0.5
-    """Share of a change by which the vehicle file may be wrong along an axis: inertia, arms and the
-    rotors' torque are known no better where nobody identified them [1]."""
+    """Relative error of a change that an error of the vehicle file may cause along an axis:
+    inertia, arms and rotor torque are no more accurate where they were not identified [1]."""
     spread_freedom: int = 4
-    """Degrees of freedom for which the spread of all axes counts next to an axis's own [1]."""
+    """Weight of the spread of all axes next to an axis's own, in degrees of freedom [1]."""
     change_p_value: float = 0.02
     """Chance of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
-    """Draws of what chance does to all candidates of a change at once."""
+    """Draws of the null of a change, all candidates together."""
     swing_periods_s: tuple[float, float] = (0.6, 3.5)
     """Periods of pendulums of 0.1 to 3 m [s]."""
     swing_p_value: float = 0.001
     """Chance of a peak in the spectrum, over all periods."""
     swing_share: float = 0.15
-    """Share of what the force view leaves that swings at least [1]."""
+    """Least share of the force residual's power that oscillates [1]."""
     swing_driven: float = 0.5
-    """Force that is left over the acceleration at the same period, from which it is no error of a
-    model that the flight's own motion shows [1]."""
+    """Least ratio of residual force to measured acceleration at that period. Below it the peak may
+    be a model error that the flight's own motion excites [1]."""
     view_block_s: float = 2.0
-    """Stretches of a flight that a view takes for independent [s]."""
+    """Length of stretches whose errors count as independent in a view [s]."""
 
     bootstrap_draws: int = 1000
     """Draws of the 95 % intervals of a gap."""
     bootstrap_block: int = 4
-    """Neighbouring windows that are drawn together: they start 0.25 s apart and last 1 s."""
+    """Neighbouring windows that are drawn together: they overlap (1 s long, 0.25 s apart)."""
     gap_stride_s: float = 0.25
     """From one start to the next of the rollouts that measure the gap [s]."""
     doubt_chi2: float = 25.0
     """Rise of chi-square on held-out flights from which a name is withdrawn (five sigma)."""
     shown_chi2: float = 9.0
-    """Fall of chi-square on held-out flights that is expected of a name at its fitted size, from
-    which it is withdrawn where none comes (three sigma)."""
+    """Expected fall of chi-square on held-out flights from which a name without any fall there is
+    withdrawn (three sigma)."""
     least_next_to_rest: float = 0.5
-    """Where the model stays off the noise floor: held-out squared error that a name takes away at
-    least, as a share of what stays and is no noise [1]."""
+    """Least fall of the held-out squared error by a name, as a share of the residual above the
+    noise, where that residual stays significant [1]."""
     cells: int = 4
-    """Places along x and y between which a force that hangs on the place is drawn."""
+    """Grid points along x and y of a force that depends on the position."""
     pieces: int = 5
     """Straight pieces of a curve over one number."""
     thrust_reversal: float = 10.0
-    """Change of thrust beyond which its direction is all that counts [m/s^3]."""
+    """Rate of change of thrust above which only its sign counts [m/s^3]."""
     colours_s: tuple[float, ...] = (0.3, 0.03)
-    """Times for which a random disturbance keeps its direction: a gust's and a rotor's [s]."""
+    """Correlation times of a random disturbance that are tested: a gust's and a rotor's [s]."""
     disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
-    """Quantiles of the information along all directions at which a disturbance is seen."""
+    """Quantiles of the information over all directions that set the tested disturbance sizes."""
     informed_share: float = 1e-9
     """Directions with less than this share of the largest information do not count [1]."""
     noise_doubt: float = 0.02
-    """Share by which the measured noise power may be wrong [1]."""
+    """Relative uncertainty of the measured noise power [1]."""
     shape_p_value: float = 0.001
-    """A shape over the state that chance equals more rarely than this is structure."""
+    """P-value up to which a shape over the state counts as structure in the residual."""
     colour_p_value: float = 1e-4
-    """So is energy of a smooth disturbance along an axis that noise gives more rarely."""
+    """The same for the energy of a smooth disturbance along an axis."""
     structure: float = 1.15
-    """Slow errors above their expectation by this factor are no noise [1]."""
+    """Ratio of slow errors to their expectation above which they are not noise [1]."""
     structure_rotor_input: float = 1.3
-    """The same where measured rotor speeds are the input: their noise is known less well [1]."""
+    """The same where measured rotor speeds are the input: their noise is less certain [1]."""
     unexplained_share: float = 0.7
-    """Where more of the gap is left, what was named does not explain it [1]."""
+    """Share of the gap that may remain for a verdict of `partly`; above it, `unknown` [1]."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
     """Shortest and longest length of turbulence that is tried [m], and how many."""
     wind_intensities: tuple[float, float, int] = (0.02, 8.0, 121)
@@ -238,18 +242,19 @@ class Thresholds:
     wind_ratio: float = 10.0
     """Log-likelihood ratio to no wind from which there is wind."""
     wind_rival_ratio: float = 8.0
-    """A disturbance along the body axes that is better by this log-likelihood is no wind."""
+    """Wind is rejected where a disturbance along the body axes has a log-likelihood higher by
+    this."""
     wind_tail: float = 4.0
-    """Standard errors by which the tails of wind's pulls may be above a normal variable's."""
+    """Standard errors by which the fourth moment of wind may exceed a normal variable's."""
     profile_fall: float = 1.92
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
     check_stride_s: float = 0.5
-    """From one window to the next where more of them are wanted than the search has [s]."""
+    """Time between windows in the comparison with a black box [s]."""
     slow_share: float = 0.6
-    """Share of the windows, the slowest, that are fitted where the fast ones judge [1]."""
+    """Share of the windows, the slowest, that are fitted while the fast ones are held out [1]."""
     least_judged: int = 6
-    """Windows to fit and to judge there, at least."""
+    """Least number of windows to fit and to hold out there."""
 
 
 THRESHOLDS = Thresholds()
-"""As `suite diagnose` uses them; tuned on flights of MuJoCo that no blind case contains."""
+"""The defaults of `suite diagnose`, tuned on MuJoCo flights that no blind case contains."""

@@ -1,7 +1,7 @@
-"""Evidence: what a source of information holds on the numbers of a space, in blocks of its noise.
+"""Blocks: whitened residuals and Jacobians of stretches of flights, and their normal equations.
 
-Everything that is done with numbers (fit, intervals, search, hold-out) is done with blocks, so that
-a new source of information is one class that makes them.
+Fit, intervals, search and hold-out use blocks only, so a new source of evidence is one class that
+makes blocks. A number is one scalar parameter of the vehicle model.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 
 
 class Estimate(NamedTuple):
-    """Where the numbers stand."""
+    """Values of all numbers and of the nuisance parameters."""
 
     theta: np.ndarray
     """(P,) the vector of all numbers."""
@@ -26,10 +26,10 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """B stretches of M rows at one estimate, in units of independent noise.
+    """B stretches of M rows, linearised at one estimate, in units of independent noise.
 
-    What the nuisance numbers of a stretch explain is projected out of its rows. Stretches with
-    fewer rows have zeros in the place of the others.
+    The nuisance parameters of a stretch are projected out of its rows. Stretches with fewer rows
+    are padded with zeros.
     """
 
     residual: np.ndarray
@@ -45,7 +45,7 @@ class Block:
     free: np.ndarray
     """(B, F) change of the nuisance numbers that fits best, with the numbers as they are."""
     free_slope: np.ndarray
-    """(B, F, K) by how much less of it is wanted for a change of each number."""
+    """(B, F, K) by how much that change falls for a unit change of each number."""
 
     def equations(self) -> NormalEquations:
         """Return the sums that a fit needs."""
@@ -62,7 +62,7 @@ class Block:
 
 
 class Linearised(Protocol):
-    """A source of information on the numbers of a space, with its noise known."""
+    """A source of evidence whose noise is known."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -70,9 +70,9 @@ class Linearised(Protocol):
         ...
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return what it gives at an estimate, along the numbers at `indices` or along all.
+        """Return the block at an estimate, along the numbers at `indices` or along all.
 
-        A source that has all slopes at once may return more than that.
+        A source that computes all slopes at once may return more columns.
         """
         ...
 

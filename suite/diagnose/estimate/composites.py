@@ -1,4 +1,4 @@
-"""Effects that are tried together as one hypothesis, and what one of them does through another.
+"""Composites: effects that are tested together as one hypothesis, as a wind and a drag.
 
 A wind does nothing where no drag passes it on, and no drag pushes a vehicle that hovers: where the
 vehicle file has none, each alone explains nothing, and both together do. The catalogue's other

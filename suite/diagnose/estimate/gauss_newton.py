@@ -1,4 +1,4 @@
-"""The one fit: Gauss-Newton with bounds, halved where a step fails, on whatever makes blocks."""
+"""Gauss-Newton with bounds and step halving, and 95 % intervals, for every source of evidence."""
 
 from __future__ import annotations
 
@@ -102,11 +102,11 @@ def fit(
 ) -> tuple[Estimate, Block]:
     """Fit the numbers at `indices` and what is free in every stretch.
 
-    At most `rounds` steps are taken, those of the limits if not given; `known` is what the evidence
-    gives at `start`, to save its calculation.
+    At most `rounds` steps are taken (default: that of `limits`); `known` is the block at `start`,
+    to save its computation.
 
     Returns:
-        The best estimate, and what the evidence gives there.
+        The best estimate, and the block there.
     """
     at, space = np.array(indices, dtype=int), evidence.space
     low, high = space.array("low")[at], space.array("high")[at]
@@ -140,13 +140,13 @@ Z95 = 1.96
 TINY = 1e-12
 """Information below this is none."""
 RIDGE = 1e-9
-"""Makes what is not identifiable wide, where a pseudo-inverse would hide it."""
+"""Gives parameters that are not identifiable a wide interval; a pseudo-inverse would hide them."""
 FEWEST = 3
-"""Flights from which on their differences count."""
+"""Least number of flights whose differences are tested."""
 
 
 class Intervals(NamedTuple):
-    """How far K fitted numbers may be off."""
+    """Uncertainty of K fitted numbers."""
 
     half_width: np.ndarray
     """(K,) of the 95 % intervals."""

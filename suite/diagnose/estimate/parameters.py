@@ -1,4 +1,8 @@
-"""Every fitted number of the catalogue as one vector, and the candidates that may explain a gap."""
+"""The fitted parameters of all effects as one vector, and the candidates that may explain a gap.
+
+A number is one scalar of the vector, as the x component of a drag coefficient. A candidate is an
+effect, or a part of one, that a diagnosis may name.
+"""
 
 from __future__ import annotations
 

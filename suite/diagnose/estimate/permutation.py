@@ -1,4 +1,4 @@
-"""Which candidate lowers the error on data left out, and whether chance could do as well."""
+"""Cross-validated gain of each candidate effect, and its p-value by a permutation test."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class CandidateScore(NamedTuple):
-    """How much a candidate explains, next to what is named already."""
+    """How much a candidate explains in addition to the effects named already."""
 
     candidate: Candidate
     gain: float
@@ -27,8 +27,8 @@ class CandidateScore(NamedTuple):
 def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.folds) -> np.ndarray:
     """Return each window's fold, (W,): windows are dealt out in turn along every flight.
 
-    Leaving out whole flights would ask the others for what only one of them can show, as a chirp
-    alone shows a rate loop's gain.
+    Whole flights are not left out: one flight alone may identify a parameter, as a chirp does a
+    rate loop's gain.
     """
     order = np.lexsort((start_s, flight))
     fold = np.empty(len(flight), int)
@@ -77,12 +77,11 @@ def permutation_test(
 ) -> tuple[list[float], list[float], float]:
     """Return the gain of each group of columns over those `always`, its p-value, and chance's gain.
 
-    The null is the largest gain of all groups where the signs of whole windows are shuffled, which
-    keeps all that is coloured within a window. What the best group explains, with those that are
-    nearly as good where it is much, is taken off before (Freedman and Lane 1983): a real effect
-    that a few windows show would otherwise stand in the null as well. Where there are too few
-    windows the null is drawn from the measured noise instead. Chance's gain is what one draw in a
-    hundred exceeds.
+    The null is the largest gain of all groups under random signs of whole windows, which keeps the
+    correlation within a window. What the best group explains (and groups nearly as good, where it
+    explains much) is subtracted first (Freedman and Lane 1983): otherwise a real effect in a few
+    windows would be part of the null. With too few windows the null is drawn from the measured
+    noise instead. Chance's gain is the 99 % quantile of the null.
 
     Args:
         hessian: (W, K, K) of the normal equations, columns of like size.

@@ -1,10 +1,11 @@
-"""Moments of force and torque: what flights and model differ by, moment by moment.
+"""Residuals of force and torque: mean measured accelerations less those of the model.
 
-The remaining error is the noise, and flights have trims of their own: an unchanged vehicle flies
-each time with a slightly other trim, so that each flight's mean of each axis is a draw of its own,
-a random effect (Laird and Ware 1982). Rows are made independent of it by taking off a share of
-their flight's mean (quasi-demeaning; Fuller and Battese 1973). What all flights are judged from is
-off by a draw, too, which is the same for all: there a share of the mean of all goes.
+A moment is one mean over a short smooth window (`data/view.py`). The noise is estimated from the
+residual itself. Flights have trims of their own: an unchanged vehicle flies each time with a
+slightly different trim, so each flight's mean along each axis is a random effect (Laird and Ware
+1982). Subtracting a share of the flight's mean makes rows independent of it (quasi-demeaning;
+Fuller and Battese 1973). Reference flights have such an error too, which all others share: there
+a share of the mean of all flights is subtracted.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ class ViewData(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What a view's numbers are judged by."""
+    """Noise of a view's residuals, by which its rows are weighted."""
 
     scatter: np.ndarray
     """(3,) RMS of the residual within flights, by axis."""
@@ -159,7 +160,7 @@ def compare(
     flights: Sequence[SmoothedFlight],
     indices: Sequence[int] | None = None,
 ) -> ViewData:
-    """Return how `flights` differ from `model` at `theta` (P,), slopes along `indices` or all."""
+    """Return residuals of `flights` at `theta` (P,), slopes along `indices` or all numbers."""
     parts = []
     for number, flight in enumerate(flights):
         forces = model.at(theta, flight.rows, indices)
@@ -190,7 +191,7 @@ def compare(
 
 
 def _believed(series: np.ndarray, credible: np.ndarray) -> np.ndarray:
-    """Return `series` (M, 3, ...) with as much of its changes as is `credible` (3,)."""
+    """Return `series` (M, 3, ...), its changes about the mean multiplied by `credible` (3,)."""
     if not len(series) or (credible == 1.0).all():
         return series
     mean = series.mean(axis=0)
@@ -209,7 +210,7 @@ def centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
 
 
 def units_of(flight: np.ndarray) -> np.ndarray:
-    """Return what is left out together (M,): flights, or thirds of a lone one."""
+    """Return the cross-validation group (M,) of each row: its flight, or a third of a lone one."""
     if len(np.unique(flight)) > 1:
         return flight
     return np.arange(len(flight)) * 3 // len(flight)
@@ -233,7 +234,7 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
 
 
 def _memory(inside: list[np.ndarray], limits: Thresholds) -> np.ndarray:
-    """Return the sum of the autocorrelation (3,), up to where it has fallen to nothing."""
+    """Return the autocorrelation time (3,), summed up to the first lag without correlation."""
     power = np.sum([(f**2).sum(axis=0) for f in inside], axis=0)
     total, alive = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
@@ -330,7 +331,7 @@ def changes_of(data: ViewData) -> ViewData:
 def fast_share(
     data: ViewData, columns: Sequence[int], away: np.ndarray, limits: Thresholds
 ) -> tuple[float, float]:
-    """Return which share of a name's numbers fast changes show, and how surely.
+    """Return which share of a named effect fast changes confirm, and the uncertainty of that share.
 
     Motors answer what disturbs the body. A controller that holds it still against a slow torque
     makes the motors' torque look like one that turns nothing, as if inertia were larger or thrust

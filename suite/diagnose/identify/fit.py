@@ -1,8 +1,8 @@
-"""Least squares on residuals of flights, with what is not identifiable left as it was.
+"""Robust least squares for `suite identify`; parameters that are not identifiable stay unchanged.
 
-Residuals are evidence: Gauss and Newton with Huber's weights, intervals by stretches and flights.
-What another fit has estimated keeps that fit's covariance (Murphy and Topel 1985). A number that
-is not identifiable is left as it was, the worst first, and the others are fitted again.
+Gauss-Newton with Huber's weights on residuals of flights; intervals by stretches and flights. What
+another fit has estimated is held fixed with that fit's covariance (Murphy and Topel 1985). The
+least identifiable parameter is set back to its start, and the others are fitted again.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ class Unknown(NamedTuple):
     low: float
     high: float
     room: float
-    """It is identified where its 95 % interval reaches less far than this to either side."""
+    """Largest half-width of its 95 % interval with which it counts as identified."""
     step: float
     """Of the finite differences."""
     floor: float = 0.0
-    """How far the method itself is off where nothing is noisy, by simulation; added to the
-    half-width in squares."""
+    """Error of the method itself on flights without noise, by simulation; added to the half-width
+    in squares."""
 
 
 class Rows(NamedTuple):
     """Residuals of one flight: N windows in C channels."""
 
     value: np.ndarray
-    """(N, C) what is missed."""
+    """(N, C) measured less modelled."""
     block: np.ndarray
     """(N,) number of the block."""
     level: np.ndarray
@@ -66,7 +66,7 @@ Residuals = Callable[[np.ndarray], Sequence[Rows]]
 
 
 class Known(NamedTuple):
-    """Numbers that another fit has identified, with that fit's covariance; they are held fixed."""
+    """Parameters that another fit has identified, held fixed, with that fit's covariance."""
 
     names: tuple[str, ...] = ()
     covariance: np.ndarray = np.zeros((0, 0))
@@ -109,7 +109,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class ResidualEvidence:
-    """Residuals of flights as evidence on the numbers that are fitted."""
+    """Residuals of flights as a source for Gauss-Newton: `estimate.block.Linearised`."""
 
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
@@ -129,7 +129,7 @@ class ResidualEvidence:
         return Estimate(value, np.zeros((0, 0)))
 
     def weighed(self, at: Estimate) -> ResidualEvidence:
-        """Return this weighed by a channel's noise, and less for what is wild (Huber)."""
+        """Return this weighted by each channel's noise, and less for outliers (Huber 1964)."""
         rows = self.residuals(at.theta)
         off = np.concatenate([np.abs(_levelled(row)) for row in rows])
         sigma = np.maximum(1.4826 * np.median(off, axis=0), 1e-9)
@@ -138,7 +138,7 @@ class ResidualEvidence:
         return replace(self, weights=weights)
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the residuals and their slopes, by finite differences away from the nearer limit."""
+        """Return residuals and slopes, by finite differences away from the nearer limit."""
         along = range(len(self.unknowns)) if indices is None else indices
         here, columns = self.residuals(at.theta), []
         for k in along:
@@ -167,9 +167,10 @@ def fit(
     held: Sequence[str] = (),
     known: Known | None = None,
 ) -> Fitted:
-    """Return the numbers that make `residuals` least, with intervals.
+    """Return the parameters that minimise `residuals`, with intervals.
 
-    What is left as it was may be wrong by its `room`; that is part of the others' intervals.
+    A parameter that is not identifiable may be wrong by its `room`; the others' intervals include
+    that.
 
     Args:
         residuals: the residuals.

@@ -1,8 +1,8 @@
-"""How often chance alone makes the best of all candidates stand out as much.
+"""P-values of a change since reference flights, corrected for the number of candidates.
 
-Candidates of a handful of flights' means are nearly one another's likeness, so that Bonferroni's
-factor, their number, would hide what is there. The least p-value of all of them is drawn instead,
-on data of the null (Westfall and Young 1993).
+On the means of a few flights most candidates are strongly correlated, so Bonferroni's correction by
+their number would be too strict. The smallest p-value of all candidates is simulated under the null
+instead (Westfall and Young 1993).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def chance_of(
     sizes: np.ndarray,
     rng: np.random.Generator,
 ) -> list[float]:
-    """Return how often any group gains as much by chance, for the gain of each.
+    """Return for each group how often the best of all groups gains as much by chance.
 
     Args:
         gains: falls of chi-square by each group of columns next to those of `always`.
@@ -55,7 +55,7 @@ def chance_of(
 
 
 def _alone(gain: np.ndarray | float, size: int) -> np.ndarray:
-    """Return how unusual the gain of a group of `size` columns is, to set groups side by side."""
+    """Return the p-value of one group's gain alone, which compares groups of different `size`."""
     return chi2.sf(gain, size)
 
 
@@ -67,14 +67,14 @@ def _directions(columns: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RotorSpread:
-    """How flights of one unchanged vehicle differ."""
+    """How much flights of one unchanged vehicle differ."""
 
     share: float
     """Standard deviation of a rotor's thrust from flight to flight, by all axes together [1]."""
     freedom: int
     """Degrees of freedom that it was estimated with."""
     along: Mapping[str, np.ndarray]
-    """By view, the same along each axis (3,): its own differences next to those of all."""
+    """By view, the same along each axis (3,), from its own differences and those of all axes."""
     freedom_along: Mapping[str, np.ndarray]
     """By view, degrees of freedom of each axis's own differences (3,)."""
     prior: int

@@ -1,8 +1,8 @@
-"""The search: one effect after another, each against the null, then every name against its rivals.
+"""The search for effects: forward selection, then each named effect against its alternatives.
 
-What is named must lower the error on stretches left out by more than the best of all candidates
-does by chance, and pass the further tests of its evidence. A rival that explains the same is an
-alternative. The search is the same for every kind of evidence.
+A named effect must lower the error on left-out stretches by more than the best of all candidates
+does by chance, and pass further tests of its source of evidence. A rival is another candidate that
+explains the same flights; it is listed as an alternative. All sources use this search.
 """
 
 from __future__ import annotations

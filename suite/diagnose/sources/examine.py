@@ -1,4 +1,4 @@
-"""One source examined: searched, held against flights that took no part, and against relevance."""
+"""The steps of a diagnosis for one source: search, held-out test, relevance, residual."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ half-widths by this factor."""
 def examine(
     source: Source, earlier: Sequence[Finding], say: Callable[[str], None], seed: int
 ) -> tuple[Finding, list[str]]:
-    """Return what `source` shows, and warnings.
+    """Return the finding of `source`, and warnings.
 
     Args:
         source: what is examined.
-        earlier: what was found in other sources. The first of them may contradict a name.
+        earlier: findings of other sources. The first of them may contradict a named effect.
         say: receives a line for people about each step.
         seed: of all draws.
     """
@@ -84,7 +84,7 @@ def examine(
 
 
 def without_names(finding: Finding, seed: int) -> Finding:
-    """Return `finding` where nothing was named, for what was named leaves most of the gap."""
+    """Return `finding` without its named effects, which leave most of the gap."""
     bare, last = finding.search.refitted(()), finding.remaining
     left = finding.source.remaining(bare, (finding.before, finding.before), seed)
     swing = left.swing if last.swing else None
@@ -99,12 +99,12 @@ def without_names(finding: Finding, seed: int) -> Finding:
 def confirmed(
     source: Source, found: SearchResult, gaps: tuple[Gap, Gap]
 ) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
-    """Return `found` without the names that do not lower the gap on held-out flights.
+    """Return `found` without the effects that do not lower the gap on held-out flights.
 
-    Where the model stays off the noise floor, what it lacks adds to any parameter: a name has to
-    lower the gap by a share of what remains then. A name stays where these flights could not show
-    it, as those that keep off the ground cannot show its effect. `gaps` are those before and after
-    it was found.
+    Where the residual stays above the noise floor, model errors bias every parameter: an effect
+    then has to lower the gap by a share of the residual. An effect stays where these flights are
+    not sensitive to it, as high flights are not to the ground effect. `gaps` are those before and
+    after.
 
     Returns:
         What stays, its gap, the gaps without each of its names, and the labels of what went.
@@ -141,10 +141,10 @@ def confirmed(
 def relevant_part(
     source: Source, found: SearchResult, gaps: tuple[Gap, Gap]
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[tuple[str, EffectSize]]]:
-    """Return `found` without what does not matter on its flights.
+    """Return `found` without the effects below the threshold of relevance.
 
-    Where the gap is surely below what matters before anything is named, only faults of the log may.
-    `gaps` are those before and after it was found.
+    Where the gap was below that threshold from the start, only faults of the log may be named.
+    `gaps` are those before and after the search.
 
     Returns:
         What stays, its gap, the sizes of its effects by name, and what was left out.
@@ -184,7 +184,7 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
 
 
 def _acting(found: SearchResult) -> tuple[NamedEffect, ...]:
-    """Return the names of `found` that do something: a wind without its drag does not."""
+    """Return the named effects that have an influence: a wind without a drag has none."""
     informed = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
     at = {index: informed[k] for k, index in enumerate(found.indices)}
     return tuple(
@@ -208,9 +208,10 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 
 
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return which names of `found` the evidence `by` refuses, and in words what it shows.
+    """Return which named effects of `found` the evidence `by` contradicts, and its values in words.
 
-    It does where the name's parameters, fitted to it with its own names, come out elsewhere.
+    It does where their parameters, fitted to it together with its own effects, differ
+    significantly.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))
@@ -232,9 +233,10 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
 
 
 def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[str]]:
-    """Return findings with one cause where one source's name could stand for another's.
+    """Return findings in which each cause is named once.
 
-    Of a candidate that two sources name the one with the relatively narrower interval stands.
+    Of an effect that two sources name, the one with the relatively narrower interval is kept. An
+    effect that is an alternative of another source's effect goes.
     """
     kept, words = list(findings), list[str]()
     for i, one in enumerate(kept):

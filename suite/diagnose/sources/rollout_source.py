@@ -1,4 +1,4 @@
-"""Rollouts of a second under commands or rotor speeds: the whole flight as evidence."""
+"""The source `whole`: errors of simulated stretches of 1 s (rollouts) against the flights."""
 
 from __future__ import annotations
 
@@ -51,10 +51,8 @@ from suite.diagnose.verdict.rollout_gap import (
     true_starts,
 )
 
-BASE_S, STRETCH_S = 5.0, 0.25
-"""About how long a diagnosis takes, in all and a stretch more, on two cores [s]."""
 SHAPES = 5
-"""Shapes of the residual that are listed."""
+"""Largest number of shapes of the residual in the report."""
 
 
 def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
@@ -65,7 +63,7 @@ def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutSource(Source):
-    """Rollouts: their gap is that of whole flights."""
+    """Rollouts of 1 s as a source; its gap is the error of rollouts on held-out flights."""
 
     flown: Rollouts
     coarser: FlightWindows | None = None
@@ -95,10 +93,10 @@ class RolloutSource(Source):
         return bool(expected > self.limits.shown_chi2)
 
     def matters(self, gap: Gap) -> bool:
-        """Return whether rollouts may be off by a relevant amount beyond what noise makes of them.
+        """Return whether rollout errors may exceed the noise by a relevant amount.
 
-        The upper end of the 95 % interval counts; rollouts overlap, so that as many are independent
-        as fit side by side.
+        The upper end of the 95 % interval is compared. Rollouts overlap: only as many count as
+        independent as fit into the flights without overlap.
         """
         force, torque, drift = self.limits.relevance
         independent = max(len(self.flown.held.flight) * self.limits.gap_stride_s, 1.0)
@@ -149,8 +147,8 @@ class RolloutSource(Source):
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in what `found` leaves, see `Source`.
 
-        A wind and a force that swings are searched for where there is some: no parameter that is
-        fitted repeats them.
+        Where there is structure, random wind and an oscillating force are tested: no fitted
+        parameter reproduces them.
         """
         structure, wind = self._structure(found, seed)
         details = {
@@ -276,13 +274,13 @@ def structure_where(
     rotor_input: bool,
     limits: Thresholds = THRESHOLDS,
 ) -> str | None:
-    """Return what the structure in an error goes with, in words; None where it is noise.
+    """Return in words what the structure in a residual depends on; None where it is noise.
 
     Args:
         slow_errors: as `RolloutEvidence.slow_errors` has them.
         residual: the structure.
-        rotor_input: whether measured rotor speeds drive, whose noise is known less well.
-        limits: from where on structure is none of noise.
+        rotor_input: whether measured rotor speeds are the input, whose noise is less certain.
+        limits: above which structure is not noise.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
@@ -310,7 +308,7 @@ def _loudest(slow: np.ndarray, expected: np.ndarray) -> str:
 
 
 def late_by(found: SearchResult) -> dict[str, float]:
-    """Return by name how much later than they were poses are logged [s], of what was named."""
+    """Return by named effect the delay of logged poses that it gives [s]."""
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
     return {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}

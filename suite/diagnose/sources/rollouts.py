@@ -1,4 +1,4 @@
-"""Flights as rollouts of a second: cut, fitted and held out."""
+"""Makes the source `whole` from flights: stretches of 1 s, of which some are held out."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from suite.diagnose.verdict.actuators import another_controller, integrator_of, 
 from suite.diagnose.verdict.rollout_gap import MEASURE, Rollouts, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
-"""About how long a diagnosis takes, in all and a stretch more, on two cores [s]."""
+"""Estimated duration on two cores: fixed part, and for each stretch [s]."""
 
 
 def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
-    """Return flights as rollouts; None where they have not what a rollout needs.
+    """Return the source of rollouts; None where the logs lack a signal that a rollout needs.
 
-    None as well where nothing in the catalogue brings rollouts of a second near the flights, unless
-    they were chosen by name.
+    None also where no effect of the catalogue brings rollouts of 1 s near the flights, unless this
+    source was chosen by name.
 
     Raises:
         ValueError: where no flight can be used, or not in the way that was chosen.
@@ -79,7 +79,7 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
         limits = with_model_error(model, begin, whole, linear, rough, limits)
     most = limits.hopeless_chi2
     if not given.chosen and least_left(model, whole, linear, limits, most) > most:
-        given.say("rollouts of a second leave these flights, whatever is fitted")
+        given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
     informed = information(linear, whole, model.size, limits)
     inside, names = choose_held_out(logs, whole.flight, whole.start_s, informed, limits)
@@ -125,10 +125,10 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
 
 
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
-    """Return whether rollouts can be flown.
+    """Return whether rollouts can be simulated.
 
-    Nothing is missing, and what drives is more than motor commands, or those to a rate loop that
-    remembers.
+    The logs must be complete, with measured rotor speeds, or with commands to a rate loop without
+    integrators and filters.
     """
     return not any(
         log.partial or (log.rotor_speed is None and (log.rate_cmd_b is None or remembers(vehicle)))

@@ -1,8 +1,8 @@
-"""A source of evidence in a diagnosis: what it fits, what it holds out, and how names are judged.
+"""Base class of a source of evidence: what it fits, what it holds out, how it judges effects.
 
 A new source is one subclass of `Source` and one function that makes it from flights, with an entry
 in `SOURCES` (`suite/diagnose/diagnose.py`). Search, held-out test, relevance, verdict, JSON and
-report need no more than what stands here.
+report use only this interface.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from suite.diagnose.verdict.rollout_gap import Rollouts
 
 
 class TestedEffect(NamedTuple):
-    """An effect that is named by a test of its own: the search has no candidate for it."""
+    """An effect that is named by a separate test, not by the search: rotor lag, random wind."""
 
     name: str
     values: Any
@@ -45,14 +45,14 @@ class TestedEffect(NamedTuple):
 
 
 class Remaining(NamedTuple):
-    """What the named effects leave of a gap."""
+    """The residual that the named effects leave."""
 
     structured: bool
-    """Whether it is more than noise."""
+    """Whether it is significantly more than noise."""
     share: float
     """Of the gap above the noise floor [1]."""
     where: str | None = None
-    """What it goes with, in words."""
+    """What it depends on, in words."""
     explainable: float = 0.0
     """Share of the gap that a black box closes, where one was fitted [1]."""
     wind: TestedEffect | None = None
@@ -82,7 +82,7 @@ class Series(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Source(ABC):
-    """Flights as evidence of one kind: some are fitted, the others are held out."""
+    """One kind of evidence from flights: some flights are fitted, the others held out."""
 
     name: str
     """As `views` of a diagnosis has it."""
@@ -99,18 +99,19 @@ class Source(ABC):
     known: tuple[Evidence, Block]
     """The fitted flights, weighed where the search begins, and their block there."""
     start: Estimate
-    """Where the search begins."""
+    """The vehicle file's parameters, from which the search starts."""
     among: Sequence[Candidate]
-    """What may be named."""
+    """The candidates."""
     limits: Thresholds
     keeps_small: bool = False
-    """Whether a name stays however small its effect is: how flights differ judges a change."""
+    """Whether effects below the threshold of relevance are named, too: a change is judged by how
+    flights differ."""
     small_explains: bool = False
-    """Whether what is too small to matter counts in what remains: it explains what it explains."""
+    """Whether the residual is computed with effects that are too small to be named."""
     otherwise: Source | None = None
-    """What is tried where nothing is named."""
+    """The source that is searched where this one names nothing."""
     rollouts: Rollouts | None = None
-    """What is flown, where it is: recordings, plans and a fitted network are made of it."""
+    """The simulated flights, for recordings, plans and a fitted network; None without rollouts."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -130,25 +131,25 @@ class Source(ABC):
         return search(self.known[0], self.start, self.among, say, seed, self.known)
 
     def worse(self, before: Gap, after: Gap) -> bool:
-        """Return whether the held-out flights contradict what took the gap to `after`.
+        """Return whether held-out flights contradict the effects that changed the gap to `after`.
 
-        Each flight's own trim may weigh more on what was named: the error within flights counts as
-        well.
+        Both the whole error and the error within flights have to grow: a flight's own trim may
+        raise the first alone.
         """
         return after.rms >= before.rms and float(after.energy.sum()) >= float(before.energy.sum())
 
     def shows(self, found: SearchResult, one: Candidate) -> bool:
-        """Return whether the held-out flights would show `one` at the size that was fitted."""
+        """Return whether held-out flights are sensitive enough to show `one` at its fitted size."""
         del found, one
         return False
 
     def matters(self, gap: Gap) -> bool:
-        """Return whether `gap` may be a relevant one beyond the noise."""
+        """Return whether `gap` may exceed the noise by a relevant amount."""
         del gap
         return True
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
-        """Return by effect what its names do on these flights, and the upper end of its interval.
+        """Return by effect its size on these flights, and the upper end of that size's interval.
 
         Empty where that has no physical unit: then no effect is too small.
         """
@@ -156,7 +157,7 @@ class Source(ABC):
         return {}
 
     def stepped(self, found: SearchResult) -> bool:
-        """Return whether the names of `found` are like the steps of a simulator."""
+        """Return whether the named effects look like the time steps of a simulator."""
         del found
         return False
 
@@ -173,7 +174,7 @@ class Source(ABC):
 
 @dataclass(frozen=True)
 class Given:
-    """What a diagnosis starts from."""
+    """The input of a diagnosis."""
 
     logs: Sequence[FlightLog]
     vehicle: Vehicle
@@ -186,13 +187,12 @@ class Given:
     say: Callable[[str], None]
     limits: Thresholds
     chosen: bool
-    """Whether the source was chosen by name: it is refused with a reason, then, where it cannot
-    be used."""
+    """Whether the source was chosen by name; then it raises an error where it cannot be used."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What flights are as evidence."""
+    """The sources of evidence that flights allow."""
 
     sources: tuple[Source, ...]
     held_out: Sequence[str]
@@ -223,7 +223,7 @@ class Finding:
     source: Source
     search: SearchResult
     names: tuple[NamedEffect, ...]
-    """What of the search's names stands, next to the other sources'."""
+    """The named effects that stand after the comparison with other sources."""
     before: Gap
     after: Gap
     without: Mapping[str, Gap]

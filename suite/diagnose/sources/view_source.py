@@ -1,7 +1,7 @@
-"""Force and torque as sources: what their names are worth next to what a black box closes.
+"""The sources `force` and `torque`, with a black box as the limit of what any model explains.
 
-A regression without any physics, fitted to the same flights, shows how much of what a model leaves
-could be explained at all, and whether something is left beyond the names.
+The black box is a ridge regression without physics, fitted to the same flights. It shows how much
+of the residual could be explained at all, and whether structure remains beyond the named effects.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ WHAT = {"force": "acceleration", "torque": "angular acceleration"}
 
 @dataclass(frozen=True, kw_only=True)
 class ViewSource(Source):
-    """One view of the flights: their errors are those of mean accelerations."""
+    """One view (force or torque): its gap is the error of mean accelerations."""
 
     view: View
     held: ViewEvidence
     """The held-out flights."""
     floor: np.ndarray
-    """(3,) what measurement noise makes of a mean acceleration, by axis of the body."""
+    """(3,) standard deviation of a mean acceleration by measurement noise, by body axis."""
     every: ViewEvidence | None = None
-    """All flights, where a force that swings may show."""
+    """All flights, in which an oscillating force is searched for; None in a torque view."""
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
@@ -181,7 +181,7 @@ class ViewSource(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSource(ViewSource):
-    """A change that shows in motion alone, tried where no mean of a flight has changed."""
+    """A change that shows only in motion, tested where no mean of a flight has changed."""
 
     reference: ViewEvidence
     fitted: ViewEvidence
@@ -197,18 +197,18 @@ class MotionSource(ViewSource):
 
 
 class Shares(NamedTuple):
-    """By axis of the body (3,), which share of the variance within flights is closed [1]."""
+    """Share of the variance within flights that is explained ('closed'), by body axis (3,) [1]."""
 
     closed: np.ndarray
-    """By the names."""
+    """By the named effects."""
     explainable: np.ndarray
     """By a black box that is fitted to the same flights."""
     left: np.ndarray
-    """By a black box, beyond the names."""
+    """By a black box, beyond the named effects."""
     variance: np.ndarray
     """Within flights, as given [the view's unit squared]."""
     repeatability: np.ndarray
-    """How flights' means differ among themselves [the view's unit]; NaN where too few show it."""
+    """Spread of flights' means [the view's unit]; NaN with too few flights."""
 
     def whole(self, by_axis: np.ndarray) -> float:
         """Return a share by axis (3,) as one of all axes together, at least 0."""
@@ -237,7 +237,7 @@ def _rms(residual: np.ndarray) -> np.ndarray:
 
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Weights of the coefficients' squares that are tried, against a moment's each."""
+"""Ridge weights that are tried, relative to the weight of a mean."""
 
 
 class BlackBox(NamedTuple):
@@ -259,10 +259,10 @@ def inputs_of(flight: SmoothedFlight) -> np.ndarray:
 
 
 def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> BlackBox:
-    """Return the black box that explains `left` (M, 3) best on flights left out of its fit.
+    """Return the black box that explains `left` (M, 3) best in cross-validation over flights.
 
-    Means of flights are taken off both sides: they are trims. `flight` (M,) numbers each's;
-    a lone flight's thirds stand for flights.
+    Means of flights, which are trims, are subtracted on both sides. `flight` (M,) is the number of
+    each row's flight; a lone flight is split into thirds.
     """
     units = units_of(flight)
     inputs, left = centred(inputs, flight), centred(left, flight)
@@ -283,7 +283,7 @@ def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> B
     best = np.argmin(errors, axis=0)
     every = np.ones(len(units), bool)
     columns = [solve(every, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
-    none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # better to predict nothing
+    none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # predicting 0 is better
     return BlackBox(spread, np.where(none, 0.0, np.stack(columns, axis=1)))
 
 

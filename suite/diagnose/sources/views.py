@@ -1,4 +1,4 @@
-"""Flights of a real vehicle as force and torque, or as what has changed since reference flights."""
+"""Makes the sources `force` and `torque`, since the vehicle file or since reference flights."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
-"""About how long it takes, in all and a row more, on two cores [s]."""
+"""Estimated duration on two cores: fixed part, and for each row [s]."""
 MEASURE = (
-    "RMS over the axes of what the model leaves of {about} on held-out flights [{unit}], both "
+    "RMS over the axes of the residual of {about} on held-out flights [{unit}], both "
     "sides smoothed over {width:g} s"
 )
 
 
 def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
-    """Return flights, partial ones too, by force and torque; None where rollouts cover all of it.
+    """Return the sources force and torque of (also partial) flights; None where rollouts are used.
 
     With reference flights the sources are those of what has changed since.
 
@@ -154,7 +154,7 @@ def _since_reference(
 
 
 def _compared(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
-    """Return in words how far reference flights are apart."""
+    """Return in words how much reference flights differ."""
     if spread is None:
         return ()
     return (
@@ -197,7 +197,7 @@ def _references(
 
 
 def _allowed(flights: ViewFlights) -> str:
-    """Return what flights allow, down to what may differ: axes, and the time of a mean."""
+    """Return in words which views, axes and means flights allow."""
     return " and ".join(
         f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
         for view in flights.views
