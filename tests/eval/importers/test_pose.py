@@ -63,7 +63,7 @@ def test_a_turn_between_the_bodies_is_found():
 
 
 def _import(tmp_path, text=None, **options):
-    log = made.write_blackbox(tmp_path / "log.csv", span=(0, 12), rate=500.0)
+    log = made.write_blackbox(tmp_path / "log.csv", span=(0, 12), rate=250.0)
     pose = tmp_path / "pose.csv"
     if text is not None:
         pose.write_text(text)

@@ -114,7 +114,7 @@ TRIALS = [
     TrialSpec(track, level, 0) for track in ("zigzag", "circular", "ellipse") for level in (1, 6)
 ]
 
-RULES = Rules(time_limit_s=0.8)
+RULES = Rules(time_limit_s=0.5)
 
 
 def results(trials, slots=64, threads=1, workers=1, policy=None):

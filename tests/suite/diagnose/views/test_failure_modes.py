@@ -37,7 +37,7 @@ def test_a_battery_that_sags_with_its_voltage_is_named_with_its_size():
     assert found.vehicle.effects["battery_sag"].per_volt == pytest.approx(0.006 / FALL, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [20, 30])
+@pytest.mark.parametrize("seed", [20, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_drag_to_one_side_is_no_wind(seed):
     def forwards(motion, t):
         ahead = motion.rot_w[:, 0]

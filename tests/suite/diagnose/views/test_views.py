@@ -72,6 +72,7 @@ def test_an_inertia_stands_though_each_flights_trim_weighs_more_on_it():
     assert found.main.after.energy.sum() < found.main.before.energy.sum()
 
 
+@pytest.mark.slow
 def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
     logs = flights(4, seed=6, duration_s=20.0, battery_sag=(0.004, 0.0))
     found = diagnose(logs, VEHICLE, by="views")

@@ -31,7 +31,7 @@ def names_by_chance(slope, groups, **asked):
     return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(250)])
 
 
-@pytest.mark.parametrize("alike", [0.0, 0.99])
+@pytest.mark.parametrize("alike", [pytest.param(0.0, marks=pytest.mark.slow), 0.99])
 def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are(alike):
     rng = np.random.default_rng(5)
     common = rng.standard_normal((6, 3, 1))
