@@ -20,9 +20,9 @@ SENSORS = Sensors(
     "tracked", 250.0, pos=0.004, attitude=0.01, gyro=0.06, vel=0.1, rotor=2.0, voltage=0.02
 )
 WAYS = (
-    Trajectory("figure_eight", 8.0, 4.0, turn="sweep"),
-    Trajectory("circle", 8.0, 3.0, turn="wobble"),
-    Trajectory("climb", 8.0, 3.0, turn="wobble"),
+    Trajectory("figure_eight", 6.5, 4.0, turn="sweep"),
+    Trajectory("circle", 6.5, 3.0, turn="wobble"),
+    Trajectory("climb", 6.5, 3.0, turn="wobble"),
     Trajectory("chirp", 6.0, 0.8),
 )
 HOVER = (Trajectory("hover", 8.0), Trajectory("vertical", 8.0, 0.5))
