@@ -27,6 +27,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from tracks.common.names import printable
+
 
 def _xyz(stem: str) -> tuple[str, ...]:
     return tuple(f"{stem}_{axis}" for axis in "xyz")
@@ -89,7 +91,11 @@ class FlightLogError(ValueError):
     """A flight log is refused; names the file, the column, the row and the reason."""
 
     def __init__(self, name: str, column: str | None, row: int | None, reason: str) -> None:
-        """Keep the parts and join them to one line; `row` is counted from 1."""
+        """Keep the parts and join them to one line; `row` is counted from 1.
+
+        A damaged file's bytes may stand in what its reader says of it.
+        """
+        reason = printable(reason, keep="")
         self.name, self.column, self.row, self.reason = name, column, row, reason
         where = [part for part in (column and f"column {column}", row and f"row {row}") if part]
         super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))

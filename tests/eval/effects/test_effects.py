@@ -11,7 +11,7 @@ import pytest
 from eval.effects import EFFECTS, all_values
 from eval.effects.body import MASS_OFFSET as MASS
 from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays
-from eval.effects.log_faults import apply_log_faults, lateness, measured, restored
+from eval.effects.log_faults import apply_log_faults, lateness, measured, restored, shifted
 from eval.effects.slung_load import SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
@@ -138,6 +138,12 @@ def test_values_have_a_field_for_each_parameter(values):
         EFFECTS.register("flywheel", replace(WHEEL, values=values))
 
 
+def test_usual_directions_are_unit_vectors():
+    for effect in EFFECTS.values():
+        for parameter in effect.parameters:
+            assert np.linalg.norm(parameter.direction or (1.0,)) == pytest.approx(1.0)
+
+
 def test_a_memory_needs_both_of_its_hooks():
     half = replace(WHEEL, carry=None)
     with pytest.raises(ValueError, match="only one of `start` and `carry`"):
@@ -151,6 +157,12 @@ def a_sample(rng, n=5):
     rot_w = exp_rot(rng.standard_normal((n, 3)))
     pos_w, vel_w, rate_b, acc_b = rng.standard_normal((4, n, 3))
     return Sample(pos_w, rot_w, vel_w, rate_b, acc_b)
+
+
+def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():
+    time_s, series = np.array([0.0, 1.0, 2.0, 4.0]), np.array([[0.0], [1.0], [5.0], [1.0]])
+    for offset, wanted in ((0.5, [-0.5, 0.5, 3.0, 2.0]), (-0.5, [0.5, 3.0, 4.0, 0.0])):
+        np.testing.assert_allclose(shifted(time_s, series, np.asarray(offset))[:, 0], wanted)
 
 
 def test_the_catalogue_undoes_its_own_faults_on_a_sample():

@@ -1,10 +1,14 @@
 """A load on a line: its weight, its period, momentum and energy, slack, and steps of any length."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eval.effects import slung_load
 from eval.effects.interface import GRAVITY
 from eval.effects.slung_load import LoadState, SlungLoad
 from eval.quadrotor.plant import Command, Motion, make_plant
@@ -43,6 +47,20 @@ def lively(time_s):
     """Return a command with hard turns; what it asks of the rotors is within their limits."""
     rate_b = 3.0 * np.sin(np.array([5.0, 4.0, 3.0]) * time_s)
     return Inputs(Command(np.asarray(12.0 + 4.0 * np.sin(7.0 * time_s)), rate_b))
+
+
+def test_a_step_of_the_line_is_backward_euler_of_a_damped_spring():
+    """The tension is that of the stretch and its speed at the end of the step, however long."""
+    at_m, speed, dt = 0.01, 0.3, 0.02
+    flow: Any = SimpleNamespace(
+        memory=LoadState(np.array([0.0, 0.0, -LENGTH - at_m]), np.array([0.0, 0.0, -speed])), dt=dt
+    )
+    values = SlungLoad(np.asarray(LOAD), np.asarray(LENGTH))
+    parting = float(slung_load._pull(values, flow)[1][0])
+    after = speed - dt * parting
+    spring = slung_load.STIFFNESS**2 * (at_m + dt * after)
+    damper = 2.0 * slung_load.DAMPING * slung_load.STIFFNESS * after
+    assert parting == pytest.approx(spring + damper) and parting > 1.0
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.004, 0.02])

@@ -1,8 +1,10 @@
 """Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
 
+import io
 import struct
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -59,6 +61,26 @@ def test_a_size_beyond_the_end_is_no_circle(tmp_path):
         "assert log.file_corruption and not log.data_list\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_dropouts_are_counted_and_their_time_is_in_seconds():
+    lost: Any = [SimpleNamespace(duration=ms) for ms in (200, 300)]
+    log = SimpleNamespace(file_corruption=False, dropouts=lost, initial_parameters={})
+    assert "2 dropouts, 0.5 s in all" in text(px4._health(log), "file")
+
+
+def test_only_a_step_back_over_a_cut_body_is_shortened():
+    file = px4._Forward(io.BytesIO(bytes(10)))  # type: ignore[arg-type]
+    file.read(20)
+    assert file.seek(-20, 1) == 0
+    file.seek(8)
+    file.read(4)
+    assert file.seek(0, 1) == 10 and file.seek(-1, 1) == 9
+
+
+def test_what_a_reader_quotes_of_a_damaged_file_is_one_line():
+    error = FlightLogError("log.bin", None, None, "message 'W\n\x1d\x1b[31m' is unknown")
+    assert str(error) == "log.bin: message 'W\\n\\x1d\\x1b[31m' is unknown"
 
 
 @pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])

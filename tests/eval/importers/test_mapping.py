@@ -5,8 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eval.importers import import_log
-from eval.importers.mapping_file import MIXERS, UNITS, WIDTHS, read_map, shipped_maps
+from eval.importers import import_log, mapping
+from eval.importers.mapping_file import (
+    MIXERS,
+    UNITS,
+    WIDTHS,
+    Column,
+    map_file,
+    read_map,
+    shipped_maps,
+)
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight
@@ -135,6 +143,10 @@ def test_the_firmwares_mixer_turns_the_body_the_way_that_it_says():
     assert list(roll > 0) == [False, False, True, True]
     assert list(pitch > 0) == [True, False, False, True]
     assert list(yaw > 0) == [True, False, True, False]
+    column = Column(("thrust", "roll", "pitch", "yaw"), (1.0,) * 4, mixer="crazyflie")
+    asked = np.array([[0.5, 0.0, 0.0, 0.0], [1.2, 0.0, 0.0, 0.0], [-0.2, 0.0, 0.0, 0.0]])
+    motors = mapping._values((np.arange(3.0), asked), column, "log")[1]
+    np.testing.assert_allclose(motors, [[0.5] * 4, [1.0] * 4, [0.0] * 4])
 
 
 def test_a_pose_is_taken_from_where_it_is_asked(tmp_path, truth):
@@ -234,3 +246,5 @@ def test_a_wrong_mapping_is_refused_by_key(tmp_path, text, reason):
 def test_an_unknown_name_is_refused_with_the_names_there_are():
     with pytest.raises(ValueError, match="nanobench"):
         read_map(Path("nanobank"))
+    for path in ("nanobank.toml", "folder/nanobank"):
+        assert map_file(Path(path)) == Path(path), "a file, which may be missing"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.outputs import actions_of, notes_of, probable_faults
@@ -27,6 +28,17 @@ def flown(policy, world="mujoco", track=None, rules=RULES, slots=1):
     options = JudgeOptions(slots=slots, workers=1, rules=rules)
     trials = [TrialSpec(track.family, 0, 0)]
     return fly(policy, trials, VEHICLE, world, options, tracks={track.family: track})[0]
+
+
+def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
+    share = GRAVITY / VEHICLE.full_thrust
+    for action, wanted in (
+        (ActionSpec(), [0.0] * 3),
+        (ActionSpec("ctbr"), [GRAVITY, 0.0, 0.0, 0.0]),
+        (ActionSpec("motors"), [share] * 4),
+        (ActionSpec("motors", motors="speed"), [share**0.5] * 4),
+    ):
+        np.testing.assert_allclose(first_action(action, VEHICLE), wanted)
 
 
 @pytest.mark.parametrize("world", ["mujoco", "reference"])

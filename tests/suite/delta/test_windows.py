@@ -63,6 +63,25 @@ def test_windows_leave_out_what_is_missing():
         cut_windows([replace(log, extra={})], 0.5, 0.1)
 
 
+def test_windows_begin_a_stride_apart_and_none_spans_a_gap():
+    log = fly(nominal_model(PointMassConfig()), 1)[0]
+    starts = cut_windows([log], 0.5, 0.3).pos_w[:, 0]
+    at = [np.flatnonzero(np.isclose(log.pos_w, p, atol=1e-6).all(-1))[0] for p in starts]
+    assert np.diff(log.time_s[at]) == pytest.approx(0.3, abs=1e-6)
+    lost = (log.time_s > 1.4) & (log.time_s < 1.6)
+    extra = {k: np.asarray(v)[~lost] for k, v in log.extra.items()}
+    names = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b")
+    arrays = {name: getattr(log, name)[~lost] for name in names}
+    gapped = replace(log, extra=extra, **arrays)
+    found = cut_windows([gapped], 0.5, 0.1)
+    assert len(found.time_step) and found.time_step.max() < 0.05
+    once = np.zeros(len(log.time_s))
+    once[10] = 1.0
+    single = replace(log, extra={**log.extra, "policy_step": once})
+    alone, both = cut_windows([log], 0.5, 0.3), cut_windows([log, single], 0.5, 0.3)
+    assert len(both.pos_w) == len(alone.pos_w), "a single decision makes no window"
+
+
 def test_windows_of_unlike_rates_are_cut_to_what_all_have():
     """A log of every other decision has half as many in a window, and in what came before it."""
     plant = nominal_model(PointMassConfig())

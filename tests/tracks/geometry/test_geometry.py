@@ -70,6 +70,10 @@ def test_stacked_scenes_have_a_leading_axis():
     assert both.boxes.center_w.dtype == np.float32
 
 
+IRREGULAR = np.array([[-0.7, -0.4], [0.6, -0.5], [0.5, 0.5], [-0.2, 0.6]])
+"""An opening whose corners all turn by other angles."""
+
+
 def inside_boxes(boxes, point_w):
     local = np.einsum("nij,pni->pnj", boxes.rot_w, point_w[:, None] - boxes.center_w)
     return np.any(np.all(np.abs(local) <= boxes.half_size, axis=-1), axis=-1)
@@ -92,8 +96,9 @@ def one_gate(opening, width=0.2, depth=0.06, yaw=0.7):
         regular_polygon(6, 0.5),
         regular_polygon(16, 0.6),
         regular_polygon(3, 0.4),
+        IRREGULAR,
     ],
-    ids=["rectangle", "hexagon", "round", "triangle"],
+    ids=["rectangle", "hexagon", "round", "triangle", "irregular"],
 )
 def test_the_frame_surrounds_the_opening_and_nothing_else(opening):
     gates = one_gate(opening)
@@ -117,9 +122,8 @@ def test_the_frame_surrounds_the_opening_and_nothing_else(opening):
 
 
 def test_repeated_corners_park_their_bars():
-    square = rectangle(1.0, 1.0)
-    padded = one_gate(np.concatenate([square, square[-1:], square[-1:]]))
-    plain, boxes = frame_boxes(one_gate(square)), frame_boxes(padded)
+    padded = one_gate(np.concatenate([IRREGULAR, IRREGULAR[-1:], IRREGULAR[-1:]]))
+    plain, boxes = frame_boxes(one_gate(IRREGULAR)), frame_boxes(padded)
     kept = boxes.center_w[:, 2] > PARKED_Z / 2
     assert kept.sum() == 4
     for field, expected in zip(boxes, plain, strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
-from eval.importers.formats import betaflight
+from eval.importers.formats import ardupilot, betaflight, px4
 from eval.importers.formats.crazyflie import unpack_quaternion
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
@@ -114,9 +114,16 @@ def test_betaflights_tenfold_values_are_found(tmp_path, fix):
         assert level == {"gyro", "rate command", "voltage"}
 
 
+def test_motors_are_where_each_firmware_has_them():
+    """Of a quadrotor X, by their numbers; (forward, left)."""
+    front, rear, left, right = 1, -1, 1, -1
+    assert betaflight.MOTOR_SIDE == ((rear, right), (front, right), (rear, left), (front, left))
+    x = ((front, right), (rear, left), (front, left), (rear, right))
+    assert px4.QUAD_X == ardupilot.QUAD_X == x
+    assert ardupilot.QUAD_PLUS == ((0, right), (0, left), (front, 0), (rear, 0))
+
+
 def test_betaflight_counts_the_motors_poles(tmp_path):
-    # Its quadrotor X: rear right, front right, rear left, front left; (forward, left).
-    assert betaflight.MOTOR_SIDE == ((-1, -1), (1, -1), (-1, 1), (1, 1))
     path = made.write_blackbox(tmp_path / "log.csv", span=(0, 8), poles=12)
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
     log, _ = import_log(path, None, ImportOptions(pose=pose, motor_poles=12, full_thrust=30.0))
