@@ -6,11 +6,11 @@ page is not what the code says.
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import inspect
 import sys
 from collections.abc import Iterable
+from dataclasses import MISSING, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def commands() -> str:
 def _default(option: Option) -> str:
     """Return an option's default as a cell; empty where the text says what happens without it."""
     value = option.default
-    if value is dataclasses.MISSING:
+    if value is MISSING:
         return "required"
     text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
     return "" if text in SILENT else cell(text)
@@ -71,10 +71,16 @@ def python() -> str:
     return "\n".join(parts)
 
 
+def _value(value: Any) -> str:
+    """Return a setting's value as a cell; the phases of a recipe are counted."""
+    counted = isinstance(value, tuple) and value and is_dataclass(value[0])
+    return f"{len(value)} of them" if counted else cell(value)
+
+
 def training() -> str:
     """Return the page of the settings of a training."""
     rows = [
-        f"| `{one.path}` | {cell(one.default)} | {one.allowed} | {cell(one.about)} |"
+        f"| `{one.path}` | {_value(one.default)} | {one.allowed} | {cell(one.about)} |"
         for one in settings(named_recipe("race"))
         if not one.path.startswith("quadrotor.vehicle.")
     ]
