@@ -1,4 +1,4 @@
-"""What every test runs under: JAX on the CPU with compiled code kept, hypothesis repeatable."""
+"""Settings of all tests: JAX on the CPU with a cache of compiled code, repeatable hypothesis."""
 
 import gc
 import os
@@ -26,14 +26,14 @@ TOGETHER = (
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-# Tests compile much and run little: code that is made in a fifth of the time, and is slower.
+# Tests compile much and run little: slower code that compiles in a fifth of the time.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "agg")
 
-# Tracing makes millions of small objects; collected this seldom they cost a tenth of the time less.
+# Tracing makes millions of small objects: rare garbage collection saves a tenth of the time.
 gc.set_threshold(100_000, 20, 100)
 
 settings.register_profile(

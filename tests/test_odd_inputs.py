@@ -1,4 +1,4 @@
-"""What people and other programs hand over that cannot be used: exit 2, one line, nothing left.
+"""Unusable input of users and other programs: exit 2, a message of one line, no files left.
 
 Every case is a whole command line in this process. Options and settings out of range are in
 tests/suite/test_cli.py; models that hang or abort, in tests/policies/formats/test_apart.py.
@@ -50,9 +50,9 @@ READ = {
     "mapping": ("it.toml", "import log.csv --map it.toml"),
     "evaluation": ("run/run.json", "view run"),
 }
-"""A kind of file, where one lies, and a command that reads it."""
+"""A kind of file, its place, and a command that reads it."""
 LOGS = ("Parquet log", "CSV log")
-"""What may be given as a folder of many."""
+"""Kinds of which a folder with many may be given."""
 
 
 def at_its_place(what, folder, monkeypatch):

@@ -1,7 +1,7 @@
-"""The world `reference`: one trial as a loop of MuJoCo steps, to be read from top to bottom.
+"""The simulator `reference`: one trial as a loop of MuJoCo steps, in one readable function.
 
-The batched worlds are held against it, so it shares the vehicle with them
-and nothing else: it keeps its own count of gates and decides on its own when a trial ends.
+Tests compare the batched simulators with it. It shares the vehicle with them and nothing else: it
+counts gates and ends a trial by its own code.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ def fly_trial(
     """Fly one trial.
 
     Args:
-        policy: who flies.
-        trial: which.
+        policy: the policy.
+        trial: its family, level and seed.
         track: the trial's.
-        vehicle: on what.
+        vehicle: what it flies.
         rules: when a trial ends.
         limits: what an action may be.
-        rows: of the policy's inputs; all but the first are zero. The rows of a call to the policy
-            are as many as in the batched worlds, since some policies answer otherwise then.
-        wanted: what the policy sees of the truth.
+        rows: number of rows of the policy's inputs, as in the batched simulators, since the output
+            of some policies depends on it; all rows but the first are zero.
+        wanted: errors in what the policy sees.
 
     Raises:
-        ValueError: for observations that are old or filtered, which this world has not.
+        ValueError: for delayed or filtered observations, which this simulator does not have.
     """
     if wanted.is_late or wanted.estimator:
         lacks = "has no estimator in the loop" if wanted.estimator else "shows nothing late"

@@ -1,4 +1,4 @@
-"""A diagnosis run over the cases of a set."""
+"""Run the diagnosis on the cases of a set."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tracks.common.work import Workers
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
 """Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""
 TIMED, FAILED = "seconds.json", "error.json"
-"""What a case's folder has in the end: how long the diagnosis took, or why it failed."""
+"""File in the folder of a diagnosed case: the time of the diagnosis, or why it failed."""
 CRASHED = 500
-"""Characters of an error that are kept."""
+"""Longest error text that is stored, in characters."""
 
 
 def run_set(
@@ -31,7 +31,7 @@ def run_set(
     into: Path | None = None,
     workers: Workers | None = None,
 ) -> int:
-    """Diagnose every case that was not diagnosed yet; return how many there are now.
+    """Diagnose every case without a result, and return the number of results.
 
     Results go to `into` (OUT/results if not given), one folder a case, with `seconds.json`
     beside `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
@@ -64,7 +64,7 @@ def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
     try:
         diagnose(flights, case / "vehicle.toml", folder)
         json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-    # Whatever a diagnosis dies of is a result of this case, and no reason to lose the others.
+    # Any failure is a result of this case; the other cases continue.
     except Exception as reason:
         write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:CRASHED]})
         return
@@ -76,7 +76,7 @@ def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
     """Diagnose by `suite diagnose`, in this process.
 
     Raises:
-        WorkFailed: where the command does not end well.
+        WorkFailed: if the command ends with another code than 0.
     """
     import contextlib
     import io
@@ -85,7 +85,7 @@ def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
 
     said = io.StringIO()
     args = [*map(str, flights), "--vehicle", str(vehicle), "--out", str(out)]
-    # What is hidden is chosen by what flights can detect, mostly less than what matters.
+    # Hidden effects are as small as flights can detect, often below the thresholds of relevance.
     args += ["--relevance", "0", "0", "0"]
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         code = main(["diagnose", *args])

@@ -1,4 +1,4 @@
-"""`suite tracks`: what can be flown, and a picture of one track."""
+"""`suite tracks`: the track families, or pictures of a track."""
 
 from __future__ import annotations
 

@@ -27,11 +27,11 @@ from tracks.input.ranges import Trials
 BASE = "mujoco"
 """The simulator that the others are compared with."""
 ROUNDING = "mjx"
-"""The simulator that differs from the first by rounding to single precision, contacts by distance
-and images by analytic rays."""
+"""The simulator that differs from `BASE` only in single precision, in contacts found by signed
+distance, and in images from analytic rays."""
 WHY = ("rounding", "air", "rest")
-"""Why a trial changes: `rounding`, it does in mjx too; `air`, in mujoco with that simulator's air
-too; `rest`, neither."""
+"""Why a trial's outcome changes: `rounding`, it changes in mjx too; `air`, it changes in mujoco too
+with that simulator's aerodynamics; `rest`, neither."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Config(options.Judged):
 
 
 class Column(NamedTuple):
-    """A simulator as the tables have it."""
+    """A column of the tables: a simulator and the vehicle that it flies."""
 
     label: str
     simulator: str
     vehicle: Vehicle
-    """What it is given; for a control, one that flies as another simulator's does."""
+    """The vehicle file; of a control, one with the aerodynamics of another simulator."""
     control_of: str | None = None
-    """The simulator whose air the vehicle has."""
+    """The simulator whose aerodynamics the vehicle has; None for no control."""
 
 
 Flown = Mapping[tuple[str, str], Sequence[TrialResult]]
@@ -65,10 +65,10 @@ Flown = Mapping[tuple[str, str], Sequence[TrialResult]]
 
 
 def columns(config: Config) -> list[Column]:
-    """Return what is flown, mujoco first.
+    """Return the columns, mujoco first.
 
     Raises:
-        ValueError: for a simulator that there is not, or that lacks a package.
+        ValueError: for an unknown simulator, or one whose package is not installed.
     """
     vehicle = load_vehicle(config.vehicle)
     twice = next((n for n in config.simulator if config.simulator.count(n) > 1), None)

@@ -1,7 +1,7 @@
 """Three policies on the same trials: before, fine-tuned without and with Delta Action Model.
 
-Fine-tuning without it costs the same training, so what more training alone brings is not taken for
-the model's merit: the difference that counts is `with` minus `without`.
+Fine-tuning without it takes the same gradient steps, so that the gain of more training alone is
+not credited to the model: the difference that counts is `with` minus `without`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)
 """The policies that are compared, in the order of the tables."""
 OVERALL = "all"
-"""What the line over all cells has for a track."""
+"""Name of the line over all cells, in place of a track."""
 CAVEAT = (
     "Intervals are 95 % over trials, for these three policies: another training seed gives other "
     "policies. The cells' intervals are not corrected for there being several."
 )
-"""What the intervals do not say."""
+"""Note below the tables: what the intervals leave out."""
 
 
 class Measure(NamedTuple):
@@ -50,7 +50,7 @@ class Measure(NamedTuple):
 
 
 class Line(NamedTuple):
-    """What the trials on one track at one level come to, or all of them."""
+    """Results of the trials on one track at one level, or of all trials."""
 
     track: str
     difficulty: int | None
@@ -181,18 +181,18 @@ def value_text(interval: Interval, scale: float, digits: int) -> str:
 def difference_cell(
     interval: Interval | PairedDifference, scale: float = 100, digits: int = 0
 ) -> Cell:
-    """Return a difference with its interval and sign, toned where it does not hold zero.
+    """Return a difference with its interval and sign, coloured if it excludes zero.
 
     By default it is one of rates, in percentage points.
     """
-    # Adding zero to what is rounded turns -0, which reads as if something had been lost, into +0.
+    # Adding zero turns a rounded -0, which looks like a loss, into +0.
     value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
 
 
 def significance(difference: Interval) -> str:
-    """Return how one policy's successes stand to another's, in words."""
+    """Return in words whether one policy succeeds significantly more often than another."""
     if difference.low > 0:
         return "more than"
     return "fewer than" if difference.high < 0 else "not significantly different from"

@@ -1,6 +1,6 @@
-"""A loop, stage by stage, each in a folder of its own, and what it came to.
+"""Run a loop stage by stage, each in its own folder, and report the result.
 
-Every stage goes on where it was cut off; a finished one is not done again.
+An interrupted stage continues where it stopped; a finished one is not repeated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def run_loop(
 
     Args:
         config: the whole loop.
-        out: its folder; one with a loop of the same configuration is gone on with.
+        out: its folder; an unfinished loop of the same configuration there continues.
         console: where progress and results go.
         workers: who shares the flights and the fine-tunings; no part of what the loop is.
 
@@ -88,7 +88,7 @@ def _conclude(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
 
 
 def seeds(run: LoopRun) -> dict[str, Any]:
-    """Return which seeds the trials and the recorded flights have: first and last."""
+    """Return the first and the last seed of the trials and of the recorded flights."""
     config = run.config
     return {
         "fine-tuning"

@@ -29,12 +29,12 @@ HOVER = (Trajectory("hover", 8.0), Trajectory("vertical", 8.0, 0.5))
 
 
 def vehicle():
-    """The quadrotor as its maker has it, with `[motors]`."""
+    """Return the nominal quadrotor, with a table `[motors]`."""
     return replace(load_vehicle("reference"), motors=MOTORS, effects=MappingProxyType({}))
 
 
 def truth():
-    """The same with drag and delay."""
+    """Return the true quadrotor: the same with drag and delay."""
     effects = {
         "linear_drag": EFFECTS["linear_drag"].values(DRAG),
         "command_delay": EFFECTS["command_delay"].values(DELAY),
@@ -43,7 +43,7 @@ def truth():
 
 
 def start():
-    """What a newcomer would start from: the right mass and arms, and wrong numbers otherwise."""
+    """Return a start of `suite identify`: right mass and arms, and wrong numbers otherwise."""
     nominal = vehicle()
     x, y, z = nominal.inertia
     return replace(
@@ -57,17 +57,17 @@ def start():
 
 @cache
 def recordings(ways=WAYS):
-    """What happened on the flights, at every step."""
+    """Return the true states and inputs of the flights, at every step."""
     return recordings_of(Fleet(truth(), ways))
 
 
 def logs(drive, seed, ways=WAYS):
-    """Their logs with noise, with what `drive` needs and no other drive."""
+    """Return logs of the flights with noise, with the inputs that `drive` needs and no others."""
     fleet = Fleet(truth(), ways)
     return logs_of(fleet, recordings(ways), drive, np.random.default_rng(seed), sensors=SENSORS)
 
 
 @cache
 def found(drive, count=None):
-    """What `start` is identified as from the logs with seed 0, or from the first so many."""
+    """Return what is identified from the logs of seed 0, or from the first few of them."""
     return identify(logs(drive, 0)[:count], start())

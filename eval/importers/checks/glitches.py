@@ -107,7 +107,7 @@ def _without_filled_in(quat: Signal) -> tuple[Signal, list[Finding]]:
     share = float(np.mean(between))
     if share < REPEATED:
         return quat, []
-    text = f"{100 * share:.0f} % of its samples are drawn between their neighbours: left out"
+    text = f"{100 * share:.0f} % of its samples are interpolated: left out"
     return _kept(quat, ~between), [Finding("corrected", "attitude", text)]
 
 

@@ -49,7 +49,7 @@ class Settings:
     pitch_ilimit: float = 33.3
     yaw_ilimit: float = 166.7
     lpf_cutoff: float = 0.0
-    """Of the derivative's second-order filter [Hz]; 0: off, as the firmware's default is."""
+    """Cut-off of the derivative's second-order filter [Hz]; 0: off, the firmware's default."""
 
 
 class Gains(NamedTuple):

@@ -5,8 +5,8 @@
 
 `accel` is the slope of the gyro behind its second-order low pass, filtered to first order (as in
 PX4's source since 2021; its parameter reference says second). A motor command is thrust plus 0.707
-of roll and pitch plus yaw; what does not fit is taken off the thrust first, then off roll and
-pitch, then yaw is mixed with 15 % more room at the top and taken off where it does not fit, then
+of roll and pitch plus yaw; where motors saturate, thrust is reduced first, then roll
+and pitch. Yaw is then added with 15 % more room at the top and reduced where it saturates, and
 thrust once more (airmode off). Source: PX4's user guide ("Multicopter PID Tuning Guide", "Control
 Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
 """

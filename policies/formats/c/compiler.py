@@ -51,7 +51,7 @@ def source_files(policy_c: Path) -> list[Path]:
     for file in files:
         if not file.is_file():
             raise PolicyError(
-                f"{file}: missing; a policy in C is policy.c with policy.h beside it, as suite "
+                f"{file}: missing; a policy in C is policy.c and policy.h in one folder, as suite "
                 "export --format c writes them"
             )
     return files
@@ -60,8 +60,8 @@ def source_files(policy_c: Path) -> list[Path]:
 def compiled_library(policy_c: Path) -> Path:
     """Return the shared library of a policy.c, compiled now or found in the cache.
 
-    The two files are what the cache knows it by: a header of their own that they include may change
-    unseen.
+    The cache is keyed by these two files: a change of another header that they include is not
+    detected.
 
     Raises:
         PolicyError: where there is no compiler, or it refuses the file.
@@ -70,8 +70,8 @@ def compiled_library(policy_c: Path) -> Path:
     if compiler is None:
         raise PolicyError(
             f"{policy_c}: a policy in C is compiled before it flies, and there is no C compiler "
-            f"({os.environ.get('CC', 'cc')!r} was looked for); install one (such as gcc), or name "
-            "it in the environment's CC"
+            f"({os.environ.get('CC', 'cc')!r} is not on the PATH); install one (such as gcc), or "
+            "name it in the environment's CC"
         )
     files = [*source_files(policy_c), TEMPLATES / "library.c"]
     try:
@@ -89,7 +89,7 @@ def compiled_library(policy_c: Path) -> Path:
 
 
 def _cache() -> Path:
-    # A home that machines share must not hand one's instructions to another.
+    # Machines may share a home, but not compiled code: processors differ.
     folder = user_cache() / "c" / (platform.node() or "here")
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     return folder

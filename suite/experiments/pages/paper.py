@@ -1,4 +1,4 @@
-"""What the paper prints (paper.toml), and by how much a policy misses a cell's goal."""
+"""The paper's printed tables (paper.toml), and by how much a policy misses the goal of a cell."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eval.judging.tables import Tally, percent
 from tracks.common.grid import Grid, table
 
 SURE = 0.90
-"""Where others won all of their few trials, our Wilson interval must reach down to this."""
+"""If a printed rate is 1, the lower end of our Wilson interval must be at least this."""
 FLOORS = {0: 0.99, 3: 0.98, 6: 0.97, 9: 0.95}
 """Success that the shipped policy must reach, by level."""
 
@@ -40,7 +40,7 @@ class SimToSim(NamedTuple):
     cells: tuple[Printed, ...]
 
     def at(self, track: str, level: int) -> list[Printed]:
-        """Return every method's cell on one track at one level."""
+        """Return the cells of all methods on one track at one level."""
         return [cell for cell in self.cells if (cell.track, cell.level) == (track, level)]
 
 

@@ -1,7 +1,7 @@
-"""Judged trials that are kept for good: whoever asks for the same flights again gets them at once.
+"""Judged trials in a permanent cache: the same flights are flown only once.
 
-What sets a trial's outcome (policy, vehicle, the judge's code, the engines) names a journal in the
-cache, and each trial goes there as it ends; documents that share flights share the journal.
+A journal in the cache is named by the digest of all that determines an outcome: policy, vehicle,
+the judge's code, the engines. Each trial is written there as it ends. Documents share journals.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class Setup:
-    """Which policy flies on what: with a trial it sets the outcome."""
+    """Policy, vehicle, sensors and simulator: with a trial they determine the outcome."""
 
     policy: str
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
     vehicle: Vehicle
-    """On what."""
+    """What it flies."""
     sensors: SensorSet = PERFECT
-    """What it sees of the truth."""
+    """Errors in what the policy sees."""
     simulator: str = "mujoco"
-    """Where."""
+    """A name of `suite list simulators`."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """Trials wanted of one setup."""
+    """Trials that are wanted of one setup."""
 
     setup: Setup
     trials: Sequence[TrialSpec]
@@ -71,9 +71,9 @@ def flown(
 
     Args:
         orders: what is wanted; the same setup may be in several.
-        place: of the journals, and who flies; with no workers as many processes of this machine as
-            are worth it.
-        console: where progress goes.
+        place: folder of the journals, and the workers; without workers as many processes of this
+            machine as give a gain.
+        console: for progress.
         what: a few words on what is flown.
 
     Raises:

@@ -31,7 +31,7 @@ TRIM_AXES = (1.0, 1.0, 0.2)
 
 
 class QuadrotorParams(NamedTuple):
-    """What is drawn once per world."""
+    """What is drawn once for each world of a batch."""
 
     time_step: Array
     """(B,) the policy's period [s]."""
@@ -61,7 +61,7 @@ class QuadrotorState(NamedTuple):
 
 
 class Substeps(NamedTuple):
-    """How a policy period is cut."""
+    """How a policy period is divided into steps."""
 
     attitude: int
     """Steps of the attitude loop."""
@@ -72,7 +72,7 @@ class Substeps(NamedTuple):
 
 
 def whole_steps(steps: float) -> int:
-    """Return the nearest whole number from 1 on; a half goes down, whichever way it was rounded."""
+    """Return the nearest whole number, at least 1; a half is rounded down, even if inexact."""
     return max(1, round(steps - 1e-6))
 
 
@@ -84,7 +84,7 @@ def substeps(config: QuadrotorConfig, period_s: float) -> Substeps:
 
 
 def cut_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """Return normal draws that are cut off at twice their deviation of 1."""
+    """Return standard normal draws, truncated at 2."""
     return np.clip(rng.standard_normal(shape), -2.0, 2.0)
 
 
@@ -189,12 +189,12 @@ def fly_period(
     noise: jax.Array | None = None,
     yaw_rate: jax.Array | None = None,
 ) -> QuadrotorState:
-    """Return the bodies one policy period later, without any fading of gradients.
+    """Return the bodies one policy period later, without decay of gradients.
 
     Args:
         vehicle: whose attitude loop flies.
         plant: of B worlds, for steps of `cut.dt`.
-        cut: how the period is cut.
+        cut: how the period is divided.
         body: now.
         action_b: (B, 3) wanted net acceleration in body axes [m/s^2], held for the period.
         heading: (heading_w (B, 3), pos_w (B, 3)) -> the wanted heading an attitude step later.
@@ -249,7 +249,7 @@ def quadrotor_dynamics(
     Args:
         config: the vehicle and how finely it is stepped.
         period_s: the policy's [s].
-        gradient_decay: rate at which gradients of the motion fade back in time [1/s].
+        gradient_decay: rate at which gradients of the motion decay backwards in time [1/s].
     """
     cut = substeps(config, period_s)
     left = float(np.exp(-gradient_decay * period_s))
@@ -260,8 +260,8 @@ def quadrotor_dynamics(
     ) -> QuadrotorState:
         return start_state(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
 
-    # What happens inside a period is computed again on the way back: kept, it would be many times
-    # all the rest of a rollout.
+    # The inside of a period is computed again in the backward pass: stored, it would take many
+    # times the memory of the rest of a rollout.
     @jax.checkpoint
     def step(
         body: QuadrotorState,

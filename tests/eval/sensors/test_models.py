@@ -1,4 +1,4 @@
-"""Every model by its equation, its bounds, finite gradients, and alike in NumPy and JAX."""
+"""Every sensor model: its equation, bounds, finite gradients, equality in NumPy and JAX."""
 
 import math
 from functools import partial

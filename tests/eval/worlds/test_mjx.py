@@ -1,4 +1,4 @@
-"""The world mjx against the world mujoco."""
+"""The simulator mjx agrees with the simulator mujoco within stated tolerances."""
 
 from collections import Counter
 from dataclasses import replace
@@ -19,8 +19,8 @@ from tracks.geometry.scene import Boxes
 
 VEHICLE = load_vehicle("reference")
 POSITION_TOLERANCE_M = 2e-4
-"""Of float32 states against float64 ones after 2 s of closed loop: the loop damps the rounding of
-1e-7 of each step, the images' edges do not enter as the pilot here does not look."""
+"""Between float32 and float64 states after 2 s of closed loop: the loop damps the rounding of each
+step, 1e-7, and this policy does not use its image."""
 
 
 def both(trials, rules=None, record=None, vehicle=VEHICLE):

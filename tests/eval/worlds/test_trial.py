@@ -1,4 +1,4 @@
-"""The rules of a trial, state by state, and what a world with slots keeps for each."""
+"""The rules of a trial, state by state, and the data that batched simulators keep for each."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ GATES = straight((1.0, 2.0)).scene.gates
 
 
 def judged(pos_w, before_w=None, passed=0, step=1, contact=False, diverged=False, rot_w=None):
-    """Return the progress of one trial that came from `before_w` to `pos_w`, `passed` behind it."""
+    """Return the progress of a trial that moved from `before_w` to `pos_w` after `passed` gates."""
     pos_w = np.array([pos_w], float)
     course = Course(Gates(*(field[None] for field in GATES)), np.array([2]))
     progress = start_progress(pos_w if before_w is None else np.array([before_w], float))

@@ -1,4 +1,4 @@
-"""Trajectories flown in continuous time, and what others get of them."""
+"""Flights in continuous time, and the logs that are written of them."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_logs_are_as_long_as_their_trajectories_and_say_nothing(fifth):
         assert log.time_s[-1] < way.duration_s + 1e-4
         assert log.about == {"source": "suite blind", "vehicle": "plain"}
         assert log.integrator is None
-        # The pilot keeps it on its way.
+        # The controller keeps it on its trajectory.
         assert np.abs(log.pos_w - way.reference(log.time_s).pos_w).max() < 1.5
     assert flown.schedule.stamp_s[0].max() < -0.2, "it flew before the first row"
 

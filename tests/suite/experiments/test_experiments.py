@@ -1,4 +1,4 @@
-"""suite reproduce: help for every experiment, and what cannot be used."""
+"""suite reproduce: help for every experiment, and options that are refused."""
 
 import pytest
 

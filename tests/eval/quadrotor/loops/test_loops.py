@@ -1,4 +1,4 @@
-"""Firmwares' rate loops fly the same quadrotor in numpy, JAX and MuJoCo; `p` stays as it is."""
+"""The rate loops of firmwares give the same flight in numpy, JAX and MuJoCo."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ DT = 1.0 / 500.0
 
 
 def vehicle(kind):
-    """The reference quadrotor without effects, under that firmware's loop."""
+    """Return the reference quadrotor without effects, with the rate loop of a firmware."""
     nominal = load_vehicle("reference")
     controller = replace(
         nominal.controller, kind=kind, settings=loops.KINDS[kind].Settings(), rate_gain=(1.0,) * 3
@@ -25,7 +25,7 @@ def vehicle(kind):
 
 
 def inputs(count, rate_b):
-    """A step of the commanded rates after 0.1 s, at hover thrust."""
+    """Return commands: a step of the body rates after 0.1 s, at hover thrust."""
     late = np.arange(count) * DT > 0.1
     rate = np.where(late[:, None], np.asarray(rate_b), 0.0)
     return Inputs(command=Command(np.full(count, 9.81), rate))
