@@ -91,11 +91,7 @@ class FlightLogError(ValueError):
     """A flight log is refused; names the file, the column, the row and the reason."""
 
     def __init__(self, name: str, column: str | None, row: int | None, reason: str) -> None:
-        """Keep the parts and join them to one line; `row` is counted from 1.
-
-        A damaged file's bytes may stand in what its reader says of it.
-        """
-        reason = printable(reason, keep="")
+        """Keep the parts and join them to one line; `row` is counted from 1."""
         self.name, self.column, self.row, self.reason = name, column, row, reason
         where = [part for part in (column and f"column {column}", row and f"row {row}") if part]
         super().__init__(": ".join([name, ", ".join(where), reason] if where else [name, reason]))
@@ -103,6 +99,11 @@ class FlightLogError(ValueError):
     def __reduce__(self) -> tuple[type[FlightLogError], tuple[object, ...]]:
         """Return the parts for pickling."""
         return type(self), (self.name, self.column, self.row, self.reason)
+
+
+def quoted(error: Exception) -> str:
+    """Return what a reader says of a damaged file, whose bytes may stand in it, in one line."""
+    return f"{type(error).__name__}: {printable(str(error), keep='')}"
 
 
 def check_columns(

@@ -28,7 +28,7 @@ import numpy as np
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.motors import check_count
 
@@ -125,7 +125,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         texts = [str(one["Message"]) for one in table.pop("MSG")]
         messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
     except Exception as error:  # whatever a damaged file makes of the reader
-        reason = f"an ArduPilot log that cannot be read ({type(error).__name__}: {error})"
+        reason = f"an ArduPilot log that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}

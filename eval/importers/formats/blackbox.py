@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.finding import Finding
 
 MARKER = b"H Product:Blackbox"
@@ -49,7 +49,7 @@ def decode(path: Path) -> Decoded:
     try:
         return _longest(decoder, raw)
     except Exception as error:  # whatever a damaged file makes of the decoder
-        reason = f"a Blackbox log that cannot be decoded ({type(error).__name__}: {error})"
+        reason = f"a Blackbox log that cannot be decoded ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
 
 

@@ -26,7 +26,7 @@ from eval.importers.mapping_file import motor_side_of
 from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.motors import check_count
 from eval.logs.files import read_head
@@ -133,7 +133,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, int, Any]]]:
                 stamps = (_stamp(decoded), message.log_time)
                 found.setdefault((kind, channel.topic), []).append((*stamps, decoded))
     except Exception as error:
-        reason = f"an MCAP file that cannot be read ({type(error).__name__}: {error})"
+        reason = f"an MCAP file that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
     if not found:
         types = ", ".join(kind_of)

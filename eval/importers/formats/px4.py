@@ -28,7 +28,7 @@ import numpy as np
 from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.motors import check_count
 from eval.logs.faults.sensors import check_voltage_fails
@@ -136,7 +136,7 @@ def _load(path: Path) -> Any:
         with _Forward(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):
             return ULog(file, list(TOPICS))
     except Exception as error:
-        reason = f"a ULog file that cannot be read ({type(error).__name__}: {error})"
+        reason = f"a ULog file that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
 
 

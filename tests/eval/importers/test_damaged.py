@@ -18,7 +18,7 @@ from eval.importers.options import ImportOptions
 from eval.importers.signals import signal
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
-from tests.support import ros_messages
+from tests.support import known_flight, raw_logs, ros_messages
 from tests.support.imported import flight, text, write
 
 
@@ -78,9 +78,27 @@ def test_only_a_step_back_over_a_cut_body_is_shortened():
     assert file.seek(0, 1) == 10 and file.seek(-1, 1) == 9
 
 
-def test_what_a_reader_quotes_of_a_damaged_file_is_one_line():
-    error = FlightLogError("log.bin", None, None, "message 'W\n\x1d\x1b[31m' is unknown")
-    assert str(error) == "log.bin: message 'W\\n\\x1d\\x1b[31m' is unknown"
+@pytest.mark.parametrize("ending", ["ulg", "mcap", "bin"])
+def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatch, ending):
+    import mcap.reader
+    import pymavlink.DFReader
+    import pyulog
+
+    def fail(*args, **kwargs):
+        raise KeyError("W\n\x1d\x1b[31m")
+
+    for module, name in (
+        (pyulog, "ULog"), (mcap.reader, "make_reader"), (pymavlink.DFReader, "DFReader_binary"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, fail)
+    path, flown = tmp_path / f"log.{ending}", known_flight.fly(np.arange(0.0, 1.2, 0.01))
+    if ending == "bin":
+        raw_logs.write_bin(path, flown)
+    else:
+        {"ulg": made.write_ulog, "mcap": made.write_mcap}[ending](path, span=(0, 1.2))
+    with pytest.raises(FlightLogError, match="cannot be read .KeyError: ") as met:
+        import_log(path)
+    assert str(met.value).isprintable()
 
 
 @pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])

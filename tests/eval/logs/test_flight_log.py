@@ -102,6 +102,11 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
     with pytest.raises(FlightLogError, match="none can be used") as caught:
         read_flights([bad])
     assert str(bad) in str(caught.value)
+    worse = bad.with_name("worse.csv")
+    worse.write_bytes(bad.read_bytes())
+    with pytest.raises(FlightLogError) as caught:
+        read_flights([bad, worse])
+    assert len(str(caught.value).splitlines()) == 3, "a line each"
     with pytest.raises(FlightLogError, match="no file"):
         read_flights([])
 
