@@ -1,5 +1,7 @@
 """Convolutions, the gated recurrent unit and fresh weights, against those of JAX and torch."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,12 @@ import pytest
 import torch
 
 from policies.networks.layers import conv_valid, gru_update, patch_product, uniform
+
+
+@partial(jax.jit, static_argnums=0)
+def value_and_gradients(function, x, weight, cotangent):
+    value, back = jax.vjp(function, x, weight)
+    return value, *back(cotangent)
 
 
 def jax_own(x, kernel):
@@ -22,28 +30,22 @@ def jax_own(x, kernel):
 def test_value_and_gradients_are_those_of_jaxs_convolution(image, kernel):
     """Integers within float32's exact range: no rounding, so no tolerance."""
     rng = np.random.default_rng(0)
-    x, k = (jnp.asarray(rng.integers(-4, 5, s), jnp.float32) for s in (image, kernel))
-    value, back = jax.vjp(conv_valid, x, k)
-    expected, own_back = jax.vjp(jax_own, x, k)
-    np.testing.assert_array_equal(value, expected)
-    cotangent = jnp.asarray(rng.integers(-4, 5, value.shape), jnp.float32)
-    for gradient, own in zip(back(cotangent), own_back(cotangent), strict=True):
-        assert np.any(own)
-        np.testing.assert_array_equal(gradient, own)
+    out = (image[0], image[1] - kernel[0] + 1, image[2] - kernel[1] + 1, kernel[3])
+    given = [rng.integers(-4, 5, s).astype(np.float32) for s in (image, kernel, out)]
+    found, expected = (value_and_gradients(one, *given) for one in (conv_valid, jax_own))
+    for ours, theirs in zip(found, expected, strict=True):
+        assert np.any(theirs)
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 12, 13])
 def test_a_product_whose_sums_are_cut_in_pieces_is_the_plain_one(count):
     rng = np.random.default_rng(0)
-    x, weight, grad = (
-        jnp.asarray(rng.integers(-4, 5, s), jnp.float32)
-        for s in ((count, 6, 8, 4), (4, 32), (count, 6, 8, 32))
-    )
-    value, back = jax.vjp(patch_product, x, weight)
-    expected, own_back = jax.vjp(jnp.matmul, x, weight)
-    np.testing.assert_array_equal(value, expected)
-    for gradient, own in zip(back(grad), own_back(grad), strict=True):
-        np.testing.assert_array_equal(gradient, own)
+    shapes = ((count, 6, 8, 4), (4, 32), (count, 6, 8, 32))
+    given = [rng.integers(-4, 5, s).astype(np.float32) for s in shapes]
+    found, expected = (value_and_gradients(one, *given) for one in (patch_product, jnp.matmul))
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_the_gated_recurrent_unit_is_torchs_cell():

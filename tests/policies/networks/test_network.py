@@ -1,6 +1,7 @@
 """Fresh networks can be trained, and trained ones go on as ones that see more; the correction's."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +43,15 @@ def error(params, states, images):
     return errors.mean(), hidden
 
 
+@cache
+def fresh(seed, spec):
+    return jax.jit(network.init, static_argnums=1)(jax.random.key(seed), spec)
+
+
+step = jax.jit(network.step)
+delta_step = jax.jit(delta_network.step)
+
+
 @jax.jit
 def learn(params, optimizer, key):
     states = jax.random.normal(key, (4, 16, SPEC.state_size))
@@ -55,7 +65,7 @@ def learn(params, optimizer, key):
 def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
     # What the first gradient steps of a training ask for. With outputs that start near zero the
     # memory's mean size comes to 0.85 to 0.91, and nothing that is seen changes it any more.
-    params = network.init(jax.random.key(seed), SPEC)
+    params = fresh(seed, SPEC)
     optimizer = ADAMW.init(params)
     loss, hidden = jnp.inf, jnp.zeros(1)
     for i in range(30):
@@ -80,14 +90,14 @@ def test_one_action_for_all_is_learned_without_saturating_the_memory(seed):
 def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
     """It acts as before, whatever the new numbers are."""
     rng = np.random.default_rng(0)
-    params = network.init(jax.random.key(5), seen)
+    params = fresh(5, seen)
     wide = network.fitted(params, seen, spec)
     state, image, hidden = (
         jnp.asarray(rng.normal(size=(4, *s)), jnp.float32)
         for s in ((spec.state_size,), (24, 32), (64,))
     )
-    before = network.step(params, hidden, state[:, columns], image)
-    for a, b in zip(before, network.step(wide, hidden, state, image), strict=True):
+    before = step(params, hidden, state[:, columns], image)
+    for a, b in zip(before, step(wide, hidden, state, image), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4, rtol=1e-5)
 
 
@@ -96,35 +106,35 @@ def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
     [(SECOND, SMALL, "second_gate"), (AXIS, SECOND, "gate_axis"), (BOTH, AXIS, "second_gate")],
 )
 def test_a_policy_that_sees_more_is_refused(seen, spec, key):
-    params = network.init(jax.random.key(5), seen)
+    params = fresh(5, seen)
     with pytest.raises(ValueError, match=rf"has spec\.{key}; set spec\.{key}=True"):
         network.fitted(params, seen, spec)
 
 
 def test_at_twice_the_rate_a_memory_lasts_as_long():
     """Two decisions forget what one did, where little is forgotten in each."""
-    params = network.init(jax.random.key(5), SMALL)
+    params = fresh(5, SMALL)
     # With an update gate of 0.9 whatever is seen, and nothing new, states only fade.
     params = {name: jnp.zeros_like(value) for name, value in params.items()}
     params["gru.bias_input"] = params["gru.bias_input"].at[64:128].set(np.log(0.9 / 0.1))
     often = network.fitted(params, SMALL, replace(SMALL, rate_hz=2 * SMALL.rate_hz))
     seen = jnp.zeros((1, SMALL.state_size)), jnp.zeros((1, 24, 32))
-    _, once = network.step(params, jnp.ones((1, 64)), *seen)
-    _, half = network.step(often, jnp.ones((1, 64)), *seen)
-    _, twice = network.step(often, half, *seen)
+    _, once = step(params, jnp.ones((1, 64)), *seen)
+    _, half = step(often, jnp.ones((1, 64)), *seen)
+    _, twice = step(often, half, *seen)
     np.testing.assert_allclose(once, 0.9, rtol=1e-5)
     np.testing.assert_allclose(twice, once, rtol=0.005)
 
 
 def test_more_rays_a_pixel_leave_the_weights_as_they_are():
-    params = network.init(jax.random.key(5), SMALL)
+    params = fresh(5, SMALL)
     finer = replace(SMALL, camera=replace(SMALL.camera, rays=2))
     for name, value in network.fitted(params, SMALL, finer).items():
         np.testing.assert_array_equal(value, params[name])
 
 
 def test_a_policy_of_another_size_is_refused():
-    params = network.init(jax.random.key(5), SMALL)
+    params = fresh(5, SMALL)
     other = {
         "hidden_size 64, and this run 32": {"hidden_size": 32},
         r"channels .*128\), and this run \(16": {"channels": (16, 32, 32)},
@@ -145,7 +155,7 @@ def inputs(n):
 
 def test_a_fresh_one_corrects_nothing():
     params = delta_network.init(jax.random.key(1))
-    correction, hidden = delta_network.step(params, delta_network.start(4), *inputs(4))
+    correction, hidden = delta_step(params, delta_network.start(4), *inputs(4))
     np.testing.assert_array_equal(correction, np.zeros((4, 3)))
     assert hidden.shape == (4, HIDDEN) and float(jnp.abs(hidden).max()) > 0.01
 
@@ -159,7 +169,7 @@ def test_a_step_is_that_of_the_same_layers_in_torch():
     }
     hidden = jnp.asarray(rng.normal(size=(4, HIDDEN)), jnp.float32)
     seen = inputs(4)
-    correction, after = delta_network.step(params, hidden, *seen)
+    correction, after = delta_step(params, hidden, *seen)
 
     held = {name: torch.from_numpy(np.array(value)) for name, value in params.items()}
     cell = torch.nn.GRUCell(HIDDEN, HIDDEN)

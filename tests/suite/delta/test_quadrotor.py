@@ -115,15 +115,15 @@ def test_the_network_remembers_the_flight_before_a_window(logs):
     """The state before a window is that of the network run over the flight's decisions."""
     params = delta_network.init(jax.random.key(1))
     windows = cut_quadrotor_windows(logs[:1], QuadrotorConfig(TRUE), 0.5, 0.3)[0]
-    hidden = np.asarray(state_after(params, windows.burn_in))
-    log, number = logs[0], 3
+    hidden = np.asarray(jax.jit(state_after)(params, windows.burn_in))
+    log, number, step = logs[0], 3, jax.jit(delta_network.step)
     at = np.flatnonzero(log.policy_step)
     at = at[log.time_s[at] < windows.start_s[number] - 1e-4]
     state = delta_network.start(1)
     for row in at[-45:]:
         vel_b = log.rot_w[row].T @ log.vel_w[row]
         inputs = (vel_b, log.rot_w[row][2], log.action_b[row])
-        state = delta_network.step(params, state, *(jnp.asarray(x[None]) for x in inputs))[1]
+        state = step(params, state, *(x[None] for x in inputs))[1]
     np.testing.assert_allclose(hidden[number], state[0], atol=1e-5)
     assert np.abs(hidden[number]).max() > 1e-2
 
@@ -170,7 +170,7 @@ def test_a_load_on_a_line_hangs_still_where_a_window_starts_and_then_swings(logs
     )
     config = QuadrotorConfig(loaded)
     windows, cut = cut_quadrotor_windows(logs[:1], config, 0.5, 0.5)
-    pos_w, _, _ = replay_quadrotor(config, cut, windows, None)
+    pos_w, _, _ = jax.jit(partial(replay_quadrotor, config, cut))(windows, None)
     sunk = np.asarray(pos_w)[:, -1, 2] - windows.pos_w[:, -1, 2]
     # 0.1 kg under 0.75 kg that nobody lifts more for: g m / (M + m) t^2 / 2.
     np.testing.assert_allclose(sunk, -0.5 * 9.81 * 0.1 / 0.85 * 0.5**2, rtol=0.3)

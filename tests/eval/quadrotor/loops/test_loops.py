@@ -105,6 +105,7 @@ def test_rate_gain_scales_the_whole_loop():
     weak = make_plant(parse_vehicle(table), DT)
     full = make_plant(vehicle("px4"), DT)
     given = inputs(56, [1.0, 1.0, 0.0])
-    slow, fast = (rollout(plant, still(), given).motion.rate_b[-1] for plant in (weak, full))
+    fly = jax.jit(rollout)
+    slow, fast = (fly(plant, still(), given).motion.rate_b[-1] for plant in (weak, full))
     np.testing.assert_allclose(slow[0], 0.5 * fast[0], rtol=0.1)
     np.testing.assert_allclose(slow[1], fast[1], rtol=0.01)
