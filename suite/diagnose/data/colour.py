@@ -1,10 +1,10 @@
-"""The colour of measurement noise: a state estimator's errors last from one row to the next.
+"""Autocorrelated (coloured) measurement noise: errors of a state estimator last over several rows.
 
-Position, attitude and velocity have white noise and noise of a first-order Gauss-Markov process,
-that decays as exp(-t / T). How much of it there is, and T, maximise the likelihood of what remains
-of every window when a polynomial is taken off it (restricted likelihood; Patterson & Thompson
-1971). A model's error adds up along a window, where noise does not: besides the noise there may be
-an error that is white in force and torque, so that it is not taken for noise.
+Position, attitude and velocity have white noise plus a first-order Gauss-Markov process, which
+decays as exp(-t / T). Its share and T maximise the likelihood of the windows after a polynomial is
+subtracted (restricted likelihood; Patterson & Thompson 1971). An error of the model accumulates
+along a window, noise does not. So the likelihood also contains an error that is white in force and
+torque; otherwise it would count as noise.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
-"""Times T that are tried [s]; what lasts longer goes with a window's start, which is free."""
+"""Times T that are tried [s]; a longer one is absorbed by a window's start, which is free."""
 LEFT_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
-"""The same where all that is left is taken for noise [s]."""
+"""The same where the whole residual counts as noise [s]."""
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
 """How fast a model's error may grow: its variance after a second, over the noise's."""
 ESTIMATED = ("position", "attitude", "velocity")
-"""One estimator makes these groups: their errors last equally long. Sensors have white noise."""
+"""Groups of one state estimator, with the same T. Other sensors have white noise."""
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
 """By group, how often a force or torque is integrated to move it; other groups follow at once."""
 LEAST_ROWS = 30
-"""A window with fewer rows does not show colours."""
+"""Least number of rows of a window to estimate T."""
 
 
 class Noise(NamedTuple):
@@ -103,10 +103,10 @@ def left_as_noise(
     windows: FlightWindows,
     limits: Thresholds = THRESHOLDS,
 ) -> Noise:
-    """Return the noise that all of a residual would be, the model's error with it.
+    """Return the noise if the whole residual counts as noise, the model's error included.
 
-    Where the best model is off by more than noise, this is how far its error may carry what is
-    fitted. The arguments are those of `measured_noise`.
+    Where the best model is off by more than noise, this bounds the bias of fitted numbers. The
+    arguments are those of `measured_noise`.
     """
     sigma = noise_of(residual, windows, limits=limits)
     residual = _freed(residual, start_slope, np.where(windows.seen, 1.0 / sigma, 0.0))
@@ -230,7 +230,7 @@ def _beside_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nda
 def _likelihood(stretches: _Stretches, process: _Process) -> float:
     """Return the restricted log-likelihood of `process`.
 
-    Every stretch has a size of noise of its own, so that a few bad ones do not decide.
+    Every stretch has its own noise variance, so that a few bad ones do not dominate.
     """
     energy, freedom, spread = _beside_polynomial(stretches, process)
     size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
@@ -242,7 +242,7 @@ def _by_time(
 ) -> list[tuple[_Process, float]]:
     """Return for each of `times_s` the likeliest process, and its gain over white noise.
 
-    What noise explains nearly as well as a drift besides is noise.
+    A drift needs a clearly higher likelihood than noise alone.
     """
 
     def likely(process: _Process) -> float:

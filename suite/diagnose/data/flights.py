@@ -1,10 +1,10 @@
-"""Flights made ready for the views: completed, smoothed, parted into fitted and held-out ones.
+"""Prepares flights for the views: fills missing signals, smooths, splits off held-out flights.
 
-What a partial log lacks comes from what it has: rates are those of the attitude, and where that is
-lacking as well, thrust is along body z and in slow flight nearly all of the force besides gravity,
-so that the body's z axis is that of the path's acceleration less gravity (differential flatness;
-Mellinger and Kumar 2011). The yaw is taken for none then. A force across the thrust is not
-identifiable, and rates only as means over a second.
+Missing signals of a partial log follow from others. Rates are derived from the attitude. Without an
+attitude, the body's z axis is along the path's acceleration less gravity, since thrust is along
+body z and nearly all of the force in slow flight (differential flatness; Mellinger and Kumar 2011);
+yaw is set to 0. A force across the thrust is not identifiable then, and rates only as means over 1
+s.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class ViewFlights:
     smoothed: dict[str, list[SmoothedFlight]]
     """By view, F each."""
     floor: dict[str, np.ndarray]
-    """By view: what the velocity's or the rates' noise makes of an acceleration, (3,)."""
+    """By view: noise (3,) of a mean acceleration, from the noise of velocity or rates."""
     source: str
-    """What is taken for the rotors' speeds."""
+    """Where the rotor speeds come from, in words."""
     kept: tuple[int, ...] = ()
     """Numbers of the logs that these flights are of; others have no stretch."""
     notes: tuple[str, ...] = ()
@@ -156,7 +156,7 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
-    """Return the fitted flights and the `held` ones by view; of a lone flight its first part.
+    """Return the fitted and the `held` flights by view; a lone flight is split in time.
 
     Raises:
         ValueError: for a lone flight that is too short to part.
@@ -198,7 +198,7 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
         path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
         series = np.asarray(path if felt_w is None else felt_w)[np.asarray(flight.rows.good)]
         bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
-        # Median, for a filter's or an estimator's steps are no noise of every row.
+        # The median ignores the occasional steps of a filter or an estimator.
         sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
         weights = flight.form.change if felt_w is None else flight.form.mean
         gain = weights.power(2).sum(axis=1).mean()
@@ -212,10 +212,10 @@ SMOOTH_S = 0.1
 
 
 def completed(log: FlightLog) -> FlightLog:
-    """Return `log` with the attitude from its path and the rates from the attitude, if it has none.
+    """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without a position and an accelerometer has no pose, which only its turning does
-    without; see `posed` for others without a position.
+    A flight without position and accelerometer gets a constant pose: only its rotation is used. See
+    `posed` for flights with an accelerometer.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -276,9 +276,9 @@ def choose_held_out(
 
     `flight` (W,) is the number of each window's flight, `start_s` (W,) when it starts there.
 
-    Held out are the flights that can best be spared: those of whose `information` (W, K), of each
-    window on each number of the catalogue, the others have most. What was measured has no part in
-    it, only what was flown; a lone chirp or the only pass near the ground is fitted.
+    The flights are held out whose `information` (W, K), of each window on each number, the others
+    contain best. Only the manoeuvres decide, not the errors: a single chirp or the only pass near
+    the ground is fitted.
     """
     flight = np.asarray(flight)
     there = list(np.unique(flight))
@@ -305,18 +305,18 @@ class ActingRotors(NamedTuple):
     source: str
     """For people."""
     each: bool
-    """Whether each rotor's own is known; of a collective thrust only their sum is."""
+    """Whether each rotor's speed is known; a collective thrust gives only their sum."""
     noise: np.ndarray | None = None
-    """(N, 4) a draw of noise as large as the speed's own [rad/s]; None where none was measured."""
+    """(N, 4) simulated noise of the same size [rad/s]; None where speeds were not measured."""
 
 
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ActingRotors | None:
-    """Return the speeds that turned in `log`, measured or commanded; None where nothing shows them.
+    """Return the rotor speeds of `log`, measured or from commands; None where neither is there.
 
-    They are those of every row, as far as no hole is in between. What was commanded is followed by
-    the vehicle's lag.
+    They are interpolated to every row, but not across holes. Commanded speeds pass through the
+    vehicle's delay and lag.
     """
     noise = None
     if log.rotor_speed is not None:
@@ -346,10 +346,7 @@ def acting_rotors(
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return the speeds that follow `wanted` (N, 4), each held until the next row.
-
-    They do so after the vehicle's delay, by its lag.
-    """
+    """Return commanded speeds `wanted` (N, 4), held until the next row, behind delay and lag."""
     constants = make_plant(vehicle, LONGEST_S).constants
     since = log.time_s - float(constants.delay)
     row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1

@@ -1,16 +1,14 @@
 """Flights without a pose: attitude and velocity by gyro and accelerometer from where they start.
 
-A log begins at rest or in hover, so that its first specific force points up. From there the gyro
-turns the attitude, and the specific force in it, less gravity, moves the body. What that drifts by
-follows from few numbers: the tilt and the velocity at the start, and the biases of gyro and
-accelerometer. Drag tells them, as the force across the thrust is against the velocity (Leishman et
-al. 2014, doi 10.1109/MCS.2013.2287362); how large it is along each axis is found with them, for the
-vehicle file may lack it. It is the same in all flights of a vehicle: a flight alone would make its
-velocity too large where it takes the drag for too small. All are estimated by least squares with
-their usual sizes as priors, for pieces of `PIECE_S` of a flight. Yaw and position start from none,
-far above any ground.
+A log begins at rest or in hover, so its first specific force points up. From there the gyro is
+integrated to the attitude, and the specific force less gravity to the velocity. The drift depends
+on few numbers: tilt and velocity at the start, and the biases of gyro and accelerometer. Drag makes
+them observable, as the force across the thrust is opposite to the velocity (Leishman et al. 2014,
+doi 10.1109/MCS.2013.2287362). The drag coefficients are estimated too, since the vehicle file may
+lack them; all flights of a vehicle share them. Least squares with usual sizes as priors is done for
+pieces of `PIECE_S` of a flight. Yaw and position start at 0, far above any ground.
 
-What is compared in such flights is no derivative of this velocity but the accelerometer itself.
+In such flights the model is compared with the accelerometer, not with a derivative of the velocity.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The measurement noise of every channel, from what changes too fast to be an error of a model."""
+"""Measurement noise of every channel: residuals that change too fast for a model error."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def noise_of(
 
 
 def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return noise `sigma` (19,) where it is no less than rounding and the model's steps."""
+    """Return noise `sigma` (19,), at least that of rounding and of the model's steps."""
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
 
 
@@ -80,10 +80,10 @@ def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarra
 
 
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return a draw of noise (T, R) as large as that of each rotor's `speed`; NaN where that is.
+    """Return simulated noise (T, R) of the size of each rotor's `speed` noise; NaN where that is.
 
-    What it does to a sum over rows theirs does as well. Noise is what a cubic over few of a rotor's
-    own rows leaves; a rotor with fewer rows than that is given none.
+    It shows what the real noise does to sums over rows. Noise is the residual of a cubic over a few
+    of a rotor's own rows; a rotor with too few rows gets none.
     """
     draw = np.random.default_rng(0).standard_normal(speed.shape)
     out = np.full(speed.shape, np.nan)

@@ -1,12 +1,12 @@
-"""Signals that are logged at rates of their own, in rows that merge them, and the model's steps.
+"""Signals with different sampling rates on common rows, and the time steps of the model.
 
-A log's rows are the times of all its signals together: of the signals that are slower, most rows
-have no value. Each signal counts on its own rows. Where a value is needed on another row it lies on
-a line between two of its own, but not across a hole; what is commanded is held.
+The rows of a log are the times of all its signals together, so a slower signal has no value in most
+rows. Each signal is used on its own rows. Between them measurements are interpolated linearly, but
+not across holes, and commands are held.
 
-A row's command acts from its stamp on and the rate loop starts its period there, so every step of
-the model lies between two rows. Between them the loop samples about as often as the vehicle's own
-does, or every `LONGEST_S` where that is rarer, and carries the rates on by what that leaves out.
+A command acts from the time of its row on, and the rate loop starts its period there, so every step
+of the model lies between two rows. Within them the loop samples about as often as the vehicle's
+own, or every `LONGEST_S` if that is longer, and predicts the rates over the difference.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ HELD = ("thrust_cmd", "rate_cmd_b", "torque_cmd_b", "pwm", "rotor_speed_cmd")
 
 
 def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
-    """Return `log` with every signal on every row, as far as no hole is in between.
+    """Return `log` with every signal on every row, but not across holes.
 
-    A log whose signals share all rows comes back as it is.
+    A log whose signals share all rows is returned unchanged.
     """
     filled = {}
     for name in (*MEASURED, *HELD):
@@ -55,10 +55,9 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
 def without_slow_rotors(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` without rotor speeds that are too slow to show what drove, and notes of it.
+    """Return `logs` without rotor speeds that are sampled too slowly, and notes on them.
 
-    What a motor does between two of its rows is unknown where they are further apart than the
-    longest hole.
+    Between rows further apart than the longest hole the motors are unknown.
     """
     kept, notes = [], []
     for log in logs:
@@ -76,9 +75,9 @@ def without_slow_rotors(
 def with_fewer_rows(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` with no more rows than the limits allow, and what was left out, in words.
+    """Return `logs` thinned to the largest number of rows, and a note on it.
 
-    Every so many-th value of each signal stays, for signals may have rows of their own.
+    Every n-th value of each signal is kept, as signals may have rows of their own.
     """
     count = sum(len(log.time_s) for log in logs)
     every = -(-count // limits.most_rows)
@@ -121,7 +120,7 @@ def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
 
 
 def thinned(seen: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
-    """Return the places (at most `most`) of rows that keep as much of every signal as can be.
+    """Return the indices of at most `most` rows that keep every signal as evenly as possible.
 
     Args:
         seen: (N, K) bool: what the rows have of K signals.
@@ -200,21 +199,21 @@ def follow_lag(wanted: np.ndarray, dt: float, time_constant: float) -> np.ndarra
 LONGEST_S = 0.002
 """A step is about so long at most [s]; the integrator's error over a second is far below noise."""
 LOST = 1.75
-"""Rows further apart than so many of their usual spacings have lost some between them."""
+"""Rows further apart than this multiple of the usual spacing have lost rows between them."""
 
 LEAST_START_ERROR = 1e-3
-"""Rotor speeds at a window's start are never known better than this [rad/s]."""
+"""Lower limit of the error of rotor speeds at a window's start [rad/s]."""
 
 
 class StepGrid(NamedTuple):
-    """T steps one after the other."""
+    """T consecutive steps."""
 
     edge_s: np.ndarray
     """(T + 1,) ends of steps [s]."""
     look_s: np.ndarray
     """(T,) until the rate loop's next sample; 0 where it takes none at the step's start [s]."""
     lead_s: np.ndarray
-    """(T,) by how much later than the steps' samples those of the vehicle are, on average [s]."""
+    """(T,) mean delay of the vehicle's samples after those of the steps [s]."""
 
 
 def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) -> StepGrid:
@@ -249,10 +248,9 @@ def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) 
 
 
 def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `time_s` (R,) and `command` (R, K) with what was lost put in on a straight line.
+    """Return `time_s` (R,) and `command` (R, K) with lost rows interpolated linearly.
 
-    The vehicle was given a command at each row that was lost; holding the last one that is known
-    would act a row late.
+    The vehicle received a command at each lost row; holding the last known one would be too late.
     """
     spacing = np.diff(time_s)
     if not len(spacing):
@@ -276,7 +274,7 @@ def integral_of_held(time: np.ndarray, command: np.ndarray) -> np.ndarray:
 
 
 def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
-    """Return `grid` with steps of no length, which move nothing, up to `count` steps."""
+    """Return `grid` padded to `count` steps with steps of zero length, which have no influence."""
     missing = count - len(grid.look_s)
     ends = (missing, 0) if at_front else (0, missing)
     return StepGrid(
@@ -309,8 +307,8 @@ def rotors_at(
 ) -> np.ndarray:
     """Return rotor speeds (S, 4) at `at_s` (S,) [s] from `every` so many of each rotor's own rows.
 
-    Between rows they run along the first-order response to one command. What a firmware's loop
-    commands changes all the time, by filtered slopes of rates: a `smooth` curve is nearer then.
+    Between rows they follow the first-order response to one command. A firmware's loop changes its
+    commands all the time, by filtered derivatives of rates: a `smooth` spline is closer then.
     """
     columns = []
     for column in speed.T:

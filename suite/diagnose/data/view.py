@@ -1,8 +1,8 @@
-"""A flight as rows of what acts and what moves; force and torque, what each compares of them.
+"""Views: force or torque of a flight, as mean accelerations over short smooth windows (bumps).
 
-Velocities and models are weighed by the same smooth bumps. Over a bump w(t) that is zero at both
-ends, the mean of an acceleration is -integral(w' v) over integral(w): what was measured is never
-differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
+Measured velocities and modelled accelerations are weighted by the same bumps w(t), which are zero
+at both ends. The mean of an acceleration is then -integral(w' v) / integral(w): measurements are
+never differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tracks.geometry.scene import Array
 
 
 class FlightRows(NamedTuple):
-    """N rows of one flight; those that miss something are filled and not `good`."""
+    """N rows of one flight; rows with a missing signal are filled in and not `good`."""
 
     time_s: Array
     """(N,) since the flight's first row [s]."""
@@ -37,15 +37,15 @@ class FlightRows(NamedTuple):
     rate_b: Array
     """(N, 3) [rad/s]."""
     rotor_speed: Array
-    """(N, 4) that act then [rad/s]."""
+    """(N, 4) [rad/s]."""
     voltage_drop: Array
-    """(N,) battery voltage at the start less now [V]; zeros where there is none."""
+    """(N,) battery voltage at the start less the present one [V]; zeros without a voltage."""
     good: Array
-    """(N,) bool: nothing is missing."""
+    """(N,) bool: all signals are there."""
     felt_w: Array | None = None
     """(N, 3) acceleration by the accelerometer, in flights without a pose [m/s^2]."""
     sway_b: Array | None = None
-    """(N, 3, K) what is not known of such a flight's pose makes of its drag [m/s^2]."""
+    """(N, 3, K) change of the drag by each uncertainty of such a flight's pose [m/s^2]."""
 
     @property
     def vel_b(self) -> Array:
@@ -59,10 +59,10 @@ def rows_of(
     rotor_speed: np.ndarray,
     limits: Thresholds = THRESHOLDS,
 ) -> FlightRows:
-    """Return the rows of `log` under rotors that turn with `rotor_speed` (N, 4) [rad/s].
+    """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
-    Where the rotors of `vehicle` give too little for a flight and it stands still, it stands on the
-    ground: such rows, and those near to them, are not good.
+    Rows at rest with too little thrust to fly are on the ground: they, and rows near them, are not
+    good.
     """
     rot_w = log.rot_w
     parts = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
@@ -101,20 +101,20 @@ def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray
 
 @dataclass(frozen=True)
 class View:
-    """One part of the dynamics: some equations under measurements of all else."""
+    """One part of the dynamics, force or torque, with all other signals as measured."""
 
     name: str
     """As in a diagnosis."""
     about: str
-    """For people: what is compared under what."""
+    """For people: what is compared, given which measurements."""
     unit: str
     """Of its three axes."""
     columns: slice
     """Of the model's accelerations."""
     width_s: float
-    """Of the bumps that both sides are smoothed by [s]."""
+    """Of the bumps [s]."""
     in_world: bool
-    """Whether its accelerations are in world axes; they are turned into the body's."""
+    """Whether its accelerations are in world axes; residuals are turned into body axes."""
     axes: tuple[int, ...] = (0, 1, 2)
     """Of the body, along which it is identifiable."""
 
@@ -129,19 +129,19 @@ TORQUE = View(
 
 
 class SmoothedFlight(NamedTuple):
-    """A flight's rows, with its measured side in one view."""
+    """A flight's rows, with its measured accelerations in one view."""
 
     rows: FlightRows
     form: WeakForm
     measured: np.ndarray
     """(M, 3) mean accelerations, axes as the view's model has them."""
     credible: np.ndarray = np.ones(3)
-    """(3,) what the model's changes within the flight are multiplied by: their share that is no
-    noise of what turns it, and what the rows do not show of them."""
+    """(3,) factor on the model's changes within the flight: the share of the rotors' torque that is
+    not noise, and a correction for what happens between rows."""
 
 
 def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
-    """Return a flight's measured side in `view`."""
+    """Return a flight's measured accelerations in `view`."""
     form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
     if view.in_world and rows.felt_w is not None:
         return SmoothedFlight(rows, form, form.mean @ rows.felt_w)
@@ -150,16 +150,16 @@ def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> S
 
 
 def calibrated(flight: SmoothedFlight, turned: np.ndarray, noise: np.ndarray) -> SmoothedFlight:
-    """Return a flight whose model is believed as far as what drives it is no noise.
+    """Return a flight whose model is corrected for noise in the measured rotor speeds.
 
-    Noise in what drives makes every slope smaller (errors in variables), as more inertia or less
-    thrust would. What is expected of the truth, given what was measured, does not (regression
+    Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
+    less thrust would. The expected true input, given the measured one, does not (regression
     calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4).
 
     Args:
         flight: in a view.
-        turned: (N, 3) the acceleration that the rotors make by what was measured of them.
-        noise: (N, 3) what noise as large as theirs adds to it.
+        turned: (N, 3) angular acceleration by the measured rotor speeds.
+        noise: (N, 3) what a simulated noise of the same size adds to it.
     """
     mean = flight.form.mean
     if len(flight.form.middle_s) < 2:
@@ -191,7 +191,7 @@ class WeakForm(NamedTuple):
 def weak_form(
     time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: float, slope: bool = False
 ) -> WeakForm:
-    """Return bumps of `width_s`, half of it apart, that reach across no bad row and no hole.
+    """Return bumps of `width_s`, half of it apart, without a bad row or a hole inside.
 
     Args:
         time_s: (N,) increasing [s].

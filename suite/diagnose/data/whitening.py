@@ -1,9 +1,9 @@
-"""Whitened residuals of windows, freed from the unknown state in which each window starts.
+"""Whitened residuals of windows, with each window's unknown start state projected out.
 
-A window's start is measured with the same noise as its other rows. It is left free: what 12 small
-changes of it can explain is projected out of residuals and slopes, and what stays has the
-measurement's own white noise. The rotor speeds' errors are free as well, but for rows that hold how
-large they may be: all along a window where measured ones are the input, else at its start.
+A window's start is measured with the same noise as its other rows, so it is a nuisance parameter:
+the effect of 12 small changes of it is projected out of residuals and slopes. Errors of the rotor
+speeds are nuisance parameters too, with a prior on their size in additional rows: all along a
+window where measured speeds are the input, else at its start.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Linearisation(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """How W windows are whitened and freed from their starts; F numbers of each are free."""
+    """Whitening of W windows, with F nuisance parameters each."""
 
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
@@ -112,12 +112,12 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 
 
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
-    """Return how far rotor speeds may be off where they are free [rad/s].
+    """Return the standard deviation of the free errors of rotor speeds [rad/s].
 
-    That is at a knot where they are an input, else at the start.
+    They are at the knots where rotor speeds are the input, else at the start.
 
-    White noise of rows adds up like errors that run straight between knots a tenth of a second
-    apart and are smaller by the root of the rows that each stands for.
+    White noise of rows is equivalent to errors that are linear between knots 0.1 s apart and
+    smaller by the root of the number of rows a knot.
     """
     start = np.asarray(windows.start_rotor_error)
     if start.all():

@@ -1,7 +1,7 @@
-"""Flight logs cut into short stretches, on steps of the model that lie between their rows.
+"""Windows: stretches of 1 s of flight logs, on time steps of the model between the logs' rows.
 
 A window starts at a row of the log. Commands act from the times of their rows on; measured rotor
-speeds are joined by the curve of the rotors' lag. What was measured stays on its own times.
+speeds are interpolated by the rotors' lag. Measurements are compared at their own times.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ HISTORY_S = 0.1
 BURN_IN_S = 0.2
 """Before a window: the rotors follow the commands at the measured rates [s]."""
 STEPS = (512, 704)
-"""A window has one of these numbers of steps, those over of no length, so that shapes are few: a
-second of steps of 2 ms, and of rows between which they have to be shorter."""
+"""Numbers of steps of a window: 1 s of 2 ms steps, and more where rows need shorter ones. Windows
+are padded to one of them, so that few array shapes are compiled."""
 BURN_IN_STEPS = (144,)
 """The same of the burn-in."""
 COMMANDS = (192, 1536)
@@ -53,7 +53,7 @@ ROWS = 101
 STATE = 12
 """Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
 KNOTS = 11
-"""Places in a window between which what is free along it runs straight."""
+"""Number of knots of a window: what is free along it is linear between knots."""
 CHANNELS = 19
 """pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
 STATE_GROUPS = ("position", "attitude", "velocity", "rates")
@@ -118,7 +118,7 @@ class FlightWindows(NamedTuple):
     rotor_seen: Array
     """(W, N, 4) bool: whether there is a rotor speed, compared or an input."""
     start_rotor_error: Array
-    """(W,) how far off the burn-in leaves the rotor speeds [rad/s]; 0 where they are an input."""
+    """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 where they are the input."""
 
 
 def step_s(vehicle: Vehicle) -> float:
@@ -129,7 +129,7 @@ def step_s(vehicle: Vehicle) -> float:
 def remembers(vehicle: Vehicle) -> bool:
     """Return whether the rate loop is a firmware's, with integrators and filters.
 
-    What it remembers where a stretch of a flight begins is in no log.
+    No log contains their state at the start of a window.
     """
     return vehicle.controller.kind != NOMINAL
 
@@ -146,7 +146,7 @@ def cut(
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
 
-    Of more than the limits allow so many are kept, evenly spread over the flights.
+    Above the limits' number an even selection of windows is kept.
 
     Args:
         logs: flights, known by their place.
@@ -196,11 +196,11 @@ def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
 def trusted(
     windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightWindows:
-    """Return `windows`, each up to where the model has not left the flight by too much.
+    """Return `windows`, each shortened to where the model is still near the flight.
 
-    Beyond, slopes taken where the model is do not hold where the flight was: it may have turned
-    over, or sunk below the ground. What is named brings the model back, and the next evaluation is
-    longer. `residual` is (W, N, 19).
+    Further away the linearisation does not hold: the model may have tipped over or be below the
+    ground. With the named effects it stays near for longer, and the next evaluation is longer.
+    `residual` is (W, N, 19).
     """
     error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)

@@ -1,4 +1,4 @@
-"""Rollouts of a second as evidence: whitened, and freed from the state in which each starts."""
+"""Rollouts (simulated stretches of 1 s) as evidence: whitened, start states projected out."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 @dataclass(frozen=True)
 class RolloutEvidence(Evidence):
-    """Rollouts of W stretches, weighed by their noise."""
+    """Rollouts of W stretches, weighted by their noise."""
 
     model: RolloutModel
     windows: FlightWindows
     """At full length."""
     trusted: FlightWindows
-    """As long as slopes can be trusted."""
+    """As long as the linearisation holds."""
     noise: Noise
     whitening: Whitening
     limits: Thresholds = THRESHOLDS
     off: bool = False
-    """Whether all that the model leaves is taken for noise."""
+    """Whether the whole residual counts as noise."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -63,7 +63,7 @@ class RolloutEvidence(Evidence):
 
     @property
     def draws(self) -> float:
-        """Flights are draws where the model is off: its error comes back in all of one."""
+        """1 where the model is off, as its error is the same all along a flight; else 0."""
         return 1.0 if self.off else 0.0
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
@@ -74,7 +74,7 @@ class RolloutEvidence(Evidence):
 
     def weighed(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
         """Return this with its noise as it is there, see `Evidence`."""
-        # Noise is measured best where the model fits best, and slopes are trusted for longer.
+        # The noise estimate is best where the model fits best; the linearisation holds for longer.
         return weighed_by(self.model, self.windows, self._everything(at), self.limits)
 
     def again(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
@@ -178,10 +178,10 @@ def least_left(
     limits: Thresholds,
     enough: float = 0.0,
 ) -> float:
-    """Return the squared error a value, 1 of noise, that all numbers of the catalogue leave.
+    """Return the mean squared error, 1 for noise, after a fit of all numbers of the catalogue.
 
-    To first order about `linear`, the slopes of `windows` along all numbers. Slopes do not
-    decide on large effects: where more than `enough` is left, some windows are fitted.
+    It is linear about `linear`, the slopes of `windows` along all numbers. Large effects are not
+    linear: where more than `enough` remains, some windows are fitted with the full model.
     """
     evidence, block = weighed_by(model, windows, linear, limits)
 
@@ -207,14 +207,14 @@ def least_left(
 BATCH = 12
 """Windows a call: one shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes a call, compiled once: a wider program besides would take longer to compile than it
-saves in a diagnosis of fewer than some 150 stretches."""
+"""Slopes a call, compiled once. A second, wider program would take longer to compile than it saves
+below some 150 stretches."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 
 
 class KnotResponse(NamedTuple):
-    """What a disturbance at each knot of W windows does, and where the model is then."""
+    """Response of W windows to a disturbance at each knot, and the model's state there."""
 
     slope: np.ndarray
     """(W, N, 19, KNOTS * 6) of the simulated values, per m/s^2 and rad/s^2 in body axes."""
@@ -274,7 +274,7 @@ class RolloutModel:
     def respond(
         self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
     ) -> KnotResponse:
-        """Return what further forces and torques along each window would do to its rows."""
+        """Return the response of each window's rows to additional forces and torques along it."""
         pushed = _responses(*self._kind)
         with jax.enable_x64(True):
             parts = [

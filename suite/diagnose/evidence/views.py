@@ -1,4 +1,4 @@
-"""Force and torque as evidence: the flights of one view, weighed by what the model leaves."""
+"""Force and torque as evidence: flights of one view, weighted by the residual's own noise."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ class ViewBlock(Block):
 
 @dataclass(frozen=True)
 class ViewEvidence(Evidence):
-    """The flights of one view; evidence on the numbers once they are weighed."""
+    """The flights of one view; its noise is estimated by `weighed`."""
 
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     limits: Thresholds = THRESHOLDS
     carried: np.ndarray | None = None
-    """(M, 3) what the model is known to lack in these flights, taken off the residual."""
+    """(M, 3) known residual of reference flights, subtracted from the residual."""
     means: bool = False
-    """Only the mean of each flight counts, and nothing that changes within one."""
+    """Whether only the mean of each flight is compared."""
     weights: Weights | None = None
-    """By which rows are judged; None where that is not yet known."""
+    """Noise of the rows; None before it is estimated."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -77,7 +77,7 @@ class ViewEvidence(Evidence):
         return Estimate(theta, np.zeros((0, 0)))
 
     def left(self, theta: np.ndarray, indices: Sequence[int] | None = ()) -> ViewData:
-        """Return what the flights leave at the numbers `theta` (P,), slopes along `indices`."""
+        """Return the residuals at the numbers `theta` (P,), slopes along `indices`."""
         data = compare(self.view, self.model, theta, self.flights, indices)
         if self.carried is not None:
             data = data._replace(residual=data.residual - self.carried)
@@ -97,7 +97,7 @@ class ViewEvidence(Evidence):
         return found, found._block(data)
 
     def folds(self, block: Block) -> np.ndarray:
-        """Return what is left out together."""
+        """Return the fold of each stretch: its flight, with three flights or more."""
         if len(np.unique(block.flight)) >= 3:
             return block.flight
         return folds_of(block.flight, np.arange(len(block.flight), dtype=float))
@@ -133,10 +133,11 @@ class ViewEvidence(Evidence):
 def holds_at_any_speed(
     then: ViewBlock, indices: Sequence[int], away: np.ndarray, limits: Thresholds
 ) -> bool:
-    """Return whether fast changes do not speak against the numbers at `indices`, fitted in `then`.
+    """Return whether fast changes are consistent with the numbers at `indices`, fitted in `then`.
 
-    They do where they show less than a share of them, and surely for less than all. Means of
-    flights have no changes. `away` (P,) is how far all numbers are from the vehicle file's.
+    They are not where they give less than a share of these values, and significantly less than all.
+    Means of flights have no changes. `away` (P,) is the change of all numbers since the vehicle
+    file.
     """
     if len(np.unique(then.data.flight)) == len(then.data.flight):
         return True
@@ -146,9 +147,9 @@ def holds_at_any_speed(
 
 
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
-    """Return those of `among` that a view can see: what moves it, and is no fault of a sensor.
+    """Return the candidates to which a view is sensitive, without faults of sensors.
 
-    Of several effects that are one hypothesis each has to move it, if through another.
+    Of a composite each effect has to act on it, if only through another.
     """
     seen, through = block.acts(), carried(among)
 

@@ -1,10 +1,10 @@
-"""The force and the torque on the body, by what drove the flights, and which numbers they identify.
+"""Fits of `suite identify` to the force and the torque on the body.
 
-Force: translation under the measured attitude. Where no flight has an attitude it is that of the
-path, and only its size is compared: thrust is along what the path's acceleration and gravity make
-up together (differential flatness; Mellinger and Kumar 2011).
+Force: translation, given the measured attitude. Where no flight has an attitude, thrust is along
+the path's acceleration less gravity, and only its size is compared (differential flatness;
+Mellinger and Kumar 2011).
 
-Torque: rotation under known motors, as changes within a window.
+Torque: rotation, given the motors, as changes within a window.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from suite.diagnose.identify.grid import FELT, LEANING, ROTOR_NOISE, FlightGrid
 WIDTH_S = 0.4
 BLOCK_S = 2.0
 PUSHES = {"pwm": "pwm", "rotors": "rotor_speed"}
-"""By drive, what pushes; under all others the commanded thrust."""
+"""By drive, the signal that gives the thrust; for all others the commanded thrust."""
 TURNS = {**PUSHES, "torques": "torque_cmd_b"}
-"""By drive, what turns."""
+"""By drive, the signal that gives the torque."""
 SLOW = 2.0
 """Without an attitude, windows faster than this are left out: a drag across the thrust would add to
 its size, by 0.3 % at this speed and 0.4 1/s [m/s]."""
@@ -119,11 +119,11 @@ def block_of(form: WeakForm) -> np.ndarray:
 
 TORQUE_WIDTH_S = 0.2
 BAND = TORQUE_WIDTH_S / (2.0 * np.pi)
-"""Torques are compared in windows of no mean, as changes within one: what a flight asks of the
-motors slowly (trim, flapping at speed) turns nothing. Times this they are accelerations."""
+"""Torques are compared as changes within a window, without its mean: slow parts of the motors'
+torque balance trim and flapping and rotate nothing. Times this they are accelerations."""
 STILL = np.array([False, False, False])
 DILUTED = ("inertia_x", "inertia_y", "yaw")
-"""What noise of the rotor speeds makes larger or smaller, by axis."""
+"""Numbers that noise of the rotor speeds biases, by axis."""
 KNOWN = ("thrust", "curve", "battery")
 """The force's numbers that the torque is built on."""
 

@@ -1,7 +1,7 @@
-"""What drove a flight, and the vehicle with trial numbers on a flight's grid.
+"""The input (drive) of flights, and the accelerations of a vehicle with trial numbers under it.
 
-The equations are those of the plant, as in the views of a diagnosis. Effects of the start that are
-another word for its numbers are in them.
+The equations are those of the plant, as in the views of a diagnosis. Effects of the start vehicle
+that scale one of its numbers are merged into that number first.
 """
 
 from __future__ import annotations
@@ -47,10 +47,9 @@ def drive_of(flights: Sequence[FlightGrid]) -> str:
 
 
 def with_battery(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
-    """Return those whose motors' thrust is known as well as it can be.
+    """Return the flights with the best known motor thrust.
 
-    What motors give hangs on the battery: where some flights have its voltage, the others only blur
-    what these show.
+    It depends on the battery: where some flights have its voltage, the others are left out.
     """
     have = [flight for flight in flights if flight.has("voltage")]
     return have if have and drive == "pwm" else list(flights)

@@ -1,8 +1,8 @@
-"""What moving air turns: the coefficient of blade flapping, by the torque view.
+"""The coefficient of blade flapping (a torque by moving air), from the torque view.
 
-Fast changes alone identify inertia and lags (`body.py`), since motors answer what disturbs the body
-slowly. That answer identifies flapping, once all else is known; the uncertainty of that widens its
-interval.
+Inertia and lags are identified by fast changes alone (`body.py`), since the motors balance slow
+disturbances. Their balance identifies flapping, once inertia and lags are known. The uncertainty of
+those widens its interval.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""From flights and a vehicle file to the numbers that the flights identify.
+"""`suite identify`: estimates the numbers of a vehicle file that flights identify.
 
-Force and torque are fitted in turn, each with what the other has found, since the rotors' lag acts
-in both. Mass is never fitted: scaling it together with inertia and thrust changes no flight.
+Force and torque are fitted in turn, each with the other's result, since the rotors' lag acts on
+both. Mass is never fitted: scaling it together with inertia and thrust changes no flight.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The nominal rate loop under its commands, and rotors behind theirs.
+"""Gains, lag and delay of the nominal rate loop, and the lag of rotors behind their commands.
 
 The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
 4.3): measured rates in the loop's own equation would turn the gyro's noise into slower gains.

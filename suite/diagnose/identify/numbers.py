@@ -25,7 +25,7 @@ class Number(NamedTuple):
     ci95: list[tuple[float, float] | None]
     """Of each component; None where it was left as it was."""
     follows: bool = False
-    """Not identified and in the file all the same: what an identified sum leaves."""
+    """Not identified, but in the file: the difference of an identified sum and another number."""
 
     @property
     def is_identified(self) -> bool:

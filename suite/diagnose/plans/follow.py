@@ -1,4 +1,4 @@
-"""A pilot follows trajectories with whatever flies: position errors to a command (CTBR)."""
+"""A position controller (the pilot) that flies trajectories in any simulator by CTBR commands."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Step(NamedTuple):
 
 
 class Bodies(Protocol):
-    """N vehicles that a simulator steps side by side."""
+    """N vehicles of a simulator, stepped together."""
 
     integrator: str | None
     """That of a `Recording`."""
@@ -85,7 +85,7 @@ class Bodies(Protocol):
 
 
 def wanted_of(trajectories: Sequence[Trajectory], period: int, dt: float) -> Reference:
-    """Return what N trajectories want at every command, (commands, N, ...)."""
+    """Return the set points of N trajectories at every command, (commands, N, ...)."""
     steps = round(max(way.duration_s for way in trajectories) / dt)
     clock = np.arange(0, steps, period) * dt
     ways = [way.reference(clock) for way in trajectories]
@@ -105,9 +105,9 @@ def follow(
 
     Args:
         bodies: N of them, where and as fast as the trajectories begin.
-        nominal: what the pilot believes.
+        nominal: the vehicle that the controller assumes.
         trajectories: N of them.
-        wanted: what they want, by `wanted_of`.
+        wanted: their set points, by `wanted_of`.
         period: physics steps for which a command is held.
         dt: of a physics step [s].
         gains: of the pilot.

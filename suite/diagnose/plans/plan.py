@@ -162,7 +162,8 @@ COLUMNS = (
     *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
     "yaw",
 )
-"""Of a CSV: s, m, m/s, m/s^2 in the world, and rad about world z."""
+"""Of a CSV: time [s], position [m], velocity [m/s], acceleration [m/s^2] in the world; yaw
+[rad]."""
 NAME = "plan.json"
 KEYS = ("file", "flown")
 """Of a flight in it: its set points, and its log where it was flown in simulation."""
@@ -234,7 +235,7 @@ class Separation:
     words: str
     """What to do, for people."""
     blurred: tuple[Trajectory, ...]
-    """Flights after which either name explains the data."""
+    """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]
     """Flights to add."""
     measure: tuple[str, ...] = ()

@@ -102,7 +102,7 @@ def _partly(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
     yield CHECK
-    if found["identified"]:
+    if found.get("identified"):
         yield "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
     else:
         yield "Run suite identify if the numbers of the vehicle file were never estimated."

@@ -1,13 +1,14 @@
-"""What has changed since other flights of a vehicle, beyond how those differ among themselves.
+"""Changes since reference flights of the same vehicle, compared with how unchanged flights differ.
 
-The vehicle file need not be right: what the reference flights leave of it, on average and with the
-velocity, is carried along. How much flights of an unchanged vehicle differ is taken from them too
-(`rotor_spread`); the reference flights' mean is off by it as well, for all others alike. A change
-is named where it is large compared with that, for all candidates together (`chance`).
+The vehicle file need not be right: the residual of the reference flights, its mean and its
+dependence on velocity, is subtracted from the other flights. The reference flights also give the
+spread of flights of an unchanged vehicle (`rotor_spread`); the error of their own mean is common to
+all others. A change is named where it is large compared with that spread, with all candidates
+tested together (`chance`).
 
-Where no mean has changed, each flight's own numbers of what shows in motion, as a drag, are two
-samples, whose means are compared by how flights differ within each (Welch 1947, doi
-10.1093/biomet/34.1-2.28), after Bonferroni over all candidates and their numbers.
+Where no mean has changed, an effect that shows in motion, as a drag, is fitted to each flight
+alone. The values before and after are compared by Welch's test (Welch 1947, doi
+10.1093/biomet/34.1-2.28) with a Bonferroni correction over all candidates and their numbers.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Measured rotor speeds against those by the commands: the actuators apart from the air.
+"""Measured rotor speeds against commanded ones: controller and motors, apart from aerodynamics.
 
-Flight controllers have integrators and filters that the nominal rate loop has not, so that a
-difference between commanded and measured rotor speeds is no missing physics of the air. Here the
-nominal rate loop and mixer give, row by row at the measured rates, the rotor speeds of the
-logged commands, and the nominal lag follows them.
+Flight controllers have integrators and filters that the nominal rate loop lacks, so a difference
+between commanded and measured rotor speeds is not missing aerodynamics. Here the nominal rate loop,
+mixer and lag compute the rotor speeds of the logged commands at the measured rates. The same
+comparison decides what drives the model, and whether the rotors have another lag.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class ActuatorMismatch(NamedTuple):
     scale: tuple[float, ...]
     """Measured over commanded, by rotor, with that lag and delay."""
     rms_fitted: float
-    """Of what they leave [rad/s]."""
+    """Of the residual with that lag and delay [rad/s]."""
     rms_own: float
-    """The same with the vehicle file's lag, next to the delay that fits best with that [rad/s]."""
+    """The same with the vehicle file's lag and the delay that fits best with it [rad/s]."""
     thrust: tuple[float, float]
     """Mean and spread of measured minus commanded collective thrust, over nominal mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
@@ -54,7 +54,7 @@ class ActuatorMismatch(NamedTuple):
 
     @property
     def followed(self) -> float:
-        """Share of the speeds' variance that the nominal loop and lag give, 1 where all."""
+        """Share of the speeds' variance that the nominal loop and lag explain [1]."""
         return 1.0 - (self.rms / max(self.spread, 1e-9)) ** 2
 
 
@@ -107,7 +107,7 @@ def rate_loop_demand(log: FlightLog, plant: Plant, at_s: np.ndarray) -> Demand |
     rates = interpolate(at_s, log.time_s, log.rate_b)
 
     def demand(delay: float) -> np.ndarray:
-        # The loop knows the rates of now; what is late is the command.
+        # The loop uses the current rates; only the command is delayed.
         late = hold(at_s - delay, log.time_s, command)
         return np.asarray(wanted_speed(plant, Command(late[:, 0], late[:, 1:]), rates))
 
@@ -198,7 +198,7 @@ def _mismatch(
 
 
 def _least(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
-    """Return the delay of the commands that costs least [s], and what it costs."""
+    """Return the delay of the commands with the smallest `cost` [s], and that cost."""
     tried = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
     place = int(np.argmin([cost(delay) for delay in tried]))
     near = (tried[max(place - 1, 0)], tried[min(place + 1, limits.delays_tried - 1)])
@@ -230,7 +230,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
-    """Return whether measured rotor speeds are the input, as far as columns and rate loop decide.
+    """Return whether measured rotor speeds drive the model, by the logs' columns and the rate loop.
 
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
@@ -313,11 +313,11 @@ def _mean_speeds(
 
 
 LAG = "motor_lag"
-"""The effect that is named."""
+"""Name of the effect."""
 
 
 class RotorLag(NamedTuple):
-    """A lag of the rotors that is not the vehicle's."""
+    """A time constant of the rotors that differs from the vehicle file's."""
 
     time_constant: float
     """[s]."""
@@ -326,7 +326,7 @@ class RotorLag(NamedTuple):
     half_width: float
     """Of its 95 % interval, over flights, and half a step of the model [s]."""
     closed: float
-    """Share that it closes of the squared error that the vehicle's lag leaves of rotor speeds."""
+    """Share of the rotor speeds' squared error under the vehicle's lag that this lag removes."""
     p_value: float
     """Of the vehicle's own lag."""
 

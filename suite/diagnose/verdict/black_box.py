@@ -1,6 +1,6 @@
-"""The named effect next to a black box: on flights left out, and outside the speeds of the fit.
+"""Compares named effects with a black box, on held-out flights and at speeds above the fitted ones.
 
-The black box is the Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
+The black box is a Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
 et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net acceleration that the
 command asks for. Its output is added to the body's acceleration, as in the point mass; three more
 outputs turn the body, since these commands hold body rates besides. It is fitted by gradients

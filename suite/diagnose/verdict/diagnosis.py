@@ -90,8 +90,8 @@ def tested_in(findings: Sequence[Finding], flights: Sources) -> tuple[TestedEffe
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
     """Return the verdict: on the sources that name something, or on all where none does.
 
-    `named` is whether an effect was named, in the search or by a test of its own. A force that
-    swings is left whatever was named: nothing that is fitted repeats it.
+    `named` is whether an effect was named, in the search or by a test of its own. An oscillating
+    force always remains: no fitted parameter reproduces it.
     """
     judged = [one for one in findings if one.names] or findings
     swings = [one.remaining.swing for one in findings if one.remaining.swing]

@@ -1,15 +1,14 @@
-"""Forces that no number of the catalogue repeats: one that swings, and random wind.
+"""Forces that no fitted parameter reproduces: an oscillating one (a swinging load), random wind.
 
-A load on a line leaves a narrow peak in the spectrum of what the force view leaves across the
-vertical, at one period in all flights, whatever was flown. A flight's own motion makes peaks as
-well, wherever a model is wrong: but then the force that is left is a small share of the
-acceleration at that period. Spectra are compared by their likelihood (Whittle 1953) with and
-without a peak on a smooth background.
+A load on a line causes a narrow peak in the spectrum of the horizontal residual force, at one
+period in all flights. Where a model is wrong, the flight's own motion causes peaks as well, but
+then the residual force is a small share of the acceleration at that period. Spectra are compared
+by their likelihood (Whittle 1953) with and without a peak on a smooth background.
 
-The wind at the knots of a window is a normal variable with the covariance of `gusts`; through the
-drag of the vehicle it adds a covariance to the residuals. Intensity and length are where the
-likelihood of the residuals is largest. Whether it is wind is tested by a rival that may push along
-the body axes as it likes.
+The wind at the knots of a window is normally distributed with the covariance of the effect `gusts`.
+Through the drag of the vehicle it adds a covariance to the residuals. Intensity and length maximise
+the likelihood of the residuals. The alternative hypothesis is a random disturbance along the body
+axes.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ ROUNDS = 60
 
 
 class Swing(NamedTuple):
-    """A force that swings."""
+    """An oscillating force: its period, and a pendulum that would cause it."""
 
     period_s: float
     ci95: tuple[float, float]
     """Of the period [s]."""
     share: float
-    """Of the power that is left between `BAND_HZ` [1]."""
+    """Share of the residual force's power within `BAND_HZ` [1]."""
     p_value: float
     """After Bonferroni over all periods."""
 
@@ -90,7 +89,7 @@ class Spectrum(NamedTuple):
 
 
 def swing_left(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
-    """Return the swing in what `task`, of the force view, leaves at the numbers `theta` (P,)."""
+    """Return the oscillation in the residual force of `task` at `theta` (P,); None without one."""
     if not {0, 1} <= set(task.view.axes):
         return None
     data = task.left(theta)
@@ -103,12 +102,12 @@ def find_swing(
     left_b: Sequence[np.ndarray],
     limits: Thresholds = THRESHOLDS,
 ) -> Swing | None:
-    """Return the swing in what a model leaves of `flights`; None where there is none.
+    """Return the oscillation in the residual force of `flights`; None where there is none.
 
     Args:
         flights: of the force view.
-        left_b: what it leaves of each, (M, 3) body axes [m/s^2].
-        limits: what counts as sure.
+        left_b: residual force of each flight, (M, 3) body axes [m/s^2].
+        limits: significance and size.
     """
     pairs = zip(flights, left_b, strict=True)
     spectra = [one for flight, left in pairs if (one := _spectrum(flight, left)) is not None]
@@ -149,7 +148,7 @@ def _spectrum(flight: SmoothedFlight, left_b: np.ndarray) -> Spectrum | None:
     left_w = (rot_w @ left_b[..., None])[..., 0][:, :2]
     yaw = np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0])
     since = np.linspace(-1.0, 1.0, len(middle))
-    # A push that turns with the heading, or creeps, is no swing.
+    # A force that turns with the heading, or drifts, is not an oscillation.
     zero, one = np.zeros_like(since), np.ones_like(since)
     steady = np.stack(
         [
@@ -176,7 +175,7 @@ def _spectrum(flight: SmoothedFlight, left_b: np.ndarray) -> Spectrum | None:
 
 
 def _gains(one: Spectrum, tried_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a peak at each frequency gains in log-likelihood, and its height.
+    """Return the gain in log-likelihood by a peak at each frequency, and its height.
 
     Both are (widths, frequencies).
     """
@@ -199,8 +198,8 @@ def _gains(one: Spectrum, tried_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the log-likelihood (C,) of sums of `shapes` (C, T, J), and their weights (C, T).
 
-    Power (J,) of two axes is twice an exponential variable about its mean; the weights are raised
-    and lowered in turn (Itakura and Saito's distance; Fevotte, Bertin and Durrieu 2009).
+    Power (J,) of two axes is chi-square distributed about its mean; the weights are found by
+    multiplicative updates (Itakura-Saito distance; Fevotte, Bertin and Durrieu 2009).
     """
     scale = shapes.mean(axis=2, keepdims=True)
     unit = shapes / scale
@@ -217,7 +216,7 @@ def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _about(
     spectra: Sequence[Spectrum], centre_hz: float, heights: Sequence[float]
 ) -> tuple[float, float]:
-    """Return the force that is left over the acceleration at a frequency, and the peak's share."""
+    """Return the ratio of residual force to acceleration at a frequency, and the peak's share."""
     left = moved = peak = whole = 0.0
     for one, height in zip(spectra, heights, strict=True):
         inside = np.abs(one.frequency_hz - centre_hz) <= one.width_hz
@@ -257,7 +256,7 @@ def find_turbulence(
     disturbance: DisturbanceEquations,
     limits: Thresholds = THRESHOLDS,
 ) -> Turbulence | None:
-    """Return the random wind that explains what `model` leaves over at `theta` (P,), or None."""
+    """Return the random wind that explains the residual of `model` at `theta` (P,), or None."""
     passed = _passed_on(model, theta, disturbance.knot)
     if np.abs(passed).max() < 1e-6:
         return None
@@ -321,7 +320,7 @@ def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
 
 
 def _pulls(equations: DisturbanceEquations, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return information (W, J) and pull (W, J) along what disturbances root @ normal do apart."""
+    """Return information and gradient (W, J) along independent directions of root @ normal."""
     turned = np.swapaxes(root, 1, 2)
     values, vectors = np.linalg.eigh(turned @ equations.hessian @ root)
     pulls = np.swapaxes(vectors, 1, 2) @ (turned @ equations.gradient[..., None])
@@ -329,7 +328,7 @@ def _pulls(equations: DisturbanceEquations, root: np.ndarray) -> tuple[np.ndarra
 
 
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood over that of none of disturbances root @ normal, for `sizes`."""
+    """Return the log-likelihood ratio of disturbances root @ normal to none, for `sizes`."""
     values, pulls = _pulls(equations, root)
     values = np.maximum(values, 0.0)
     raised = sizes[:, None, None] ** 2
@@ -340,11 +339,11 @@ def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.nda
 def _has_outliers(
     equations: DisturbanceEquations, root: np.ndarray, size: float, tail: float
 ) -> bool:
-    """Return whether the pulls are larger now and then than those of a normal wind.
+    """Return whether the disturbance has heavier tails than a normal wind.
 
-    Their fourth power has mean 3 and variance 96 over their variance; `tail` is how many standard
-    errors it may be above. What comes only in some places, or at some speeds, has more of it than
-    wind has.
+    The fourth power of a normal variable of variance 1 has mean 3 and variance 96; the measured
+    mean may exceed 3 by `tail` standard errors. A force at some places or speeds only has a higher
+    one.
     """
     values, pulls = _pulls(equations, root)
     heard = size**2 * values > 1.0

@@ -20,7 +20,7 @@ class Channel(NamedTuple):
     error: float
     """RMS, in the channel's unit."""
     floor: float
-    """What measurement noise alone gives."""
+    """RMS by measurement noise alone."""
 
 
 class Gap(NamedTuple):
@@ -29,8 +29,8 @@ class Gap(NamedTuple):
     score: np.ndarray
     """(W,) mean squared error, in the unit of the floor."""
     energy: np.ndarray
-    """(W,) squared error by which models are compared: what is each flight's or stretch's own, as
-    its trim or its start, is taken off."""
+    """(W,) squared error by which models are compared: what belongs to a flight or stretch alone,
+    as its trim or its start, is subtracted."""
     channels: Mapping[str, Mapping[str, Channel]]
     """By group and channel."""
     floor: float = 1.0
@@ -64,7 +64,7 @@ class Gap(NamedTuple):
 
 
 def share_left(before: Gap, after: Gap) -> float:
-    """Return how much of the gap above the noise floor is left, 0 to 1."""
+    """Return the share of the gap above the noise floor that remains, 0 to 1."""
     left = max(after.rms - after.floor, 0.0)
     return left / max(before.rms - before.floor, left, 1e-9)
 

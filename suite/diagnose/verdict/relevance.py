@@ -1,9 +1,9 @@
-"""What an effect does on these flights, in units of practice, and what is too small to matter.
+"""Size of an effect on these flights in physical units, and the test of practical relevance.
 
-With little noise any difference is significant, the model's own small errors among them. What does
-less than the thresholds of practical relevance is no finding, however small its p-value
-(equivalence testing; Lakens 2017, doi 10.1177/1948550617697177): it is left out where the upper end
-of the interval of its size is below all of them.
+With little noise every difference is significant, also the model's numerical errors. An effect is
+reported only if it can matter, however small its p-value: it is left out where the upper end of the
+95 % interval of its size is below all thresholds (equivalence testing; Lakens 2017, doi
+10.1177/1948550617697177).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import Thresholds
 
 FORCE_S, TORQUE_S = 0.5, 0.1
-"""Times over which an effect's mean acceleration is taken [s]: the rate loop soon meets its
-turning."""
+"""Times over which an effect's mean linear and angular accelerations are computed [s]. The second
+is short, as the rate loop soon counteracts a rotation."""
 DRIFT_S = 1.0
 """When its drift is measured [s]."""
 
@@ -51,7 +51,7 @@ class EffectSize(NamedTuple):
 def rollout_size(moved: np.ndarray, windows: FlightWindows) -> EffectSize:
     """Return the size of an effect that moves rollouts by `moved` (W, N, 19).
 
-    A fault of the log alone moves what is logged as if something had moved the vehicle so far.
+    A fault of the log has the size of the motion that would change the log as much.
     """
     row_s, seen = np.asarray(windows.row_s), np.asarray(windows.seen)
 

@@ -1,10 +1,9 @@
-"""What the model leaves over: is there structure, what does it go with, how is it coloured.
+"""Structure in the residual: which simple force or torque over the state explains it, if any.
 
-A disturbance, a further force and torque on a grid of knots along every window, stands for whatever
-the model lacks. Two questions are put to it, neither of which needs a name: does one plain shape
-over the state (`shapes`) lower the error on flights that were left out, as a candidate would; and
-is there more energy in it than noise gives, whatever it goes with (a score test of a smooth random
-disturbance).
+A disturbance, which is an additional force and torque at knots along every window, stands for
+whatever the model lacks. Two tests need no effect of the catalogue: whether one simple shape over
+the state (as drag over speed) lowers the error on left-out stretches; and whether the disturbance
+has more energy than noise (a score test of a smooth random disturbance).
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def disturbance_equations(
     estimate: Estimate,
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
-    """Return the normal equations of a disturbance on what `estimate` leaves over."""
+    """Return the normal equations of a disturbance on the residual at `estimate`."""
     response = model.respond(estimate.theta, estimate.free, windows)
     linear = model.linearise(estimate.theta, estimate.free, windows, [])
     residual = project_out_start(whitening, whitened_residual(whitening, linear))
@@ -106,11 +105,10 @@ def residual_structure(
 def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
     """Return the p-value of the energy of a random disturbance along `axis`, over several colours.
 
-    Along the directions in which a disturbance of one colour is uncorrelated, before and after the
-    data, z are the pulls over their noise. What one of size s adds is weighed as the likelihood
-    weighs it, by s^2 l / (1 + s^2 l) with l the information along the direction: a small s weighs
-    slow ones, a large one at all. The sum of weighed squares is close to a gamma variable
-    (Satterthwaite 1946).
+    Directions are those in which a disturbance of one correlation time is uncorrelated before and
+    after the data. The squared gradient along each, over its information l, is weighted as in the
+    likelihood of a disturbance of size s, by s^2 l / (1 + s^2 l): a small s weights slow
+    directions, a large one all. The weighted sum is close to a gamma variable (Satterthwaite 1946).
     """
     at = np.arange(KNOTS) * 6 + axis
     hessian = equations.hessian[:, at][:, :, at]

@@ -1,13 +1,13 @@
 """The gap of rollouts on held-out flights, and the model's own numerical error.
 
-The headline takes rollouts of 1 s whose start is free within what was measured, and the slow part
-of their errors, in which a model's error shows: it is 1 where there is noise only. Next to it
-stand plain rollouts from measured states, in metres. Their error is what the model got wrong and
-what the noise of the start made of it; the second is known from the model's slopes.
+The gap is the slow part of the errors of 1 s rollouts, in units of what noise gives: 1 means noise
+only. The start state of each rollout is free within its measurement noise. Plain rollouts from
+measured states are reported as well, in metres; their error contains the model's error and the
+effect of the start's noise, which follows from the model's Jacobian.
 
 A rollout with steps of twice the length and every second rotor speed differs from the usual one by
-several times the usual one's error (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). What
-of it no free start explains is a floor of the noise.
+several times the usual one's error (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). The
+part that no free start explains is a lower limit of the noise.
 """
 
 from __future__ import annotations
@@ -136,12 +136,12 @@ def gap_of(
 
 
 def overlap(limits: Thresholds) -> float:
-    """Return how often each row of a log counts once in overlapping windows, as a share."""
+    """Return the weight of a row in overlapping windows, so that each row counts once."""
     return limits.gap_stride_s / LENGTH_S
 
 
 def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
-    """Return where windows start (W, F), off what was measured, by the model's clock offset."""
+    """Return the start states (W, F), relative to the measured ones, under the clock offset."""
     late = lateness(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
@@ -175,7 +175,7 @@ def start_noise(
 
 
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return what the noise of start and row makes of a perfect model's errors, (..., 12).
+    """Return the errors (..., 12) of a perfect model by the noise of start and row.
 
     `slope` is (..., 12, F) along what is free, `noise` (F,) of it; its first 12 are a row's too.
     """
