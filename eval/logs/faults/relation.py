@@ -11,6 +11,9 @@ ALIKE = 0.8
 """Axes with a higher correlation are the same."""
 UNLIKE = 0.5
 """An axis is another one if the best correlation exceeds that with its own axis by this."""
+CLEAR = 0.1
+"""Another order of axes is taken where its squared correlations exceed those of the given order by
+this in all: on a straight line two axes are proportional, and noise alone would decide."""
 LEAST = 20
 """Least rows for a comparison."""
 SEEN = 0.5
@@ -66,7 +69,7 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     corr = (wanted.T @ given) / size
     order = max(
         permutations(range(3)),
-        key=lambda p: float(np.sum(corr[range(3), p] ** 2)) + 1e-6 * (p == (0, 1, 2)),
+        key=lambda p: float(np.sum(corr[range(3), p] ** 2)) + CLEAR * (p == (0, 1, 2)),
     )
     best = corr[range(3), order]
     seen = np.abs(best) > SEEN
