@@ -19,12 +19,12 @@ from eval.sensors.filter.kalman import (
     GRAVITY,
     SIZE,
     Corners,
+    FilterSettings,
     FilterState,
     project,
     start,
     update_gate,
 )
-from eval.sensors.filter.settings import FilterSettings
 from eval.sensors.interface import Inertial, Moment, sticky, turned_by
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of

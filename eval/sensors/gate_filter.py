@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eval.sensors.filter.kalman import ImuNoise
-from eval.sensors.filter.settings import FilterSettings
+from eval.sensors.filter.kalman import FilterSettings, ImuNoise
 from eval.sensors.interface import Array, Parameter, Sensor
 
 

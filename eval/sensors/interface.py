@@ -114,7 +114,7 @@ class Sensor:
     ages: Callable[[Values], Ages] | None = None
     """For a delay: the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
-    """For an estimator in the loop: its `eval.sensors.filter.settings.FilterSettings`."""
+    """For an estimator in the loop: its `eval.sensors.filter.kalman.FilterSettings`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
     """For an inertial sensor: (values, state, truth, draws, dt_s) -> measurement, state."""
 
