@@ -187,19 +187,22 @@ def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
     assert len(found) == 1
 
 
-def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_work(tmp_path):
-    with cluster(tmp_path) as found:
-        results = {}
+def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_work(
+    two_nodes, tmp_path
+):
+    """The last test here: one node of the two is gone afterwards."""
+    found = two_nodes
+    results = {}
 
-        def keep(number, result):
-            results[number] = result
-            if len(results) == 10:
-                threading.Thread(target=found.kill, args=[0]).start()
+    def keep(number, result):
+        results[number] = result
+        if len(results) == 10:
+            threading.Thread(target=found.kill, args=[0]).start()
 
-        work_off(partial(lived, str(tmp_path)), range(30), found.address, keep)
-        assert results == {k: k * k for k in range(30)}
-        begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(30)]
-        # What it was at, and what it had done and not handed over yet.
-        assert sum(begun) - 30 <= 3 and max(begun) <= 2 and crew(found.address) == 1
-        with pytest.raises(WorkerDied, match="gave up piece 0.*same command goes on"):
-            work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)
+    work_off(partial(lived, str(tmp_path)), range(30), found.address, keep)
+    assert results == {k: k * k for k in range(30)}
+    begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(30)]
+    # What it was at, and what it had done and not handed over yet.
+    assert sum(begun) - 30 <= 3 and max(begun) <= 2 and crew(found.address) == 1
+    with pytest.raises(WorkerDied, match="gave up piece 0.*same command goes on"):
+        work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)
