@@ -39,7 +39,7 @@ class Config:
     """For plan: effects that your flights do not separate."""
     workers: WorkersOption = None
     """For make and run: share the cases among N processes of this machine, or on the cluster at
-    HOST:PORT. Without it one case follows the other."""
+    HOST:PORT, whose owner can run code here. Without it one case follows the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

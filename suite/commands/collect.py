@@ -20,8 +20,8 @@ class Config:
     out: Path = Path("runs/flights")
     """Folder for the flights, and for flights.json, which lists them."""
     workers: WorkersOption = None
-    """Share the flights among N processes of this machine, or on the cluster at HOST:PORT. Without
-    it as many cores are used as give a gain."""
+    """Share the flights among N processes of this machine, or on the cluster at HOST:PORT, whose
+    owner can run code here. Without it as many cores are used as give a gain."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

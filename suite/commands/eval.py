@@ -24,8 +24,8 @@ class Config:
     rerun: Advanced[Path | None] = None
     """Also write this recording (.rrd, for rerun) of the first trial of every track and level."""
     workers: WorkersOption = None
-    """Share the trials among N processes of this machine, or on the cluster at HOST:PORT. Without
-    it as many cores are used as give a gain."""
+    """Share the trials among N processes of this machine, or on the cluster at HOST:PORT, whose
+    owner can run code here. Without it as many cores are used as give a gain."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -63,7 +63,8 @@ class Config:
     """Folder of the loop; a loop that is there already continues."""
     workers: WorkersOption = None
     """Share flights and fine-tunings among N processes of this machine, or on the cluster at
-    HOST:PORT. Without it flights use as many cores as give a gain, and one process fine-tunes."""
+    HOST:PORT, whose owner can run code here. Without it flights use as many cores as give a gain,
+    and one process fine-tunes."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

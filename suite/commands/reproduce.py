@@ -39,7 +39,8 @@ class Config(Generic[Experiment]):
     """Folder of finished trials and trainings, shared by all documents."""
     workers: WorkersOption = None
     """Share trainings and flights among N processes of this machine, each with its share of the
-    cores, or on the cluster at HOST:PORT. Without it one training follows the other."""
+    cores, or on the cluster at HOST:PORT, whose owner can run code here. Without it one training
+    follows the other."""
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 

@@ -18,9 +18,8 @@ from tracks.common.work.threads import share_threads
 
 Result = TypeVar("Result")
 
-OWNER = "(a cluster's owner can run code here: name your own)"
 WorkersOption = Advanced[
-    Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint=OWNER)]
+    Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint="")]
 ]
 """As a command's option; `workers_given` reads it."""
 

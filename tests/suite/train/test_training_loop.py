@@ -125,7 +125,7 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
     train_in_folder([counting(2)], run_in(tmp_path), FRESH, Console())
-    with pytest.raises(ValueError, match=r"another run \(seed is 0 there, 9 here\); give another"):
+    with pytest.raises(ValueError, match=r"another run \(seed is 0 there, 9 here\); repeat its options"):
         train_in_folder([counting(2)], run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
     changed = replace(CONFIG, loss=replace(CONFIG.loss, progress=9.0))
     with pytest.raises(ValueError, match=r"\(loss\.progress is 1\.2 there, 9\.0 here\)"):
@@ -140,7 +140,7 @@ def test_a_run_of_a_version_with_more_settings_is_refused_by_their_names(tmp_pat
     record = json.loads(path.read_text())
     record["training"]["config"]["loss"]["survival"] = 0.0
     path.write_text(json.dumps(record))
-    words = r"\(loss\.survival is 0\.0 there, None here\); give another --out"
+    words = r"\(loss\.survival is 0\.0 there, None here\); repeat its options"
     with pytest.raises(ValueError, match=words):
         train_in_folder([counting(4)], run_in(tmp_path), FRESH, Console())
 
