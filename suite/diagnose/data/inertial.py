@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from eval.effects.interface import GRAVITY
@@ -184,7 +185,7 @@ class _Piece:
         rot_w[0] = Rotation.from_rotvec(tilt).as_matrix() @ self.rot
         for k, turn in enumerate(turns.as_matrix()):
             rot_w[k + 1] = rot_w[k] @ turn
-        moved = self.summed(self._force_w(rot_w) - [0.0, 0.0, GRAVITY])
+        moved = self._integral(self._force_w(rot_w) - [0.0, 0.0, GRAVITY])
         return rot_w, self.vel + vel + moved
 
     def begin_after(self, before: _Piece) -> None:
@@ -219,12 +220,9 @@ class _Piece:
         prior = np.eye(12, 15) / self.prior[:, None]
         return np.concatenate([design, prior]), np.append(left, -self.numbers / self.prior)
 
-    def summed(self, values: np.ndarray) -> np.ndarray:
+    def _integral(self, values: np.ndarray) -> np.ndarray:
         """Return the integral (N, ...) of `values` (N, ...) from the first row."""
-        out = np.zeros_like(values)
-        span = self.span.reshape(-1, *[1] * (values.ndim - 1))
-        out[1:] = np.cumsum(0.5 * (values[1:] + values[:-1]) * span, axis=0)
-        return out
+        return np.asarray(cumulative_trapezoid(values, self.time_s, axis=0, initial=0))
 
     def _force_w(self, rot_w: np.ndarray) -> np.ndarray:
         return (rot_w @ (self.acc_b - self.numbers[9:])[..., None])[..., 0]
@@ -234,9 +232,9 @@ class _Piece:
         count = len(self.time_s)
         each = np.broadcast_to(np.eye(3), (count, 3, 3))
         force_w = self._force_w(rot_w)[:, :, None]
-        tilts = np.concatenate([each, -self.summed(rot_w)], axis=2)  # by tilt and gyro bias
-        by_tilt, by_gyro = np.split(self.summed(np.cross(tilts, force_w, axis=1)), 2, axis=2)
-        return np.concatenate([by_tilt, each, by_gyro, -self.summed(rot_w)], axis=2)
+        tilts = np.concatenate([each, -self._integral(rot_w)], axis=2)  # by tilt and gyro bias
+        by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
+        return np.concatenate([by_tilt, each, by_gyro, -self._integral(rot_w)], axis=2)
 
 
 def _start(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:

@@ -30,6 +30,12 @@ RATE_HZ = 100.0
 TURNED = 2.1
 """By which the second flight of each trajectory is turned about z [rad]: one of the two may be
 held out, and their headings differ."""
+MEASURES = {
+    "motor": "Log the rotor speeds as well.",
+    "voltage": "Log the battery's voltage as well.",
+    "scale": "Better still: weigh the vehicle.",
+}
+"""What to measure besides, by its name in a `Separation`."""
 FLIGHTS = "flights"
 """Folder of the simulated logs, within the plan's."""
 
@@ -55,7 +61,7 @@ def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
             words.append(f"To separate {together}: fly fast, with changes of thrust and heading.")
         for entry in entries:
             words.append(f"To separate {' from '.join(entry.pair)}: {entry.words}.")
-            words += [_besides(what) for what in entry.measure]
+            words += [MEASURES[what] for what in entry.measure]
     ways = list(dict.fromkeys(ways))
     twice = [turned for way in ways for turned in (way, replace(way, direction=TURNED))]
     return twice, list(dict.fromkeys(words))
@@ -118,15 +124,6 @@ def fly_plan(
     if flights:
         write_json(folder / NAME, {**plan, **stamp(SCHEMA, seed)})
     return {**plan, "warnings": warnings}
-
-
-def _besides(what: str) -> str:
-    lines = {
-        "motor": "Log the rotor speeds as well.",
-        "voltage": "Log the battery's voltage as well.",
-        "scale": "Better still: weigh the vehicle.",
-    }
-    return lines[what]
 
 
 def _rate(vehicle: Vehicle) -> float:

@@ -21,7 +21,7 @@ from suite.diagnose.verdict.rollout_gap import Rollouts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
-"""Colours of the vehicle as given, with what was named, with a wrong name, with a black box."""
+"""Colours: vehicle as given, with the named effects, with a wrong effect, with a black box."""
 FLOOR = "#1d2430"
 SHOWN = 14
 """Candidates in the chart."""
@@ -30,7 +30,7 @@ SHOWN = 14
 def gains_chart(
     scores: Sequence[CandidateScore], threshold: float | None, named: set[str]
 ) -> bytes:
-    """Return the gains of the best candidates, and what chance reaches.
+    """Return a chart of the gains of the best candidates, and the gain that chance reaches.
 
     Args:
         scores: best first.
@@ -121,7 +121,7 @@ def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> No
 
 
 def _few_ticks(axes: Axes, which: str = "y") -> None:
-    """Write numbers as people do on a logarithmic axis."""
+    """Label a logarithmic axis with plain numbers."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis

@@ -1,4 +1,4 @@
-"""What a report shows: the answer in a sentence, what it does and means, then the evidence."""
+"""The page of a report: answer, picture and next steps first, then folded sections of evidence."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def page(
 ) -> Report:
     """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
 
-    `checks` are there where rollouts were flown, `toml` is the vehicle file that was written, and
-    `files` which of `FILES` there are.
+    `checks` is None without rollouts, `toml` is the text of the vehicle file that was written, and
+    `files` lists which of `FILES` exist.
     """
     gap, flights = found["gap"], diagnosis.flights
     facts = {

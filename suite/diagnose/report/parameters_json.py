@@ -12,7 +12,7 @@ from suite.diagnose.estimate.parameters import ParameterSpace
 from tracks.common.grid import Cell, Grid
 
 UNSEEN = "not identifiable"
-"""In the place of a value that no flight can give."""
+"""Shown in place of a value that no flight identifies."""
 
 
 class Component(NamedTuple):

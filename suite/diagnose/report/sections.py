@@ -69,7 +69,7 @@ def noise_section(diagnosis: Diagnosis) -> Section:
 
 
 def actuators_section(checks: Checks, input_source: str) -> list[Section]:
-    """Return what measured rotor speeds show of the actuators; nothing where there are none."""
+    """Return measured rotor speeds compared with commanded ones; nothing without measured ones."""
     if not checks.actuators:
         return []
     words = (
@@ -112,7 +112,7 @@ RIVALS = 6
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
-    """Return what each candidate gains alone, by source."""
+    """Return the gain of each candidate alone, by source."""
     parts: list[Part] = []
     for one in diagnosis.findings:
         scores, limits = one.search.first, one.source.limits
@@ -141,7 +141,7 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
 
 
 def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
-    """Return what was fitted in each name's place; `found` is the JSON."""
+    """Return what was fitted in place of each named effect; `found` is the JSON."""
     rows = []
     for _, one in diagnosis.named:
         ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
@@ -163,7 +163,7 @@ def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
 
 
 def residual_section(found: Mapping[str, Any]) -> Section:
-    """Return what the named effects leave; `found` is the JSON."""
+    """Return the residual after the named effects; `found` is the JSON."""
     left = found["unexplained"]
     words = "No structure beyond the measurement noise remains."
     if left["where"]:
@@ -187,7 +187,7 @@ def residual_section(found: Mapping[str, Any]) -> Section:
 def evidence_section(
     diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks | None
 ) -> Section:
-    """Return the gap on flights that took no part, with its rivals; `found` is the JSON."""
+    """Return the gap on held-out flights, with controls; `found` is the JSON."""
     seed, main = diagnosis.seed, diagnosis.main
     gaps = [("as given", main.before, BEFORE)]
     if main.control is not None:

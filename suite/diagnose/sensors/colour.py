@@ -1,8 +1,8 @@
-"""Size, colour and drift of an estimate's errors, by how errors some time apart differ.
+"""Size, autocorrelation and drift of an estimate's errors, fitted to their variogram.
 
-Half the mean square of that difference, the variogram, is for two first-order Gauss-Markov
-processes, a fast one with a share f of the variance v, and a random walk with the distance (c^2 a
-metre, at the speed s)
+The variogram, half the mean squared difference of errors a lag apart, is for two first-order
+Gauss-Markov processes, a fast one with a share f of the variance v, and a random walk with the
+distance (c^2 a metre, at the speed s)
 
     g(l) = v (1 - f exp(-l / T_f) - (1 - f) exp(-l / T)) + c^2 s l / 2
 
@@ -57,10 +57,10 @@ class Series(NamedTuple):
 
 
 class Coloured(NamedTuple):
-    """What one error does."""
+    """Parameters of one error."""
 
     noise: Interval
-    """Standard deviation of what comes and goes, in the error's unit."""
+    """Standard deviation without bias and drift, in the error's unit."""
     fast: Interval
     """Share of its variance that changes fast [1]."""
     fast_s: Interval
@@ -70,7 +70,7 @@ class Coloured(NamedTuple):
     drift: Interval
     """Random walk with the distance [unit/sqrt(m)]."""
     bias: Interval
-    """Standard deviation over flights of what stays for a flight."""
+    """Standard deviation over flights of the part that is constant in a flight."""
 
     def correlation(self, lag_s: np.ndarray, duration_s: float) -> np.ndarray:
         """Return the autocorrelation (L,) that a flight of `duration_s` shows on average.

@@ -1,4 +1,4 @@
-"""What an on-board estimate is off by in a flight log, next to the log's own pose."""
+"""Errors of an on-board state estimate in a flight log, compared with the log's reference pose."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ PARTS = {"position": "pos", "velocity": "vel", "attitude": "quat"}
 SLOPE_ROWS = 15
 """The reference is differentiated over so many rows."""
 SETTLES_S = 2.0
-"""So much after the first row and before the last is left out: the ground is near [s]."""
+"""Time left out after the first row and before the last: the vehicle is near the ground [s]."""
 LEAST_S = 8.0
-"""Shorter flights show too little of errors that last [s]."""
+"""Least length of a flight, as the errors last for seconds [s]."""
 
 
 class Errors(NamedTuple):
@@ -37,7 +37,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
-    """Return the errors of the estimate in `log` against the reference of `late_s` ago.
+    """Return the errors of the estimate in `log` relative to the reference `late_s` earlier [s].
 
     Raises:
         FlightLogError: where the log holds no estimate, or no reference for it.

@@ -1,9 +1,10 @@
-"""How late an estimate is, and by what factor its velocity is wrong.
+"""Delay of a state estimate, and the scale error of its velocity.
 
-To first order an estimate of age d is off by -d times the slope of the truth, and a scale k of the
-velocity by k v. Both are fitted by least squares to the errors of all flights, less each flight's
-mean; each axis counts by its variance. Errors last, so intervals are by how stretches disagree.
-Rows are not whitened: that would fit what an estimator's own dynamics do to fast motion alone.
+To first order a delay d causes the error -d times the derivative of the truth, and a scale error k
+of the velocity causes k v. Both are fitted by least squares to the errors of all flights, less each
+flight's mean; axes are weighted by their variance. Errors are correlated in time, so intervals come
+from the disagreement of stretches. Rows are not whitened: that would weight fast motion, in which
+an estimator's own dynamics dominate.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ROUNDS = 3
 
 
 class Lateness(NamedTuple):
-    """What is no noise."""
+    """The systematic part of the errors."""
 
     delay_s: Interval
     velocity_scale: Interval
@@ -41,7 +42,7 @@ class Lateness(NamedTuple):
 def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
     """Return the delay and the scale of the velocity, and the errors at that delay.
 
-    Where its interval does not leave out 0 a delay is none.
+    A delay whose interval contains 0 is set to 0.
     """
     delay_s, found = 0.0, None
     for _ in range(ROUNDS):
@@ -58,7 +59,7 @@ def _fitted(flights: Sequence[Errors], at_s: float) -> Lateness:
     value, half = _solved(_summed(channels), fitted)
     if value[1]:
         scale = _interval(value[1], half[1])
-        if not acting(scale):  # then it only makes the delay less sure
+        if not acting(scale):  # it would only widen the delay's interval
             fitted = (0,)
             value, half = _solved(_summed(channels), fitted)
     by_part = {}
@@ -71,7 +72,7 @@ def _fitted(flights: Sequence[Errors], at_s: float) -> Lateness:
 
 
 def acting(found: Interval) -> float:
-    """Return the value, or 0 where the interval does not leave out 0."""
+    """Return the value, or 0 where the interval contains 0."""
     return 0.0 if found.low <= 0.0 <= found.high else found.value
 
 
