@@ -28,7 +28,7 @@ def network(weights: jax.Array, state: jax.Array, image: jax.Array) -> jax.Array
 
 
 def main(trials: int) -> None:
-    """Fly the function in the judge and print how it went."""
+    """Fly the function in the judge and print the results."""
     weights = 0.01 * jax.random.normal(jax.random.key(0), (24 * 32, 3))
     compiled = jax.jit(lambda state, image: network(weights, state, image))
 

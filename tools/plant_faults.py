@@ -230,9 +230,9 @@ class Work:
         if key not in self._done:
             self._done[key] = run_tests(self.copy, tests)
             self._out.parent.mkdir(parents=True, exist_ok=True)
-            beside = self._out.with_suffix(".new")
-            beside.write_text(json.dumps(self._done, indent=1), "utf-8")
-            beside.replace(self._out)
+            temporary = self._out.with_suffix(".new")
+            temporary.write_text(json.dumps(self._done, indent=1), "utf-8")
+            temporary.replace(self._out)
         return self._done[key]
 
 

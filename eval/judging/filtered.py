@@ -135,7 +135,7 @@ class Filtered:
         new = fresh & flying
         if new.any():
             self._begin(truth, new)
-            self._look(new)
+            self._detect(new)
         assert self.filters is not None
         state = present(self.filters)
         own = View(state.pos_w, state.rot_w, state.vel_w, *seen[3:])
@@ -189,9 +189,9 @@ class Filtered:
         self._truth = select(flew, now, before)
         self._steps += flew
         self._arrive(flew)
-        self._look(flew & (self._steps == np.rint(self._frame * self._period)))
+        self._detect(flew & (self._steps == np.rint(self._frame * self._period)))
 
-    def _look(self, due: np.ndarray) -> None:
+    def _detect(self, due: np.ndarray) -> None:
         """Detect the corners in the slots in which a frame is `due`."""
         rows, settings = np.flatnonzero(due), self._settings
         if not len(rows):

@@ -200,7 +200,7 @@ def _log_drone(recording: rr.RecordingStream, entity: str, flight: Flight, drone
     discs = rr.Ellipsoids3D(
         centers=rotors,
         half_sizes=np.tile([ROTOR_RADIUS_M, ROTOR_RADIUS_M, 0.006], (len(rotors), 1)),
-        # The two in front are told by their colour.
+        # The colour marks the two in front.
         colors=[colours.AHEAD if x > 0 else colours.SOLID_EDGE for x in rotors[:, 0]],
         fill_mode="solid",
     )

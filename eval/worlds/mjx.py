@@ -209,11 +209,11 @@ class MjxWorld:
         """Return the current view."""
         assert self._on_device is not None
         course, scene = self._on_device
-        seen = self._look(self._state, course, scene)
+        seen = self._view(self._state, course, scene)
         return View(*(np.asarray(part, np.float64) for part in seen))
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _look(self, state: Flying, course: Course, scene: Scene) -> View:
+    def _view(self, state: Flying, course: Course, scene: Scene) -> View:
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
         gate, after = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))

@@ -83,10 +83,10 @@ def make_set(
                 return
             # The answer first: a case that is there has one.
             write_json(out / "answers" / f"{name}.json", {**stamp(SCHEMA, seed), **built.answer})
-            with replacing_folder(out / "cases" / name) as beside:
-                save_vehicle(built.nominal, beside / "vehicle.toml")
+            with replacing_folder(out / "cases" / name) as temporary:
+                save_vehicle(built.nominal, temporary / "vehicle.toml")
                 for log in built.logs:
-                    write_flight(beside / f"{log.name}.parquet", log)
+                    write_flight(temporary / f"{log.name}.parquet", log)
             update(len(cases) - len(names) + number + 1, name)
 
         work_off(_build, [cases[name] for name in names], workers or 1, keep)

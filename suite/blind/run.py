@@ -34,7 +34,7 @@ def run_set(
     """Diagnose every case without a result, and return the number of results.
 
     Results go to `into` (OUT/results if not given), one folder a case, with `seconds.json`
-    beside `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
+    next to `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
     `workers` diagnose several at once; None is this process.
     """
     results = into or out / "results"

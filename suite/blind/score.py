@@ -50,7 +50,7 @@ class Verdict:
     """Gap after over noise floor."""
     seconds: float | None
     brought: int = 0
-    """Named effects that the simulator has beside the hidden ones, by their nature and size."""
+    """Named effects that the simulator has in addition to the hidden ones, by name and size."""
 
     @property
     def exact(self) -> bool:
@@ -252,7 +252,7 @@ def _beside_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
     brought = any(v.brought for v in verdicts)
     flags = [v.exact and not v.brought for v in verdicts if brought]
     kind = verdicts[0].kind if verdicts else ""
-    return f"  {kind}: with no damping by moving hubs beside them", "", flags
+    return f"  {kind}: with no damping by moving hubs in addition", "", flags
 
 
 def _matched(

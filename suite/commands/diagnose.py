@@ -105,9 +105,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         compared = (result.get("black_box") or {}).get(side)
         if compared:
             named = compared["named"]
-            beside = f"{named['gap']:.2f} with the names, " if named else ""
+            named_gap = f"{named['gap']:.2f} with the names, " if named else ""
             console.say(
-                f"on {compared['judged_on']}: {compared['before']['gap']:.2f} before, {beside}"
+                f"on {compared['judged_on']}: {compared['before']['gap']:.2f} before, {named_gap}"
                 f"{compared['black_box']['gap']:.2f} with a Delta Action Model"
             )
     plan = result.get("plan")

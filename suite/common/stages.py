@@ -71,7 +71,7 @@ class Stage:
     needs: Estimate
     """Time and memory."""
     work: Callable[[Path], Any]
-    """Called with the folder; it must go on where an earlier call was cut off."""
+    """Called with the folder; it must continue an interrupted earlier call."""
     tell: Callable[[Path], None] = lambda folder: None
     """Called with the folder of the finished stage, also of one found again, to say what came."""
 

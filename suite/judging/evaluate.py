@@ -200,7 +200,7 @@ def _refuse_twice(called: list[str]) -> None:
         if called.count(label) > 1:
             raise ValueError(
                 f"{label} would be judged twice; give each --policy and each --speed once "
-                "(speeds are told apart by 6 digits)"
+                "(speeds are compared to 6 digits)"
             )
 
 

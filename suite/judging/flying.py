@@ -247,10 +247,10 @@ def who_flies(
         return policy
     if isinstance(workers, int):
         return partial(load_in_manner, name_or_path, trust, manner)
-    return partial(_flier_of, PolicyContent.of(name_or_path, trust), manner)
+    return partial(_in_manner_of, PolicyContent.of(name_or_path, trust), manner)
 
 
-def _flier_of(content: PolicyContent, manner: Manner) -> Policy:
+def _in_manner_of(content: PolicyContent, manner: Manner) -> Policy:
     return manner(content())
 
 
@@ -277,7 +277,7 @@ def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:
 def by_content(about: dict[str, Any]) -> dict[str, Any]:
     """Return what a journal or a list of flights is about, without where its files lay.
 
-    What they held is there by digest or as it was read, so flights go on where a folder was moved.
+    Their content is there as a digest or as it was read, so that a moved folder changes nothing.
     """
     about = plain(about)
     paths = {"policy": ("source",), "collection": ("policy", "vehicle")}

@@ -49,7 +49,7 @@ def estimate(
 
     Args:
         config: the run.
-        steps_per_core_s: steps of worlds that a processor core makes, or learns from once [1/s].
+        steps_per_core_s: environment steps of one processor core, gradient included [1/s].
         compile_s: time to compile [s].
         passes: how often an iteration goes through its steps.
         images: how many copies of its images are held at once.
@@ -96,8 +96,8 @@ def train(
 
     Args:
         config: the whole run.
-        folder: where it lives; a folder with a run of the same configuration is resumed.
-        console: where progress goes.
+        folder: of the run; a run of the same configuration in it is resumed.
+        console: for progress.
         params: start from these instead of fresh ones.
         delta: a frozen Delta Action network to train under.
         watch: measures the policy on the way; in one process alone.

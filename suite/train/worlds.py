@@ -117,8 +117,10 @@ def _beside_a_gate(
     gates = track.scene.gates
 
     def place(target: int) -> np.ndarray:
-        angle, beside = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
-        point_g = np.array([rng.uniform(-0.7, 1.2), beside * np.cos(angle), beside * np.sin(angle)])
+        angle, radius_g = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
+        point_g = np.array(
+            [rng.uniform(-0.7, 1.2), radius_g * np.cos(angle), radius_g * np.sin(angle)]
+        )
         return gates.center_w[target] + gates.rot_w[target] @ point_g
 
     point, target = _roomiest(track, rng, place)

@@ -70,8 +70,8 @@ def test_how_fast_to_fly_comes_last_as_the_spec_or_each_row_says():
     own = observe(spec, view, zero).state
     np.testing.assert_array_equal(own[:, :15], without)
     np.testing.assert_array_equal(own[:, 15], 0.3)
-    told = observe(spec, view, zero, np.array([0.0, 0.9])).state
-    np.testing.assert_array_equal(told[:, 15], [0.0, 0.9])
+    observed = observe(spec, view, zero, np.array([0.0, 0.9])).state
+    np.testing.assert_array_equal(observed[:, 15], [0.0, 0.9])
 
 
 def test_the_papers_twelve_numbers():

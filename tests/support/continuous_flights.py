@@ -1,8 +1,8 @@
-"""Flights in continuous time: the equations of a quadrotor integrated finely, by themselves.
+"""Flights in continuous time: the equations of a quadrotor, integrated finely and independently.
 
-Nothing here is the model's: Runge-Kutta of order 4 at a fixed fine step between the events of one
-flight (a row's stamp, a look of the rate loop, a command that arrives late), scalar loops, so that
-the diagnosis is held to the equations and not to its own code.
+No code of the model is used: Runge-Kutta of order 4 at a fixed fine step between the events of one
+flight (a row's stamp, an update of the rate loop, a delayed command), in scalar loops. So the
+diagnosis is tested against the equations and not against its own code.
 """
 
 from types import SimpleNamespace
@@ -37,8 +37,8 @@ class Truth:
         self.mixer = np.stack([np.ones(4), self.arm[:, 1], -self.arm[:, 0], -self.spin * ratio])
         self.most = self.k_t * rotors.speed_max**2
 
-    def asked(self, command, rate_b):
-        """Return the rotor speeds that the loop asks for; gentle commands saturate nothing."""
+    def commanded(self, command, rate_b):
+        """Return the rotor speeds that the loop commands; gentle commands saturate nothing."""
         torque = self.inertia * (self.gain * (command[1:] - rate_b))
         torque += np.cross(rate_b, self.inertia * rate_b)
         thrust = np.linalg.solve(self.mixer, [self.mass * command[0], *torque])
@@ -49,8 +49,8 @@ class Truth:
         push = np.array([0.0, 0.0, (self.k_t * speed**2).sum()])
         return push - self.mass * self.drag * (state.rot.T @ state.vel)
 
-    def slope(self, state, asked):
-        speed = asked if self.lag_s == 0.0 else state.speed
+    def slope(self, state, commanded):
+        speed = commanded if self.lag_s == 0.0 else state.speed
         thrust = self.k_t * speed**2
         torque = [
             self.arm[:, 1] @ thrust,
@@ -64,19 +64,19 @@ class Truth:
             vel=state.rot @ force_b / self.mass + GRAVITY_W,
             rot=state.rot @ skew(state.rate),
             rate=turn / self.inertia,
-            speed=np.zeros(4) if self.lag_s == 0.0 else (asked - state.speed) / self.lag_s,
+            speed=np.zeros(4) if self.lag_s == 0.0 else (commanded - state.speed) / self.lag_s,
         )
 
-    def rk4(self, state, asked, h):
+    def rk4(self, state, commanded, h):
         def moved(slope, by):
             return SimpleNamespace(
                 **{k: v + by * getattr(slope, k) for k, v in vars(state).items()}
             )
 
-        one = self.slope(state, asked)
-        two = self.slope(moved(one, h / 2), asked)
-        three = self.slope(moved(two, h / 2), asked)
-        four = self.slope(moved(three, h), asked)
+        one = self.slope(state, commanded)
+        two = self.slope(moved(one, h / 2), commanded)
+        three = self.slope(moved(two, h / 2), commanded)
+        four = self.slope(moved(three, h), commanded)
         mean = {
             k: (getattr(one, k) + 2 * getattr(two, k) + 2 * getattr(three, k) + getattr(four, k))
             / 6
@@ -84,7 +84,7 @@ class Truth:
         }
         new = moved(SimpleNamespace(**mean), h)
         if self.lag_s == 0.0:
-            new.speed = asked
+            new.speed = commanded
         return new
 
 
@@ -104,9 +104,9 @@ def fly_finely(
     stamps = row_times(rng, rate_hz, duration_s, jitter)
     period = 1.0 / vehicle.controller.frequency
     pos, vel, _ = on_curves(*path, stamps[0])
-    hover = truth.asked(np.array([9.81, 0, 0, 0]), np.zeros(3))
+    hover = truth.commanded(np.array([9.81, 0, 0, 0]), np.zeros(3))
     state = SimpleNamespace(pos=pos, vel=vel, rot=np.eye(3), rate=np.zeros(3), speed=hover)
-    given, asked, rows = [(-1.0, np.array([9.81, 0.0, 0.0, 0.0]))], hover, []
+    given, commanded, rows = [(-1.0, np.array([9.81, 0.0, 0.0, 0.0]))], hover, []
     for k, now in enumerate(stamps):
         acc = truth.force_b(state, state.speed) / truth.mass
         motion = SimpleNamespace(pos_w=state.pos, vel_w=state.vel, rot_w=state.rot)
@@ -125,10 +125,10 @@ def fly_finely(
             if np.abs(looks - begin).min() < 1e-12:
                 seen = state.rate
             acts = next(c for t, c in reversed(given) if t + delay_s <= begin + 1e-12)
-            asked = truth.asked(acts, seen)
+            commanded = truth.commanded(acts, seen)
             parts = max(int(np.ceil((end - begin) / finest_s)), 1)
             for _ in range(parts):
-                state = truth.rk4(state, asked, (end - begin) / parts)
+                state = truth.rk4(state, commanded, (end - begin) / parts)
     pos, rot, vel, rate, acc, command = (np.array(field) for field in zip(*rows, strict=True))
     blur = {name: noise * size * rng.standard_normal(pos.shape) for name, size in NOISE.items()}
     u, _, vt = np.linalg.svd(rot @ (np.eye(3) + np.array([skew(a) for a in blur["att"]])))

@@ -3,7 +3,7 @@
 Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
 positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
 the header names no unit (ten times that under `blackbox_high_resolution`, which the attitude shows:
-`eval/logs/faults/vectors.py`). Units that `blackbox_decode` was told to use stand in brackets after
+`eval/logs/faults/vectors.py`). Units given to `blackbox_decode` stand in brackets after
 a column's name.
 Position and attitude are not logged: --pose brings them, or --partial does without.
 """

@@ -1,7 +1,7 @@
 """Work whose product is a folder, on a machine that has none of our folders: they go as content.
 
 There it is done in the user's cache, in a folder named by what is to be done, so that what a killed
-worker had saved is gone on with by the next one that finds it.
+worker had saved is continued by the next worker that finds it.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
     """Return the fitted numbers (K,) and their normal equations, stretch by stretch."""
     import mujoco.sysid as sysid
 
-    # Its optimiser can be told to print nothing, `sysid.optimize` cannot.
+    # Its optimiser has an option to print nothing, `sysid.optimize` has none.
     with contextlib.redirect_stdout(io.StringIO()):
         params, result = sysid.optimize(
             problem.params.copy(),

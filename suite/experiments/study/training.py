@@ -65,7 +65,7 @@ class Trained(NamedTuple):
     compile_s: float
     """What those that compile took longer than the others [s]."""
     commit: str
-    """That trained it; several, where it was stopped and gone on with."""
+    """Commits that trained it; several if it was interrupted and resumed."""
     diverged: str
     """What was said where it diverged, else ""."""
     points: list[dict[str, float]]
@@ -92,9 +92,9 @@ class Study:
 
 
 def trained(study: Study, place: Place, console: Console) -> list[Trained]:
-    """Return every training of `study`; it is done, or gone on with, where missing.
+    """Return every training of `study`; missing ones are trained or resumed first.
 
-    The others go on where one diverges.
+    If one diverges, the others continue.
 
     Args:
         study: what is trained.
@@ -206,7 +206,7 @@ def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
 def commit_of(policy: Path) -> str:
     """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so.
 
-    A training that was stopped and gone on with may have several: all of them.
+    A training that was interrupted and resumed may have several: all of them.
     """
     path = policy.parent / "run.json"
     try:

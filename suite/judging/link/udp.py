@@ -28,7 +28,7 @@ class UdpLink:
         if kind not in ("udpin", "udpout") or not host or not port.isdecimal():
             raise ValueError(
                 f"--link {address}: allowed are udpin:HOST:PORT (wait to be called) and "
-                "udpout:HOST:PORT (call); for a serial port run mavlink-router beside it"
+                "udpout:HOST:PORT (call); for a serial port run mavlink-router on the same computer"
             )
         if int(port) > 65535:
             raise ValueError(f"--link {address}: the port must be 0 to 65535")

@@ -1,4 +1,4 @@
-"""Clocks of motion capture and flight controller are laid over each other."""
+"""Align the clocks of motion capture and flight controller."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_a_long_flight_with_a_strong_drift():
     assert found.drift == pytest.approx(4e-4, abs=2e-6)
 
 
-def test_noise_widens_the_error_that_is_told():
+def test_noise_widens_the_reported_error():
     calm = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")
     poses = _poses((1, 19), 120.0, 2.0, 0.0, noise=0.002)
     shaken = align(poses, _gyro((0, 20), noise=0.1), "pose")
@@ -71,7 +71,7 @@ def _import(tmp_path, text=None, **options):
     return import_log(log, None, ImportOptions(**told))
 
 
-def test_the_poses_own_faults_are_put_right(tmp_path):
+def test_faults_of_the_poses_are_corrected(tmp_path):
     made.write_mocap(tmp_path / "pose.csv", span=(1.0003, 11), offset=4.0)
     lines = (tmp_path / "pose.csv").read_text().splitlines()
     # Time in us, the quaternion xyzw under the names of wxyz.

@@ -135,9 +135,9 @@ def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
         helper.make_node("MatMul", ["x", "w"], ["action"]),
     ]
     shape = numpy_helper.from_array(np.array([7, 12], np.int64), "shape")
-    with pytest.raises(PolicyError, match="it.onnx: fails while it runs") as told:
+    with pytest.raises(PolicyError, match="it.onnx: fails while it runs") as refused:
         load_policy(_save(tmp_path, _proto(nodes, [W, shape])))
-    assert len(str(told.value).splitlines()) == 1
+    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():

@@ -218,9 +218,9 @@ def script(folder, module):
 def test_a_module_that_fails_while_it_flies_gives_no_answer_and_flies_on(tmp_path):
     policy = load_policy(script(tmp_path, Failing()), trust=True)
     image, fresh = np.zeros((2, 24, 32)), np.zeros(2, bool)
-    with pytest.raises(NoAnswer, match="it.pt: fails while it runs .*too far") as told:
+    with pytest.raises(NoAnswer, match="it.pt: fails while it runs .*too far") as refused:
         policy.act(policy.start(2), np.full((2, 12), 1e4), image, fresh)
-    assert len(str(told.value).splitlines()) == 1
+    assert len(str(refused.value).splitlines()) == 1
     assert policy.act(policy.start(2), np.ones((2, 12)), image, fresh)[0].all()
 
 

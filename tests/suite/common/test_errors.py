@@ -42,14 +42,19 @@ def test_what_the_system_refuses_is_one_line_with_the_file():
     usage = ("EROFS", "ENAMETOOLONG", "ELOOP", "ENXIO", "EACCES")
     for name in (*usage, "ENOSPC", "EIO", "EMFILE"):
         number = getattr(errno, name)
-        told = explain(OSError(number, os.strerror(number), "runs/x"))
-        assert told is not None and told[0] == (2 if name in usage else 1), name
-        assert "runs/x" in told[1]
+        explained = explain(OSError(number, os.strerror(number), "runs/x"))
+        assert explained is not None and explained[0] == (2 if name in usage else 1), name
+        assert "runs/x" in explained[1]
 
 
 @pytest.mark.parametrize(("name", "words"), [("x" * 10_000, "xxx"), ("a\0b", "NUL")])
 def test_a_name_that_cannot_be_is_a_short_message(name, words):
     with pytest.raises((OSError, ValueError)) as met:
         open(name)
-    told = explain(met.value)
-    assert told is not None and told[0] == 2 and words in told[1] and len(told[1]) < 400
+    explained = explain(met.value)
+    assert (
+        explained is not None
+        and explained[0] == 2
+        and words in explained[1]
+        and len(explained[1]) < 400
+    )

@@ -1,4 +1,4 @@
-"""Stages in folders, the record of a run, and what people are told of both."""
+"""Stages in folders, the record of a run, and the messages about both."""
 
 import json
 from dataclasses import dataclass

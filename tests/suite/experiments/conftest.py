@@ -9,7 +9,7 @@ from suite.experiments.study import judging
 
 
 class Sky:
-    """Counts the trials that are flown, and stops where it is told to."""
+    """Counts the trials that are flown, and stops at a given one."""
 
     def __init__(self, monkeypatch):
         self.flown = []

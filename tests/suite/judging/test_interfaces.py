@@ -1,4 +1,4 @@
-"""What a person is told about a policy file, a track file and a working folder of their own."""
+"""Messages about a user's own policy file, track file and working folder."""
 
 import subprocess
 import sys

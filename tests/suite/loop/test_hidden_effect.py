@@ -82,8 +82,8 @@ class Stub(Small):
         params = {k: np.asarray(v) + shift for k, v in params.items()}
         save_delta(out / "delta", params, seed=0, fit={"model": "quad"})
         errors = {"position_m": 0.1, "velocity_m_s": 0.2}
-        told = {"without": errors, "delta_action": errors}
-        (out / "delta.json").write_text(json.dumps(told))
+        stored = {"without": errors, "delta_action": errors}
+        (out / "delta.json").write_text(json.dumps(stored))
         (out / "table.md").write_text("| fitted |\n")
 
 
@@ -206,8 +206,8 @@ def test_the_example_hides_one_effect(root):
     assert hidden_effects(true, simulated) == "no com_offset"
     assert hidden_effects(simulated, replace(simulated, mass=0.8)) == "other nominal values"
     trimmed = with_effects(simulated, {"torque_trim": TorqueTrim(np.array([0.01, 0.0, 0.0]))})
-    told = hidden_effects(simulated, replace(trimmed, mass=0.8))
-    assert told == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"
+    stored = hidden_effects(simulated, replace(trimmed, mass=0.8))
+    assert stored == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"
 
 
 def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
@@ -220,9 +220,9 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     assert [one.simulator for one in judged] == ["mujoco"] + ["rotorpy"] * 5
     assert [one.vehicle for one in judged] == ["reference"] + ["examples/rotorpy.toml"] * 5
     assert place(config) == "the simulator rotorpy"
-    told = what_is_hidden(config)
-    assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in told[0] and "no linear_drag" in told[0]
-    assert "the rotors' drag acts at each hub" in told[1]
+    stored = what_is_hidden(config)
+    assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in stored[0] and "no linear_drag" in stored[0]
+    assert "the rotors' drag acts at each hub" in stored[1]
     same = resolve(recipe="quick", simulator="rotorpy")
     assert isinstance(same, HiddenLoopConfig)
     plain = what_is_hidden(same)

@@ -18,7 +18,7 @@ def far(tmp_path, monkeypatch):
 
 
 def count_on(mark, job):
-    """Add a line to a file of the job's own folder, and end badly after the first if told to."""
+    """Add a line to a file of the job's folder; fail after the first if the job says so."""
     job.folder.mkdir(exist_ok=True)
     with open(job.folder / "lines", "a") as file:
         file.write((job.reads / "deep" / "word").read_text() + "\n")

@@ -46,7 +46,7 @@ def test_what_python_can_stop_is_interrupted_and_cleaned_up():
 
 
 class Tired:
-    """Is told to end while it is being freed, where Python has no one to raise an error to."""
+    """Gets the signal to end while it is freed, where Python cannot raise an error."""
 
     def __del__(self):
         os.kill(os.getpid(), signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""One writer a folder: who comes second is told who was first, and nobody waits for the dead."""
+"""One writer a folder: a second one is refused, and a dead one blocks nobody."""
 
 import contextlib
 import json

@@ -253,7 +253,7 @@ def test_a_vehicle_that_waits_to_be_called_is_called(bench):
         vehicle.close()
 
 
-def told(capsys):
+def printed(capsys):
     return " ".join(capsys.readouterr().err.split())
 
 
@@ -271,10 +271,10 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
 
     monkeypatch.setattr(commanded, "fly_link", lambda companion, link: None)
     assert cli.main([*asked, "--confirm"]) == 1
-    assert "no vehicle sent a state (ODOMETRY) and a depth image within 30 s" in told(capsys)
+    assert "no vehicle sent a state (ODOMETRY) and a depth image within 30 s" in printed(capsys)
     monkeypatch.setattr(commanded, "fly_link", refused)
     assert cli.main([*asked, "--confirm"]) == 1
-    assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in told(capsys)
+    assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in printed(capsys)
 
 
 def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
@@ -289,10 +289,10 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     monkeypatch.setattr(commanded, "fly_link", ended)
     monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
     assert cli.main(asked) == 1
-    assert "the operator" in told(capsys) and len(sent) == 1 and b"the operator" in sent[0]
+    assert "the operator" in printed(capsys) and len(sent) == 1 and b"the operator" in sent[0]
     (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
     assert cli.main(asked) == 2
-    assert "holds an earlier flight" in told(capsys)
+    assert "holds an earlier flight" in printed(capsys)
 
 
 def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first(
@@ -320,7 +320,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
     monkeypatch.setattr(commanded, "load_in_manner", lambda *_: fast)
     assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
-    assert "decides at 2000 Hz" in told(capsys) and not (tmp_path / "b").exists()
+    assert "decides at 2000 Hz" in printed(capsys) and not (tmp_path / "b").exists()
 
 
 def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsys):
@@ -331,7 +331,7 @@ def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsy
     shutil.copytree(yard.parent, tmp_path / "other")
     both = f"{yard},{tmp_path / 'other' / 'yard.toml'}"
     assert cli.main(["fly", "--track", both, "--out", str(tmp_path / "out")]) == 2
-    assert "more than one is called 'yard'" in told(capsys)
+    assert "more than one is called 'yard'" in printed(capsys)
 
 
 @pytest.mark.slow
