@@ -125,7 +125,7 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
     train_in_folder([counting(2)], run_in(tmp_path), FRESH, Console())
-    with pytest.raises(ValueError, match=r"another run \(seed is 0 there, 9 here\); repeat its options"):
+    with pytest.raises(ValueError, match=r"another run \(seed is 0 there, 9 here\); repeat"):
         train_in_folder([counting(2)], run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
     changed = replace(CONFIG, loss=replace(CONFIG.loss, progress=9.0))
     with pytest.raises(ValueError, match=r"\(loss\.progress is 1\.2 there, 9\.0 here\)"):
