@@ -55,6 +55,8 @@ with contextlib.redirect_stdout(io.StringIO()):  # its import prints what option
     from mujoco import mjx
 
 
+PRECISION = "highest"
+"""Of products of matrices: accelerators round to fewer bits by default, and a rotation is one."""
 FARTHEST_M = 1000.0
 """Largest coordinate, at which a float32's resolution is 0.06 mm [m]."""
 
@@ -152,9 +154,10 @@ class MjxWorld:
         # A copy: on a CPU JAX may go on looking at the array it is given.
         on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
-        self._state = self._start(
-            self._state, jnp.array(qpos), jnp.array(started), noise, *on_device
-        )
+        with jax.default_matmul_precision(PRECISION):
+            self._state = self._start(
+                self._state, jnp.array(qpos), jnp.array(started), noise, *on_device
+            )
 
     @functools.partial(jax.jit, static_argnums=0)
     def _start(
@@ -209,7 +212,8 @@ class MjxWorld:
         """Return the current view."""
         assert self._on_device is not None
         course, scene = self._on_device
-        seen = self._view(self._state, course, scene)
+        with jax.default_matmul_precision(PRECISION):
+            seen = self._view(self._state, course, scene)
         return View(*(np.asarray(part, np.float64) for part in seen))
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -230,10 +234,11 @@ class MjxWorld:
             pairs = zip(first.tolist(), self._noise, strict=True)
             noise = np.stack([draws.at(step, most) for step, draws in pairs], axis=1)
             noise = noise.astype(np.float32)
-        self._state, rows = self._fly(
-            self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,
-            *self._on_device, most, record,
-        )  # fmt: skip
+        with jax.default_matmul_precision(PRECISION):
+            self._state, rows = self._fly(
+                self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,
+                *self._on_device, most, record,
+            )  # fmt: skip
         if not record:
             return []
         each = [jax.tree.map(np.asarray, part) for part in rows]

@@ -13,6 +13,7 @@ EXPERIMENTS: dict[str, str] = {
     "ablation": "trainings with the vector field and without it, flown on unseen worlds",
     "schemes": "PPO, our method, and it without the field, measured as they learn",
     "faults": "faults of a log's interface put into good logs: how many are named, by kind",
+    "gpu": "training and judging on an accelerator: speed, memory, and the CPU's outcomes",
     "simulators": "the shipped policies on the same trials in every simulator",
 }
 """Name -> one-line summary; NAME lives in suite/experiments/NAME.py."""

@@ -136,7 +136,9 @@ def make_shards(
         def one(shard: int) -> Shard:
             part = jax.tree.map(lambda leaf: leaf[shard * size : (shard + 1) * size], worlds)
             given = (params, hidden, iteration, part)
-            found = computed(*jax.device_put(given, devices[shard % len(devices)]))
+            # Accelerators use fewer bits by default, which are too few for a rotation.
+            with jax.default_matmul_precision("highest"):
+                found = computed(*jax.device_put(given, devices[shard % len(devices)]))
             return jax.block_until_ready(jax.device_put(found, devices[0]))
 
         # Threads that come to a program at once would each compile it.

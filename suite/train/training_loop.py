@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +31,7 @@ from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
 from suite.common.stages import Estimate, announce, differences, first_of
+from suite.train.ahead import WorldsAhead
 from suite.train.worlds import Worlds
 from tracks.common.files import recover_folder
 from tracks.common.work.threads import threads
@@ -151,7 +151,7 @@ def _iterate(
     with (
         console.progress("training", total, begun=first) as show,
         _Recorder(run, watch, total) as recorder,
-        ThreadPoolExecutor(1) as ahead,
+        WorldsAhead() as ahead,
     ):
         recorder.last = (next(method for method in phases if first <= method.end), state)
         if _is_missing(watch, run.folder, first, total):
@@ -170,17 +170,14 @@ def _iterate_phase(
     state: Any,
     recorder: _Recorder,
     show: Callable[[int, str], None],
-    ahead: ThreadPoolExecutor,
+    ahead: WorldsAhead,
 ) -> Any:
     first = int(state.iteration)
-    update, worlds = method.make_update(), method.worlds(first)
-    for iteration in range(first, method.end):
-        started = time.monotonic()
+    update = method.make_update()
+    started = time.monotonic()
+    for iteration, worlds in ahead.worlds(method.worlds, first, method.end):
         with _others_there(iteration, recorder.run.folder):
-            # The update waits for the devices: prepare the next worlds meanwhile.
-            following = ahead.submit(method.worlds, iteration + 1)
             state, numbers = update(state, worlds)
-            worlds = following.result()
             row = {key: float(value) for key, value in numbers.items()}
         _check_finite(iteration, row, recorder.run.folder)
         seconds = time.monotonic() - started
@@ -190,6 +187,7 @@ def _iterate_phase(
         row = {"iteration": iteration, **row, "steps_per_s": round(speed), **clock}
         recorder.add(method, state, row)
         show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
+        started = time.monotonic()
     return state
 
 

@@ -180,3 +180,25 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
             _percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))
     _legend(figure, upper[0])
     return png(figure)
+
+
+TRAINED = {"gates": ("Gates a rollout", 1), "collided": ("Collided [%]", 100),
+           "speed": ("Mean speed [m/s]", 1)}  # fmt: skip
+"""Numbers of a training's curve with their titles and scales."""
+
+
+def training_chart(rows: Sequence[Mapping[str, float]]) -> bytes:
+    """Return one training's curve, a column a number; a dot is the mean of up to 1 % of it."""
+    figure = Figure(figsize=(10.4, 3.0), layout="constrained")
+    size = max(1, len(rows) // 100)
+    groups = [rows[k : k + size] for k in range(0, len(rows), size)]
+    at = [np.mean([row["iteration"] for row in group]) for group in groups]
+    for axes, (name, (title, scale)) in zip(
+        figure.subplots(1, len(TRAINED)), TRAINED.items(), strict=True
+    ):
+        axes.plot(at, [scale * np.mean([row[name] for row in group]) for group in groups], ".",
+                  ms=4, color=LINES[0])  # fmt: skip
+        axes.set_xlabel("gradient steps", fontsize=9)
+        axes.set_ylim(bottom=0)
+        titled(axes, title)
+    return png(figure)

@@ -49,7 +49,7 @@ def train_ppo(
         end=config.iterations,
         spec=config.spec,
         frames=config.episode.batch * config.episode.steps,
-        worlds=lambda iteration: sample_worlds(shared, iteration),
+        worlds=functools.partial(sample_worlds, shared),
         make_update=lambda: make_update(config),
         note=functools.partial(flight_note, "reward"),
     )

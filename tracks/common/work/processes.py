@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class _Process:
         before = set(multiprocessing.active_children())
         # Spawned, as threads of JAX and MuJoCo do not survive a fork.
         context = multiprocessing.get_context("spawn")
-        self.pool = ProcessPoolExecutor(1, context, _start, (self._cores,))
+        self.pool = ProcessPoolExecutor(1, context, become_worker, (self._cores,))
         self.pool.submit(usable_cores)  # starts it
         self._processes = set(multiprocessing.active_children()) - before
 
@@ -161,8 +161,12 @@ def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
         return pack(failure(error)), False
 
 
-def _start(cores: list[int]) -> None:
-    """Make this process a worker."""
+def become_worker(cores: Sequence[int] = ()) -> None:
+    """Make this process, started by another, one that works for it and ends with it.
+
+    Args:
+        cores: which it may use; none: all.
+    """
     # A keyboard interrupt reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:

@@ -1,0 +1,408 @@
+"""Training and judging on an accelerator: speed, memory, a short training, the CPU's outcomes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from eval.judging.judge import JudgeOptions, fly
+from eval.judging.statistics import paired_success, wilson
+from eval.judging.tables import percent
+from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import Vehicle
+from eval.worlds.trial import Rules, TrialResult, TrialSpec
+from policies.policy import load_policy
+from suite.common.console import Console
+from suite.common.curve import read
+from suite.common.report import Picture
+from suite.experiments.pages.charts import training_chart
+from suite.experiments.pages.document import Made
+from suite.experiments.study import judging
+from suite.experiments.study.cache import Place
+from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
+from suite.judging.flying import default_policy
+from suite.train.config import TrainConfig
+from suite.train.gradient import make_gradient
+from suite.train.overrides import phase_configs, without_quadrotor
+from suite.train.recipes import named_recipe, with_iterations
+from suite.train.run import train
+from suite.train.update import make_update, start_state
+from suite.train.worlds import Worlds, sample_worlds
+from tracks.common.grid import Grid, table
+from tracks.common.work.processes import become_worker
+from tracks.families import JUDGED
+from tracks.input.ranges import Range, Seed, Trials
+
+LEVELS = (0, 3, 6, 9)
+"""That the trained policy and the comparison with the CPU fly."""
+SAMPLED, COUNTED = 128, 8
+"""Different worlds of a speed measurement, repeated until there are as many as asked for; and
+worlds whose operations are counted."""
+MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
+"""What trains, by key."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Measure training and judging on this machine's accelerator, or on its CPU without one."""
+
+    worlds: tuple[Annotated[int, Range(1, 10**6)], ...] = (256, 1024, 4096)
+    """Worlds at once whose speed is measured, in the trainer and in the judge."""
+    seconds: Annotated[float, Range(0.1, 36000.0)] = 120.0
+    """Of the short training, about [s]."""
+    train_worlds: Annotated[int, Range(1, 10**6)] = 1024
+    """Worlds per gradient step of the short training, which follows the recipe gpu; one of
+    --worlds."""
+    trials: Trials = 60
+    """Judged trials of the trained policy, over three tracks and levels 0, 3, 6 and 9."""
+    paired_trials: Trials = 200
+    """Trials that the shipped policy flies in mjx on the accelerator and on the CPU."""
+    timed_s: Annotated[float, Range(0.1, 60.0)] = 2.0
+    """Of a trial in the judge's speed measurement [s]."""
+    matrix: Annotated[int, Range(8, 65536)] = 8192
+    """Side of the matrices whose product shows what the device reaches at best."""
+    seed: Seed = 0
+    """Of the training, and of the first judged trial."""
+
+
+class Row(NamedTuple):
+    """The trainer's speed on so many worlds."""
+
+    model: str
+    """A key of MODELS."""
+    worlds: int
+    """In a gradient step."""
+    seconds: float
+    """Of a gradient step [s]."""
+    operations: float
+    """Of a gradient step, floating-point [1]."""
+    memory_bytes: int | None
+    """Most that the device has held since the command began; None where it does not say."""
+
+
+def document(config: Config, place: Place, console: Console) -> Made:
+    """Return tables, a chart and numbers.
+
+    Raises:
+        ValueError: where the short training's number of worlds is none whose speed is measured.
+    """
+    if config.train_worlds not in config.worlds:
+        raise ValueError(
+            f"--train-worlds is {config.train_worlds}, allowed are those of --worlds: "
+            f"{' '.join(map(str, config.worlds))}"
+        )
+    device, vehicle = jax.devices()[0], load_vehicle("reference")
+    best = multiplying_rate(config.matrix)
+    console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
+    # The CPU's flights are flown by a process of their own beside all else.
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawned, become_worker) as beside:
+        theirs = beside.submit(flown_on_cpu, config, vehicle)
+        programs = compiled(config, vehicle, console)
+        trainer = trainer_speeds(config, programs.updates, console)
+        judge = [judge_speed(config, vehicle, worlds, console) for worlds in config.worlds]
+        pairs = compared(programs.here, theirs.result(), console)
+    step_s = {row.worlds: row.seconds for row in trainer if row.model == "quadrotor"}
+    short = short_training(config, step_s[config.train_worlds], place, console)
+    facts = {
+        "device": f"{len(jax.devices())} x {device.device_kind}",
+        "a product of matrices": f"{best / 1e12:.1f} TFLOP/s, float32 unrounded",
+        "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions a world",
+        "compiling": f"{programs.seconds:.0f} s, all programs at once",
+    }
+    curve = Picture(training_chart(short["curve"]), "The short training's curve")
+    parts: dict[str, Sequence[Grid | Picture]] = {
+        "Trainer": [_trainer_grid(trainer, _steps(config), best)],
+        "Judge": [_judge_grid(judge)],
+        "The same trials on the CPU": [_pairs_grid(pairs)],
+        "A short training": [curve, _training_grid(short)],
+    }
+    numbers = {
+        "device": device.device_kind,
+        "multiplying_rate": best,
+        "compile_s": programs.seconds,
+        "trainer": [row._asdict() for row in trainer],
+        "judge": judge,
+        "paired": pairs,
+        "training": short,
+    }
+    return Made(facts, parts, numbers)
+
+
+def recipe(config: Config, worlds: int) -> TrainConfig:
+    """Return the recipe gpu for so many worlds in one shard."""
+    base = named_recipe("gpu")
+    episode = replace(base.episode, batch=worlds, shards=1)
+    return replace(base, episode=episode, seed=config.seed)
+
+
+def last_phase(config: Config, model: str, worlds: int) -> TrainConfig:
+    """Return the settings of the recipe's last phase for so many worlds of a model."""
+    phase = phase_configs(recipe(config, worlds))[-1]
+    return without_quadrotor(phase) if model == "point" else phase
+
+
+def _steps(config: Config) -> int:
+    return last_phase(config, "quadrotor", 1).episode.steps
+
+
+class Update(NamedTuple):
+    """A gradient step that has been compiled, on worlds of its own."""
+
+    phase: TrainConfig
+    call: Callable[[], Any]
+
+
+class Compiled(NamedTuple):
+    """What compiling all programs gives."""
+
+    updates: Mapping[tuple[str, int], Update]
+    """By model and number of worlds."""
+    here: list[TrialResult]
+    """The trials that are compared with the CPU's."""
+    seconds: float
+    """How long it took [s]."""
+
+
+def compiled(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
+    """Run every program once, all at the same time, since most of that is compiling.
+
+    The short training's phases are among them: JAX keeps what is compiled, so that the training
+    need not compile it again.
+    """
+    wanted = {
+        (model, worlds): last_phase(config, model, worlds)
+        for worlds in config.worlds
+        for model in MODELS
+    }
+    phases = phase_configs(recipe(config, config.train_worlds))
+    began = time.perf_counter()
+    with ThreadPoolExecutor(len(wanted) + len(phases) + len(config.worlds)) as pool:
+        judged = [pool.submit(_timed, config, vehicle, worlds) for worlds in config.worlds]
+        here = pool.submit(_flown, config, vehicle, "mjx")
+        others = [pool.submit(_update, phase) for phase in phases[:-1]]
+        updates = dict(zip(wanted, pool.map(_update, wanted.values()), strict=True))
+        for one in (*judged, *others):
+            one.result()
+        found = Compiled(updates, here.result(), time.perf_counter() - began)
+    console.say(f"every program compiled: {found.seconds:.0f} s")
+    return found
+
+
+def _update(phase: TrainConfig) -> Update:
+    """Return a gradient step of a phase, done once."""
+    update, worlds = make_update(phase), repeated(phase)
+    state = jax.device_put(start_state(phase), jax.devices()[0])
+    jax.block_until_ready(update(state, worlds))
+    return Update(phase, lambda: update(state, worlds))
+
+
+def repeated(config: TrainConfig) -> Worlds:
+    """Return the worlds of the first iteration, of which SAMPLED differ."""
+    batch = config.episode.batch
+    few = replace(config, episode=replace(config.episode, batch=min(batch, SAMPLED)))
+    found = sample_worlds(few, 0)
+    order = np.resize(np.arange(few.episode.batch), batch)
+    return jax.tree.map(lambda leaf: leaf[order], found)._replace(number=np.arange(batch))
+
+
+def trainer_speeds(
+    config: Config, updates: Mapping[tuple[str, int], Update], console: Console
+) -> list[Row]:
+    """Return the speed of each gradient step, few worlds first."""
+    each = {model: _operations_a_world(config, model) for model in MODELS}
+    rows = []
+    for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
+        seconds = best_time(update.call)
+        rows.append(Row(model, worlds, seconds, worlds * each[model], peak_memory()))
+        console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s a gradient step")
+    return rows
+
+
+def _operations_a_world(config: Config, model: str) -> float:
+    """Return the operations of a world's gradient."""
+    phase = last_phase(config, model, COUNTED)
+    gradient = make_gradient(phase)
+    given = (start_state(phase).params, repeated(phase), jax.random.key(0))
+    return count_operations(lambda p, w, k: gradient(p, w, k, None)[0], *given) / COUNTED
+
+
+def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console) -> dict[str, Any]:
+    """Return what the simulator mjx reaches with so many trials at once, tracks made anew."""
+    began = time.perf_counter()
+    results = _timed(config, vehicle, worlds)
+    seconds = time.perf_counter() - began
+    flown_s = sum(result.time_s for result in results)
+    console.say(f"judge, {worlds} trials at once: {seconds:.1f} s")
+    return {
+        "worlds": worlds,
+        "seconds": seconds,
+        "decisions_per_s": flown_s * load_policy(default_policy()).spec.rate_hz / seconds,
+        "flown_s_per_s": flown_s / seconds,
+        "memory_bytes": peak_memory(),
+    }
+
+
+def _timed(config: Config, vehicle: Vehicle, worlds: int) -> list[TrialResult]:
+    options = JudgeOptions(slots=worlds, workers=1, rules=Rules(time_limit_s=config.timed_s))
+    trials = _trials(worlds, config.seed)
+    return fly(load_policy(default_policy()), trials, vehicle, "mjx", options)
+
+
+def _trials(count: int, seed: int) -> list[TrialSpec]:
+    """Return trials over the three tracks and LEVELS in turn."""
+    cells = [(track, level) for track in JUDGED for level in LEVELS]
+    return [TrialSpec(*cells[k % len(cells)], seed + k // len(cells)) for k in range(count)]
+
+
+def _flown(config: Config, vehicle: Vehicle, world: str) -> list[TrialResult]:
+    options = JudgeOptions(slots=min(config.worlds), workers=1)
+    trials = _trials(config.paired_trials, config.seed)
+    return fly(load_policy(default_policy()), trials, vehicle, world, options)
+
+
+def flown_on_cpu(config: Config, vehicle: Vehicle) -> dict[str, list[TrialResult]]:
+    """Return the shipped policy's trials, flown on the CPU, by what flew them."""
+    jax.config.update("jax_platforms", "cpu")
+    return {f"{world} on the CPU": _flown(config, vehicle, world) for world in ("mjx", "mujoco")}
+
+
+def compared(
+    here: Sequence[TrialResult], theirs: Mapping[str, Sequence[TrialResult]], console: Console
+) -> dict[str, Any]:
+    """Return how alike the shipped policy's trials end on the accelerator and on the CPU."""
+    found = {}
+    for name, others in theirs.items():
+        won, lost = (np.array([r.success for r in rows]) for rows in (here, others))
+        found[name] = {
+            "trials": len(here),
+            "same_success": int((won == lost).sum()),
+            "same_ending": sum(a.ended_by == b.ended_by for a, b in zip(here, others, strict=True)),
+            "difference": paired_success(won, lost),
+        }
+        console.say(f"{found[name]['same_success']} of {len(here)} succeed or fail as in {name}")
+    return found
+
+
+def short_training(config: Config, step_s: float, place: Place, console: Console) -> dict[str, Any]:
+    """Train by the recipe gpu for about so many seconds, and judge what comes out.
+
+    Args:
+        config: of the experiment.
+        step_s: of a gradient step of the last phase, by which their number is chosen [s].
+        place: of the run, which is made anew: its time is a result.
+        console: where progress goes.
+    """
+    wanted = recipe(config, config.train_worlds)
+    phases = phase_configs(with_iterations(wanted, 1000))
+    mean = sum(p.optimizer.iterations * p.episode.steps for p in phases) / 1000
+    iterations = max(len(phases), round(config.seconds / step_s * _steps(config) / mean))
+    folder = place.cache / "gpu"
+    shutil.rmtree(folder, ignore_errors=True)
+    began = time.perf_counter()
+    outcome = train(with_iterations(wanted, iterations), folder, console)
+    seconds = time.perf_counter() - began
+    curve = read(folder)
+    warm = [row for row in curve if not row["cold"]] or curve
+    order = judging.Order(
+        judging.Setup(str(outcome.policy), load_vehicle("reference")),
+        _trials(config.trials, config.seed),
+    )
+    results = judging.flown({0: order}, place, console, "judging the short training")[0]
+    fast = [result.v_max for result in results if result.success]
+    return {
+        "worlds": config.train_worlds,
+        "iterations": iterations,
+        "seconds": seconds,
+        "decisions_per_s": float(np.median([row["steps_per_s"] for row in warm])),
+        "success": wilson(sum(result.success for result in results), len(results)),
+        "v_max": float(np.median(fast)) if fast else None,
+        "curve": [
+            {key: row[key] for key in ("iteration", "gates", "collided", "speed", "loss")}
+            for row in curve
+        ],
+    }
+
+
+def _gigabytes(size: int | None) -> str:
+    return "" if size is None else f"{size / 1e9:.1f}"
+
+
+def _trainer_grid(rows: Sequence[Row], steps: int, best: float) -> Grid:
+    lines = [
+        (
+            MODELS[row.model],
+            f"{row.worlds}",
+            f"{row.worlds * steps / row.seconds:,.0f}",
+            f"{1e3 * row.seconds:,.0f}",
+            f"{row.operations / row.seconds / 1e12:.2f}",
+            f"{row.operations / row.seconds / best:.1%}",
+            _gigabytes(row.memory_bytes),
+        )
+        for row in rows
+    ]
+    headers = (
+        *("trains", "worlds", "decisions/s", "a gradient step [ms]", "TFLOP/s"),
+        *("share of the product's", "peak memory [GB]"),
+    )
+    return table(headers, lines)
+
+
+def _judge_grid(judged: Sequence[Mapping[str, Any]]) -> Grid:
+    lines = [
+        (
+            f"{row['worlds']}",
+            f"{row['decisions_per_s']:,.0f}",
+            f"{row['flown_s_per_s']:,.0f}",
+            f"{row['seconds']:.1f}",
+            _gigabytes(row["memory_bytes"]),
+        )
+        for row in judged
+    ]
+    headers = (
+        *("trials at once", "decisions/s", "seconds flown a second", "all of them [s]"),
+        "peak memory [GB]",
+    )
+    return table(headers, lines)
+
+
+def _pairs_grid(pairs: Mapping[str, Mapping[str, Any]]) -> Grid:
+    lines = [
+        (
+            name,
+            f"{found['trials']}",
+            f"{found['same_success']}",
+            f"{found['same_ending']}",
+            "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in found["difference"])),
+        )
+        for name, found in pairs.items()
+    ]
+    headers = (
+        *("compared with", "trials", "the same success", "the same ending"),
+        "success here minus there [points, 95 %]",
+    )
+    return table(headers, lines)
+
+
+def _training_grid(short: Mapping[str, Any]) -> Grid:
+    line = (
+        f"{short['worlds']}",
+        f"{short['iterations']}",
+        f"{short['seconds']:.0f}",
+        f"{short['decisions_per_s']:,.0f}",
+        percent(short["success"]),
+        "" if short["v_max"] is None else f"{short['v_max']:.1f}",
+    )
+    headers = (
+        *("worlds", "gradient steps", "time with compiling [s]", "decisions/s"),
+        *("success (95 %)", "v_max, median [m/s]"),
+    )
+    return table(headers, [line])

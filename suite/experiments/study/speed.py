@@ -1,0 +1,84 @@
+"""How fast a compiled program is, against how fast the device multiplies matrices."""
+
+from __future__ import annotations
+
+import math
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+REPEATS = 4
+"""Timed calls of a program, of which the fastest counts."""
+
+
+def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
+    """Return the seconds of the fastest of several calls, results awaited; it has been compiled."""
+    taken = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        taken.append(time.perf_counter() - began)
+    return min(taken)
+
+
+def count_operations(function: Callable[..., Any], *args: Any) -> float:
+    """Return about how many floating-point operations a call takes.
+
+    A product of matrices and a convolution count a multiplication and an addition per term, any
+    other operation one for every number of its result. Loops count as often as they run; of a loop
+    whose length is unknown one pass counts. (XLA's own count takes one pass of every loop.)
+    """
+    return _operations(jax.make_jaxpr(function)(*args).jaxpr)
+
+
+def _operations(jaxpr: Any) -> float:
+    return sum(_of_equation(equation) for equation in jaxpr.eqns)
+
+
+def _of_equation(equation: Any) -> float:
+    name, params = equation.primitive.name, equation.params
+    inner = [
+        getattr(part, "jaxpr", part)
+        for value in params.values()
+        for part in (value if isinstance(value, (tuple, list)) else (value,))
+        if hasattr(part, "eqns") or hasattr(getattr(part, "jaxpr", None), "eqns")
+    ]
+    if inner:
+        each = [_operations(part) for part in inner]
+        if name == "cond":
+            return max(each)
+        return params.get("length", 1) * sum(each)
+    size = sum(math.prod(out.aval.shape) for out in equation.outvars)
+    if name == "dot_general":
+        (contracted, _), _ = params["dimension_numbers"]
+        return 2.0 * size * math.prod(equation.invars[0].aval.shape[k] for k in contracted)
+    if name == "conv_general_dilated":
+        kernel = equation.invars[1].aval.shape
+        outputs = kernel[params["dimension_numbers"].rhs_spec[0]]
+        return 2.0 * size * math.prod(kernel) / outputs
+    return float(size)
+
+
+def multiplying_rate(size: int) -> float:
+    """Return the operations a second of a product of float32 matrices, unrounded [1/s].
+
+    This is what the device reaches at best where nothing is rounded to fewer bits.
+    """
+    matrix = jax.random.normal(jax.random.key(0), (size, size))
+    with jax.default_matmul_precision("highest"):
+        product = jax.jit(lambda a: a @ a)
+        jax.block_until_ready(product(matrix))
+        return 2.0 * size**3 / best_time(lambda: product(matrix))
+
+
+def peak_memory() -> int | None:
+    """Return the most bytes that the default device, or on a CPU this process, has held."""
+    if jax.default_backend() == "cpu":
+        unit = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    found = jax.devices()[0].memory_stats() or {}
+    return found.get("peak_bytes_in_use")
