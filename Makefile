@@ -1,5 +1,6 @@
 # make env    the environment in .venv, from requirements.lock
 # make race   fly a policy where the dynamics hide an effect, name it, train for it, fly again
+# make gpu    speed, a short training and the CPU's outcomes on this machine's GPU: docs/results/gpu.md
 # make test   lint, types and tests
 # make lint   ruff, pyright, and docs/reference against the code
 # make docs   the pages of docs/ as a site in site/, links checked
@@ -15,7 +16,7 @@ USABLE := import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] < (3,
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: env race test tests lint style types docs lock clean
+.PHONY: env race gpu test tests lint style types docs lock clean
 
 env: $(STAMP)
 
@@ -35,6 +36,9 @@ $(STAMP): requirements.lock pyproject.toml setup.py
 
 race: $(STAMP)
 	$(VENV)/bin/suite loop --hidden-vehicle examples/hidden.toml --policy race-paper --recipe quick --no-delta --workers $(JOBS) --out $(OUT)
+
+gpu: $(STAMP)
+	$(VENV)/bin/suite reproduce gpu --seconds 100 --out docs/results
 
 lint: style types
 

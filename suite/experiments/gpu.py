@@ -15,7 +15,6 @@ import numpy as np
 
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.statistics import paired_success, wilson
-from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
@@ -25,6 +24,13 @@ from suite.common.curve import read
 from suite.common.report import Picture
 from suite.experiments.pages.charts import training_chart
 from suite.experiments.pages.document import Made
+from suite.experiments.pages.gpu_tables import (
+    MODELS,
+    judge_grid,
+    pairs_grid,
+    trainer_grid,
+    training_grid,
+)
 from suite.experiments.study import judging
 from suite.experiments.study.cache import Place
 from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
@@ -36,7 +42,7 @@ from suite.train.recipes import named_recipe, with_iterations
 from suite.train.run import train
 from suite.train.update import make_update, start_state
 from suite.train.worlds import Worlds, sample_worlds
-from tracks.common.grid import Grid, table
+from tracks.common.grid import Grid
 from tracks.common.work.processes import become_worker
 from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
@@ -46,8 +52,6 @@ LEVELS = (0, 3, 6, 9)
 SAMPLED, COUNTED = 128, 8
 """Different worlds of a speed measurement, repeated until there are as many as asked for; and
 worlds whose operations are counted."""
-MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
-"""What trains, by key."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Config:
 
     worlds: tuple[Annotated[int, Range(1, 10**6)], ...] = (256, 1024, 4096)
     """Worlds at once whose speed is measured, in the trainer and in the judge."""
-    seconds: Annotated[float, Range(0.1, 36000.0)] = 120.0
+    seconds: Annotated[float, Range(0.1, 36000.0)] = 100.0
     """Of the short training, about [s]."""
     train_worlds: Annotated[int, Range(1, 10**6)] = 1024
     """Worlds per gradient step of the short training, which follows the recipe gpu; one of
@@ -84,8 +88,6 @@ class Row(NamedTuple):
     """Of a gradient step [s]."""
     operations: float
     """Of a gradient step, floating-point [1]."""
-    memory_bytes: int | None
-    """Most that the device has held since the command began; None where it does not say."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -112,23 +114,26 @@ def document(config: Config, place: Place, console: Console) -> Made:
         pairs = compared(programs.here, theirs.result(), console)
     step_s = {row.worlds: row.seconds for row in trainer if row.model == "quadrotor"}
     short = short_training(config, step_s[config.train_worlds], place, console)
+    memory = peak_memory()
     facts = {
         "device": f"{len(jax.devices())} x {device.device_kind}",
         "a product of matrices": f"{best / 1e12:.1f} TFLOP/s, float32 unrounded",
         "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions a world",
+        "most memory held": "unknown" if memory is None else f"{memory / 1e9:.1f} GB",
         "compiling": f"{programs.seconds:.0f} s, all programs at once",
     }
     curve = Picture(training_chart(short["curve"]), "The short training's curve")
     parts: dict[str, Sequence[Grid | Picture]] = {
-        "Trainer": [_trainer_grid(trainer, _steps(config), best)],
-        "Judge": [_judge_grid(judge)],
-        "The same trials on the CPU": [_pairs_grid(pairs)],
-        "A short training": [curve, _training_grid(short)],
+        "Trainer": [trainer_grid([row._asdict() for row in trainer], _steps(config), best)],
+        "Judge": [judge_grid(judge)],
+        "The same trials on the CPU": [pairs_grid(pairs)],
+        "A short training": [curve, training_grid(short)],
     }
     numbers = {
         "device": device.device_kind,
         "multiplying_rate": best,
         "compile_s": programs.seconds,
+        "memory_bytes": memory,
         "trainer": [row._asdict() for row in trainer],
         "judge": judge,
         "paired": pairs,
@@ -222,7 +227,7 @@ def trainer_speeds(
     rows = []
     for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
         seconds = best_time(update.call)
-        rows.append(Row(model, worlds, seconds, worlds * each[model], peak_memory()))
+        rows.append(Row(model, worlds, seconds, worlds * each[model]))
         console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s a gradient step")
     return rows
 
@@ -247,7 +252,6 @@ def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console)
         "seconds": seconds,
         "decisions_per_s": flown_s * load_policy(default_policy()).spec.rate_hz / seconds,
         "flown_s_per_s": flown_s / seconds,
-        "memory_bytes": peak_memory(),
     }
 
 
@@ -330,79 +334,3 @@ def short_training(config: Config, step_s: float, place: Place, console: Console
             for row in curve
         ],
     }
-
-
-def _gigabytes(size: int | None) -> str:
-    return "" if size is None else f"{size / 1e9:.1f}"
-
-
-def _trainer_grid(rows: Sequence[Row], steps: int, best: float) -> Grid:
-    lines = [
-        (
-            MODELS[row.model],
-            f"{row.worlds}",
-            f"{row.worlds * steps / row.seconds:,.0f}",
-            f"{1e3 * row.seconds:,.0f}",
-            f"{row.operations / row.seconds / 1e12:.2f}",
-            f"{row.operations / row.seconds / best:.1%}",
-            _gigabytes(row.memory_bytes),
-        )
-        for row in rows
-    ]
-    headers = (
-        *("trains", "worlds", "decisions/s", "a gradient step [ms]", "TFLOP/s"),
-        *("share of the product's", "peak memory [GB]"),
-    )
-    return table(headers, lines)
-
-
-def _judge_grid(judged: Sequence[Mapping[str, Any]]) -> Grid:
-    lines = [
-        (
-            f"{row['worlds']}",
-            f"{row['decisions_per_s']:,.0f}",
-            f"{row['flown_s_per_s']:,.0f}",
-            f"{row['seconds']:.1f}",
-            _gigabytes(row["memory_bytes"]),
-        )
-        for row in judged
-    ]
-    headers = (
-        *("trials at once", "decisions/s", "seconds flown a second", "all of them [s]"),
-        "peak memory [GB]",
-    )
-    return table(headers, lines)
-
-
-def _pairs_grid(pairs: Mapping[str, Mapping[str, Any]]) -> Grid:
-    lines = [
-        (
-            name,
-            f"{found['trials']}",
-            f"{found['same_success']}",
-            f"{found['same_ending']}",
-            "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in found["difference"])),
-        )
-        for name, found in pairs.items()
-    ]
-    headers = (
-        *("compared with", "trials", "the same success", "the same ending"),
-        "success here minus there [points, 95 %]",
-    )
-    return table(headers, lines)
-
-
-def _training_grid(short: Mapping[str, Any]) -> Grid:
-    line = (
-        f"{short['worlds']}",
-        f"{short['iterations']}",
-        f"{short['seconds']:.0f}",
-        f"{short['decisions_per_s']:,.0f}",
-        percent(short["success"]),
-        "" if short["v_max"] is None else f"{short['v_max']:.1f}",
-    )
-    headers = (
-        *("worlds", "gradient steps", "time with compiling [s]", "decisions/s"),
-        *("success (95 %)", "v_max, median [m/s]"),
-    )
-    return table(headers, [line])

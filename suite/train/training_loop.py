@@ -31,8 +31,7 @@ from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
 from suite.common.stages import Estimate, announce, differences, first_of
-from suite.train.ahead import WorldsAhead
-from suite.train.worlds import Worlds
+from suite.train.worlds import Worlds, WorldsAhead
 from tracks.common.files import recover_folder
 from tracks.common.work.threads import threads
 

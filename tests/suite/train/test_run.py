@@ -62,10 +62,10 @@ def assert_same_run(folder, whole):
 
 
 def stop_at(monkeypatch, iteration, error=KeyboardInterrupt):
-    """Let `error` come while iteration - 1 is computed; call the result to let it pass again."""
+    """Let `error` come before iteration - 1 is computed; call the result to let it pass again."""
 
     def worlds(config, i):
-        if i == iteration:
+        if i == iteration - 1:
             raise error
         return boxes_worlds(config, i)
 

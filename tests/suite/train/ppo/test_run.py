@@ -52,7 +52,7 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
     assert all(np.any(policy.params[name] != np.array(value)) for name, value in fresh.items())
 
     def worlds(config, iteration):
-        if iteration == 2:
+        if iteration == 1:
             raise KeyboardInterrupt
         return boxes_worlds(config, iteration)
 
