@@ -30,7 +30,7 @@ IMPORTERS = (
 AREAS = (
     ("suite/train/losses.py", "suite/train/test_losses"),
     ("tracks/geometry/field.py", "tracks/geometry/test_field"),
-    ("tracks/geometry/gates.py", "tracks/geometry tracks/families"),
+    ("tracks/geometry/gates.py", "tracks/families tracks/geometry"),
     ("eval/worlds/trial.py", "eval/worlds/test_trial eval/worlds/test_worlds"),
     ("eval/judging/ages.py", "eval/judging/test_ages"),
     ("eval/judging/guard.py", "eval/judging/test_guard eval/judging/test_actions"),

@@ -36,6 +36,8 @@ SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False
 HEAD = b"\xa3\x95\x80"
 MESSAGES = ("IMU", "ATT", "XKF1", "NKF1", "RATE", "CTUN", "RCOU", "ESC", "BAT", "PARM", "MSG")
+HELD = ("data_map", "filehandle")
+"""What a reader of pymavlink has open."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """Motors 1 to 4 of a quadrotor X (x forward, y left): front right, rear left, front left, rear
 right."""
@@ -117,8 +119,12 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         with (
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(io.StringIO()),
-            DFReader_binary(str(path)) as reader,
+            contextlib.ExitStack() as opened,
         ):
+            reader = DFReader_binary.__new__(DFReader_binary)
+            # Where a damaged file ends its constructor, it leaves the file open.
+            opened.callback(lambda: [vars(reader)[n].close() for n in HELD if n in vars(reader)])
+            DFReader_binary.__init__(reader, str(path))
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
         parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}

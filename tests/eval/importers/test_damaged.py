@@ -1,6 +1,7 @@
 """Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
 
 import io
+import os
 import struct
 import subprocess
 import sys
@@ -87,18 +88,18 @@ def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatc
     def fail(*args, **kwargs):
         raise KeyError("W\n\x1d\x1b[31m")
 
-    for module, name in (
-        (pyulog, "ULog"), (mcap.reader, "make_reader"), (pymavlink.DFReader, "DFReader_binary"),
-    ):  # fmt: skip
-        monkeypatch.setattr(module, name, fail)
+    monkeypatch.setattr(pyulog, "ULog", fail)
+    monkeypatch.setattr(mcap.reader, "make_reader", fail)
+    monkeypatch.setattr(pymavlink.DFReader.DFReader_binary, "init_clock", fail)
     path, flown = tmp_path / f"log.{ending}", known_flight.fly(np.arange(0.0, 1.2, 0.01))
     if ending == "bin":
         raw_logs.write_bin(path, flown)
     else:
         {"ulg": made.write_ulog, "mcap": made.write_mcap}[ending](path, span=(0, 1.2))
+    held = os.listdir("/proc/self/fd")
     with pytest.raises(FlightLogError, match="cannot be read .KeyError: ") as met:
         import_log(path)
-    assert str(met.value).isprintable()
+    assert str(met.value).isprintable() and len(os.listdir("/proc/self/fd")) == len(held)
 
 
 @pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])
