@@ -141,4 +141,5 @@ def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch)
     assert not small.trained and not (end / "train").exists(), "a given policy is not trained"
     assert (end / "given" / "policy" / WEIGHTS).read_bytes() == (given / WEIGHTS).read_bytes()
     one, two = (read_trials(run / "eval-before" / "trials.parquet") for run in (whole[0], end))
-    assert one == two, "as in the loop that trained it and was never stopped"
+    flown = [[row._replace(policy="") for row in rows] for rows in (one, two)]
+    assert flown[0] == flown[1], "as in the loop that trained it and was never stopped"
