@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.formats import betaflight
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
@@ -84,3 +85,20 @@ def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):
         log, _ = import_log(path, None, PARTIAL)
         assert log.partial == lacks
         np.testing.assert_allclose(log.rate_b, known_flight.fly(log.time_s).rate, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "unit", "volts"),
+    [
+        ([16.13, 16.02], "", [16.13, 16.02]),
+        ([1613.0, 1602.0], "", [16.13, 16.02]),
+        ([16.13, 16.02], "V", [16.13, 16.02]),
+        ([0.21, 0.22], "V", [0.21, 0.22]),
+        ([161.3, 160.2], "V", [16.13, 16.02]),
+        ([5.0, 4.0], "", [0.05, 0.04]),
+    ],
+)
+def test_a_voltage_is_in_volts_whatever_wrote_it(numbers, unit, volts):
+    """Whole numbers without a unit are in hundredths; others are volts, or ten times too much."""
+    read = np.array(numbers) * betaflight._VOLT[unit]
+    np.testing.assert_allclose(betaflight._volts(read, unit, True, []), volts)
