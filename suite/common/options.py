@@ -26,6 +26,8 @@ Advanced = Annotated[T, GROUP]
 """A rare option."""
 VALUES = {str: "STR", int: "INT", float: "FLOAT", Path: "PATH"}
 """Type -> what help calls a value of it."""
+NUMBERS = {int: "a whole number", float: "a number"}
+"""Types of numbers and what they are called."""
 SILENT = ("", "''", "None", "False")
 """Defaults that help does not print: its text says what happens without the option."""
 
@@ -131,6 +133,7 @@ def read_options(
     """
     registry = tyro.constructors.ConstructorRegistry()
     registry.struct_rule(_read)
+    registry.primitive_rule(_number)
     marks = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     with registry:
         if all_known:
@@ -169,6 +172,27 @@ def _read(
         return _built(command, {**values, **(vars(values[GROUP]) if rare else {})})
 
     return tyro.constructors.StructConstructorSpec(build, tuple(fields))
+
+
+def _number(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """Return how a number, or one that may be left out, is read; others are refused plainly."""
+    kinds = {_bare(kind) for kind in get_args(info.type) or (info.type,)} - {type(None)}
+    kind: Any = kinds.pop() if len(kinds) == 1 else None
+    if kind not in NUMBERS or get_origin(info.type) is tuple:
+        return None
+    wanted = NUMBERS[kind]
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"{words[0]!r} is not {wanted}") from None
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        1, VALUES[kind], read, lambda v: v is None or isinstance(v, kind), lambda v: [str(v)]
+    )
 
 
 def _built(command: Any, values: dict[str, Any]) -> Any:

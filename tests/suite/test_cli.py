@@ -88,6 +88,9 @@ def test_every_command_has_help_for_every_option(name, capsys):
         ("probe --sede 3", "--seed"),
         ("--json eval", "options come after a command: suite eval --json"),
         ("bench nothing", "unknown benchmark 'nothing'"),
+        ("eval --trials ten", "'ten' is not a whole number"),
+        ("train --iterations 1.5", "'1.5' is not a whole number"),
+        ("train --lr high", "'high' is not a number"),
     ],
 )
 def test_a_wrong_command_or_option_is_code_2(command, capsys, line, words):
