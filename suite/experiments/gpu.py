@@ -52,6 +52,8 @@ LEVELS = (0, 3, 6, 9)
 SAMPLED, COUNTED = 128, 8
 """Different worlds of a speed measurement, repeated until there are as many as asked for; and
 worlds whose operations are counted."""
+CPU_MOST = 256
+"""Most worlds that a CPU is measured with: more take it hours."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +96,18 @@ def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables, a chart and numbers.
 
     Raises:
-        ValueError: where the short training's number of worlds is none whose speed is measured.
+        ValueError: where the short training's number of worlds is none whose speed is measured,
+            and for too many worlds for a CPU.
     """
     if config.train_worlds not in config.worlds:
         raise ValueError(
             f"--train-worlds is {config.train_worlds}, allowed are those of --worlds: "
             f"{' '.join(map(str, config.worlds))}"
+        )
+    if jax.default_backend() == "cpu" and max(config.worlds) > CPU_MOST:
+        raise ValueError(
+            f"--worlds is {' '.join(map(str, config.worlds))}, but JAX finds no GPU here (see "
+            "suite info): install '.[cuda]', or measure the CPU with --worlds 64 --train-worlds 64"
         )
     device, vehicle = jax.devices()[0], load_vehicle("reference")
     best = multiplying_rate(config.matrix)

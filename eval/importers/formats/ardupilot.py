@@ -19,8 +19,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import traceback
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -123,7 +126,7 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         ):
             reader = DFReader_binary.__new__(DFReader_binary)
             # Where a damaged file ends its constructor, it leaves the file open.
-            opened.callback(lambda: [vars(reader)[n].close() for n in HELD if n in vars(reader)])
+            opened.push(partial(_close, reader))
             DFReader_binary.__init__(reader, str(path))
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
@@ -135,6 +138,15 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}
+
+
+def _close(reader: Any, kind: object, error: object, trace: TracebackType | None) -> None:
+    """Close what a reader has open, at the end of a context that may end with an error."""
+    # The frames of a failed constructor hold views of its map, which keep that from closing.
+    traceback.clear_frames(trace)
+    for name in HELD:
+        if name in vars(reader):
+            vars(reader)[name].close()
 
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Rows:

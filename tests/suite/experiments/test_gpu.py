@@ -47,6 +47,12 @@ def test_a_training_whose_speed_is_not_measured_is_refused(tmp_path, capsys):
     assert "--train-worlds is 6, allowed are those of --worlds: 4 8" in capsys.readouterr().err
 
 
+def test_thousands_of_worlds_without_a_gpu_are_refused_with_what_to_do(tmp_path, capsys):
+    assert reproduce(tmp_path, "gpu") == 2
+    said = capsys.readouterr().err
+    assert "JAX finds no GPU here" in said and "--worlds 64" in said
+
+
 def test_worlds_that_are_repeated_have_numbers_of_their_own(monkeypatch):
     monkeypatch.setattr(gpu, "SAMPLED", 2)
     phase = gpu.last_phase(gpu.Config(), "quadrotor", 5)
