@@ -27,6 +27,7 @@ def two_nodes(tmp_path_factory):
 
 def tens(table, piece):
     time.sleep(0.05)
+    time.sleep(0.05)  # else one node may do them all before the other has begun
     for item in piece:
         yield item, table[0] * item, os.getpid()
 
