@@ -56,7 +56,7 @@ class Thresholds:
     """Degree of that polynomial."""
     colour_degree: int = 3
     """Degree of the polynomial that is subtracted from 1 s before noise is modelled as coloured:
-    errors of the start state look like it."""
+    errors of the start state resemble coloured noise."""
     colour_gain: float = 3.0
     """Rise of the log-likelihood from which noise is modelled as coloured, not white [1]."""
     drift_gain: float = 3.0

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
@@ -43,15 +42,15 @@ from suite.train.run import train
 from suite.train.update import make_update, start_state
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.grid import Grid
-from tracks.common.work.processes import become_worker
+from tracks.common.work.processes import worker_pool
 from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
 """That the trained policy and the comparison with the CPU fly."""
 SAMPLED, COUNTED = 128, 8
-"""Different worlds of a speed measurement, repeated until there are as many as asked for; and
-worlds whose operations are counted."""
+"""Different worlds of a speed measurement, repeated up to its number of worlds; and worlds whose
+operations are counted."""
 CPU_MOST = 256
 """Most worlds that a CPU is measured with: more take it hours."""
 
@@ -112,16 +111,16 @@ def document(config: Config, place: Place, console: Console) -> Made:
     device, vehicle = jax.devices()[0], load_vehicle("reference")
     best = multiplying_rate(config.matrix)
     console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
-    # The CPU's flights are flown by a process of their own beside all else.
-    spawned = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, spawned, become_worker) as beside:
-        theirs = beside.submit(flown_on_cpu, config, vehicle)
+    # A process of its own flies on the CPU while this one keeps the accelerator busy.
+    with worker_pool(1) as cpu_process:
+        theirs = cpu_process.submit(flown_on_cpu, config, vehicle)
         programs = compiled(config, vehicle, console)
-        trainer = trainer_speeds(config, programs.updates, console)
+        rows = trainer_speeds(config, programs.updates, console)
         judge = [judge_speed(config, vehicle, worlds, console) for worlds in config.worlds]
         pairs = compared(programs.here, theirs.result(), console)
-    step_s = {row.worlds: row.seconds for row in trainer if row.model == "quadrotor"}
-    short = short_training(config, step_s[config.train_worlds], place, console)
+    step_s = {row.worlds: row.seconds for row in rows if row.model == "quadrotor"}
+    short = short_training(config, vehicle, step_s[config.train_worlds], place, console)
+    trainer = [row._asdict() for row in rows]
     memory = peak_memory()
     facts = {
         "device": f"{len(jax.devices())} x {device.device_kind}",
@@ -132,7 +131,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     }
     curve = Picture(training_chart(short["curve"]), "The short training's curve")
     parts: dict[str, Sequence[Grid | Picture]] = {
-        "Trainer": [trainer_grid([row._asdict() for row in trainer], _steps(config), best)],
+        "Trainer": [trainer_grid(trainer, _steps(config), best)],
         "Judge": [judge_grid(judge)],
         "The same trials on the CPU": [pairs_grid(pairs)],
         "A short training": [curve, training_grid(short)],
@@ -142,7 +141,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "multiplying_rate": best,
         "compile_s": programs.seconds,
         "memory_bytes": memory,
-        "trainer": [row._asdict() for row in trainer],
+        "trainer": trainer,
         "judge": judge,
         "paired": pairs,
         "training": short,
@@ -304,11 +303,14 @@ def compared(
     return found
 
 
-def short_training(config: Config, step_s: float, place: Place, console: Console) -> dict[str, Any]:
+def short_training(
+    config: Config, vehicle: Vehicle, step_s: float, place: Place, console: Console
+) -> dict[str, Any]:
     """Train by the recipe gpu for about so many seconds, and judge what comes out.
 
     Args:
         config: of the experiment.
+        vehicle: that the trained policy flies.
         step_s: of a gradient step of the last phase, by which their number is chosen [s].
         place: of the run, which is made anew: its time is a result.
         console: where progress goes.
@@ -325,7 +327,7 @@ def short_training(config: Config, step_s: float, place: Place, console: Console
     curve = read(folder)
     warm = [row for row in curve if not row["cold"]] or curve
     order = judging.Order(
-        judging.Setup(str(outcome.policy), load_vehicle("reference")),
+        judging.Setup(str(outcome.policy), vehicle),
         _trials(config.trials, config.seed),
     )
     results = judging.flown({0: order}, place, console, "judging the short training")[0]

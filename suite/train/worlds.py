@@ -6,10 +6,9 @@ and those of the next iterations are sampled while the devices compute.
 
 from __future__ import annotations
 
-import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from itertools import islice
 from typing import NamedTuple
 
@@ -23,8 +22,7 @@ from suite.train.config import TrainConfig
 from suite.train.dynamics import interface as dynamics
 from suite.train.dynamics import point_mass
 from tracks.common.work import usable_cores
-from tracks.common.work.processes import become_worker
-from tracks.common.work.travel import let_views_travel
+from tracks.common.work.processes import worker_pool
 from tracks.families import MAX_COUNTS, random_track
 from tracks.families.random import Mix
 from tracks.geometry.cull import Bounds, bounds
@@ -250,12 +248,8 @@ class WorldsAhead:
         self._depth = 1 if jax.default_backend() == "cpu" else max(2, usable_cores() - 1)
 
     def __enter__(self) -> WorldsAhead:
-        self._pool: Executor = ThreadPoolExecutor(1)
-        if self._depth > 1:
-            let_views_travel()
-            # A fork would have a copy of JAX whose threads are gone.
-            spawned = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._depth, spawned, become_worker)
+        alone = self._depth == 1
+        self._pool: Executor = ThreadPoolExecutor(1) if alone else worker_pool(self._depth)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -18,7 +18,15 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from tracks.common.work.threads import core_shares, usable_cores
-from tracks.common.work.travel import Failure, WorkerDied, failure, pack, raised, unpack
+from tracks.common.work.travel import (
+    Failure,
+    WorkerDied,
+    failure,
+    let_views_travel,
+    pack,
+    raised,
+    unpack,
+)
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -49,9 +57,7 @@ class _Process:
     def begin(self) -> None:
         """Start or restart the process."""
         before = set(multiprocessing.active_children())
-        # Spawned, as threads of JAX and MuJoCo do not survive a fork.
-        context = multiprocessing.get_context("spawn")
-        self.pool = ProcessPoolExecutor(1, context, become_worker, (self._cores,))
+        self.pool = worker_pool(1, self._cores)
         self.pool.submit(usable_cores)  # starts it
         self._processes = set(multiprocessing.active_children()) - before
 
@@ -161,12 +167,21 @@ def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
         return pack(failure(error)), False
 
 
-def become_worker(cores: Sequence[int] = ()) -> None:
-    """Make this process, started by another, one that works for it and ends with it.
+def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecutor:
+    """Return processes that leave keyboard interrupts to this one and end with it.
 
     Args:
-        cores: which it may use; none: all.
+        processes: how many.
+        cores: which each may use; none: all.
     """
+    let_views_travel()
+    # Spawned, as threads of JAX and MuJoCo do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(processes, context, _become_worker, (cores,))
+
+
+def _become_worker(cores: Sequence[int]) -> None:
+    """Make this process a worker."""
     # A keyboard interrupt reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:
