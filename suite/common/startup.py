@@ -29,6 +29,8 @@ SWITCHES = (
     "JAX_DISABLE_MOST_OPTIMIZATIONS",
 )
 """Those for people who look for a mistake; 0 or 1."""
+PRECISE = ("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+"""Unrounded float32: accelerators multiply with fewer bits by default, too few for a rotation."""
 UNKEPT = tuple(f"Error {what} persistent compilation cache" for what in ("reading", "writing"))
 """Beginnings of what JAX says where it cannot keep a program: it compiles that anew."""
 
@@ -98,7 +100,8 @@ def check_names(args: Iterable[str]) -> None:
 def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
     """Set aside variables of JAX that might change what is computed or end the command, in place.
 
-    JAX has a hundred of them, so those are listed that do not.
+    JAX has a hundred of them, so those are listed that do not. Products of matrices are computed
+    in full precision.
 
     Returns:
         Their names.
@@ -106,10 +109,15 @@ def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
     values = os.environ if environment is None else environment
     known = ("0", "1", "true", "false")
     fine = {name for name in SWITCHES if values.get(name, "0").lower() in known}
-    found = [name for name, value in values.items() if name.startswith("JAX_") and value]
+    found = [
+        name
+        for name, value in values.items()
+        if name.startswith("JAX_") and value and (name, value) != PRECISE
+    ]
     aside = [name for name in found if name not in fine and not name.startswith(KEPT)]
     for name in aside:
         del values[name]
+    values.update([PRECISE])
     return sorted(aside)
 
 

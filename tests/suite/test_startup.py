@@ -146,7 +146,10 @@ def test_variables_that_change_results_are_set_aside(monkeypatch, capsys):
     kept = {"JAX_PLATFORMS": "cpu", "JAX_DISABLE_JIT": "", "JAX_DEBUG_NANS": "True", "HOME": "/"}
     aside = {"JAX_ENABLE_X64": "1", "JAX_DEBUG_INFS": "perhaps", "JAX_TRANSFER_GUARD": "disallow"}
     own = kept | aside
-    assert startup.pin(own) == sorted(aside) and own == kept
+    full = {"JAX_DEFAULT_MATMUL_PRECISION": "highest"}
+    assert startup.pin(own) == sorted(aside) and own == kept | full
+    assert startup.pin(own) == [] and own == kept | full, "a process of a command finds its own"
+    assert startup.pin(own | {"JAX_DEFAULT_MATMUL_PRECISION": "bfloat16"}) == list(full)
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     assert cli.main(["effects"]) == 0
     assert "JAX_ENABLE_X64 of the environment is set aside" in capsys.readouterr().err
