@@ -44,8 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _output_fails()
         return FAILED
     except Exception as error:
-        if _output_fails() and isinstance(error, OSError) and error.filename is None:
-            error.filename = "standard output"
+        _output_fails()
         known = explain(error)
         if known is None:
             traceback.print_exc()
@@ -133,6 +132,7 @@ def _run(name: str, args: list[str]) -> int:
     for note in notes:
         _complain(note)
     keep_compiled()
+    os.environ["MPLBACKEND"] = "agg"  # charts become files; a notebook's backend may be missing
     set_threads()
     one_thread_a_product()
     try:

@@ -1,7 +1,8 @@
 """Odd inputs of every kind: each is used, or refused in a line; no traceback, no wait.
 
 At a small size with all tests; `pytest -m slow tests/test_fuzz.py` tries 1,000 of each kind of our
-own files and 10,000 of each foreign format, in parts that draw from seeds of their own.
+own files and 10,000 of each foreign format and of sensors files, in parts that draw from seeds of
+their own.
 """
 
 import json
@@ -51,10 +52,10 @@ FOREIGN = (
 )
 """Formats that other programs write, or that others hand over."""
 EACH, PARTS_FOREIGN = 1000, 10
-"""Inputs of each kind at full size, and how many times as many of a foreign one."""
+"""Inputs of each kind at full size, and how many times as many of foreign and sensors files."""
 FULL = [
-    *((kind, 0) for kind in KINDS),
-    *((kind, part) for kind in FOREIGN for part in range(PARTS_FOREIGN)),
+    *((kind, 0) for kind in KINDS if kind != "sensors"),
+    *((kind, part) for kind in (*FOREIGN, "sensors") for part in range(PARTS_FOREIGN)),
 ]
 """Each (kind, part) at full size."""
 MEMORY_BYTES = 2 * 2**30

@@ -1,13 +1,14 @@
 """Change the core's code at random places, one at a time, and count the changes that tests notice.
 
-    python tools/mutants.py COUNT [--seed N] [--out FILE.json]
+    python tools/mutants.py COUNT [--seed N] [--out FILE.json] [--again]
 
 A mutant has another operator (+ and -, * and /, < and <=, == and !=, and/or, & and |), a sign or
 a `not` less, or another number. Messages, annotations and ranges stay, and what has no right value:
-defaults of settings and the catalogue's bounds and usual sizes. AREAS says which files are
-changed and which tests run, in a copy of the files that git tracks, up to the first that fails.
-The same command goes on where it was stopped. Prints those that survive; exit 1 where they are more
-than 5 %.
+defaults of settings, the catalogue's bounds and usual sizes, and tolerances below 1e-6. AREAS says
+which files are changed and which tests run, in a copy of the files that git tracks, up to the first
+that fails. The same command goes on where it was stopped, also after the code has changed: mutants
+in FILE.json come first, then others. With --again those that survived run once more. Prints those
+that survive; exit 1 where they are more than 5 %.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ PAIRS = "+ - * / < <= > >= == != and or & |".split()
 OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
 CHOICE = re.compile(r"\w+: [^#]* = |(.*\W)?(low|high|typical)=[^=]*$")
 """What stands before a default, a bound or a usual size in its line."""
+TOLERANCE = re.compile(r"\d+(\.\d*)?e-([7-9]|[1-9]\d)f?")
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
 
 
@@ -123,12 +125,19 @@ def mutants(copy: Path) -> list[list[Mutant]]:
     return found
 
 
-def line_of(copy: Path, mutant: Mutant) -> tuple[int, str, str]:
-    """Return the number of the line that a mutant changes, its text and that before the change."""
+def named(copy: Path, mutant: Mutant) -> tuple[str, bool]:
+    """Return a name that other lines do not change, and whether the change has a right value."""
     source = (copy / mutant.file).read_bytes()
-    line = source[: mutant.first].count(b"\n") + 1
+    lines, row = source.splitlines(), source[: mutant.first].count(b"\n")
+    text, twin = lines[row].decode().strip(), lines[:row].count(lines[row])
     before = source[: mutant.first].splitlines()[-1].decode().lstrip()
-    return line, source.splitlines()[line - 1].decode().strip(), before
+    old = source[mutant.first : mutant.last].decode()
+    choice = CHOICE.match(before) or TOLERANCE.fullmatch(old)
+    name = (
+        f"{mutant.file}: {old!r} -> {mutant.new!r} at {len(before)} in {text!r}"
+        + f" {twin + 1}" * bool(twin)
+    )
+    return name, not choice
 
 
 def fail(copy: Path, tests: str) -> bool:
@@ -153,8 +162,10 @@ def main() -> int:
     parser.add_argument("count", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
+    parser.add_argument("--again", action="store_true", help="run those that survived once more")
     asked = parser.parse_args()
     done = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
+    known = {name: killed or not asked.again for name, killed in done.items() if " -> " in name}
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     draw, survive = random.Random(asked.seed), []
     with tempfile.TemporaryDirectory() as folder:
@@ -163,17 +174,17 @@ def main() -> int:
         areas = [draw.sample(area, len(area)) for area in mutants(copy)]
         most = max(map(len, areas))
         order = [area[k] for k in range(most) for area in areas if k < len(area)]
-        order = [mutant for mutant in order if not CHOICE.match(line_of(copy, mutant)[2])]
-        for mutant in order[: asked.count]:
-            if mutant.tests not in done:
-                done[mutant.tests] = fail(copy, mutant.tests)
-            if done[mutant.tests]:
-                raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
-            path = copy / mutant.file
-            right = path.read_bytes()
-            old, (line, text, _) = right[mutant.first : mutant.last], line_of(copy, mutant)
-            name = f"{mutant.file}:{line}: {old.decode()!r} -> {mutant.new!r} in {text!r}"
-            if name not in done:
+        named_order = [(*named(copy, mutant), mutant) for mutant in order]
+        # First those with a result: a line changed elsewhere draws no other ones.
+        queue = sorted((one for one in named_order if one[1]), key=lambda one: one[0] not in known)
+        intact = set()
+        for name, _, mutant in queue[: asked.count]:
+            if not known.get(name):
+                if mutant.tests not in intact and fail(copy, mutant.tests):
+                    raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
+                intact.add(mutant.tests)
+                path = copy / mutant.file
+                right = path.read_bytes()
                 path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])
                 done[name] = fail(copy, mutant.tests)
                 path.write_bytes(right)
@@ -181,7 +192,7 @@ def main() -> int:
             if not done[name]:
                 survive.append(name)
                 print(name, flush=True)
-    print(f"{len(survive)} of {min(asked.count, len(order))} survive")
+    print(f"{len(survive)} of {min(asked.count, len(queue))} survive")
     return int(len(survive) > 0.05 * asked.count)
 
 

@@ -126,19 +126,19 @@ def guard_action(
             f"wanted real numbers of shape {last_b.shape}: one {limits.action.kind} for each row "
             "of its input. Check the policy's output."
         )
-    largest = np.abs(action).max(-1).astype(np.float64)
-    finite = np.isfinite(action).all(-1)
+    largest = np.abs(action).max(1).astype(np.float64)
+    finite = np.isfinite(action).all(1)
     action = np.asarray(limits.action.to_si(action)).astype(np.float64)
     late = np.full(len(action), limits.deadline_s is not None and took_s > limits.deadline_s)
-    bad = ~(finite & np.isfinite(action).all(-1)) & ~late
+    bad = ~(finite & np.isfinite(action).all(1)) & ~late
     action = np.where((bad | late)[:, None], last_b, action)
     if limits.high:
         inside = np.clip(action, limits.low, limits.high)
-        return Guarded(inside, bad, (inside != action).any(-1), late, largest)
+        return Guarded(inside, bad, (inside != action).any(1), late, largest)
     # Scaled before squaring, so that a huge finite action does not overflow to infinity.
-    longest = np.abs(action).max(-1, keepdims=True)
+    longest = np.abs(action).max(1, keepdims=True)
     unit = action / np.maximum(longest, 1e-30)
-    size = longest[:, 0] * np.sqrt((unit * unit).sum(-1))
+    size = longest[:, 0] * np.sqrt((unit * unit).sum(1))
     limited = size > limits.size
-    shortened = unit * (limits.size / np.sqrt(np.maximum((unit * unit).sum(-1), 1e-30)))[:, None]
+    shortened = unit * (limits.size / np.sqrt(np.maximum((unit * unit).sum(1), 1e-30)))[:, None]
     return Guarded(np.where(limited[:, None], shortened, action), bad, limited, late, largest)

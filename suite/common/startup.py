@@ -14,7 +14,7 @@ import sys
 import warnings
 from collections.abc import Iterable, MutableMapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from tracks.common.files import user_cache
 
@@ -46,6 +46,17 @@ class _Unfailing(io.FileIO):
         return len(memoryview(data).cast("B"))
 
 
+class _Named(io.FileIO):
+    """Standard output: an error of writing names it, as one of a file names that."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            error.filename = "standard output"
+            raise
+
+
 def open_streams() -> None:
     """Give a process without standard input, output or error the null device in its place.
 
@@ -58,14 +69,16 @@ def open_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
     sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)
-    sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
-    encoding = sys.stderr.encoding if sys.stderr else "utf-8"
-    unfailing = io.BufferedWriter(_Unfailing(2, "w", closefd=False))
-    sys.stderr = io.TextIOWrapper(unfailing, encoding, line_buffering=True)
-    for stream in (sys.stdout, sys.stderr):
-        reconfigure = getattr(stream, "reconfigure", None)  # a test's own stream has none
-        if reconfigure is not None:
-            reconfigure(errors="backslashreplace")
+    sys.stdout = _text(_Named(1, "w", closefd=False), sys.stdout)
+    sys.stderr = _text(_Unfailing(2, "w", closefd=False), sys.stderr)
+
+
+def _text(raw: io.FileIO, old: TextIO | None) -> TextIO:
+    encoding = old.encoding if old else "utf-8"
+    lines = raw.isatty() or isinstance(raw, _Unfailing)
+    return io.TextIOWrapper(
+        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=lines
+    )
 
 
 def hush() -> None:
@@ -91,9 +104,14 @@ def check_names(args: Iterable[str]) -> None:
         try:
             arg.encode()
         except UnicodeEncodeError:
+            encoding = sys.getfilesystemencoding()
+            if encoding != "utf-8":
+                raise ValueError(
+                    f"{arg!r} cannot be read, since the locale's encoding is {encoding}; set "
+                    "LC_ALL to a UTF-8 locale such as C.UTF-8, and PYTHONUTF8 not to 0"
+                ) from None
             raise ValueError(
-                f"{arg!r} is not UTF-8, so result files cannot name it; rename the file or folder, "
-                "and set LC_ALL to a UTF-8 locale such as C.UTF-8"
+                f"{arg!r} is not UTF-8, so result files cannot name it; rename the file or folder"
             ) from None
 
 

@@ -99,8 +99,8 @@ def window_errors(replay: Replay, windows: Any, delta: Any) -> tuple[jax.Array, 
     """Return position [m] and velocity [m/s] errors at the end of every window, (N,) each."""
     pos, vel, _ = replay(windows, delta)
     return (
-        jnp.linalg.norm(pos[:, -1] - windows.pos_w[:, -1], axis=-1),
-        jnp.linalg.norm(vel[:, -1] - windows.vel_w[:, -1], axis=-1),
+        jnp.linalg.norm(pos[:, -1] - windows.pos_w[:, -1], axis=1),
+        jnp.linalg.norm(vel[:, -1] - windows.vel_w[:, -1], axis=1),
     )
 
 

@@ -57,7 +57,7 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
     """
     left, up = rot_w[..., 1], rot_w[..., 2]
     ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
-    ahead = ahead * np.where(up[..., 2:] < 0, -1.0, 1.0)
+    ahead = np.where(up[..., 2:] < 0, -ahead, ahead)
     size = np.linalg.norm(ahead, axis=-1, keepdims=True)
     return np.where(size > 1e-3, ahead / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
 
@@ -144,7 +144,7 @@ def decision_period(time_s: np.ndarray, row_s: float) -> float:
     gaps = np.diff(time_s)
     if not len(gaps):
         return float("nan")
-    return float(gaps[gaps < _longest_gap(float(np.median(gaps)), row_s)].mean())
+    return float(gaps[in_a_row(gaps, float(np.median(gaps)), row_s)].mean())
 
 
 def decision_rate(logs: Sequence[FlightLog]) -> float:
@@ -174,9 +174,15 @@ def decision_rate(logs: Sequence[FlightLog]) -> float:
     return median
 
 
-def _longest_gap(period_s: float, row_s: float) -> float:
-    """Return what is too far apart for two decisions in a row [s]."""
-    return 1.5 * period_s + row_s
+def in_a_row(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.ndarray:
+    """Return which gaps are between two decisions in a row, below 1.5 periods and a row of a log.
+
+    Args:
+        gaps_s: (T,) between decisions.
+        period_s: of decisions.
+        row_s: between rows.
+    """
+    return gaps_s < 1.5 * period_s + row_s
 
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
@@ -188,16 +194,16 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
     acc = (log.vel_w[at + 1] - log.vel_w[at]) / gap
     command = (rot @ action[at][:, :, None])[:, :, 0]
     heading = _heading(rot)
-    if len(at) < HISTORY + 3:
-        return []
     row_s = float(np.median(np.diff(log.time_s)))
     period = decision_period(time, row_s)
+    if np.isnan(period):
+        return []
     steps, stride = round(duration_s / period), max(1, round(stride_s / period))
     found = []
     for first in range(HISTORY, len(at) - steps, stride):
         span = slice(first, first + steps + 1)
-        steady = np.diff(time[first - HISTORY : first + steps + 1])
-        if (steady > _longest_gap(period, row_s)).any() or not np.isfinite(acc[first]).all():
+        gaps = np.diff(time[first - HISTORY : first + steps + 1])
+        if not in_a_row(gaps, period, row_s).all() or not np.isfinite(acc[first]).all():
             continue
         found.append(
             PointMassWindows(

@@ -39,14 +39,14 @@ def barrier(step: Step) -> jax.Array:
 
 def clearance(_: LossConfig, step: Step) -> jax.Array:
     """Return L_clearance, the mean over the path [1]."""
-    return (BARRIER_HEIGHT * barrier(step)).mean(-1)
+    return (BARRIER_HEIGHT * barrier(step)).mean(1)
 
 
 def collide(_: LossConfig, step: Step) -> jax.Array:
     """Return L_collide, the mean over the path [m^3/s]."""
     held_vel = jax.lax.stop_gradient(step.vel_w)
     closing = jnp.maximum(-(step.away_w * held_vel[:, None]).sum(-1), 0.0)
-    return (closing * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(-1)
+    return (closing * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(1)
 
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:

@@ -87,7 +87,10 @@ def frame_boxes(gates: Gates) -> Boxes:
 
     center_w = np.where(real[..., None], center_w, [0.0, 0.0, PARKED_Z])
     half_size = np.where(real[..., None], half_size, 1e-3)
-    return Boxes(center_w.reshape(-1, 3), rot_w.reshape(-1, 3, 3), half_size.reshape(-1, 3))
+    count = real.size
+    return Boxes(
+        center_w.reshape(count, 3), rot_w.reshape(count, 3, 3), half_size.reshape(count, 3)
+    )
 
 
 def _corner_extensions(

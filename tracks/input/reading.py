@@ -6,6 +6,7 @@ would fill the memory; numbers with thousands of digits; and tables that are nes
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import stat
@@ -122,7 +123,9 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     where = os.fspath(path)
     try:
-        table = tomllib.loads(read_bytes(path).decode())
+        data = read_bytes(path)
+        refuse_utf16(data, where)
+        table = tomllib.loads(data.decode("utf-8-sig"))
     except RecursionError:
         raise _too_deep(where) from None
     except InputError:
@@ -131,6 +134,22 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise InputError(f"{where}: is not TOML: {error}") from None
     _check_depth(table, where)
     return table
+
+
+def refuse_utf16(head: bytes, where: str) -> None:
+    """Refuse text in UTF-16 or UTF-32 by its first bytes.
+
+    Raises:
+        InputError: with how to save it.
+    """
+    marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    begin = head[:64]
+    halves = sorted(begin[k::2].count(b"\0") for k in (0, 1))
+    if marked or (len(begin) >= 8 and halves == [0, len(begin) // 2] and begin.isascii()):
+        raise InputError(
+            f"{where}: text in UTF-16, as Excel and PowerShell save it; save it as UTF-8 (Excel: "
+            "CSV UTF-8; PowerShell: -Encoding utf8)"
+        )
 
 
 def reason(error: OSError) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -20,6 +22,8 @@ HERE = ("-march=native",)
 """Options for this machine's processor, left out where the compiler does not support them."""
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 """Options under which the suite's policy.c compiles without warnings."""
+TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
+"""What a compiler says of the machine, not of the file."""
 COMPILE_S = 600.0
 """Time limit of the compiler [s]."""
 
@@ -108,6 +112,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
                 capture_output=True,
                 timeout=COMPILE_S,
                 stdin=subprocess.DEVNULL,
+                env={**os.environ, "LC_ALL": "C"},
                 check=False,
             )
         except subprocess.TimeoutExpired:
@@ -118,6 +123,10 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
         if done.returncode == 0:
             return
         message = message or done.stderr.decode(errors="replace").strip()
+        for number in TROUBLE:
+            if os.strerror(number) in message:
+                place = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)
+                raise OSError(number, os.strerror(number), place[1] if place else str(out))
     first = next((line for line in message.splitlines() if "error" in line), message[:300])
     raise PolicyError(
         f"{policy_c}: {compiler[0]} refuses it ({first[:300]}); export it again, or compile it by "

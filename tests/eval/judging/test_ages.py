@@ -75,6 +75,11 @@ def test_an_age_between_two_physics_steps_is_that_of_the_nearer_one(age_s, steps
     assert found == pytest.approx(steps * DT, abs=1e-9)
 
 
+def test_as_many_views_are_kept_as_decisions_lie_within_the_oldest_age():
+    for age_s, jitter, kept in ((0.0, 0.0, 0), (0.066, 0.0, 1), (0.067, 0.0, 2), (0.1, 0.4, 3)):
+        assert Aged(age_s, jitter, 1, STEPS, DT).ahead == kept
+
+
 def test_a_fresh_trial_sees_its_own_start_while_the_others_go_on():
     aged, none = Aged(0.1, 0.5, 2, STEPS, DT), np.zeros(2, bool)
     for k in range(4):

@@ -95,10 +95,10 @@ def test_gates_of_the_first_8_s_count_up_to_that_very_step():
 
 def test_what_is_no_state_and_no_wrench():
     fine = np.zeros((3, 3))
-    vel_w = np.array([[0.0, 0.0, 0.0], [1001.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    vel_w = np.array([[0.0, 1000.0, 0.0], [1001.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
     motion = Motion(fine, np.tile(np.eye(3), (3, 1, 1)), vel_w, fine)
     np.testing.assert_array_equal(has_diverged(Rules(), motion), [False, True, True])
-    torque_b = np.array([[0.0, 0.0, 0.0], [2e6, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    torque_b = np.array([[0.0, 1e6, 0.0], [2e6, 0.0, 0.0], [np.inf, 0.0, 0.0]])
     np.testing.assert_array_equal(is_wrench(Rules(), Wrench(fine, torque_b)), [True, False, False])
 
 

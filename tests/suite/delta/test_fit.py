@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -35,6 +35,20 @@ def test_lag_drag_and_delay_of_a_point_mass_are_identified():
     assert float(found.lag) == pytest.approx(6.0, rel=0.05)
     assert float(found.delay) == pytest.approx(1.6, abs=0.1)
     np.testing.assert_allclose(found.drag, truth.drag, atol=0.04)
+
+
+def test_lag_drag_and_delay_take_a_third_of_the_steps_and_at_least_one(monkeypatch):
+    taken: list[int] = []
+    nothing: Any = None
+
+    def descend(config, loss, start, windows, iterations, watch):
+        taken.append(iterations)
+        return start
+
+    monkeypatch.setattr("suite.delta.fit._descend", descend)
+    for iterations in (2, 9):
+        identify(FitConfig(iterations=iterations), PHYSICS, nothing)
+    assert taken == [1, 3]
 
 
 def push(vel_b, action_b):

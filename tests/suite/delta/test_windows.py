@@ -17,6 +17,7 @@ from suite.delta.windows import (
     decision_period,
     decision_rate,
     forgotten,
+    in_a_row,
     state_after,
 )
 from suite.train.config import PointMassConfig
@@ -118,6 +119,19 @@ def test_the_rate_of_flights_is_that_of_their_policy():
     )
     with pytest.raises(ValueError, match=r"has 15 decisions a second, and most flights 30"):
         decision_rate([thin, *rest])
+    # Rates within 5 % of the median are one.
+    for share, fits in ((1.04, True), (1.06, False)):
+        slower = replace(first, time_s=first.time_s * share)
+        if fits:
+            assert decision_rate([slower, *rest]) == pytest.approx(30.0, rel=1e-3)
+        else:
+            with pytest.raises(ValueError, match="fit to flights of one rate"):
+                decision_rate([slower, *rest])
+
+
+def test_decisions_in_a_row_are_less_than_one_and_a_half_periods_and_a_row_apart():
+    found = in_a_row(np.array([1.0, 1.99, 2.0]), period_s=1.0, row_s=0.5)
+    np.testing.assert_array_equal(found, [True, True, False])
 
 
 STILL = np.tile(np.eye(3), (5, 1, 1))
