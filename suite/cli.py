@@ -162,8 +162,16 @@ def _complain(message: str) -> None:
 
 
 def _without_working_folder() -> None:
-    """Keep the working folder off the module path: its eval.py would stand for our package."""
-    root, here = Path(__file__).resolve().parents[1], Path.cwd()
+    """Keep the working folder off the module path: its eval.py would stand for our package.
+
+    That of processes of ours as well, which begin with Python's own socket.py.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"
+    root = Path(__file__).resolve().parents[1]
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # removed meanwhile: what is relative to it is refused by its name
+        return
     if here != root:
         sys.path[:] = [path for path in sys.path if path and Path(path).absolute() != here]
 

@@ -15,6 +15,7 @@ from policies import shipped
 from suite import cli
 from suite.diagnose import example
 from tests.support.mutations import DEEP
+from tracks.input.reading import read_toml
 
 EXAMPLE = Path(example.__file__).parent
 
@@ -116,6 +117,33 @@ def test_text_that_is_nested_long_or_damaged_is_refused(
     path.write_text(text, encoding="utf-8", errors="surrogateescape")
     refused(line, capsys)
     assert not list(tmp_path.glob("out*"))
+
+
+OTHERS = {
+    "utf-16": ("a,b\n1,2\n3,4\n".encode("utf-16"), "text in UTF-16"),
+    "utf-16-be": ("a,b\n1,2\n3,4\n".encode("utf-16-be"), "text in UTF-16"),
+    "gzip": (b"\x1f\x8b\x08\0", "compressed by gzip"),
+    "Excel": (b"PK\3\4\x14\0", "an Excel workbook"),
+    "Git LFS": (b"version https://git-lfs.github.com/spec/v1\n", "run git lfs pull"),
+    "page": (b"<!DOCTYPE html>\n<html><title>Not found</title>", "a web page"),
+}
+
+
+@pytest.mark.parametrize("content", OTHERS)
+@pytest.mark.parametrize("what", ["vehicle", "CSV log", "Parquet log", "foreign log"])
+def test_archives_pages_and_other_encodings_are_called_what_they_are(
+    what, content, tmp_path, monkeypatch, capsys
+):
+    path, line = at_its_place(what, tmp_path, monkeypatch)
+    path.write_bytes(OTHERS[content][0])
+    assert OTHERS[content][1] in refused(line, capsys)
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_a_toml_file_with_the_mark_of_windows_is_read(tmp_path):
+    text = (Path(cli.__file__).parents[1] / "eval/vehicles/racer5.toml").read_text("utf-8")
+    (tmp_path / "it.toml").write_text(text.replace("\n", "\r\n"), "utf-8-sig")
+    assert read_toml(tmp_path / "it.toml")["name"] == "racer5"
 
 
 WRITERS = {

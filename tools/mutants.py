@@ -29,7 +29,7 @@ IMPORTERS = (
     "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
 )
 AREAS = (
-    ("suite/train/losses.py", "suite/train/test_losses"),
+    ("suite/train/losses.py", "suite/train/test_losses suite/train/test_config"),
     ("tracks/geometry/field.py", "tracks/geometry/test_field"),
     ("tracks/geometry/gates.py", "tracks/families tracks/geometry"),
     ("eval/worlds/trial.py", "eval/worlds/test_trial eval/worlds/test_worlds"),

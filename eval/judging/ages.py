@@ -91,8 +91,8 @@ class Aged:
         self._ages = np.roll(self._ages, -1, axis=0)
         for slot in np.flatnonzero(flying).tolist():
             count = self.ahead if fresh[slot] else 1
-            share = self._jitter * self._draws[slot].uniform(-1.0, 1.0, count)
-            self._ages[-count:, slot] = self._mean * (1.0 + share)
+            share = self._draws[slot].uniform(1.0 - self._jitter, 1.0 + self._jitter, count)
+            self._ages[-count:, slot] = self._mean * share
 
     def due(self) -> Iterator[Due]:
         """Yield the views to take before the next decision."""

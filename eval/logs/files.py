@@ -19,7 +19,7 @@ import pyarrow.parquet
 
 from eval.logs.columns import KNOWN, FlightLogError
 from tracks.common.files import replacing_file
-from tracks.input.reading import LOG_BYTES, InputError, check_file, refuse_utf16
+from tracks.input.reading import LOG_BYTES, InputError, check_file, refuse_other_kinds
 
 METADATA = "flight"
 """Parquet metadata key and CSV column of the JSON text."""
@@ -291,7 +291,7 @@ def read_head(path: Path) -> bytes:
         check_file(path, LOG_BYTES)
         with path.open("rb") as file:
             head = file.read(8192)
-        refuse_utf16(head, str(path))
+        refuse_other_kinds(head, str(path))
     except OSError as error:
         reason = f"cannot be read: {error.strerror or error}"
         raise FlightLogError(str(path), None, None, reason) from None

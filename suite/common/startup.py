@@ -95,12 +95,14 @@ def hush() -> None:
 
 
 def check_names(args: Iterable[str]) -> None:
-    """Refuse words of a command line that no result file could name.
+    """Refuse words of a command line that no result file could name, and folders called ~.
 
     Raises:
-        ValueError: for one that is not UTF-8.
+        ValueError: for one that is not UTF-8, or holds a ~ that the shell left.
     """
     for arg in args:
+        if arg.partition("=")[2].startswith("~/") or arg.startswith("~/"):
+            raise ValueError(f"{arg!r}: the shell has not replaced ~ here; write $HOME for it")
         try:
             arg.encode()
         except UnicodeEncodeError:

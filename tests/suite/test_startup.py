@@ -52,6 +52,9 @@ def test_a_home_that_cannot_be_written_is_none(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     place = files.user_cache({"XDG_CACHE_HOME": str(tmp_path / "file" / "below")})
     assert place.parent == tmp_path and place.is_dir()
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    place = files.user_cache({"XDG_CACHE_HOME": "relative"})
+    assert place == tmp_path / "home" / ".cache" / "diffracing-suite"
 
 
 def test_a_command_runs_without_home_passwd_entry_and_streams(root, tmp_path):
@@ -72,20 +75,38 @@ def test_a_command_runs_without_home_passwd_entry_and_streams(root, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("closed", "line", "code", "said"),
+    ("closed", "line", "code", "said", "env"),
     [
-        ("<&- >&- 2>&-", "eval --trials 0", 2, b""),
-        (">&-", "effects", 0, b""),
-        ("2>/dev/full", "eval --trials 0", 2, b""),
-        (">/dev/full", "effects", 1, b"the disk is full: standard output;"),
+        ("<&- >&- 2>&-", "eval --trials 0", 2, b"", {}),
+        (">&-", "effects", 0, b"", {}),
+        ("2>/dev/full", "eval --trials 0", 2, b"", {}),
+        (">/dev/full", "effects", 1, b"the disk is full: standard output;", {}),
+        (">/dev/full", "effects", 1, b"full: standard output;", {"PYTHONUNBUFFERED": "1"}),
     ],
 )
 def test_closed_and_full_streams_end_no_work_but_where_the_result_goes(
-    root, closed, line, code, said
+    root, closed, line, code, said, env
 ):
-    done = suite(root, line.split(), closed=closed)
+    done = suite(root, line.split(), env, closed=closed)
     assert done.returncode == code and b"Traceback" not in done.stderr
     assert said in done.stderr and len(done.stderr.splitlines()) == bool(said)
+
+
+def test_a_working_folder_that_is_gone_is_refused_by_what_needs_it(root, tmp_path):
+    gone = (
+        f"import os; os.mkdir('g'); os.chdir('g'); os.rmdir('../g'); import sys\n"
+        f"sys.path.insert(0, {str(root)!r}); sys.argv[0] = 'suite'\n"
+    )
+    for line, code in (("effects", 0), ("tracks zigzag --out it.png", 2)):
+        run = f"{gone}sys.argv[1:] = {line.split()!r}\nfrom suite.cli import entry; entry()"
+        done = subprocess.run([sys.executable, "-c", run], cwd=tmp_path, capture_output=True)
+        assert (done.returncode, len(done.stderr.splitlines())) == (code, code // 2), done.stderr
+
+
+def test_a_home_that_the_shell_did_not_write_out_is_refused(capsys):
+    for line in (["eval", "--out=~/runs"], ["diagnose", "~/flights"]):
+        assert cli.main(line) == 2
+        assert "write $HOME for it" in capsys.readouterr().err
 
 
 def test_names_that_are_not_utf8_are_refused_before_work(tmp_path, monkeypatch, capsys):
@@ -105,6 +126,12 @@ def test_text_is_written_and_printed_in_any_locale(root, tmp_path):
     env = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = suite(root, ["effects"], env)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
+    done = suite(root, ["tracks", "--out", "é.png"], env, cwd=tmp_path)
+    assert done.returncode == 2 and b"the locale's encoding is ascii; set LC_ALL" in done.stderr
+    # A notebook's commands inherit its backend, which another environment need not have.
+    env = {"LC_ALL": "C", "MPLBACKEND": "module://matplotlib_inline.missing"}
+    done = suite(root, ["tracks", "zigzag", "--out", "é.png"], env, cwd=tmp_path)
+    assert done.returncode == 0 and (tmp_path / "é.png").exists(), done.stderr
 
 
 @pytest.mark.parametrize("name", ["EFBIG", "EIO", "ESTALE", "ENOTCONN", "EMFILE", "EREMOTEIO"])

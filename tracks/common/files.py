@@ -42,8 +42,10 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
     """
     values = os.environ if environment is None else environment
     try:
-        place = values.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        folder = Path(place) / "diffracing-suite"
+        place = Path(values.get("XDG_CACHE_HOME", ""))
+        # A relative one is to be ignored: https://specifications.freedesktop.org/basedir
+        place = place if place.is_absolute() else Path.home() / ".cache"
+        folder = place / "diffracing-suite"
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.access(folder, os.W_OK):
             return folder

@@ -22,6 +22,11 @@ def _norm(vector: Array) -> Array:
     return xp.where(some, xp.sqrt(xp.where(some, square, 1.0)), 0.0)
 
 
+def _unit(vector: Array) -> Array:
+    xp = vector.__array_namespace__()
+    return vector / xp.maximum(_norm(vector), _TINY)[..., None]
+
+
 def magnetic_field(
     center_w: Array, rot_w: Array, opening_g: Array, point_w: Array, current: float = CURRENT
 ) -> Array:
@@ -43,10 +48,8 @@ def magnetic_field(
     corners = xp.concatenate([xp.zeros_like(opening_g[..., :1]), opening_g], axis=-1)
     start = corners - point_g[..., None, :]
     end = xp.roll(corners, -1, axis=-2) - point_g[..., None, :]
-    edge = end - start
-    length = _norm(edge)
-    unit = edge / xp.maximum(length, _TINY)[..., None]
-    ends = start / (_norm(start) + _TINY)[..., None] - end / (_norm(end) + _TINY)[..., None]
+    unit = _unit(end - start)
+    ends = _unit(start) - _unit(end)
     perpendicular = start - (start * unit).sum(-1)[..., None] * unit
     # On the wire itself the field is undefined; a distance of a micrometre keeps it finite.
     square = xp.maximum((perpendicular * perpendicular).sum(-1), 1e-12)

@@ -35,6 +35,16 @@ _KINDS = {
 }
 
 
+_OTHER_KINDS = {
+    b"\x1f\x8b": "compressed by gzip; unpack it",
+    b"pk\3\4": "a zip archive or an Excel workbook; unpack it, or save it as CSV in UTF-8",
+    b"version https://git-lfs": "a pointer of Git LFS, not the file itself; run git lfs pull",
+    b"<!doctype html": "a web page; download the file itself",
+    b"<html": "a web page; download the file itself",
+}
+"""First bytes, in small letters, of what is given for a table or a log by mistake."""
+
+
 class InputError(ValueError):
     """A file cannot be used; the message has its name and what is allowed."""
 
@@ -124,7 +134,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     where = os.fspath(path)
     try:
         data = read_bytes(path)
-        refuse_utf16(data, where)
+        refuse_other_kinds(data, where)
         table = tomllib.loads(data.decode("utf-8-sig"))
     except RecursionError:
         raise _too_deep(where) from None
@@ -136,12 +146,15 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     return table
 
 
-def refuse_utf16(head: bytes, where: str) -> None:
-    """Refuse text in UTF-16 or UTF-32 by its first bytes.
+def refuse_other_kinds(head: bytes, where: str) -> None:
+    """Refuse archives, web pages, pointers of Git LFS and text in UTF-16, by their first bytes.
 
     Raises:
-        InputError: with how to save it.
+        InputError: with what it is and what to do.
     """
+    for start, advice in _OTHER_KINDS.items():
+        if head[: len(start)].lower() == start:
+            raise InputError(f"{where}: {advice}")
     marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     begin = head[:64]
     halves = sorted(begin[k::2].count(b"\0") for k in (0, 1))

@@ -66,9 +66,10 @@ def test_windows_leave_out_what_is_missing():
 
 def test_windows_begin_a_stride_apart_and_none_spans_a_gap():
     log = fly(nominal_model(PointMassConfig()), 1)[0]
-    starts = cut_windows([log], 0.5, 0.3).pos_w[:, 0]
-    at = [np.flatnonzero(np.isclose(log.pos_w, p, atol=1e-6).all(-1))[0] for p in starts]
-    assert np.diff(log.time_s[at]) == pytest.approx(0.3, abs=1e-6)
+    for stride_s, apart_s in ((0.3, 0.3), (0.001, 1.0 / 30.0)):
+        starts = cut_windows([log], 0.5, stride_s).pos_w[:, 0]
+        at = [np.flatnonzero(np.isclose(log.pos_w, p, atol=1e-6).all(-1))[0] for p in starts]
+        assert np.diff(log.time_s[at]) == pytest.approx(apart_s, abs=1e-3)
     lost = (log.time_s > 1.4) & (log.time_s < 1.6)
     extra = {k: np.asarray(v)[~lost] for k, v in log.extra.items()}
     names = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b")

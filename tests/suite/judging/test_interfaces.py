@@ -33,12 +33,20 @@ def test_a_track_in_millimetres_is_asked_about():
     assert "millimetres" in _in_millimetres("here", large)[0]
 
 
-def test_an_eval_py_in_the_working_folder_does_not_stand_for_ours(tmp_path, root):
-    (tmp_path / "eval.py").write_text("raise SystemExit('mine')\n")
-    code = f"import sys; sys.path[:0] = ['', {str(root)!r}]; sys.argv[1:] = ['info', '--json']\n"
-    code += "from suite.cli import entry; entry()"
+def test_modules_in_the_working_folder_do_not_stand_for_ours_or_pythons(tmp_path, root):
+    for name in ("eval", "socket", "tokenize"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('mine')\n")
+    code = (
+        f"import sys; sys.path[0] = {str(root)!r}; import socket, tokenize\n"
+        "from suite import cli\n"
+        "from tracks.common.work.processes import worker_pool\n"
+        "sys.path.insert(0, ''); sys.argv[1:] = ['info', '--json']; main = cli.main\n"
+        # A process of its own begins as those that fly trials do.
+        "cli.main = lambda: main() or worker_pool(1).submit(int, 0).result()\n"
+        "cli.entry()\n"
+    )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0 and "mine" not in done.stderr, done.stderr
 

@@ -17,6 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from tracks.common.files import naming
 from tracks.common.work.threads import core_shares, usable_cores
 from tracks.common.work.travel import (
     Failure,
@@ -177,7 +178,8 @@ def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecuto
     let_views_travel()
     # Spawned, as threads of JAX and MuJoCo do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(processes, context, _become_worker, (cores,))
+    with naming("/dev/shm"):  # holds the locks between processes
+        return ProcessPoolExecutor(processes, context, _become_worker, (cores,))
 
 
 def _become_worker(cores: Sequence[int]) -> None:

@@ -1,5 +1,6 @@
 """The exported C: what it looks like, that it compiles without a word, and what it answers."""
 
+import errno
 import shutil
 import subprocess
 
@@ -143,6 +144,14 @@ def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monke
     (folder / "policy.h").unlink()
     with pytest.raises(PolicyError, match="policy.h: missing"):
         load_c(folder, trust=True)
+    full = tmp_path / "full"
+    said = "policy.c:9: error writing to /t/x.s: No space left on device"
+    full.write_text(f"#!/bin/sh\necho {said} >&2\nexit 1\n")
+    full.chmod(0o700)
+    monkeypatch.setenv("CC", str(full))
+    with pytest.raises(OSError) as met:
+        load_c(exports["odd"].folder, trust=True)
+    assert met.value.errno == errno.ENOSPC and met.value.filename == "/t/x.s"
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(PolicyError, match="no C compiler"):
         load_c(exports["odd"].folder, trust=True)

@@ -1,6 +1,7 @@
 """Who works and with how many threads; what travels to another machine, and what it must share."""
 
 import copy
+import errno
 import os
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import pytest
 
 from suite.cli import main
 from suite.common.errors import explain
-from tracks.common.work import MOST, core_shares, crew, read_workers, threads
+from tracks.common.work import MOST, core_shares, crew, processes, read_workers, threads
 from tracks.common.work.threads import (
     one_thread_a_product,
     set_threads,
@@ -134,6 +135,16 @@ def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
         )
         found.add(done.stdout)
     assert len(found) == 1
+
+
+def test_processes_that_share_no_lock_are_refused_by_its_place(monkeypatch):
+    def refuse(*args):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", refuse)
+    with pytest.raises(OSError) as met:
+        processes.worker_pool(1)
+    assert explain(met.value) == (2, "read-only file system: /dev/shm")
 
 
 def test_numpys_setting_of_a_user_stays():
