@@ -2,9 +2,9 @@
 
 A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
 line under each field is its help), and `run(config, console)`, which does the work and returns
-what --json prints; where it has `written(config)`, no other command writes into these folders
-meanwhile, and where it has `config_type(args)`, its options go by what it is called with. See
-docs/commands.md for how to add one.
+what --json prints. `written(config)`, where it has one, returns the folders that no other command
+may write into meanwhile. `config_of(args)`, where it has one, returns the configuration that the
+first word selects, that word, and the other words.
 """
 
 from __future__ import annotations
@@ -22,7 +22,14 @@ from typing import Any
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
 from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
-from suite.common.usage import COMMANDS, description, overview, renamed, split_lists, spread_lists
+from suite.common.usage import (
+    COMMANDS,
+    JOINED,
+    description,
+    overview,
+    renamed,
+    with_lists,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -93,24 +100,28 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
         ValueError: for an option that is given twice, and for a word that belongs to none.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
-    from suite.common.options import options_within, read_options
+    from suite.common.options import options, read_options
 
     command = importlib.import_module(f"suite.commands.{name}")
-    kind = command.config_type(args) if hasattr(command, "config_type") else command.Config
-    found = list(options_within(kind))
-    repeated = {option.flag for option in found if option.repeated}
-    args = split_lists(args, {option.flag for option in found if option.listed})
-    # Behind the options of a command with positional words, a word may be one of those.
-    if not any(option.positional and option.about for option in found):
-        args = spread_lists(args, repeated)
+    kind, prog = command.Config, f"suite {name}"
+    if hasattr(command, "config_of"):
+        kind, word, args = command.config_of(args)
+        prog = f"{prog} {word}".rstrip()
+    found = list(options(kind))
+    listed, repeated = ({o.flag for o in found if getattr(o, f)} for f in ("listed", "repeated"))
+    if any(option.positional for option in found):
+        # A word behind an option may be a positional one.
+        args = with_lists(args, listed)
+    else:
+        args = with_lists(args, listed, JOINED, repeated)
     _refuse_twice(args, repeated)
-    about = description(name, command.Config.__doc__ or "")
-    config, left = read_options(kind, f"suite {name}", about, args)
+    about = description(name, kind.__doc__ or "")
+    config, left = read_options(kind, prog, about, args)
     if left and not any(word.startswith("-") for word in left):
-        raise ValueError(f"{left[0]!r} belongs to no option; suite {name} --help lists them")
+        raise ValueError(f"{left[0]!r} belongs to no option; {prog} --help lists them")
     if left:
-        # Once more, and it ends by saying which options were meant.
-        read_options(kind, f"suite {name}", about, args, all_known=True)
+        # Read again only to end with a message that lists similar options.
+        read_options(kind, prog, about, args, all_known=True)
     return command, config
 
 

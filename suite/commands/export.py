@@ -36,13 +36,17 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     Raises:
         ValueError: where the policy is not ours, or a format or type is unknown.
     """
+    from policies import shipped
     from suite.judging.deploy.exporting import export
     from suite.judging.flying import default_policy
 
     if config.name and config.policy and config.name != config.policy:
-        raise ValueError(f"--policy {config.policy}: {config.name} was asked for, too; give one")
-    given = config.policy or config.name or default_policy()
-    answer = export(given, config.out, config.formats, config.dtype, console)
+        raise ValueError(f"--policy {config.policy}: NAME is {config.name}; give one of them")
+    given, formats = config.policy or config.name, config.formats
+    if not given and (formats[-1] in shipped.names() or Path(formats[-1]).exists()):
+        # `--format c race`: a list takes the words behind it, the policy's name too.
+        *formats, given = formats
+    answer = export(given or default_policy(), config.out, formats, config.dtype, console)
     for path in answer["written"]:
         console.say(f"written: {path} ({size(path.stat().st_size)})")
     return answer

@@ -1,42 +1,37 @@
-"""`suite reproduce NAME`: the paper's tables and more, made by one command each."""
+"""`suite reproduce PAGE`: the paper's tables and more, made by one command each."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, Union
-
-import tyro
+from typing import Any
 
 from suite.common.console import Console
+from suite.common.options import Advanced
 from suite.common.work import WorkersOption, workers_given
 from suite.experiments import EXPERIMENTS, OVER_ALL
 from tracks.common.grid import rich_table
-
-Experiment = TypeVar("Experiment")
-
-
-@dataclass(frozen=True)
-class Unread:
-    """Stands for the options of an experiment that a command line does not name."""
+from tracks.common.names import unknown_name
 
 
 @dataclass(frozen=True)
-class Config(Generic[Experiment]):
-    """Make one of the documents of docs/results; the same command again continues where it stopped.
+class Config:
+    """Make one of the pages of docs/results; the same command again continues where it stopped.
 
-    NAME.json with the numbers, charts and NAME.md with the tables go to --out. Of a NAME.md that is
-    there, what stands between its two comments is replaced.
+    Pages: table2, robustness, perception, ablation, schemes, faults, gpu, simulators. `all` makes
+    the published ones, `status` lists what is newer than they are. suite reproduce alone has a line
+    about each, suite reproduce PAGE --help the options of a page.
+
+    PAGE.json with the numbers, charts, and PAGE.md with the tables go to --out. If PAGE.md exists,
+    only the part between its two comments is replaced.
     """
 
-    experiment: Experiment
-    """Which document."""
     out: Path = Path("runs/reproduce")
-    """Folder of the document; docs/results in a checkout is where the published ones are."""
-    cache: Path = Path("runs/reproduce/cache")
-    """Folder of finished trials and trainings, shared by all documents."""
+    """Folder of the page; docs/results in a checkout has the published ones."""
+    cache: Advanced[Path] = Path("runs/reproduce/cache")
+    """Folder of finished trials and trainings, shared by all pages."""
     workers: WorkersOption = None
     """Share trainings and flights among N processes of this machine, each with its share of the
     cores, or on the cluster at HOST:PORT, whose owner can run code here. Without it one training
@@ -45,61 +40,68 @@ class Config(Generic[Experiment]):
     """Print one JSON object to standard output and nothing else."""
 
 
-def config_type(args: Sequence[str]) -> Any:
-    """Return what `args` are read into: the options of the experiments they name, and no others.
+def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
+    """Return the options of the page that `args` name, its name, and the other words.
 
-    An experiment brings what it needs with it, which takes longer than to read a command line.
+    Only that page's module is loaded: what it needs takes longer to load than a command line.
+
+    Raises:
+        ValueError: for an unknown page.
     """
-    kinds = [
-        _options(name) if name in args else _summary(name, summary)
-        for name, summary in {**EXPERIMENTS, **OVER_ALL}.items()
-    ]
-    asked = Config[Union[tuple(kinds)]]  # noqa: UP007  (made from the table)
-    return Annotated[asked, tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes]
-
-
-def _options(name: str) -> Any:
+    known = {**EXPERIMENTS, **OVER_ALL}
+    name = next((word for word in args if word in known), "")
+    if not name:
+        if args and not args[0].startswith("-"):
+            raise unknown_name("page", args[0], known)
+        return Config, "", list(args)
     if name in OVER_ALL:
         from suite.experiments import published
 
-        return Annotated[getattr(published, name.capitalize()), tyro.conf.subcommand(name)]
-    config = importlib.import_module(f"suite.experiments.{name}").Config
-    return Annotated[config, tyro.conf.subcommand(name)]
+        chosen = getattr(published, name.capitalize())
+    else:
+        chosen = importlib.import_module(f"suite.experiments.{name}").Config
+    field = ("experiment", chosen, chosen())
+    about = {"__doc__": chosen.__doc__}
+    kind = make_dataclass("Config", [field], bases=(Config,), namespace=about, frozen=True)
+    at = list(args).index(name)
+    return kind, name, [*args[:at], *args[at + 1 :]]
 
 
-def _summary(name: str, summary: str) -> Any:
-    return Annotated[Unread, tyro.conf.subcommand(name, description=summary)]
-
-
-def written(config: Config[Any]) -> list[Path]:
+def written(config: Config) -> list[Path]:
     """Return the folders that the command writes into."""
-    return [config.out, config.cache]
+    return [config.out, config.cache] if hasattr(config, "experiment") else []
 
 
-def run(config: Config[Any], console: Console) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write its document.
+def run(config: Any, console: Console) -> dict[str, Any]:
+    """Make the page, or what is left of it; without a page list them.
 
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
     """
     from suite.experiments import published
 
-    if isinstance(config.experiment, published.Status):
+    experiment = getattr(config, "experiment", None)
+    if experiment is None:
+        pages = {**EXPERIMENTS, **OVER_ALL}
+        for name, summary in pages.items():
+            console.say(f"{name:<12} {summary}")
+        return {"pages": pages}
+    if isinstance(experiment, published.Status):
         states = published.page_states(config.out)
         console.show(rich_table(published.status_grid(states)))
         return {"pages": states}
-    if isinstance(config.experiment, published.All):
+    if isinstance(experiment, published.All):
+        from suite.cli import parse
 
         def make(name: str, options: Sequence[str]) -> dict[str, Any]:
-            return _made(
-                replace(config, experiment=tyro.cli(_options(name), args=options)), console
-            )
+            _, page = parse("reproduce", [name, *options])
+            return _made(replace(config, experiment=page.experiment), console)
 
         return published.make_all(make, console)
     return _made(config, console)
 
 
-def _made(config: Config[Any], console: Console) -> dict[str, Any]:
+def _made(config: Any, console: Console) -> dict[str, Any]:
     from suite.experiments.pages.document import Place, check_page, write_document
     from suite.experiments.study.options import check
 

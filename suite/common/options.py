@@ -72,8 +72,8 @@ class Option(NamedTuple):
 
     @property
     def positional(self) -> bool:
-        """Return whether it is given without a name; a type variable stands for subcommands."""
-        return tyro.conf.Positional in self.notes or isinstance(self.kind, TypeVar)
+        """Return whether it is given without a name."""
+        return tyro.conf.Positional in self.notes
 
     @property
     def flag(self) -> str:
@@ -105,15 +105,6 @@ def options(command: type, default: Any = None, advanced: bool = False) -> Itera
             yield from options(type(value), value, rare)
         else:
             yield Option(field.name, kind, value, texts.get(field.name, ""), rare)
-
-
-def options_within(kind: Any) -> Iterator[Option]:
-    """Yield the options of `kind`, a type as tyro reads it, those of its subcommands included."""
-    for part in get_args(kind):
-        yield from options_within(part)
-    made = get_origin(kind) or kind
-    if isinstance(made, type) and dataclasses.is_dataclass(made):
-        yield from options(made)
 
 
 def read_options(
@@ -151,12 +142,10 @@ def _read(
     info: tyro.constructors.StructTypeInfo,
 ) -> tyro.constructors.StructConstructorSpec | None:
     """Return a configuration as tyro reads it, with the rare options in a group of their own."""
-    command: Any = get_origin(info.type) or info.type
+    command: Any = info.type
     if not hasattr(command, "__dataclass_fields__") or command.__name__ == GROUP:
         return None
     found = list(options(command))
-    if any(isinstance(option.kind, TypeVar) for option in found):
-        return None  # what it stands for is tyro's affair
     fields = [_field(option) for option in found if not option.advanced]
     rare = [_field(option) for option in found if option.advanced]
     if rare:

@@ -78,7 +78,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "export": (
         "suite export --policy runs/mine/policy --out runs/export",
-        "suite export --format c --out runs/c",
+        "suite export race --format c --out runs/c",
     ),
     "import": (
         "suite import flight.ulg --out flight.parquet",
@@ -112,7 +112,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 """Command -> examples that its help begins with."""
 
 JOINED = ("--track", "--difficulty")
-"""Options that take a list in one text; words behind them are joined with commas."""
+"""Options that read a list from one text."""
 
 
 def overview() -> str:
@@ -151,36 +151,34 @@ def description(name: str, about: str) -> str:
     return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
 
 
-def split_lists(args: Sequence[str], listed: Container[str]) -> list[str]:
-    """Return `args` with commas between the values of a `listed` option as spaces.
+def with_lists(
+    args: Sequence[str],
+    listed: Container[str],
+    joined: Container[str] = (),
+    repeated: Container[str] = (),
+) -> list[str]:
+    """Return `args` with each list as its option reads it, whether commas or spaces separate it.
 
-    A word with "=" stays as it is: its commas are within a value, as in `--set fov_deg=87,58`.
-    """
-    out, option = list[str](), ""
-    for word in args:
-        flag, equal, value = word.partition("=")
-        if word.startswith("--"):
-            option = flag
-            out += [flag, *value.split(",")] if equal and option in listed else [word]
-        else:
-            out += word.split(",") if option in listed and not equal else [word]
-    return out
+    A word with "=" keeps its commas: they are within a value, as in `--set fov_deg=87,58`.
 
-
-def spread_lists(args: Sequence[str], repeated: Container[str]) -> list[str]:
-    """Return `args` with the words of a list behind an option as the option takes them.
-
-    `--track a b` is `--track a,b`, and with `--policy` among the `repeated` ones, `--policy a b`
-    is `--policy a --policy b`, as a shell expands `--policy runs/*`.
+    Args:
+        args: the words of a command line.
+        listed: options that read one word for each value: `--speed 0.3,1` becomes `--speed 0.3 1`.
+        joined: options that read one text: `--track a b` becomes `--track a,b`.
+        repeated: options that are given again for each value: `--policy a b`, which a shell makes
+            of `--policy runs/*`, becomes `--policy a --policy b`.
     """
     out, option, values = list[str](), "", 0
     for word in args:
-        if word.startswith("-"):
-            option, values = word, int("=" in word)
-            out.append(word)
+        flag, equal, value = word.partition("=")
+        if word.startswith("--") or (word.startswith("-") and option not in listed):
+            option, values = flag, int(bool(equal))
+            out += [flag, *value.split(",")] if equal and option in listed else [word]
             continue
         values += 1
-        if values > 1 and option.partition("=")[0] in JOINED:
+        if option in listed:
+            out += [word] if equal else word.split(",")
+        elif values > 1 and option in joined:
             out[-1] += f",{word}"
         else:
             out += [option, word] if values > 1 and option in repeated else [word]

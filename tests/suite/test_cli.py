@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import pytest
 
 from suite import cli
-from suite.common.options import options_within
+from suite.common.options import options
 from tracks.common.provenance import VERSION
 
 
@@ -73,11 +73,10 @@ def test_every_command_has_help_for_every_option(name, capsys):
     module = sys.modules[f"suite.commands.{name}"]
     assert module.Config.__dataclass_params__.frozen
     assert text.index("Examples:\n  suite ") < text.index("--help ") and "None" not in text
-    for option in options_within(module.Config):
+    for option in options(module.Config):
         assert option.about and (option.positional or option.flag in text), option
-    rare = [option.flag for option in options_within(module.Config) if option.advanced]
-    if name != "reproduce":  # whose subcommands have groups of their own
-        assert all(flag in text.partition("advanced options")[2] for flag in rare)
+    rare = [option.flag for option in options(module.Config) if option.advanced]
+    assert all(flag in text.partition("advanced options")[2] for flag in rare)
 
 
 @pytest.mark.parametrize(
@@ -128,9 +127,13 @@ def test_every_list_may_have_commas_but_within_a_value():
     assert config.relevance == (0.0, 0.0, 0.0)
 
 
-def test_a_word_behind_a_list_may_be_a_positional_one():
+def test_a_word_behind_a_list_may_be_a_positional_one(tmp_path, capsys):
     _, config = cli.parse("tracks", ["--difficulty", "9", "ellipse"])
     assert (config.difficulty, config.track) == ("9", "ellipse")
+    assert cli.main(["export", "--out", str(tmp_path), "--format", "onnx", "race-paper"]) == 0
+    assert (tmp_path / "race-paper.onnx").is_file()
+    assert cli.main(["export", "--out", str(tmp_path), "--format", "onnx", "rac"]) == 2
+    assert "unknown format 'rac'" in capsys.readouterr().err
 
 
 def test_a_word_too_many_belongs_to_no_option(capsys):

@@ -11,7 +11,23 @@ from tests.support.documents import reproduce
 def test_every_experiment_has_help_for_every_option(name, capsys):
     assert cli.main(["reproduce", name, "--help"]) == 0
     said = capsys.readouterr().out
-    assert "--out" in said and "--cache" in said and "--json" in said
+    assert "--out" in said and "--json" in said and f"suite reproduce {name} [-h]" in said
+    assert "--cache" in said.partition("advanced options")[2]
+
+
+def test_pages_are_listed(capsys):
+    assert cli.main(["reproduce"]) == 0
+    listed = capsys.readouterr().out
+    assert cli.main(["reproduce", "--help"]) == 0
+    told = capsys.readouterr().out
+    assert all(name in listed and name in told for name in EXPERIMENTS)
+
+
+def test_lists_of_a_page_may_have_commas_or_spaces():
+    line = "robustness --policy race race-paper --difficulty 0 3 --only wind,mass"
+    config = cli.parse("reproduce", line.split())[1].experiment
+    assert config.policy == ("race", "race-paper") and config.only == ("wind", "mass")
+    assert config.difficulty == "0,3"
 
 
 def test_an_experiment_that_does_not_exist_is_code_2(capsys):

@@ -4,8 +4,8 @@ import json
 from dataclasses import replace
 
 from policies import shipped
+from suite.cli import parse
 from suite.commands import reproduce as command
-from suite.commands.reproduce import Config
 from suite.common.console import Console
 from suite.experiments import EXPERIMENTS, published
 from suite.experiments.study.cache import FLIES, code_digest
@@ -23,7 +23,7 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
     write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
     write_page(tmp_path, "robustness", ("gone-policy", current), "another")
-    config = Config(published.Status(), out=tmp_path)
+    _, config = parse("reproduce", ["status", "--out", str(tmp_path)])
     pages = command.run(config, Console())["pages"]
     assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
     assert pages["simulators"]["newer"] == ["policy"]
@@ -35,7 +35,7 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
 def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(command, "_made", lambda config, console: asked.append(config) or {})
-    config = Config(published.All(), out=tmp_path)
+    _, config = parse("reproduce", ["all", "--out", str(tmp_path)])
     assert list(command.run(config, Console())["seconds"]) == list(published.PUBLISHED)
     assert [type(c.experiment).__module__.rpartition(".")[2] for c in asked] == list(
         published.PUBLISHED
