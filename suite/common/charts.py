@@ -1,9 +1,12 @@
-"""What all charts share: colours, plain axes, and a figure as PNG bytes."""
+"""What all charts share: colours, plain axes, intervals, legends, training curves, PNG bytes."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -14,18 +17,106 @@ LINES = ("#2463c9", "#e0892b", "#2e8b57", "#b0413e", "#7a5cb8", "#8b93a1")
 DPI = 130
 
 
+class Metric(NamedTuple):
+    """A number of a training, as tables and charts show it."""
+
+    title: str
+    scale: float
+    digits: int
+
+    @property
+    def heading(self) -> str:
+        """The title over a chart."""
+        return self.title if self.title.startswith("v_max") else self.title.capitalize()
+
+
+METRICS = {
+    "reward": Metric("reward", 1, 0),
+    "success_cross": Metric("success cross [%]", 100, 0),
+    "collision_free": Metric("collision-free rate [%]", 100, 0),
+    "v_max": Metric("v_max [m/s]", 1, 1),
+    "gates": Metric("gates", 1, 2),
+    "collided": Metric("collided [%]", 100, 0),
+    "speed": Metric("mean speed [m/s]", 1, 1),
+}
+"""Numbers of a training's curve and of the measurements of its policy, by their key."""
+CURVE = ("gates", "collided", "speed")
+"""Numbers of a training's curve that are drawn."""
+
+
 def titled(axes: Axes, title: str) -> None:
-    """Put `title` above the axes and leave out what is no data."""
+    """Put `title` above the axes and draw plain axes."""
     axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
     plain_axes(axes)
 
 
 def plain_axes(axes: Axes) -> None:
-    """Leave out what is no data."""
+    """Draw a light grid, small ticks, and no frame at the top and on the right."""
     axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
+
+
+def legend(figure: Figure, axes: Axes, columns: int = 3, size: float = 9) -> None:
+    """Draw the legend of `axes` below the figure."""
+    handles, labels = axes.get_legend_handles_labels()
+    place = "outside lower center"
+    drawn = figure.legend(handles, labels, loc=place, ncols=columns, frameon=False, fontsize=size)
+    for text in drawn.get_texts():
+        text.set_parse_math(False)  # a policy's name may hold dollar signs
+
+
+def dots(
+    axes: Axes, at: Any, intervals: Sequence[Any], scale: float = 1, fmt: str = "o", **style: Any
+) -> None:
+    """Draw values with their intervals (value, low, high) as dots with error bars."""
+    value, low, high = scale * np.array(intervals).T
+    axes.errorbar(at, value, np.maximum([value - low, high - value], 0), fmt=fmt, **style)
+
+
+def curves_chart(
+    curves: Mapping[str, Sequence[Mapping[str, Any]]],
+    colours: Sequence[str] = LINES,
+    follow: bool = False,
+) -> bytes:
+    """Return gates, collisions and speed over gradient steps, a column each.
+
+    Thick lines are running means, thin ones single steps.
+
+    Args:
+        curves: rows of metrics.jsonl by label; an empty one is left out.
+        colours: by curve.
+        follow: whether the curves after the first begin where the first one ends.
+    """
+    figure = Figure(figsize=(10.4, 3.1), layout="constrained")
+    panels = figure.subplots(1, len(CURVE))
+    first = len(next(iter(curves.values()))) if follow else 0
+    for axes, name in zip(panels, CURVE, strict=True):
+        start = 0
+        for (label, rows), colour in zip(curves.items(), colours, strict=False):
+            if not rows:
+                continue
+            values = METRICS[name].scale * np.array([row[name] for row in rows], float)
+            at = start + np.array([row["iteration"] for row in rows])
+            axes.plot(at, values, color=colour, lw=0.7, alpha=0.25)
+            axes.plot(at, _running_mean(values), color=colour, lw=1.8, label=label)
+            start = first
+        titled(axes, METRICS[name].heading)
+        axes.set_xlabel("gradient steps", fontsize=9)
+        axes.set_ylim(bottom=0)
+    if len(curves) > 1:
+        legend(figure, panels[0], len(curves))
+    return png(figure)
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Return means over a twentieth of the values, shorter at the ends."""
+    half = max(1, len(values) // 40)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    first = np.maximum(np.arange(len(values)) - half, 0)
+    last = np.minimum(np.arange(len(values)) + half + 1, len(values))
+    return (total[last] - total[first]) / (last - first)
 
 
 def png(figure: Figure) -> bytes:

@@ -21,4 +21,4 @@ OVER_ALL: dict[str, str] = {
     "all": "every published page, in order; finished parts are not done again",
     "status": "the published pages, and which policy or code is newer than a page",
 }
-"""What is done with all of them, in suite/experiments/published.py."""
+"""Names for all of them together, in suite/experiments/published.py."""

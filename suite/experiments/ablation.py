@@ -19,8 +19,8 @@ from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
-"""lambda_p of L_p. The paper has the field at the first alone; here it is on and off at each and at
-the recipe's own weight, so that a pair differs in the field and in nothing else."""
+"""lambda_p of L_p. The paper has the field only at the first; here each weight, and the recipe's
+own, is trained with and without it, so that a pair differs in nothing but the field."""
 NORMALISED = (1.6, 3.2, 6.4)
 """lambda_p of L_p^norm without the field."""
 KINDS = ("field", "progress", "normalised")
@@ -33,11 +33,11 @@ SPREADS = ("success_cross", "collision_free", "v_max", "v_max_most", "gates")
 class Config(options.FourGates):
     """Train with the vector field and without it, from several seeds, and fly unseen worlds.
 
-    Trainings are found again by the hash of their configuration.
+    A training is reused if its configuration has the same hash.
     """
 
     only: tuple[str, ...] = ()
-    """Settings, such as "field 0.4"; all if none is named."""
+    """Settings, such as "field 0.4"; all by default."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -93,10 +93,10 @@ def document(config: Config, place: Place, console: Console) -> Made:
 
 
 def settings(config: Config) -> list[training.Row]:
-    """Return the chosen rows, in the paper's order.
+    """Return the chosen settings, in the paper's order.
 
     Raises:
-        ValueError: for a recipe, a change or a row that does not exist.
+        ValueError: for an unknown recipe, change or setting.
     """
     fixed = ("progress_norm", "projection")
     check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
@@ -117,7 +117,7 @@ def settings(config: Config) -> list[training.Row]:
 
 
 def weight(row: Summary) -> float:
-    """Return lambda_p."""
+    """Return lambda_p of the progress term that is used."""
     return row.recipe.loss.progress or row.recipe.loss.progress_norm
 
 

@@ -1,4 +1,4 @@
-"""Faults put into simulated and real logs: how many are named, and how many good logs accused."""
+"""Faults put into simulated and real logs: the share that is named, and the false alarms."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ OWN = "flight log"
 FORMATS = (*WRITERS, OWN)
 POLICY_HZ = 30.0
 OUTCOMES = ("named", "not identifiable", "refused", "another name", "silent")
-"""What becomes of a faulty log: named as it should be, reported as not identifiable, refused with a
-reason, reported under another name only, imported without a word."""
+"""Outcomes of a faulty log: its fault is named, or reported as not identifiable; the log is refused
+with a reason; only another fault is named; or it is imported without a finding."""
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,16 @@ class Config:
     """Put every kind of fault into simulated logs of four formats and real ones, and check them."""
 
     flights: Annotated[int, Range(1, 100)] = 5
-    """Simulated flights a kind; each in another format."""
+    """Simulated flights for each kind of fault, in formats that alternate."""
     clean: Annotated[int, Range(1, 2000)] = 200
     """Simulated flights without a fault."""
     real: Path = Path("../shared/real_logs")
-    """Folder of real logs (nanobench, crazyswarm2, crazypad); left out where it is missing."""
+    """Folder of real logs (nanobench, crazyswarm2, crazypad); without it simulated logs alone."""
     vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml): flown with an offset centre of mass."""
+    """A shipped vehicle's name or a vehicle file (.toml); it flies with an offset centre of
+    mass."""
     seed: Seed = 7_000_000
-    """Of the flights, their noise and what is drawn."""
+    """Seed of the flights, their noise and the faults."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Case:
     path: Path
     """The good flight."""
     number: int
-    """Of the flight, for its noise."""
+    """Number of the flight, the seed of its noise."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -86,8 +87,8 @@ def document(config: Config, place: Place, console: Console) -> Made:
         for kind in KINDS
         for k, path in enumerate(_share(kind, real, config.flights))
     ]
-    unhurt = [Case("", "real", path, 0) for path in real]
-    cases = [*faulty, *clean, *on_real, *unhurt]
+    intact = [Case("", "real", path, 0) for path in real]
+    cases = [*faulty, *clean, *on_real, *intact]
     done = _checked(cases, config, folder, console, place)
     groups = {"simulated": faulty, "real": on_real}
     parts = {
@@ -95,7 +96,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         for name, held in groups.items()
         if any(done[c] for c in held)
     }
-    parts["Logs without a fault"] = [_clean_grid([(c, done[c]) for c in (*clean, *unhurt)])]
+    parts["Logs without a fault"] = [_clean_grid([(c, done[c]) for c in (*clean, *intact)])]
     facts = {
         "flights": f"{len(good)} of the judge on all tracks, levels 0, 3 and 6, vehicle "
         f"{config.vehicle} with its centre of mass off by 6 and -3 mm, measured with noise; held "
@@ -115,7 +116,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
 
 
 def _flights(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> list[Path]:
-    """Return good flights of four seconds and more, flown where they are not there yet."""
+    """Return good flights of at least 4 s; missing ones are flown first."""
     count = max(config.clean, config.flights * len(FORMATS))
     true = with_effects(vehicle, TRUE_EFFECTS)
     folder.mkdir(parents=True, exist_ok=True)
@@ -146,19 +147,19 @@ def _holds(format: str) -> set[str]:
 
 
 def _share(kind: str, real: Sequence[Path], count: int) -> list[Path]:
-    """Return the real logs that a kind is put into, spread over all of them."""
+    """Return `count` of the real logs, spread over all of them by kind."""
     start = list(KINDS).index(kind) * 3
     return [real[(start + 7 * k) % len(real)] for k in range(min(count, len(real)))]
 
 
 Answer = list[dict[str, Any]] | str | None
-"""Records of findings; the reason of a refusal; None where a log lacks what the fault is of."""
+"""Records of findings; the reason of a refusal; None if the log lacks the fault's signals."""
 
 
 def _checked(
     cases: Sequence[Case], config: Config, folder: Path, console: Console, place: Place
 ) -> dict[Case, Answer]:
-    """Return the findings of every case; those of an interrupted run are kept."""
+    """Return the findings of every case; those of an interrupted run are reused."""
     path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
     keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}": c for c in cases}
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
@@ -178,7 +179,7 @@ def _checked(
 
 
 def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
-    """Yield what is found in one log."""
+    """Yield the findings in one log."""
     kind = KINDS.get(case.kind, Kind(()))
     rng = np.random.default_rng([seed, case.number, len(case.kind)])
     if case.format == "real":
@@ -216,7 +217,7 @@ def _findings(case: Case, parts: dict[str, np.ndarray], vehicle: Vehicle, agains
 
 
 def _real(path: Path) -> tuple[FlightLog, Vehicle]:
-    """Return a real log as it is imported, and the vehicle file that it is held against."""
+    """Return an imported real log, and the vehicle that it is compared with."""
     name = path.parent.name if path.parent.name in ("nanobench", "crazyswarm2") else "crazypad"
     vehicle = load_vehicle("crazyflie21")
     options = ImportOptions(map=Path(name), partial=True, vehicle=vehicle)
@@ -224,7 +225,7 @@ def _real(path: Path) -> tuple[FlightLog, Vehicle]:
 
 
 def _reported(answer: Answer) -> list[str]:
-    """Return the names of what is found, of a refusal "refused"."""
+    """Return the names of the reported faults, or "refused"."""
     if isinstance(answer, str):
         return ["refused"]
     return [f["fault"] for f in answer or () if f["status"] != "not identifiable"]

@@ -18,10 +18,10 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.policy import load_policy
+from suite.common.charts import CURVE, curves_chart
 from suite.common.console import Console
 from suite.common.curve import read
 from suite.common.report import Picture
-from suite.experiments.pages.charts import training_chart
 from suite.experiments.pages.document import Made
 from suite.experiments.pages.gpu_tables import (
     MODELS,
@@ -47,12 +47,12 @@ from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
-"""That the trained policy and the comparison with the CPU fly."""
+"""Levels of the trained policy's trials, and of the comparison with the CPU."""
 SAMPLED, COUNTED = 128, 8
-"""Different worlds of a speed measurement, repeated up to its number of worlds; and worlds whose
-operations are counted."""
+"""Number of different worlds in a speed measurement, which are repeated to its size; and of worlds
+whose operations are counted."""
 CPU_MOST = 256
-"""Most worlds that a CPU is measured with: more take it hours."""
+"""Most worlds on a CPU: more take hours."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Config:
     worlds: tuple[Annotated[int, Range(1, 10**6)], ...] = (256, 1024, 4096)
     """Worlds at once whose speed is measured, in the trainer and in the judge."""
     seconds: Annotated[float, Range(0.1, 36000.0)] = 100.0
-    """Of the short training, about [s]."""
+    """Approximate length of the short training [s]."""
     train_worlds: Annotated[int, Range(1, 10**6)] = 1024
     """Worlds per gradient step of the short training, which follows the recipe gpu; one of
     --worlds."""
@@ -71,32 +71,31 @@ class Config:
     paired_trials: Trials = 200
     """Trials that the shipped policy flies in mjx on the accelerator and on the CPU."""
     timed_s: Annotated[float, Range(0.1, 60.0)] = 2.0
-    """Of a trial in the judge's speed measurement [s]."""
+    """Length of a trial in the judge's speed measurement [s]."""
     matrix: Annotated[int, Range(8, 65536)] = 8192
-    """Side of the matrices whose product shows what the device reaches at best."""
+    """Size of the square matrices whose product shows the best speed of the device."""
     seed: Seed = 0
-    """Of the training, and of the first judged trial."""
+    """Seed of the training, and of the first judged trial."""
 
 
 class Row(NamedTuple):
-    """The trainer's speed on so many worlds."""
+    """The trainer's speed for a number of worlds."""
 
     model: str
     """A key of MODELS."""
     worlds: int
-    """In a gradient step."""
+    """Worlds in a gradient step."""
     seconds: float
-    """Of a gradient step [s]."""
+    """Time of a gradient step [s]."""
     operations: float
-    """Of a gradient step, floating-point [1]."""
+    """Floating-point operations of a gradient step."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables, a chart and numbers.
 
     Raises:
-        ValueError: where the short training's number of worlds is none whose speed is measured,
-            and for too many worlds for a CPU.
+        ValueError: if --train-worlds is not one of --worlds, and for too many worlds on a CPU.
     """
     if config.train_worlds not in config.worlds:
         raise ValueError(
@@ -111,7 +110,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     device, vehicle = jax.devices()[0], load_vehicle("reference")
     best = multiplying_rate(config.matrix)
     console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
-    # A process of its own flies on the CPU while this one keeps the accelerator busy.
+    # Another process flies on the CPU at the same time.
     with worker_pool(1) as cpu_process:
         theirs = cpu_process.submit(flown_on_cpu, config, vehicle)
         programs = compiled(config, vehicle, console)
@@ -129,7 +128,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "most memory held": "unknown" if memory is None else f"{memory / 1e9:.1f} GB",
         "compiling": f"{programs.seconds:.0f} s, all programs at once",
     }
-    curve = Picture(training_chart(short["curve"]), "The short training's curve")
+    curve = Picture(curves_chart({"training": short["curve"]}), "The short training's curve")
     parts: dict[str, Sequence[Grid | Picture]] = {
         "Trainer": [trainer_grid(trainer, _steps(config), best)],
         "Judge": [judge_grid(judge)],
@@ -150,14 +149,14 @@ def document(config: Config, place: Place, console: Console) -> Made:
 
 
 def recipe(config: Config, worlds: int) -> TrainConfig:
-    """Return the recipe gpu for so many worlds in one shard."""
+    """Return the recipe gpu for a number of worlds in one shard."""
     base = named_recipe("gpu")
     episode = replace(base.episode, batch=worlds, shards=1)
     return replace(base, episode=episode, seed=config.seed)
 
 
 def last_phase(config: Config, model: str, worlds: int) -> TrainConfig:
-    """Return the settings of the recipe's last phase for so many worlds of a model."""
+    """Return the settings of the recipe's last phase for a model and a number of worlds."""
     phase = phase_configs(recipe(config, worlds))[-1]
     return without_quadrotor(phase) if model == "point" else phase
 
@@ -167,28 +166,27 @@ def _steps(config: Config) -> int:
 
 
 class Update(NamedTuple):
-    """A gradient step that has been compiled, on worlds of its own."""
+    """A compiled gradient step with its worlds."""
 
     phase: TrainConfig
     call: Callable[[], Any]
 
 
 class Compiled(NamedTuple):
-    """What compiling all programs gives."""
+    """The compiled programs."""
 
     updates: Mapping[tuple[str, int], Update]
     """By model and number of worlds."""
     here: list[TrialResult]
-    """The trials that are compared with the CPU's."""
+    """Results of the trials that the CPU flies as well."""
     seconds: float
-    """How long it took [s]."""
+    """Time of compiling [s]."""
 
 
 def compiled(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
-    """Run every program once, all at the same time, since most of that is compiling.
+    """Run every program once, all at the same time, since compiling takes most of the time.
 
-    The short training's phases are among them: JAX keeps what is compiled, so that the training
-    need not compile it again.
+    The programs of the short training are among them, so that it need not compile them again.
     """
     wanted = {
         (model, worlds): last_phase(config, model, worlds)
@@ -210,7 +208,7 @@ def compiled(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
 
 
 def _update(phase: TrainConfig) -> Update:
-    """Return a gradient step of a phase, done once."""
+    """Return a gradient step of a phase, after one call."""
     update, worlds = make_update(phase), repeated(phase)
     state = jax.device_put(start_state(phase), jax.devices()[0])
     jax.block_until_ready(update(state, worlds))
@@ -240,7 +238,7 @@ def trainer_speeds(
 
 
 def _operations_a_world(config: Config, model: str) -> float:
-    """Return the operations of a world's gradient."""
+    """Return the operations of the gradient for one world."""
     phase = last_phase(config, model, COUNTED)
     gradient = make_gradient(phase)
     given = (start_state(phase).params, repeated(phase), jax.random.key(0))
@@ -248,7 +246,7 @@ def _operations_a_world(config: Config, model: str) -> float:
 
 
 def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console) -> dict[str, Any]:
-    """Return what the simulator mjx reaches with so many trials at once, tracks made anew."""
+    """Return the speed of mjx with `worlds` trials at once; making their tracks counts."""
     began = time.perf_counter()
     results = _timed(config, vehicle, worlds)
     seconds = time.perf_counter() - began
@@ -281,7 +279,7 @@ def _flown(config: Config, vehicle: Vehicle, world: str) -> list[TrialResult]:
 
 
 def flown_on_cpu(config: Config, vehicle: Vehicle) -> dict[str, list[TrialResult]]:
-    """Return the shipped policy's trials, flown on the CPU, by what flew them."""
+    """Return the shipped policy's trials, flown on the CPU, by simulator."""
     jax.config.update("jax_platforms", "cpu")
     return {f"{world} on the CPU": _flown(config, vehicle, world) for world in ("mjx", "mujoco")}
 
@@ -289,7 +287,7 @@ def flown_on_cpu(config: Config, vehicle: Vehicle) -> dict[str, list[TrialResult
 def compared(
     here: Sequence[TrialResult], theirs: Mapping[str, Sequence[TrialResult]], console: Console
 ) -> dict[str, Any]:
-    """Return how alike the shipped policy's trials end on the accelerator and on the CPU."""
+    """Return how many of the shipped policy's trials end alike on the accelerator and the CPU."""
     found = {}
     for name, others in theirs.items():
         won, lost = (np.array([r.success for r in rows]) for rows in (here, others))
@@ -306,14 +304,14 @@ def compared(
 def short_training(
     config: Config, vehicle: Vehicle, step_s: float, place: Place, console: Console
 ) -> dict[str, Any]:
-    """Train by the recipe gpu for about so many seconds, and judge what comes out.
+    """Train by the recipe gpu for about `config.seconds`, and judge the policy.
 
     Args:
         config: of the experiment.
-        vehicle: that the trained policy flies.
-        step_s: of a gradient step of the last phase, by which their number is chosen [s].
-        place: of the run, which is made anew: its time is a result.
-        console: where progress goes.
+        vehicle: of the judged trials.
+        step_s: time of a gradient step of the last phase; it determines how many are made [s].
+        place: cache; an earlier run is removed, since the time is a result.
+        console: shows progress.
     """
     wanted = recipe(config, config.train_worlds)
     phases = phase_configs(with_iterations(wanted, 1000))
@@ -339,8 +337,5 @@ def short_training(
         "decisions_per_s": float(np.median([row["steps_per_s"] for row in warm])),
         "success": wilson(sum(result.success for result in results), len(results)),
         "v_max": float(np.median(fast)) if fast else None,
-        "curve": [
-            {key: row[key] for key in ("iteration", "gates", "collided", "speed", "loss")}
-            for row in curve
-        ],
+        "curve": [{key: row[key] for key in ("iteration", *CURVE, "loss")} for row in curve],
     }

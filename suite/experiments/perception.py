@@ -27,15 +27,15 @@ from tracks.common.grid import Cell, Grid, table
 from tracks.input.ranges import Trials
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
-"""1: as the shipped files have it."""
+"""Factors of the magnitudes in the shipped files."""
 
 
 @dataclass(frozen=True)
 class Config(options.Judged):
     """Judge policies through sensor models: all presets on every cell, and growing magnitudes.
 
-    All fly the same trials under every condition. A policy trained with sensor models next to the
-    first shows what that training gains, and what it costs with perfect sensors.
+    All policies fly the same trials under every condition. Give a policy that was trained with
+    sensor models as the second one to see the effect of that training.
     """
 
     difficulty: str = "0,3,6,9"
@@ -45,7 +45,7 @@ class Config(options.Judged):
     growing_trials: Trials = 32
     """Trials of every policy on every track at level 3 at every magnitude."""
     only: tuple[str, ...] = ()
-    """Only these presets and models, by name; by default all."""
+    """Only these presets and models, by name; all by default."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -92,7 +92,7 @@ def chosen_sets(only: Sequence[str]) -> dict[str, SensorSet]:
     """Return the presets, then each model alone at its usual size, that are in `only`, or all.
 
     Raises:
-        ValueError: for a name that does not exist.
+        ValueError: for an unknown name.
     """
     presets = {name: load_sensors(name) for name in shipped_sensors() if name != "perfect"}
     usual = {**presets["tof-depth"].models, **presets["all"].models}
@@ -122,7 +122,7 @@ def _speed(entry: Tested, policy: str) -> float:
 
 
 def preset_grid(tested: Sequence[Tested]) -> Grid:
-    """Return success by level, over all, its change from perfect, and speed, a row a preset."""
+    """Return a row a preset: success by level and over all, its change from perfect, speed."""
     base, lines = tested[0], []
     levels = list(dict.fromkeys(row.difficulty for row in next(iter(base.results.values()))))
     for entry in tested:
@@ -142,7 +142,7 @@ def preset_grid(tested: Sequence[Tested]) -> Grid:
 
 
 def gain_grids(tested: Sequence[Tested]) -> list[Grid]:
-    """Return how the other policies differ from the first under each preset, if there are any."""
+    """Return the differences of the other policies to the first under each preset."""
     first, *others = tested[0].results
     lines = []
     for entry in tested:

@@ -39,7 +39,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class All:
-    """Make every published page, in order; what is finished is not done again."""
+    """Make every published page, in order; finished parts are reused."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,10 @@ def make_all(make: Callable[[str, tuple[str, ...]], Any], console: Console) -> d
 
 
 def page_states(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return of every published page in `folder` what made it, and what is newer than it.
+    """Return for every published page in `folder` the commit that made it, and what is newer.
 
-    `newer` has "policy" where a shipped policy has other weights than those that flew, and "code"
-    where the code that flies (tracks, policies, eval) is another; None where there is no page.
+    `newer` has "policy" if a shipped policy has other weights than the one that flew, and "code" if
+    the code that flies (tracks, policies, eval) has changed; it is None if there is no page.
     """
     return {name: _state(folder / f"{name}.json") for name in PUBLISHED}
 

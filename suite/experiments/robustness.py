@@ -23,12 +23,12 @@ from tracks.common.grid import Cell, Grid, table
 class Config(options.Judged):
     """Judge policies under every physical effect and under growing disturbances.
 
-    All fly the same trials under every condition. A policy trained with another randomisation
-    next to the first shows what that randomisation gains.
+    All policies fly the same trials under every condition. Give a policy that was trained with
+    another randomisation as the second one to see the effect of that randomisation.
     """
 
     only: tuple[str, ...] = ()
-    """Only these effects and sweeps, by name; by default all."""
+    """Only these effects and sweeps, by name; all by default."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -67,9 +67,9 @@ def condition_grid(
     """Return success and change under each of `entries`, a row each.
 
     Args:
-        entries: conditions; their other policies are compared with the first.
-        base: the undisturbed one.
-        first: headers of what names a row: the size, or the name and the size.
+        entries: tested conditions; the other policies are compared with the first.
+        base: the undisturbed condition.
+        first: headers of the first columns: the size, or the name and the size.
         title: of the table.
     """
     headers, names = list(first), list(base.results)

@@ -8,12 +8,13 @@ from typing import Annotated
 
 import numpy as np
 
+from suite.common.charts import METRICS
 from suite.common.console import Console, duration
 from suite.common.report import Picture
 from suite.experiments.pages.document import Made
 from suite.experiments.study import options, training
 from suite.experiments.study.cache import Place
-from suite.experiments.study.summary import METRICS, Summary, summaries
+from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
 from tracks.common.grid import Grid, table
@@ -23,28 +24,30 @@ PROJECTION, PROJECTION_DECAY = 3.0, 0.5
 """lambda_proj and beta_3 of the paper's scheme without the field."""
 FIGURE = ("reward", "v_max", "collision_free", "gates")
 """What the paper's figure shows."""
+MEASURED = ("reward", "success_cross", "collision_free", "v_max", "gates")
+"""Numbers of `validation.measured` in the table and in schemes.json."""
 WANTED = (1, 2, 3)
-"""Mean gates a trial, of four, whose first time the table gives."""
+"""Mean gates a trial, of four: the table has the time at which each is first reached."""
 
 
 @dataclass(frozen=True)
 class Config(options.FourGates):
     """Train by PPO, by our method, and by it without the field, and measure them as they learn.
 
-    All three share policy, dynamics, worlds and the number of environment steps. Trainings are
-    found again by the hash of their configuration and of what is measured on the way.
+    All three share policy, dynamics, worlds and the number of environment steps. A training is
+    reused if its configuration and its measurements have the same hash.
     """
 
     progress: Annotated[float, Range(0.0, 1e6)] = 0.4
     """lambda_p of both differentiable schemes; the paper's."""
     ppo_iterations: Iterations | None = None
-    """Rollouts of PPO; as many as the others' gradient steps if not given."""
+    """Rollouts of PPO; by default as many as the others' gradient steps."""
     trials: Trials = 100
-    """Unseen worlds that are flown at every measurement."""
+    """Unseen worlds flown at every measurement."""
     measurements: Annotated[int, Range(1, 10_000)] = 20
-    """About how many a training has; their time is no part of the curves."""
+    """About how many measurements a training has; their time does not count in the curves."""
     only: tuple[str, ...] = ()
-    """Schemes: ppo, ours, projection; all if none is named."""
+    """Schemes: ppo, ours, projection; all by default."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
@@ -80,7 +83,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
             "diverged": row.diverged,
             "steps": [int(point["steps"].mean) for point in row.at],
             "time": [point["time"].mean for point in row.at],
-            "curves": {n: [point[n] for point in row.at] for n in METRICS if row.at},
+            "curves": {n: [point[n] for point in row.at] for n in MEASURED if row.at},
             "reached": {gates: first_times(row, gates) for gates in WANTED},
             "compile_s": compiling[row.key],
         }
@@ -95,8 +98,8 @@ def schemes(config: Config) -> list[training.Row]:
     """Return the chosen schemes, in the paper's order.
 
     Raises:
-        ValueError: for a recipe, a change or a scheme that does not exist, and for worlds that PPO
-            cannot share among its minibatches.
+        ValueError: for an unknown recipe, change or scheme, and for a number of worlds that is no
+            multiple of PPO's minibatches.
     """
     compared = ("progress_norm", "projection", "projection_decay")
     owned = {f"loss.{name}": "it is compared" for name in compared}
@@ -121,15 +124,15 @@ def schemes(config: Config) -> list[training.Row]:
 
 
 def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:
-    """Return steps and seconds of the first measurement with `gates`, of the seeds that have it."""
+    """Return steps and seconds of each seed's first measurement with `gates`, where it has one."""
     firsts = [next((p for p in points if p["gates"] >= gates), None) for points in row.whole]
     return [(point["steps"], point["time"]) for point in firsts if point is not None]
 
 
 def _end(rows: Sequence[Summary]) -> Grid:
-    headers = ["scheme", *(metric.title for metric in METRICS.values()), "diverged"]
+    headers = ["scheme", *(METRICS[name].title for name in MEASURED), "diverged"]
     lines = [
-        [row.words, *(row.text(name) for name in METRICS), f"{row.diverged} of {row.seeds}"]
+        [row.words, *(row.text(name) for name in MEASURED), f"{row.diverged} of {row.seeds}"]
         for row in rows
     ]
     return table(headers, lines, "At the end of each budget: mean over seeds [least, most]")

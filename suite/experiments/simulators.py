@@ -1,25 +1,25 @@
-"""The shipped policies in every simulator on the same trials: where simulators differ, and why."""
+"""The shipped policies on the same trials in every simulator: which trials differ, and why."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import tyro
 
-from eval.judging.statistics import paired_success, wilson
+from eval.judging.statistics import paired_success
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE, WORLDS, differences, world_class
-from eval.worlds.trial import TrialResult
 from policies import shipped
 from suite.common.console import Console
 from suite.experiments.pages.document import Made
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import Place
+from suite.experiments.study.conditions import Condition
+from suite.experiments.study.disturbed import Tested, flown_under
 from suite.loop.compare import difference_cell
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Trials
@@ -27,11 +27,11 @@ from tracks.input.ranges import Trials
 BASE = "mujoco"
 """The simulator that the others are compared with."""
 ROUNDING = "mjx"
-"""The simulator that differs from `BASE` only in single precision, in contacts found by signed
-distance, and in images from analytic rays."""
+"""This simulator differs from `BASE` in single precision, in contacts by signed distance, and in
+images from analytic rays."""
 WHY = ("rounding", "air", "rest")
-"""Why a trial's outcome changes: `rounding`, it changes in mjx too; `air`, it changes in mujoco too
-with that simulator's aerodynamics; `rest`, neither."""
+"""Why the success of a trial changes: `rounding`, it changes in mjx too; `air`, it changes in
+mujoco with that simulator's aerodynamics too; `rest`, for another reason."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,13 @@ class Config(options.Judged):
     """A simulator besides mujoco; may be given several times. Without it mjx and rotorpy."""
 
 
-class Column(NamedTuple):
-    """A column of the tables: a simulator and the vehicle that it flies."""
-
-    label: str
-    simulator: str
-    vehicle: Vehicle
-    """The vehicle file; of a control, one with the aerodynamics of another simulator."""
-    control_of: str | None = None
-    """The simulator whose aerodynamics the vehicle has; None for no control."""
+def air_of(simulator: str) -> str:
+    """Return the label of the control of a simulator: mujoco with that simulator's aerodynamics."""
+    return f"{BASE}, the air of {simulator}"
 
 
-Flown = Mapping[tuple[str, str], Sequence[TrialResult]]
-"""Results by policy and column, the trials in one order."""
-
-
-def columns(config: Config) -> list[Column]:
-    """Return the columns, mujoco first.
+def conditions(config: Config) -> list[Condition]:
+    """Return the simulators and their controls, mujoco first.
 
     Raises:
         ValueError: for an unknown simulator, or one whose package is not installed.
@@ -74,7 +64,7 @@ def columns(config: Config) -> list[Column]:
     twice = next((n for n in config.simulator if config.simulator.count(n) > 1), None)
     if twice is not None:
         raise ValueError(f"--simulator {twice} is given twice; give each simulator once")
-    found = [Column(BASE, BASE, vehicle)]
+    found = [Condition(BASE, 1.0, "", vehicle)]
     for name in config.simulator or (ROUNDING, "rotorpy"):
         simulator = world_class(name)
         if name in (BASE, REFERENCE):
@@ -84,81 +74,75 @@ def columns(config: Config) -> list[Column]:
                 f"one of {others}"
             )
         if hasattr(simulator, "nearest"):
-            label = f"{BASE}, the air of {name}"
-            found.append(Column(label, BASE, simulator.nearest(vehicle), name))
-        found.append(Column(name, name, vehicle))
+            found.append(Condition(air_of(name), 1.0, "", simulator.nearest(vehicle)))
+        found.append(Condition(name, 1.0, "", vehicle, simulator=name))
     return found
 
 
 def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; what is missing is flown first."""
-    flown_in = columns(config)
+    flown_in = conditions(config)
     policies = judging.named_policies(config.policy or tuple(shipped.names()))
-    names = list(policies)
     trials = judging.trials_of(config)
-    orders = {
-        (name, column.label): judging.Order(
-            judging.Setup(policy, column.vehicle, simulator=column.simulator), trials
-        )
-        for name, policy in policies.items()
-        for column in flown_in
-    }
-    results = judging.flown(orders, place, console, "flying in every simulator")
-    changed = changes(names, flown_in, results)
+    tested, _ = flown_under(flown_in, {}, policies, trials, place, console)
+    changed = changes(tested)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, levels {config.difficulty}, seeds "
         f"{options.judged_seeds(config)}: {len(trials)} of each policy in each simulator",
         "vehicle": config.vehicle,
     }
+    otherwise = [
+        [entry.name, sentence]
+        for entry in flown_in
+        for sentence in differences(entry.simulator, entry.vehicle)
+    ]
     parts = {
-        "Success by simulator": [_overall(names, flown_in, results)],
-        "Trials that change their success": [_each(changed, flown_in)],
-        "What the simulators fly otherwise": [_otherwise(flown_in)],
+        "Success by simulator": [_overall(tested)],
+        "Trials that change their success": [_each(changed, tested)],
+        "What the simulators fly otherwise": [
+            table(["simulator", "difference to the vehicle's file"], otherwise)
+        ],
     }
     numbers = {
         "success": [
-            {"policy": name, "column": column.label, **_numbers(results, name, column.label)}
-            for name in names
-            for column in flown_in
+            {"policy": name, "column": entry.condition.name, **_numbers(entry, tested[0], name)}
+            for name in policies
+            for entry in tested
         ],
         "changed": changed,
     }
     return Made(facts, parts, numbers)
 
 
-def _won(rows: Sequence[TrialResult]) -> np.ndarray:
-    return np.array([row.success for row in rows])
+def _numbers(entry: Tested, base: Tested, policy: str) -> dict[str, Any]:
+    """Return one policy's results in a simulator, and their difference to those in mujoco."""
+    rows, others = entry.results[policy], base.results[policy]
+    pairs = [(a, b) for a, b in zip(rows, others, strict=True) if a.success and b.success]
 
-
-def _numbers(results: Flown, name: str, label: str) -> dict[str, Any]:
-    rows, base = results[name, label], results[name, BASE]
-    won = _won(rows)
-    pairs = [(a, b) for a, b in zip(rows, base, strict=True) if a.success and b.success]
-
-    def apart(of: str) -> float | None:
-        gaps = [abs(getattr(a, of) - getattr(b, of)) for a, b in pairs]
+    def apart(field: str) -> float | None:
+        gaps = [abs(getattr(a, field) - getattr(b, field)) for a, b in pairs]
         return float(np.median(gaps)) if gaps else None
 
     return {
-        "success": wilson(int(won.sum()), len(won)),
-        "minus_mujoco": paired_success(won, _won(base)),
-        "ends_alike": sum(a.ended_by == b.ended_by for a, b in zip(rows, base, strict=True)),
+        "success": entry.success(policy),
+        "minus_mujoco": paired_success(entry.won(policy), base.won(policy)),
+        "ends_alike": sum(a.ended_by == b.ended_by for a, b in zip(rows, others, strict=True)),
         "trials": len(rows),
         "lap_apart_s": apart("time_s"),
         "v_mean_apart": apart("v_mean"),
     }
 
 
-def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -> Grid:
+def _overall(tested: Sequence[Tested]) -> Grid:
     headers = ["policy", "simulator", "success", "minus mujoco", "p", "ends alike"]
     headers += ["lap apart [s]", "mean speed apart [m/s]"]
     lines = []
-    for name in names:
-        for column in flown_in:
-            found = _numbers(results, name, column.label)
-            line = [name, column.label, percent(found["success"])]
-            if column.label == BASE:
+    for name in tested[0].results:
+        for entry in tested:
+            found = _numbers(entry, tested[0], name)
+            line = [name, entry.condition.name, percent(found["success"])]
+            if entry is tested[0]:
                 lines.append([*line, *[""] * 5])
                 continue
             less = found["minus_mujoco"]
@@ -169,55 +153,51 @@ def _overall(names: Sequence[str], flown_in: Sequence[Column], results: Flown) -
     return table(headers, lines)
 
 
-def changes(
-    names: Sequence[str], flown_in: Sequence[Column], results: Flown
-) -> list[dict[str, Any]]:
+def changes(tested: Sequence[Tested]) -> list[dict[str, Any]]:
     """Return the trials whose success in a simulator is not that in mujoco.
 
-    Each has the endings by column, and `why`: one of `WHY`, by the controls that were flown; in
-    `ROUNDING` itself and in controls it is None.
+    Each has the endings by simulator, and `why`, one of `WHY`; it is None in mjx and in controls.
     """
-    has_rounding = any(column.simulator == ROUNDING for column in flown_in)
+    by_name = {entry.condition.name: entry for entry in tested}
+    base, *others = tested
     found = []
-    for name in names:
-        for column in flown_in[1:]:
-            own = [c.label for c in flown_in if c.control_of == column.simulator]
-            explained = column.simulator not in (BASE, ROUNDING)
-            for number, base in enumerate(results[name, BASE]):
-                row = results[name, column.label][number]
-                if row.success == base.success:
+    for policy, rows in base.results.items():
+        for entry in others:
+            simulator = entry.condition.simulator
+            for number, first in enumerate(rows):
+                result = entry.results[policy][number]
+                if result.success == first.success:
                     continue
-                why = None
-                if explained:
-                    aired = any(results[name, c][number].success == row.success for c in own)
-                    why = "air" if aired else "rest"
-                    if has_rounding and results[name, ROUNDING][number].success != base.success:
-                        why = "rounding"
-                ends = {c.label: results[name, c.label][number].ending for c in flown_in}
+                # Whether the two controls change the success of this trial as well.
+                rounding, air = (
+                    name in by_name
+                    and by_name[name].results[policy][number].success == result.success
+                    for name in (ROUNDING, air_of(simulator))
+                )
+                why = "rounding" if rounding else "air" if air else "rest"
                 found.append(
-                    {"policy": name, "column": column.label, "trial": row.trial, "why": why,
-                     "endings": ends}
-                )  # fmt: skip
+                    {
+                        "policy": policy,
+                        "column": entry.condition.name,
+                        "trial": result.trial,
+                        "why": None if simulator in (BASE, ROUNDING) else why,
+                        "endings": {
+                            name: each.results[policy][number].ending
+                            for name, each in by_name.items()
+                        },
+                    }
+                )
     return found
 
 
-def _each(changed: Sequence[Mapping[str, Any]], flown_in: Sequence[Column]) -> Grid:
+def _each(changed: Sequence[Mapping[str, Any]], tested: Sequence[Tested]) -> Grid:
     """Return the trials that change for a reason of `WHY`, one by one."""
+    names = [entry.condition.name for entry in tested]
     lines = [
         [c["policy"], c["trial"].track, str(c["trial"].difficulty), str(c["trial"].seed)]
-        + [c["endings"][column.label] for column in flown_in]
+        + [c["endings"][name] for name in names]
         + [c["why"]]
         for c in changed
         if c["why"]
     ]
-    headers = ["policy", "track", "level", "seed", *(c.label for c in flown_in), "why"]
-    return table(headers, lines)
-
-
-def _otherwise(flown_in: Sequence[Column]) -> Grid:
-    lines = [
-        [column.label, sentence]
-        for column in flown_in
-        for sentence in differences(column.simulator, column.vehicle)
-    ]
-    return table(["simulator", "difference to the vehicle's file"], lines)
+    return table(["policy", "track", "level", "seed", *names, "why"], lines)

@@ -22,13 +22,13 @@ from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
 
 OURS = "ours"
-"""What tables call the policy next to the printed rows."""
+"""Label of the policy next to the printed rows."""
 COLUMNS = [
     header
     for track in JUDGED
     for header in (f"{track} SR", "v_max [m/s]", "of ten [m/s]", "v_mean [m/s]", "lap [s]")
 ]
-"""Of every track."""
+"""Columns of every track."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class Config:
     """Judge a policy on three tracks at all ten levels, next to the paper's and baseline's rows."""
 
     policy: str | None = None
-    """A shipped policy's name, a checkpoint's folder or a policy file; by default the shipped."""
+    """A shipped policy's name, a checkpoint's folder or a policy file; the shipped one by
+    default."""
     trials: Trials = 100
     """Trials on every track at every level."""
     seed: Seed = 0
@@ -44,7 +45,7 @@ class Config:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     sensors: str = "perfect"
-    """What policies see of the truth: shipped sensors' name or a sensors file (.toml)."""
+    """Errors in what the policy sees: a shipped name or a sensors file (.toml)."""
 
 
 def document(config: Config, place: Place, console: Console) -> Made:

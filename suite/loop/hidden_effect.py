@@ -18,9 +18,10 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import differences
 from eval.worlds.trial import TrialResult
 from suite.common import curve
+from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.parameters_json import components, grid
-from suite.loop.charts import success_chart, tuning_chart
+from suite.loop.charts import SEVERAL, success_chart
 from suite.loop.compare import BEFORE, points, significance
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
 from suite.loop.report import errors_row
@@ -188,12 +189,13 @@ def _delta(out: Path) -> Section:
 def _training(out: Path, config: LoopConfig) -> Section:
     assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
-    chart = tuning_chart({LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned})
+    curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}
+    chart = curves_chart(curves, SEVERAL[2:])
     words = (
         f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each curve "
         "is of the vehicle that it was trained in, so their levels are not comparable."
     )
-    return Section("Fine-tuning", [words, Picture(chart, "Running means.")])
+    return Section("Fine-tuning", [words, Picture(chart, "Thin: each step. Thick: means.")])
 
 
 LOOP = Loop(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from tracks.common.names import printable
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+Row = TypeVar("Row")
 _TAG = re.compile(r"<(?=[A-Za-z/!?])")
 
 
@@ -47,6 +48,14 @@ def table(
     """Return a table of texts and of cells with a tone."""
     rows = [[Cell(entry) if isinstance(entry, str) else entry for entry in row] for row in lines]
     return Grid(title, headers, rows, note=note)
+
+
+def table_of(
+    rows: Iterable[Row], *columns: tuple[str, Callable[[Row], str | Cell]], title: str = ""
+) -> Grid:
+    """Return a table with a line for each of `rows`; a column is its header and its cells' text."""
+    lines = [[text(row) for _, text in columns] for row in rows]
+    return table([header for header, _ in columns], lines, title)
 
 
 def markdown(grid: Grid) -> str:

@@ -1,22 +1,23 @@
-"""Timing two implementations in turn, and saying when the machine is too busy to be believed."""
+"""Times implementations in turn, and warns where the machine is too busy for a fair comparison."""
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from tracks.common.grid import Grid
 
 BUSY_SHARE = 0.15
-"""Share of the processor that others may use before a benchmark is not to be trusted [1]."""
+"""Share of the processor that other processes may use without a warning [1]."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured rate, of which more is better, or a time."""
+    """A measured rate (more is better) or a time."""
 
     value: float
     """The figure, in `unit`."""
@@ -39,9 +40,9 @@ class Comparison:
     warnings: tuple[str, ...] = ()
     """Why the figures may not be trusted; empty on a free machine."""
     details: dict[str, Any] = field(default_factory=dict)
-    """Whatever else the benchmark measured."""
+    """Further results of the benchmark."""
     grid: Grid | None = None
-    """The details as a table for people; without one they are shown line by line."""
+    """The details as a table; without it they are printed line by line."""
 
     @property
     def ratio(self) -> float:
@@ -51,34 +52,61 @@ class Comparison:
 
 
 def in_turn(
-    ours: Callable[[], object],
-    baseline: Callable[[], object],
-    repeats: int = 5,
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int = 5,
     clock: Callable[[], float] = time.perf_counter,
-) -> tuple[float, float]:
-    """Return the median seconds of one call of each, called alternately after one warm-up.
+    most_s: float = math.inf,
+) -> dict[str, list[float]]:
+    """Return the seconds of each call in every round, after one call each to warm up.
 
-    Both callables must finish their work before they return (`jax.block_until_ready`).
+    Args:
+        calls: by name; each must finish its work before it returns (`jax.block_until_ready`).
+        rounds: in each of them every call is made once.
+        clock: seconds, increasing.
+        most_s: no round begins after this time; the first one always does [s].
     """
-    ours()
-    baseline()
-    taken: tuple[list[float], list[float]] = ([], [])
-    for _ in range(repeats):
-        for seconds, call in zip(taken, (ours, baseline), strict=True):
+    for call in calls.values():
+        call()
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    until = time.perf_counter() + most_s
+    for done in range(rounds):
+        if done and time.perf_counter() > until:
+            break
+        for name, call in calls.items():
             started = clock()
             call()
-            seconds.append(clock() - started)
-    return statistics.median(taken[0]), statistics.median(taken[1])
+            taken[name].append(clock() - started)
+    return taken
+
+
+def compared(
+    name: str,
+    taken: Mapping[str, list[float]],
+    work: float,
+    unit: str,
+    details: Mapping[str, Any],
+) -> Comparison:
+    """Return the comparison of two implementations by the medians of their times.
+
+    Args:
+        name: of the benchmark.
+        taken: times from `in_turn`, ours first [s].
+        work: done in one call, in units of the figure times seconds.
+        unit: of the figures.
+        details: further results.
+    """
+    ours, baseline = (Figure(work / statistics.median(seconds), unit) for seconds in taken.values())
+    return Comparison(name, ours, baseline, details=dict(details))
 
 
 def load_warnings(interval_s: float = 1.0) -> tuple[str, ...]:
-    """Return a warning where other processes use the processor, measured while we are idle."""
+    """Return a warning if other processes use the processor, measured while this one is idle."""
     import psutil
 
     share = psutil.cpu_percent(interval_s) / 100
     if share <= BUSY_SHARE:
         return ()
     return (
-        f"other processes use {share:.0%} of the processor: the figures, and the baseline's most "
-        "of all, are not to be trusted; run again on a free machine",
+        f"other processes use {share:.0%} of the processor: the figures, above all the baseline's, "
+        "are not reliable; run again on a free machine",
     )

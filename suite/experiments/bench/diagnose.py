@@ -1,13 +1,14 @@
 """`suite bench diagnose`: the diagnosis's refit against `mujoco.sysid` on the same data.
 
-Both fit mass, centre of mass and inertia, six numbers, to the same stretches of five flights of
-10 s, from the same start, in turn. Timed is the fit alone: reading logs is done, the compiled
-programs are loaded.
+Both fit six numbers (mass, centre of mass, inertia) to the same windows of five flights of 10 s,
+from the same initial values, in turn. Only the fit is timed: the logs have been read and the
+programs compiled before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
-from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.experiments.bench.compare import Comparison, compared, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
 SEED = 20_001
@@ -26,7 +27,7 @@ ROUNDS = 3
 
 
 def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
-    """Time both refits in turn and compare what they say.
+    """Time both refits in turn and compare their estimates.
 
     Args:
         seed: of the truth, the flights and their noise.
@@ -34,7 +35,7 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
         rounds: how often each side is timed, after one call to warm up.
 
     Raises:
-        WorkFailed: where `mujoco.sysid` is not installed whole.
+        WorkFailed: if a package of `mujoco.sysid` is missing.
     """
     from suite.experiments.bench import sysid_baseline
 
@@ -55,22 +56,22 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     def theirs() -> None:
         answers["mujoco.sysid"] = sysid_baseline.refit(problem)
 
-    seconds = in_turn(ours, theirs, rounds)
+    taken = in_turn({"ours": ours, "mujoco.sysid": theirs}, rounds)
     details = {
         **_agreement(task, answers),
         "stretches": len(task.windows.flight),
         "seed": seed,
-        "seconds": dict(zip(answers, seconds, strict=True)),
+        "seconds": {side: median(seconds) for side, seconds in taken.items()},
     }
-    first, second = (Figure(60.0 / each, "refits/min") for each in seconds)
-    return Comparison("diagnose", first, second, details=details)
+    return compared("diagnose", taken, 60.0, "refits/min", details)
 
 
 def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]:
-    """Return the fitted numbers (K,) and their normal equations, as the diagnosis does it.
+    """Return the fitted numbers (K,) and their normal equations, as the diagnosis fits them.
 
-    Noise, slopes along what is free in every stretch, and the Gauss-Newton rounds on stretches as
-    long as the model can be trusted, which get longer as the numbers get better.
+    It estimates the noise, linearises along the free start of every window, and repeats
+    Gauss-Newton steps on windows as long as the model is accurate; these grow as the numbers
+    improve.
     """
     indices, state = list(task.indices), start_estimate(model, task.windows)
     seen = 0
@@ -87,10 +88,10 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
 def _agreement(
     task: Task, answers: Mapping[str, tuple[np.ndarray, NormalEquations]]
 ) -> dict[str, Any]:
-    """Return each side's numbers, and how far they are apart over the joint 95 % half-width.
+    """Return each side's numbers, and their difference over the joint 95 % half-width.
 
-    The half-widths are worked out in the same way for both, from how stretches disagree; the joint
-    one is their root sum of squares.
+    The half-widths of both sides come from the disagreement between windows; the joint one is their
+    root sum of squares.
     """
     widths = {side: intervals95(equations).half_width for side, (_, equations) in answers.items()}
     first, second = (values for values, _ in answers.values())

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.experiments.bench.compare import Comparison, compared, in_turn
 
 ENVS, DECISIONS = 64, 20
 """Environments, and decisions of each that are timed at once."""
 
 
 def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Comparison:
-    """Step both with images and the same actions; episodes that end start anew."""
+    """Step both with images and the same actions; an environment whose episode ends is reset."""
     from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 
     many = RaceVectorEnv(envs, track="random")
@@ -33,7 +33,6 @@ def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Compa
                 if terminated or truncated:
                     env.reset()
 
-    seconds = in_turn(ours, baseline, repeats)
-    first, second = (Figure(envs * decisions / each, "decisions/s") for each in seconds)
+    taken = in_turn({"ours": ours, "baseline": baseline}, repeats)
     details = {"environments": envs, "image": "24 x 32", "vehicle": "racer5"}
-    return Comparison("env", first, second, details=details)
+    return compared("env", taken, envs * decisions, "decisions/s", details)

@@ -20,7 +20,7 @@ from eval.worlds import WORLDS
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.policy import load_policy
-from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.experiments.bench.compare import Comparison, compared, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
@@ -29,7 +29,7 @@ BASELINE = "mujoco, its own rays"
 
 
 class OwnRays(MujocoWorld):
-    """The world `mujoco` with images by MuJoCo's rays."""
+    """The world `mujoco` with images cast by MuJoCo's rays."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -47,33 +47,33 @@ class OwnRays(MujocoWorld):
 
 
 def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> Comparison:
-    """Time both in turn, and count the trials that end alike.
+    """Time both in turn, and count the trials that end in the same way.
 
     Args:
-        policy: who flies, by name or folder; by default the shipped one.
-        trials: of one pass.
+        policy: name or folder; the shipped one by default.
+        trials: of one call.
         time_limit_s: of a trial [s].
     """
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
-    pilot, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
+    flown, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
     specs = [TrialSpec(JUDGED[k % 3], 9, k // 3) for k in range(trials)]
     ended: dict[str, list[TrialResult]] = {}
 
     def judged(world: str, slots: int) -> None:
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
-        ended[world] = fly(pilot, specs, vehicle, world, options)
+        ended[world] = fly(flown, specs, vehicle, world, options)
 
     ours = partial(judged, "mujoco", JudgeOptions().slots)
-    seconds = in_turn(ours, partial(judged, BASELINE, 64), repeats=2, clock=time.process_time)
+    calls = {"ours": ours, "baseline": partial(judged, BASELINE, 64)}
+    taken = in_turn(calls, rounds=2, clock=time.process_time)
     pairs = list(zip(*ended.values(), strict=True))
     alike = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
     details = {
-        "policy": pilot.name,
-        "rays_a_pixel": pilot.spec.camera.rays**2,
+        "policy": flown.name,
+        "rays_a_pixel": flown.spec.camera.rays**2,
         "trials": trials,
         "trials_that_end_alike": alike,
-        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * pilot.spec.rate_hz,
+        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * flown.spec.rate_hz,
     }
-    rates = [Figure(trials / taken, "trials/s of processor time") for taken in seconds]
-    return Comparison("judge", rates[0], rates[1], details=details)
+    return compared("judge", taken, trials, "trials/s of processor time", details)

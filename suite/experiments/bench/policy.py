@@ -2,8 +2,8 @@
 
 The shipped policy is exported as C (float32 and int8), compiled for this machine and stepped one
 observation at a time with its memory, in turn with ONNX Runtime and torch, each called from Python.
-The baseline is ONNX Runtime as it is usually called, `session.run`; what is left of it with inputs
-and outputs bound to memory beforehand is measured next to it.
+The baseline is ONNX Runtime as it is usually called, `session.run`. It is also timed with inputs
+and outputs bound to memory beforehand.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from suite.experiments.bench.compare import Comparison, Figure
 from tracks.common.grid import Grid, table
 
 M7_HZ, M7_CYCLES = 480e6, {"C float32": 3.0, "C int8": 2.0}
-"""A Cortex-M7: clock, and the cycles of a multiply-add in plain C with the weights in memory that
-answers at once (a load of each side, the product, the loop's share) [1]. Assumed, not measured."""
+"""A Cortex-M7: clock, and cycles of a multiply-add in plain C with the weights in fast memory (two
+loads, the product, a share of the loop) [1]. Assumed, not measured."""
 A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
-"""A Cortex-A76: a quarter of what two units of four lanes could do [1]. Assumed, not measured."""
+"""A Cortex-A76: a quarter of the peak of two units of four lanes [1]. Assumed, not measured."""
 ROUNDS = 20
 
 
@@ -28,7 +28,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
     """Time single steps in turn.
 
     Args:
-        policy: which, by name or folder; by default the shipped one.
+        policy: name or folder; the shipped one by default.
         rounds: blocks of 100 steps of each engine.
 
     Raises:
@@ -44,7 +44,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
     from suite.judging.flying import default_policy
 
     if find_compiler() is None:
-        raise WorkFailed("no C compiler (cc, or what CC names) is here; install one, such as gcc")
+        raise WorkFailed("no C compiler (cc, or what CC names); install one, such as gcc")
     name, checkpoint = exported_checkpoint(policy or default_policy())
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -91,7 +91,7 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
     from policies.formats.c.project import c_project, drawn
     from suite.judging.deploy.latency import c_step
 
-    # How long a step takes does not hang on the scales, so no flights are flown for them.
+    # The time of a step does not depend on the scales, so no flights are needed for them.
     observed, steps, layers = drawn(checkpoint.spec, 50), {}, {}
     for dtype in ("float32", "int8"):
         engine, place = f"C {dtype}", folder / dtype

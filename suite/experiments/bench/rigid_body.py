@@ -1,7 +1,7 @@
-"""What both sides of the diagnosis benchmark are given: the same stretches of the same flights.
+"""The data of the diagnosis benchmark: the same windows of the same flights for both sides.
 
-Motors drive both: a loop around the rotors is no part of a MuJoCo model, and mass, centre of mass
-and inertia are what MuJoCo's own identification is made for.
+Measured rotor speeds drive both models, since a MuJoCo model has no rate loop. Mass, centre of mass
+and inertia are fitted: `mujoco.sysid` is made for these.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from suite.diagnose.data.windows import FlightWindows, cut
 from suite.diagnose.estimate.parameters import ParameterSpace, make_space
 
 REFITTED = ("mass_offset", "com_offset", "inertia_scale")
-"""Effects whose numbers are fitted; between them six that a flight can tell."""
+"""Effects whose numbers are fitted; six of these are identifiable."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """Stretches and what is computed for them."""
+    """Windows, and what is fitted to them."""
 
     nominal: Vehicle
-    """What both sides start from."""
+    """The initial values of both sides."""
     space: ParameterSpace
-    """The catalogue's numbers on that vehicle."""
+    """The catalogue's parameters for that vehicle."""
     indices: tuple[int, ...]
-    """Places of the numbers that are fitted, K of them."""
+    """Indices of the K fitted numbers in `space`."""
     truth: np.ndarray
-    """(K,) what was flown."""
+    """(K,) true values of the flown vehicle."""
     windows: FlightWindows
-    """Stretches of 1 s, driven by measured rotor speeds."""
+    """Windows of 1 s, driven by measured rotor speeds."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -49,7 +49,7 @@ class Task:
 
 
 def make_task(seed: int, duration_s: float = 10.0) -> Task:
-    """Return five flights of MuJoCo with other mass, centre of mass and inertia, cut.
+    """Return windows of five MuJoCo flights of a vehicle with other mass and inertia.
 
     Args:
         seed: of the truth, the flights and the noise.
@@ -78,13 +78,13 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     indices = tuple(i for i, entry in enumerate(space.entries) if entry.effect in REFITTED)
     number = 0
     while True:
-        with contextlib.suppress(FlightFailed):  # too heavy for its pilot; most draws are not
+        with contextlib.suppress(FlightFailed):  # too heavy for its controller; few draws are
             return attempt(number)
         number += 1
 
 
 def _drawn(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the effects' values: every number off by a usual size, to either side."""
+    """Return the effects' values: every number off by its usual size, up or down at random."""
     neutral, values = all_values(nominal), dict[str, Any]()
     for name in REFITTED:
         fields = {}

@@ -1,8 +1,8 @@
 """The same refit by `mujoco.sysid`: finite differences of rollouts in MuJoCo's C engine.
 
-The quadrotor is MuJoCo's own model, its actuators' controls are the rotors' thrusts, its bounds and
-typical sizes are ours, and residuals are over the measurement's noise, so that both sides lower the
-same error. A stretch starts in its measured state: `mujoco.sysid` has no start that is left free.
+The model is MuJoCo's, with the rotors' thrusts as controls. Bounds and typical sizes are those of
+the catalogue. Residuals are divided by the measurement noise, so both sides minimise the same
+error. A window starts in its measured state: `mujoco.sysid` cannot fit the start.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from suite.experiments.bench.rigid_body import Task
 POSE = 13
 """Numbers of qpos and qvel of a free body."""
 FILL_S = 1e-3
-"""Between rows that hold nothing [s]."""
+"""Time between empty rows [s]."""
 
 
 class Problem(NamedTuple):
-    """What is prepared once and not timed."""
+    """What is prepared once, outside the timing."""
 
     task: Task
     params: Any
@@ -40,17 +40,17 @@ class Problem(NamedTuple):
 
 
 def is_installed() -> bool:
-    """Say whether `mujoco.sysid` has all that it needs."""
+    """Return whether all packages of `mujoco.sysid` are installed."""
     import mujoco.sysid as sysid
 
     return hasattr(sysid, "optimize")
 
 
 def prepare(task: Task, sigma: np.ndarray) -> Problem:
-    """Return the task as `mujoco.sysid` takes it.
+    """Return the task in the form that `mujoco.sysid` reads.
 
     Args:
-        task: what is fitted to what.
+        task: windows and parameters.
         sigma: (19,) noise of the channels.
     """
     import mujoco.sysid as sysid
@@ -59,7 +59,7 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
     add_quadrotor(spec, task.nominal)
-    # What was measured, computed by nobody: `mujoco.sysid` asks for its size.
+    # Never computed: `mujoco.sysid` only needs the size of a measurement.
     spec.add_sensor(name="measured", type=mujoco.mjtSensor.mjSENS_USER, dim=POSE)
     base = spec.compile()
     windows = task.windows
@@ -102,7 +102,7 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
 
 
 def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
-    """Return the fitted numbers (K,) and their normal equations, stretch by stretch."""
+    """Return the fitted numbers (K,) and their normal equations, one for each window."""
     import mujoco.sysid as sysid
 
     # Its optimiser has an option to print nothing, `sysid.optimize` has none.
@@ -125,7 +125,7 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
 
 
 def _built(base: Any, task: Task, values: np.ndarray) -> Any:
-    """Return a copy of the compiled model with the numbers in their places."""
+    """Return a copy of the compiled model with the fitted numbers."""
     theta = task.space.array("start")
     theta[list(task.indices)] = values
     effects = task.space.effects(theta)
@@ -173,7 +173,7 @@ def _measured(task: Task, w: int) -> Any:
     seen = np.asarray(windows.seen[w])[:, :12]
     # Three angles are four numbers of a quaternion.
     values[~seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
-    # A stretch with fewer rows is filled up with rows of nothing, whose times must still rise.
+    # A window with fewer rows is filled with empty rows, whose times must still increase.
     times, filled = np.array(windows.row_s[w]), ~seen.any(axis=1)
     times[filled] = times.max() + FILL_S * np.arange(1, filled.sum() + 1)
     return sysid.TimeSeries(times, values)

@@ -8,7 +8,6 @@ quadrotor, varied as the recipe `race` does, are given as a multiple of the poin
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from suite.experiments.bench.compare import Comparison, Figure
+from suite.experiments.bench.compare import Comparison, Figure, in_turn
 from suite.train.config import TrainConfig
 from suite.train.recipes import named_recipe
 from suite.train.worlds import Worlds, sample_worlds
@@ -31,7 +30,7 @@ UNTRUSTED_BELOW = 2000.0
 ROUNDS = 4
 OURS, BASELINE, QUADROTOR = "ours", "baseline", "quadrotor"
 ENOUGH_S = 100.0
-"""No further round is started after this; a free machine does all of them in that time [s]."""
+"""No further round begins after this time, enough for all rounds on a free machine [s]."""
 
 
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
@@ -43,7 +42,7 @@ def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
 def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
     """Return worlds of the training distribution with exactly SOLIDS solids each, none parked.
 
-    Solids that a track lacks are set at random within 4 m of its gates, off the line.
+    Solids that a track lacks are placed at random 1.5 to 4 m from its gates.
     """
     worlds = sample_worlds(config, seed)
     rng = np.random.default_rng(seed)
@@ -57,7 +56,7 @@ def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
     }
     for part in kinds.values():
         missing = part.center_w[..., 2] < PARKED_Z / 2
-        part.center_w[missing] = _beside(scene.gates, missing, rng)
+        part.center_w[missing] = _near_gates(scene.gates, missing, rng)
         for name, low, high in (("half_size", 0.05, 0.25), ("radius", 0.1, 0.3)):
             if hasattr(part, name):
                 array = getattr(part, name)
@@ -67,7 +66,7 @@ def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
     return worlds._replace(scene=scene._replace(**kinds, triangles=scene.triangles[:, :0]))
 
 
-def _beside(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _near_gates(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     world, _ = np.nonzero(missing)
     center = gates.center_w[world, rng.integers(0, gates.center_w.shape[1], len(world))]
     angle, away = rng.uniform(0, 2 * np.pi, len(world)), rng.uniform(1.5, 4.0, len(world))
@@ -100,7 +99,7 @@ def _baseline(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
 
 
 def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Comparison:
-    """Time both sides in turn and return the best round of each.
+    """Time both sides in turn and return the best of all rounds for each.
 
     Args:
         batch: worlds.
@@ -113,7 +112,7 @@ def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Compari
 
 @contextmanager
 def _two_cores() -> Iterator[None]:
-    """Hold the process to THREADS cores, and JAX to as many threads."""
+    """Limit the process to THREADS cores, and JAX to as many threads."""
     import torch
 
     torch.set_num_threads(THREADS)
@@ -138,24 +137,14 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
         BASELINE: _baseline(point, worlds),
         QUADROTOR: _ours(quadrotor, bench_worlds(quadrotor)),
     }
-    taken: dict[str, list[float]] = {key: [] for key in sides}
-    for side in sides.values():
-        side()
-    until = time.perf_counter() + ENOUGH_S
-    for done in range(rounds):
-        if done and time.perf_counter() > until:
-            break
-        for key, side in sides.items():
-            started = time.perf_counter()
-            side()
-            taken[key].append(time.perf_counter() - started)
+    taken = in_turn(sides, rounds, most_s=ENOUGH_S)
     rates = {key: batch * steps / min(seconds) for key, seconds in taken.items()}
     ours, baseline = rates[OURS], rates[BASELINE]
     warnings = ()
     if baseline < UNTRUSTED_BELOW:
         warnings = (
-            f"the baseline makes {baseline:.0f} steps/s; on a free machine of two cores it makes "
-            f"{UNTRUSTED_BELOW:.0f} or more: it is not to be trusted, run again on a free machine",
+            f"the baseline makes {baseline:.0f} steps/s, on a free machine of two cores at least "
+            f"{UNTRUSTED_BELOW:.0f}: the figures are not reliable, run again on a free machine",
         )
     unit = "gradient steps/s"
     details = {

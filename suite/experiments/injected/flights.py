@@ -1,4 +1,4 @@
-"""Good flights: the judge's as a logger has them, and real ones."""
+"""Good flights: simulated ones with measurement noise, and real logs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle
 
 TRUE_EFFECTS = {"com_offset": EFFECTS["com_offset"].values((0.006, -0.003, 0.0))}
-"""What the flown vehicle has besides the nominal one's effects."""
+"""Effects of the flown vehicle that the nominal one lacks."""
 NOISE = {"pos": 0.002, "vel": 0.02, "quat": 0.001, "rate": 0.03, "acc": 0.3, "motor": 3.0,
          "voltage": 0.05, "baro": 0.05}  # fmt: skip
 """Standard deviation of the white noise of each signal [its unit]."""
@@ -26,7 +26,7 @@ LOGS = ("nanobench/*.csv", "crazyswarm2/log*", "crazypad/*/*log*")
 def flight_parts(
     log: FlightLog, vehicle: Vehicle, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return a judge's flight as signals with noise, and a battery and a barometer besides."""
+    """Return a flight of the judge as noisy signals, with a battery voltage and a barometer."""
     assert log.thrust_cmd is not None and log.rate_cmd_b is not None and log.rotor_speed is not None
     change = velocity_from_position(log.time_s, log.vel_w)
     parts = {
@@ -50,7 +50,7 @@ def flight_parts(
 
 
 def as_log(parts: Mapping[str, np.ndarray], name: str) -> FlightLog:
-    """Return signals as a flight log, `throttle` and `baro` as columns of their own.
+    """Return signals as a flight log, with extra columns `throttle` and `baro`.
 
     Raises:
         FlightLogError: where they break a rule of flight logs.
@@ -65,5 +65,5 @@ def as_log(parts: Mapping[str, np.ndarray], name: str) -> FlightLog:
 
 
 def real_logs(folder: Path) -> list[Path]:
-    """Return the real logs in `folder`, sorted; none where it is not there."""
+    """Return the real logs in `folder`, sorted; none if the folder is missing."""
     return [path for pattern in LOGS for path in sorted(folder.glob(pattern))]

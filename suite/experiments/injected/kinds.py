@@ -1,6 +1,6 @@
-"""Kinds of faults: what each does to a good flight or to its vehicle file, and its names.
+"""Kinds of faults: the change of a good flight or of its vehicle file, and the fault's names.
 
-Most are a reading (`eval.logs.faults.reading`) that makes a good signal wrong.
+Most are a reading (`eval.logs.faults.reading`) that corrupts a good signal.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ class Kind:
     """One fault."""
 
     names: tuple[str, ...]
-    """Faults of `eval.logs.faults.catalogue`, of which one must be reported."""
+    """Names in `eval.logs.faults.catalogue`, of which one must be reported."""
     readings: tuple[str, ...] = ()
-    """What makes the flight wrong."""
+    """Readings that corrupt the flight."""
     change: Callable[[Parts, np.random.Generator], Parts] | None = None
-    """What readings cannot do."""
+    """A change that no reading describes."""
     vehicle: Callable[[Vehicle], Vehicle] | None = None
-    """What makes the vehicle file wrong."""
+    """A change of the vehicle file."""
     fov: float = 1.0
-    """The policy's field of view over the vehicle's."""
+    """The policy's field of view, as a factor of the vehicle's."""
     race: bool = False
-    """One of those that cost teams of a vision race of 2026 their flights."""
+    """Whether it has cost teams of a vision race of 2026 their flights."""
     of: tuple[str, ...] = ()
-    """Signals that `change` is of, and those without which the fault cannot be seen."""
+    """Signals that `change` needs, and those without which the fault is not identifiable."""
 
     def needs(self) -> set[str]:
-        """Return the signals that a log must hold for the fault to be put into it."""
+        """Return the signals that a log must have for this fault."""
         turned = {"quat"} if any("from-" in text for text in self.readings) else set()
         return {*self.of, *turned, *(text.partition("=")[0] for text in self.readings)}
 
@@ -63,7 +63,7 @@ def _biased_by_throttle(parts: Parts, _: np.random.Generator) -> Parts:
 
 
 def _curved(parts: Parts, _: np.random.Generator) -> Parts:
-    """A linear map of sticks, where the firmware's curve gives 0.62 to 2.4 times as much."""
+    """A linear stick map; the firmware's curve gives 0.62 to 2.4 times as much."""
     command = parts["cmd_rate"]
     most = np.maximum(np.quantile(np.abs(command), 0.98, axis=0), 1e-6)
     share = np.clip(np.abs(command) / most, 0.0, 1.5)
@@ -76,14 +76,14 @@ def _dead(parts: Parts, _: np.random.Generator) -> Parts:
 
 
 def _ahead(parts: Parts, _: np.random.Generator) -> Parts:
-    """Commands act 150 ms later than the log has them."""
+    """Commands act 150 ms later than logged."""
     count = round(0.15 / float(np.median(np.diff(parts["time"]))))
     moved = {n: np.roll(parts[n], -count, axis=0) for n in ("cmd_rate", "throttle", "cmd_thrust")}
     return {**parts, **moved}
 
 
 def _held(parts: Parts, _: np.random.Generator) -> Parts:
-    """Commands at two thirds of the policy's rate: 20 instead of 30 Hz, as 40 instead of 60."""
+    """Commands at two thirds of the policy's rate: 20 instead of 30 Hz."""
     step = float(np.median(np.diff(parts["time"])))
     first = np.floor(parts["time"] * 20.0 + 1e-6) / 20.0
     index = np.clip(np.round((first - parts["time"][0]) / step).astype(int), 0, None)
@@ -97,7 +97,7 @@ def _late(parts: Parts, _: np.random.Generator) -> Parts:
 
 
 def _drifting(parts: Parts, _: np.random.Generator) -> Parts:
-    """The pose's clock runs 0.5 % fast: it is half a millisecond later with every 0.1 s."""
+    """The pose's clock runs 0.5 % fast."""
     time_s = parts["time"]
     at = time_s - 0.005 * (time_s - time_s.mean())
     moved = {
@@ -228,4 +228,4 @@ KINDS: dict[str, Kind] = {
         of=("motor", "pos", "quat"),
     ),
 }
-"""Kind -> what it does, and what it must be reported as."""
+"""Kind -> its change and the names under which it must be reported."""

@@ -23,7 +23,7 @@ Parts = Mapping[str, np.ndarray]
 
 
 class Written(NamedTuple):
-    """A file, and how it is to be imported."""
+    """A file, and the options of its import."""
 
     path: Path
     options: ImportOptions
@@ -128,7 +128,7 @@ column = "t"
 
 
 def write_table(folder: Path, parts: Parts, full_thrust: float) -> Written:
-    """Write a table as teams make of PX4's logs, north-east-down, with its mapping file."""
+    """Write a table as teams export it from PX4, north-east-down, with its mapping file."""
     signals = {
         "pos": parts["pos"] * FLIP,
         "vel": parts["vel"] * FLIP,

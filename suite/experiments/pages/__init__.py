@@ -1,1 +1,1 @@
-"""What a document shows: its page, tables, charts, and what the paper prints."""
+"""Result pages: the page, tables, charts, and the paper's printed numbers."""

@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eval.judging.statistics import Interval, wilson
+from eval.judging.statistics import wilson
 from eval.judging.tables import Tally
-from suite.common.charts import LINES, plain_axes, png, titled
+from suite.common.charts import LINES, METRICS, dots, legend, plain_axes, png, titled
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
 from suite.experiments.study.disturbed import Tested
-from suite.experiments.study.summary import METRICS, Spread, Summary
+from suite.experiments.study.summary import Spread, Summary
 from tracks.families import JUDGED
-
-
-def _legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    legend = figure.legend(
-        handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
-    )
-    for text in legend.get_texts():
-        text.set_parse_math(False)  # a policy's name may hold dollar signs
 
 
 def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
@@ -35,35 +25,25 @@ def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
     (axes.set_ylim if vertical else axes.set_xlim)(*ends)
 
 
-def _dots(
-    axes: Axes, at: Any, found: Sequence[Interval], scale: float, label: str, **style: Any
-) -> None:
-    """Draw values with their intervals."""
-    value, low, high = scale * np.array(found).T
-    axes.errorbar(
-        at, value, np.maximum([value - low, high - value], 0), lw=1.2, label=label, **style
-    )
-
-
 def level_chart(cells: Sequence[Tally]) -> bytes:
     """Return a policy's success and v_max below by level, a column a track, next to the paper's."""
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
-    lowest, dots = 100.0, {"fmt": "o", "ms": 4, "color": LINES[0]}
+    lowest, filled = 100.0, {"ms": 4, "lw": 1.2, "color": LINES[0]}
+    hollow = {"ms": 5, "color": "#555b66", "mfc": "none"}
     for number, track in enumerate(JUDGED):
         upper, lower = rows[:, number]
         theirs = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
         at = np.array([c.level for c in theirs]) + 0.25
         words = f"the paper, {theirs[0].trials} trials a level"
-        hollow = {"fmt": "D", "ms": 5, "color": "#555b66", "mfc": "none"}
         printed = [wilson(c.won, c.trials) for c in theirs]
-        _dots(upper, at, printed, 100, words, **hollow)
-        lower.plot(at, [c.v_max for c in theirs], "D", ms=5, color="#555b66", mfc="none")
+        dots(upper, at, printed, 100, label=words, fmt="D", lw=1.2, **hollow)
+        lower.plot(at, [c.v_max for c in theirs], "D", **hollow)
         mine = [cell for cell in cells if cell.track == track]
         levels = [c.difficulty for c in mine]
         words = f"{mine[0].policy}, {mine[0].trials} trials a level"
-        _dots(upper, levels, [c.success for c in mine], 100, words, **dots)
-        _dots(lower, levels, [c.v_max for c in mine], 1, "", **dots)
+        dots(upper, levels, [c.success for c in mine], 100, label=words, **filled)
+        dots(lower, levels, [c.v_max for c in mine], **filled)
         lowest = min([lowest, *(100 * c.success.low for c in mine)])
         lowest = min([lowest, *(100 * c.value for c in printed)])
         titled(upper, track)
@@ -73,7 +53,7 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
     _percent_axis(rows[0, 0], lowest)
     rows[0, 0].set_ylabel("success [%]", fontsize=9)
     rows[1, 0].set_ylabel("v_max, median [m/s]", fontsize=9)
-    _legend(figure, rows[0, 0])
+    legend(figure, rows[0, 0])
     return png(figure)
 
 
@@ -100,7 +80,7 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
     axes.set_xlabel("success [%]", fontsize=9)
     titled(axes, "Success under one effect at a time, with 95 % Wilson intervals")
     axes.tick_params(axis="y", labelsize=7)
-    _legend(figure, axes)
+    legend(figure, axes)
     return png(figure)
 
 
@@ -124,7 +104,7 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
         axes.set_xlabel(sweep.axis, fontsize=8)
         axes.set_ylabel("success [%]", fontsize=8)
         _percent_axis(axes, min(100 * p.success(name).low for p in points for name in names))
-    _legend(figure, panels[0])
+    legend(figure, panels[0])
     return png(figure)
 
 
@@ -141,7 +121,7 @@ def bars_chart(
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     every = figure.subplots(1, 3, sharey=True)
     for axes, name in zip(every, ("success_cross", "collision_free", "v_max"), strict=True):
-        title, scale, _ = METRICS[name]
+        scale = METRICS[name].scale
         for at, (key, numbers) in enumerate(rows.items()):
             colour = LINES[kinds.index(key.split()[0])]
             mean, least, most = (scale * value for value in numbers[name])
@@ -152,12 +132,12 @@ def bars_chart(
                 theirs = scale * getattr(printed[key], name)
                 label = "the paper" if at == 0 else None
                 axes.plot(theirs, at, "D", ms=7, mfc="none", mec="black", label=label)
-        titled(axes, title)
+        titled(axes, METRICS[name].title)
         if scale == 100:
             axes.set_xlim(-3, 103)
     every[0].set_yticks(range(len(rows)), list(rows))
     every[0].invert_yaxis()
-    _legend(figure, every[0])
+    legend(figure, every[0])
     return png(figure)
 
 
@@ -166,7 +146,7 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, len(names), sharey="col")
     for column, name in enumerate(names):
-        title, scale, _ = METRICS[name]
+        scale = METRICS[name].scale
         for axes, x, words in ((upper[column], "steps", "environment steps"),
                                (lower[column], "time", "training [s]")):  # fmt: skip
             for colour, row in zip(LINES, rows, strict=False):
@@ -175,30 +155,8 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
                 axes.fill_between(at, least, most, color=colour, alpha=0.15, lw=0)
                 axes.plot(at, mean, color=colour, label=row.words)
             axes.set_xlabel(words, fontsize=9)
-            titled(axes, title if name == "v_max" else title[0].upper() + title[1:])
+            titled(axes, METRICS[name].heading)
         if scale == 100:
             _percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))
-    _legend(figure, upper[0])
-    return png(figure)
-
-
-TRAINED = {"gates": ("Gates a rollout", 1), "collided": ("Collided [%]", 100),
-           "speed": ("Mean speed [m/s]", 1)}  # fmt: skip
-"""Numbers of a training's curve with their titles and scales."""
-
-
-def training_chart(rows: Sequence[Mapping[str, float]]) -> bytes:
-    """Return one training's curve, a column a number; a dot is the mean of up to 1 % of it."""
-    figure = Figure(figsize=(10.4, 3.0), layout="constrained")
-    size = max(1, len(rows) // 100)
-    groups = [rows[k : k + size] for k in range(0, len(rows), size)]
-    at = [np.mean([row["iteration"] for row in group]) for group in groups]
-    for axes, (name, (title, scale)) in zip(
-        figure.subplots(1, len(TRAINED)), TRAINED.items(), strict=True
-    ):
-        axes.plot(at, [scale * np.mean([row[name] for row in group]) for group in groups], ".",
-                  ms=4, color=LINES[0])  # fmt: skip
-        axes.set_xlabel("gradient steps", fontsize=9)
-        axes.set_ylim(bottom=0)
-        titled(axes, title)
+    legend(figure, upper[0])
     return png(figure)

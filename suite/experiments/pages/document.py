@@ -1,7 +1,7 @@
-"""A result page: what an experiment made stands between two comments, the text around it in docs.
+"""A result page: the generated part stands between two comments, hand-written text around it.
 
-`suite reproduce` replaces what stands between the comments and nothing else, so that a page can be
-made again without losing its text.
+`suite reproduce` replaces only the part between the comments, so that a page can be made again
+without losing its text.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from tracks.common.provenance import stamp
 SCHEMA = 1
 """Version of NAME.json."""
 BEGIN, END = "<!-- made by suite reproduce -->", "<!-- end of what suite reproduce made -->"
-"""The lines between which a page is made anew."""
+"""The lines around the generated part."""
 
 
 class Made(NamedTuple):
-    """What an experiment came to."""
+    """The results of an experiment."""
 
     facts: Mapping[str, str]
-    """Name and value of what was done: policies, recipe, trials, seeds."""
+    """Conditions by name: policies, recipe, trials, seeds."""
     parts: Mapping[str, Sequence[Grid | Picture]]
     """Tables and charts, by heading."""
     numbers: Mapping[str, Any]
-    """What NAME.json holds next to the configuration and how it was made."""
+    """Contents of NAME.json, besides configuration and provenance."""
 
 
 def check_page(out: Path, name: str) -> None:
@@ -54,20 +54,20 @@ def write_document(
 ) -> dict[str, Any]:
     """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `place.out`.
 
-    The page is written last: where it stands, all that it shows does.
+    The page is written last, after everything that it shows.
 
     Args:
-        place: where.
+        place: folder of the files.
         name: of the experiment.
-        config: of the experiment; its `seed` is what every seed was made from, or the first one.
-        made: what came out.
-        console: shows what was written.
+        config: of the experiment; its `seed` goes into the stamp.
+        made: the results.
+        console: prints which files were written.
 
     Returns:
-        What `name`.json holds, and `out`, the page's path.
+        The contents of `name`.json, and `out`, the page's path.
 
     Raises:
-        ValueError: where a page is there that lacks the two comments.
+        ValueError: if the existing page lacks the two comments.
         OSError: where a file cannot be written.
     """
     header, page = stamp(SCHEMA, config.seed), place.out / f"{name}.md"
@@ -101,7 +101,7 @@ def _new_page(name: str) -> str:
 
 
 def _around(text: str, path: Path) -> tuple[str, str]:
-    """Return what stands before and after the part of a page that is made."""
+    """Return the text before and after the generated part of a page."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:

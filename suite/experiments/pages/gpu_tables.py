@@ -1,4 +1,4 @@
-"""The tables of what an accelerator reaches."""
+"""The tables of the page `gpu`: speed of training and judging, and the CPU's outcomes."""
 
 from __future__ import annotations
 
@@ -6,84 +6,67 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from eval.judging.tables import percent
-from tracks.common.grid import Grid, table
+from tracks.common.grid import Grid, table_of
 
 MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
-"""What trains, by key."""
+"""Dynamics that are trained through, by key."""
+Numbers = Mapping[str, Any]
 
 
-def trainer_grid(rows: Sequence[Mapping[str, Any]], steps: int, best: float) -> Grid:
+def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
     """Return the trainer's speed: a row a model and number of worlds.
 
     Args:
         rows: model, worlds, seconds and operations of a gradient step.
-        steps: decisions of a world in it.
-        best: operations a second of a product of matrices.
+        steps: decisions of a world in a gradient step.
+        best: operations a second of a matrix product.
     """
-    lines = [
-        (
-            MODELS[row["model"]],
-            f"{row['worlds']}",
-            f"{row['worlds'] * steps / row['seconds']:,.0f}",
-            f"{1e3 * row['seconds']:,.0f}",
-            f"{row['operations'] / row['seconds'] / 1e12:.2f}",
-            f"{row['operations'] / row['seconds'] / best:.1%}",
-        )
-        for row in rows
-    ]
-    headers = (
-        *("trains", "worlds", "decisions/s", "a gradient step [ms]", "TFLOP/s"),
-        "share of the product's",
+    return table_of(
+        rows,
+        ("trains", lambda row: MODELS[row["model"]]),
+        ("worlds", lambda row: f"{row['worlds']}"),
+        ("decisions/s", lambda row: f"{row['worlds'] * steps / row['seconds']:,.0f}"),
+        ("a gradient step [ms]", lambda row: f"{1e3 * row['seconds']:,.0f}"),
+        ("TFLOP/s", lambda row: f"{row['operations'] / row['seconds'] / 1e12:.2f}"),
+        ("share of the product's", lambda row: f"{row['operations'] / row['seconds'] / best:.1%}"),
     )
-    return table(headers, lines)
 
 
-def judge_grid(judged: Sequence[Mapping[str, Any]]) -> Grid:
+def judge_grid(rows: Sequence[Numbers]) -> Grid:
     """Return the judge's speed, a row a number of trials at once."""
-    lines = [
-        (
-            f"{row['worlds']}",
-            f"{row['decisions_per_s']:,.0f}",
-            f"{row['flown_s_per_s']:,.0f}",
-            f"{row['seconds']:.1f}",
-        )
-        for row in judged
-    ]
-    headers = ("trials at once", "decisions/s", "seconds flown a second", "all of them [s]")
-    return table(headers, lines)
-
-
-def pairs_grid(pairs: Mapping[str, Mapping[str, Any]]) -> Grid:
-    """Return how alike trials end on the accelerator and on the CPU, a row a simulator."""
-    lines = [
-        (
-            name,
-            f"{found['trials']}",
-            f"{found['same_success']}",
-            f"{found['same_ending']}",
-            "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in found["difference"])),
-        )
-        for name, found in pairs.items()
-    ]
-    headers = (
-        *("compared with", "trials", "the same success", "the same ending"),
-        "success here minus there [points, 95 %]",
+    return table_of(
+        rows,
+        ("trials at once", lambda row: f"{row['worlds']}"),
+        ("decisions/s", lambda row: f"{row['decisions_per_s']:,.0f}"),
+        ("seconds flown a second", lambda row: f"{row['flown_s_per_s']:,.0f}"),
+        ("all of them [s]", lambda row: f"{row['seconds']:.1f}"),
     )
-    return table(headers, lines)
 
 
-def training_grid(short: Mapping[str, Any]) -> Grid:
-    """Return what the short training came to, in one row."""
-    line = (
-        f"{short['worlds']}",
-        f"{short['iterations']}",
-        f"{short['seconds']:.0f}",
-        f"{short['decisions_per_s']:,.0f}",
-        percent(short["success"]),
-        "" if short["v_max"] is None else f"{short['v_max']:.1f}",
+def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
+    """Return a row a simulator on the CPU: how many trials end as on the accelerator."""
+
+    def difference(row: Numbers) -> str:
+        return "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in row["difference"]))
+
+    return table_of(
+        [{"name": name, **found} for name, found in pairs.items()],
+        ("compared with", lambda row: row["name"]),
+        ("trials", lambda row: f"{row['trials']}"),
+        ("the same success", lambda row: f"{row['same_success']}"),
+        ("the same ending", lambda row: f"{row['same_ending']}"),
+        ("success here minus there [points, 95 %]", difference),
     )
-    headers = (
-        *("worlds", "gradient steps", "time with compiling [s]", "decisions/s"),
-        *("success (95 %)", "v_max, median [m/s]"),
+
+
+def training_grid(short: Numbers) -> Grid:
+    """Return the results of the short training in one row."""
+    return table_of(
+        [short],
+        ("worlds", lambda row: f"{row['worlds']}"),
+        ("gradient steps", lambda row: f"{row['iterations']}"),
+        ("time with compiling [s]", lambda row: f"{row['seconds']:.0f}"),
+        ("decisions/s", lambda row: f"{row['decisions_per_s']:,.0f}"),
+        ("success (95 %)", lambda row: percent(row["success"])),
+        ("v_max, median [m/s]", lambda row: f"{row['v_max']:.1f}" if row["v_max"] else ""),
     )
-    return table(headers, [line])

@@ -1,4 +1,4 @@
-"""The paper's printed tables (paper.toml), and by how much a policy misses the goal of a cell."""
+"""The paper's printed tables (paper.toml), and how far each cell of a policy is from its goal."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from eval.judging.tables import Tally, percent
 from tracks.common.grid import Grid, table
 
 SURE = 0.90
-"""If a printed rate is 1, the lower end of our Wilson interval must be at least this."""
+"""Where the printed rate is 1, the least lower end of our Wilson interval."""
 FLOORS = {0: 0.99, 3: 0.98, 6: 0.97, 9: 0.95}
-"""Success that the shipped policy must reach, by level."""
+"""Least success rate of the shipped policy, by level."""
 
 
 class Printed(NamedTuple):
@@ -83,26 +83,26 @@ def sim_to_sim() -> SimToSim:
 
 
 class Goal(NamedTuple):
-    """One cell against its goal; a miss of 0 is met."""
+    """One cell and its goals; a miss is the distance to a goal, 0 if it is met."""
 
     track: str
     level: int
     success: float
-    """The goal: the best printed rate; 1 needs an interval from `SURE` up."""
+    """Goal: the best printed rate; for 1 the interval must begin at `SURE` or above."""
     success_miss: float
     floor: float
-    """The shipped policy's success."""
+    """Goal: the entry of `FLOORS`."""
     floor_miss: float
     v_max: float
-    """The goal: the largest printed [m/s]."""
+    """Goal: the largest printed one [m/s]."""
     v_max_miss: float
-    """By how much the median over trials misses it [m/s]."""
+    """Of the median over trials [m/s]."""
     of_ten_miss: float | None = None
-    """By how much the mean largest of ten trials misses it; None with fewer trials [m/s]."""
+    """Of the mean largest v_max of ten trials; None with fewer trials [m/s]."""
 
 
 def goals(cells: Sequence[Tally]) -> list[Goal]:
-    """Return the goal of every cell that the paper prints."""
+    """Return the goals of every cell that the paper prints."""
     printed = sim_to_sim()
     found = []
     for cell in cells:
@@ -123,7 +123,7 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
 
 
 def goal_grid(cells: Sequence[Tally]) -> Grid:
-    """Return by how much each cell of one policy misses its goal."""
+    """Return a table of the cells of one policy and their goals."""
     by_key = {(cell.track, cell.difficulty): cell for cell in cells}
     headers = ["track", "level", "success", "best of the others", "missed by", "floor",
                "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip

@@ -1,1 +1,1 @@
-"""One study: rows x training seeds, trained, flown in unseen worlds or judged, and compared."""
+"""A study: settings x training seeds, trained, flown in unseen worlds or judged, and compared."""

@@ -1,4 +1,4 @@
-"""Where experiments keep what they made, and under which names: by its inputs and its code."""
+"""The cache of experiments: results are named by a digest of their inputs and code."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
 NO_RESULT = ("view", "importers", "faults", "envs")
-"""Folders whose code changes no flight."""
+"""Folders whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
-"""The rooms whose code sets how a policy flies."""
+"""The rooms whose code affects a flight."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where an experiment's files go, and who works on it."""
+    """Folders and workers of an experiment."""
 
     out: Path
-    """Folder of the documents."""
+    """Folder of the pages."""
     cache: Path
-    """Folder of what was computed before, by any experiment."""
+    """Folder of results that all experiments reuse."""
     workers: Workers | None = None
-    """Who trains and flies; None trains one after the other, and flies in processes."""
+    """Processes or a cluster; None trains one after the other, and flies in processes."""
 
     @property
     def at_once(self) -> str:
-        """Trainings at once: their number, or the address of the cluster."""
+        """Number of trainings at once, or the address of the cluster."""
         return str(self.workers or 1)
 
 
 def digest(value: Any) -> str:
-    """Return 16 hex digits that stand for `value`, which JSON must be able to hold."""
+    """Return a digest (16 hex digits) of `value`, which JSON must be able to hold."""
     return digest_of(value)[:16]
 
 
 @functools.cache
 def code_digest(*rooms: str) -> str:
-    """Return 16 hex digits that stand for the code of `rooms`.
+    """Return a digest (16 hex digits) of the code of `rooms`.
 
     Args:
         rooms: folders of the project, such as "tracks" or "suite/train".
@@ -61,7 +61,7 @@ def code_digest(*rooms: str) -> str:
 
 @functools.cache
 def engines() -> dict[str, str | None]:
-    """Return what else can change a number: processor, versions and what other packages add."""
+    """Return what else can change a result: processor, versions and added packages."""
     versions = package_versions()
     names = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco", "mujoco-mjx", "torch")
     return {
@@ -72,7 +72,7 @@ def engines() -> dict[str, str | None]:
 
 
 def added_digest() -> str | None:
-    """Return 16 hex digits for the effects, tracks and worlds of other packages; None: none."""
+    """Return a digest (16 hex digits) of effects, tracks and worlds of other packages, if any."""
     sums = hashlib.sha256()
     entries = added_entries()
     for entry in entries:
@@ -83,7 +83,7 @@ def added_digest() -> str | None:
 
 
 def _sources(module: str) -> list[Path]:
-    """Return the source files of a module or a package; none where it is not there."""
+    """Return the source files of a module or a package; none if it is missing."""
     spec = find_spec(module)
     if spec is None:
         return []

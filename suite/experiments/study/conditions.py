@@ -1,4 +1,4 @@
-"""What robustness is measured under: every effect at its usual size, and growing disturbances."""
+"""Conditions of robustness: every effect at its usual size, and growing disturbances."""
 
 from __future__ import annotations
 
@@ -17,44 +17,45 @@ from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
 from eval.vehicles.vehicle import Vehicle
 
 STATE_UNIT = {"position": 0.03, "velocity": 0.1, "attitude": math.radians(1.0)}
-"""What 1 means in the sweep of the state's estimate."""
+"""Errors at size 1 in the sweep of the state estimate."""
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
-"""Effects that grow in the sweep of drag, as many of them as the vehicle has."""
+"""Effects that grow in the sweep of drag, if the vehicle has them."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A vehicle and sensors that differ from what the tables are flown on."""
+    """A vehicle, sensors and a simulator other than those of the result tables."""
 
     name: str
-    """Of the effect or the sweep."""
+    """Name of the effect or the sweep."""
     size: float
-    """How strong it is, in the sweep's or the effect's unit."""
+    """Size, in the unit of the sweep or the effect."""
     words: str
-    """How strong it is, for people, with its unit."""
+    """Size as text, with its unit."""
     vehicle: Vehicle
     sensors: SensorSet = PERFECT
+    simulator: str = "mujoco"
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A disturbance that grows; its first point is what the tables are flown on."""
+    """A disturbance of growing size; its first point is the undisturbed vehicle."""
 
     name: str
-    """For people."""
+    """Title of the chart."""
     axis: str
-    """The size's meaning and unit."""
+    """What the size is, with its unit."""
     sizes: Sequence[float]
-    """Growing; the first is the undisturbed vehicle's own."""
+    """In increasing order; the first is the vehicle's own."""
     make: Callable[[Vehicle, float], tuple[Vehicle, SensorSet]]
-    """Returns what flies at one size."""
+    """Returns vehicle and sensors of a size."""
 
 
 def effect_conditions(vehicle: Vehicle) -> list[Condition]:
-    """Return `vehicle` with each effect that touches a flight, at the upper end of its usual size.
+    """Return `vehicle` with each effect that changes a flight, at the upper end of its usual size.
 
-    Where the vehicle has more of an effect already, it keeps that; where it may not have so much,
-    as 27 g may not have 0.2 kg less, it has the most it may. What else it says of an effect stays.
+    A larger value of the vehicle's own is kept, and the size is limited to what is physical: a
+    vehicle of 27 g cannot lose 0.2 kg. The effect's other parameters stay.
     """
     found = []
     for effect in EFFECTS.values():
@@ -87,17 +88,17 @@ def with_effect(vehicle: Vehicle, name: str, values: Any) -> Vehicle:
 
 
 def _plain(value: np.ndarray | np.floating) -> float | tuple[float, ...]:
-    """Return a number or an array (N,) as an effect's values hold it."""
+    """Return a number or an array (N,) as plain numbers, as an effect's values hold them."""
     return tuple(map(float, np.atleast_1d(value))) if value.ndim else float(value)
 
 
 def _own(vehicle: Vehicle, name: str) -> Any:
-    """Return the values of the effect `name` that `vehicle` has, neutral ones where it has none."""
+    """Return the vehicle's values of the effect `name`, or neutral ones."""
     return vehicle.effects.get(name, neutral(EFFECTS[name], vehicle))
 
 
 def sweep_conditions(vehicle: Vehicle, sweep: Sweep) -> list[Condition]:
-    """Return the points of `sweep`; the first is `vehicle` as it is."""
+    """Return the conditions of `sweep`; the first is the unchanged `vehicle`."""
     first = Condition(sweep.name, sweep.sizes[0], f"{sweep.sizes[0]:g}", vehicle)
     rest = [
         Condition(sweep.name, size, f"{size:g}", *sweep.make(vehicle, size))
@@ -139,7 +140,7 @@ def _drags(vehicle: Vehicle) -> list[str]:
 
 
 def _drag_sweep(vehicle: Vehicle) -> Sweep:
-    """Return the sweep of drag: the vehicle's own, or where it has none all of it new."""
+    """Return the sweep of drag: multiples of the vehicle's own, or linear drag if it has none."""
     if _drags(vehicle):
         return Sweep("drag", "drag, times the vehicle's own", (1, 2, 4, 8, 16), _draggier)
     drag = _effect("linear_drag", "coefficient", (1.0, 1.0, 1.0))
@@ -149,7 +150,10 @@ def _drag_sweep(vehicle: Vehicle) -> Sweep:
 def _sensing(
     model: str, scale: float, *names: str, **held: float
 ) -> Callable[..., tuple[Vehicle, SensorSet]]:
-    """Return what makes parameters of a sensor model `scale` times a size; `held` stay."""
+    """Return a function that sets parameters of a sensor model to `scale` times a size.
+
+    The parameters `held` are the same at every size.
+    """
 
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
         return vehicle, sensor_set({model: dict.fromkeys(names, scale * size) | held})
@@ -163,14 +167,14 @@ def _estimating(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
 
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
-    """Return the sweeps from what `vehicle` is."""
+    """Return all sweeps, each starting from `vehicle`."""
     lag = 1e3 * _own(vehicle, "motor_lag").time_constant
     delay = 1e3 * _own(vehicle, "command_delay").delay
     heavier = 100 * _own(vehicle, "mass_offset").offset / vehicle.mass
     wind = float(np.linalg.norm(_own(vehicle, "constant_wind").velocity))
 
     def more(first: float, *others: float) -> tuple[float, ...]:
-        # A vehicle at the last of them or past it is disturbed as well.
+        # A vehicle at or beyond the last size gets larger ones.
         return (first, *([size for size in others if size > first] or (1.5 * first, 2 * first)))
 
     return [

@@ -1,4 +1,4 @@
-"""Policies flown under conditions that differ from what the tables are flown on."""
+"""Policies flown under other conditions than those of the result tables."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from suite.experiments.study.options import chosen
 
 
 class Tested(NamedTuple):
-    """A condition and how every policy did under it, on the same trials."""
+    """A condition and the results of every policy under it, on the same trials."""
 
     condition: Condition
     results: Mapping[str, Sequence[TrialResult]]
-    """By what tables call the policy."""
+    """By the policy's label."""
 
     def success(self, policy: str) -> Interval:
-        """Return the rate over all tracks and levels."""
+        """Return the success rate over all tracks and levels."""
         return wilson(int(self.won(policy).sum()), len(self.results[policy]))
 
     def won(self, policy: str) -> np.ndarray:
@@ -39,16 +39,16 @@ class Tested(NamedTuple):
 
 
 Grown = dict[Sweep, list[Tested]]
-"""The points of each sweep, the undisturbed first."""
+"""The tested conditions of each sweep, the undisturbed first."""
 
 
 def chosen_conditions(
     vehicle: Vehicle, only: Sequence[str]
 ) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
-    """Return the effects and the sweeps of `vehicle` whose names are in `only`, all if it is empty.
+    """Return the effects and the sweeps of `vehicle` that are in `only`, all if it is empty.
 
     Raises:
-        ValueError: for a name that does not exist.
+        ValueError: for an unknown name.
     """
     grown, alone = sweeps(vehicle), effect_conditions(vehicle)
     known = dict.fromkeys(entry.name for entry in (*grown, *alone))
@@ -67,23 +67,25 @@ def flown_under(
     place: Place,
     console: Console,
 ) -> tuple[list[Tested], Grown]:
-    """Return conditions, and those of sweeps, with every policy's trials under them.
+    """Return all conditions with the results of every policy under them.
 
     Args:
-        alone: conditions.
-        grown: conditions of sweeps.
-        policies: by what tables call them.
-        trials: that each flies under every condition.
-        place: of the kept flights, and who flies.
-        console: where progress goes.
+        alone: single conditions.
+        grown: conditions by sweep.
+        policies: by label.
+        trials: each policy flies all of them under every condition.
+        place: cache of flights, and workers.
+        console: shows progress.
     """
     conditions = [*alone, *(point for points in grown.values() for point in points)]
     orders = {
-        (at, name): Order(Setup(policy, condition.vehicle, condition.sensors), trials)
+        (at, name): Order(
+            Setup(policy, condition.vehicle, condition.sensors, condition.simulator), trials
+        )
         for name, policy in policies.items()
         for at, condition in enumerate(conditions)
     }
-    rows = flown(orders, place, console, "flying under disturbances")
+    rows = flown(orders, place, console, "flying under every condition")
     tested = [
         Tested(condition, {name: rows[at, name] for name in policies})
         for at, condition in enumerate(conditions)
@@ -93,7 +95,7 @@ def flown_under(
 
 
 def tested_numbers(entry: Tested, base: Tested) -> dict[str, Any]:
-    """Return one condition as JSON holds it, track by track too."""
+    """Return the results under one condition for JSON, over all trials and by track."""
     found: dict[str, Any] = {
         "name": entry.condition.name,
         "size": entry.condition.size,

@@ -1,7 +1,7 @@
-"""Judged trials in a permanent cache: the same flights are flown only once.
+"""Judged trials in a permanent cache: the same flight is flown only once.
 
 A journal in the cache is named by the digest of all that determines an outcome: policy, vehicle,
-the judge's code, the engines. Each trial is written there as it ends. Documents share journals.
+the judge's code, the engines. Each trial is written there as it ends. All pages share the journals.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class Setup:
-    """Policy, vehicle, sensors and simulator: with a trial they determine the outcome."""
+    """Policy, vehicle, sensors and simulator; together with a trial they determine its outcome."""
 
     policy: str
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
     vehicle: Vehicle
-    """What it flies."""
+    """The vehicle that it flies."""
     sensors: SensorSet = PERFECT
     """Errors in what the policy sees."""
     simulator: str = "mujoco"
@@ -56,7 +56,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Order:
-    """Trials that are wanted of one setup."""
+    """Trials of one setup."""
 
     setup: Setup
     trials: Sequence[TrialSpec]
@@ -67,14 +67,14 @@ def flown(
 ) -> dict[Key, list[TrialResult]]:
     """Return the results of every order; those not in the cache are flown first.
 
-    An interrupt keeps what was flown.
+    After an interrupt, finished trials stay in the cache.
 
     Args:
-        orders: what is wanted; the same setup may be in several.
+        orders: several may have the same setup.
         place: folder of the journals, and the workers; without workers as many processes of this
-            machine as give a gain.
-        console: for progress.
-        what: a few words on what is flown.
+            machine as shorten the work.
+        console: shows progress.
+        what: label of the progress.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
@@ -107,7 +107,7 @@ def flown(
                 def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
                     number, result = ended
                     all_journals[number].append(result)
-                    # A sweep has more journals than a process may have files open.
+                    # A sweep has more journals than a process may have open files.
                     all_journals[number].close()
                     update(next(numbers))
 
@@ -121,10 +121,10 @@ def flown(
 
 
 def name_of(policy: str) -> str:
-    """Return what a policy that a document is to fly calls itself.
+    """Return the name of a policy that a page may fly.
 
     Raises:
-        PolicyError: where it cannot be loaded, or loading it can run its maker's code.
+        PolicyError: if it cannot be loaded, or loading it can run code from its file.
     """
     try:
         return load_policy(policy).name
@@ -136,13 +136,13 @@ def name_of(policy: str) -> str:
 
 
 def named_policies(given: Sequence[str]) -> dict[str, str]:
-    """Return the policies that are given, or the shipped one, by what tables call them."""
+    """Return the given policies, or the shipped one, by label."""
     given = given or (default_policy(),)
     return dict(zip(labels(given, [name_of(path) for path in given]), given, strict=True))
 
 
 def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:
-    """Return what a page says of which policies flew."""
+    """Return name and digest of each policy, for the facts of a page."""
     return {name: f"{path}, SHA-256 {policy_digest(path)[:16]}" for name, path in policies.items()}
 
 
@@ -153,7 +153,7 @@ def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpe
 
 
 def _about(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Return all that sets the outcome of a trial besides the trial."""
+    """Return everything but the trial that determines an outcome."""
     return {
         "policy_sha256": digests[setup.policy],
         "vehicle": setup.vehicle,
@@ -165,20 +165,20 @@ def _about(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
 
 
 Loaders = dict[str, Callable[[], Policy]]
-"""How each policy is loaded where it flies, by what setups call it."""
+"""Function that loads each policy in the process that flies it."""
 
 
 class Share(NamedTuple):
     """Trials of one setup."""
 
     number: int
-    """Of the setup."""
+    """Number of the setup."""
     setup: Setup
     trials: Sequence[TrialSpec]
 
 
 def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
-    """Return how policies are loaded: by name on this machine, by content on others."""
+    """Return functions that load policies: by name on this machine, by content on others."""
     if isinstance(workers, int):
         return {name: partial(load_policy, name) for name in policies}
     return {name: PolicyContent.of(name) for name in policies}
@@ -187,7 +187,7 @@ def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
 def _pieces(
     setups: Sequence[Setup], missing: Sequence[Sequence[TrialSpec]], processes: int
 ) -> list[list[Share]]:
-    """Cut the trials of all setups into pieces for so many processes, each of about as many."""
+    """Cut the trials of all setups into pieces of about equal size for `processes`."""
     total = sum(map(len, missing))
     most = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
     pieces: list[list[Share]] = [[]]
@@ -204,7 +204,7 @@ def _pieces(
 
 
 def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, TrialResult]]:
-    """Yield (number of the setup, result) of trials flown here; each policy is loaded once."""
+    """Fly a piece and yield (number of the setup, result); each policy is loaded once."""
     loaded: dict[str, Policy] = {}
     for number, setup, trials in piece:
         if setup.policy not in loaded:

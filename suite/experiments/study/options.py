@@ -1,4 +1,4 @@
-"""What options of experiments have in common: what is allowed, and the recipe they ask for."""
+"""Options that experiments share: their ranges, and the recipe that they select."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 T = TypeVar("T")
 
 GATES = 4
-"""Of the paper's tracks in its ablation and its comparison of schemes."""
+"""Number of gates in the paper's ablation and its comparison of schemes."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What the experiments on judged policies have in common; their options derive from it."""
+    """Options of all experiments on judged policies."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
@@ -34,15 +34,15 @@ class Judged:
     seed: Seed = 0
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
-    """What flies: a shipped vehicle's name or a vehicle file (.toml)."""
+    """A shipped vehicle's name or a vehicle file (.toml)."""
 
 
 @dataclass(frozen=True)
 class FourGates:
-    """What the experiments on tracks of four gates have in common; their options derive from it."""
+    """Options of all experiments on tracks of four gates."""
 
     recipe: str = "race-paper"
-    """The recipe that all trainings share, but for its size, its gates and what is compared."""
+    """The recipe of all trainings, except for its size, its gates and what is compared."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
     iterations: Iterations = 200
@@ -50,20 +50,20 @@ class FourGates:
     worlds: Annotated[int, Range(1, 10**6)] = 48
     """Worlds in one gradient step, instead of the recipe's."""
     training_seeds: tuple[Seed, ...] = (0, 1, 2)
-    """Seeds that everything is trained from."""
+    """Seeds of the trainings."""
     trials: Trials = 300
-    """Unseen worlds that are flown at every measurement."""
+    """Unseen worlds flown at every measurement."""
     seconds: Annotated[float, Range(0.5, 3600.0)] = 10.0
-    """Of a trial, from standing start."""
+    """Length of a trial, from a standing start [s]."""
     seed: Seed = 1000
-    """Of the unseen worlds; none of the training seeds."""
+    """Seed of the unseen worlds; must not be a training seed."""
 
 
 def chosen(known: Mapping[str, T], only: Sequence[str], what: str) -> dict[str, T]:
-    """Return the entries of `known` whose names are in `only`, all where it is empty.
+    """Return the entries of `known` whose names are in `only`, all if it is empty.
 
     Raises:
-        ValueError: for a name that no entry has; `what` says what an entry is.
+        ValueError: for an unknown name; `what` is what the message calls an entry.
     """
     for name in only:
         if name not in known:
@@ -72,7 +72,7 @@ def chosen(known: Mapping[str, T], only: Sequence[str], what: str) -> dict[str, 
 
 
 def check(config: Any) -> None:
-    """Refuse numbers of an experiment's options that cannot be used, by their fields' names.
+    """Refuse option values of an experiment that are out of range.
 
     Raises:
         ValueError: naming the option and what is allowed.
@@ -93,10 +93,10 @@ def check(config: Any) -> None:
 
 
 def four_gate_recipe(config: FourGates) -> TrainConfig:
-    """Return the recipe that `config` asks for on tracks of four gates.
+    """Return the recipe that `config` selects, on tracks of four gates.
 
     Raises:
-        ValueError: for a recipe or a change that does not exist, or no field: that is compared.
+        ValueError: for an unknown recipe or change, or one without the field, which is compared.
     """
     from suite.train.overrides import changed, check_phases
     from suite.train.recipes import named_recipe, with_iterations

@@ -1,4 +1,4 @@
-"""How fast a compiled program is, against how fast the device multiplies matrices."""
+"""Speed of a compiled program, compared with the device's speed of multiplying matrices."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any
 import jax
 
 REPEATS = 4
-"""Timed calls of a program, of which the fastest counts."""
+"""Timed calls of a program; the fastest counts."""
 
 
 def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Return the seconds of the fastest of several calls, results awaited; it has been compiled."""
+    """Return the shortest time of several calls of a compiled program, results awaited [s]."""
     taken = []
     for _ in range(repeats):
         began = time.perf_counter()
@@ -26,11 +26,11 @@ def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 
 def count_operations(function: Callable[..., Any], *args: Any) -> float:
-    """Return about how many floating-point operations a call takes.
+    """Return the approximate number of floating-point operations of a call.
 
-    A product of matrices and a convolution count a multiplication and an addition per term, any
-    other operation one for every number of its result. Loops count as often as they run; of a loop
-    whose length is unknown one pass counts. (XLA's own count takes one pass of every loop.)
+    Matrix products and convolutions count a multiplication and an addition per term, any other
+    operation one per element of its result. A loop counts once per pass, and once if its length is
+    unknown. (XLA's own count takes one pass of every loop.)
     """
     return _operations(jax.make_jaxpr(function)(*args).jaxpr)
 
@@ -64,9 +64,9 @@ def _of_equation(equation: Any) -> float:
 
 
 def multiplying_rate(size: int) -> float:
-    """Return the operations a second of a product of float32 matrices, unrounded [1/s].
+    """Return the operations a second of a product of float32 matrices in full precision [1/s].
 
-    This is what the device reaches at best where nothing is rounded to fewer bits.
+    It is about the best that the device reaches without rounding to fewer bits.
     """
     matrix = jax.random.normal(jax.random.key(0), (size, size))
     with jax.default_matmul_precision("highest"):

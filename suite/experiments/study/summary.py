@@ -1,4 +1,4 @@
-"""Rows over their training seeds: what policies came to in worlds that no training has seen."""
+"""Results of each setting over its training seeds, in worlds that no training has seen."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from suite.common.charts import METRICS
 from suite.experiments.study.training import Row, Trained
 
 
@@ -18,47 +19,30 @@ class Spread(NamedTuple):
     most: float
 
 
-class Metric(NamedTuple):
-    """A number of `validation.measured`, as tables show it."""
-
-    title: str
-    scale: float
-    digits: int
-
-
-METRICS = {
-    "reward": Metric("reward", 1, 0),
-    "success_cross": Metric("success cross [%]", 100, 0),
-    "collision_free": Metric("collision-free rate [%]", 100, 0),
-    "v_max": Metric("v_max [m/s]", 1, 1),
-    "gates": Metric("gates", 1, 2),
-}
-
-
 class Summary(NamedTuple):
-    """One row over its training seeds; those that diverged are left out of all numbers."""
+    """One setting over its training seeds; diverged trainings are left out of all numbers."""
 
     key: str
     words: str
     recipe: Any
     seeds: int
-    """Trainings, the diverged ones included."""
+    """Number of trainings, including diverged ones."""
     whole: list[list[dict[str, float]]]
     """The measurements of every training that did not diverge."""
     at: list[dict[str, Spread]]
-    """Over seeds, at each measurement; empty where all diverged."""
+    """Over seeds, at each measurement; empty if all diverged."""
 
     @property
     def diverged(self) -> int:
-        """How many trainings did."""
+        """Number of trainings that diverged."""
         return self.seeds - len(self.whole)
 
     def values(self, name: str) -> list[float]:
-        """Return a number of each training that did not diverge, at its end."""
+        """Return a number of each training at its end, without diverged ones."""
         return [points[-1][name] for points in self.whole]
 
     def text(self, name: str) -> str:
-        """Return a number's mean at the end with the least and the most of a seed, for cells."""
+        """Return a number at the end for a cell: mean over seeds [least, most]."""
         if not self.at:
             return "diverged"
         _, scale, digits = METRICS[name]
@@ -67,7 +51,7 @@ class Summary(NamedTuple):
 
 
 def summaries(rows: Sequence[Row], runs: Sequence[Trained]) -> list[Summary]:
-    """Return every row over its seeds, in order."""
+    """Return every setting over its seeds, in order."""
     found = []
     for row in rows:
         mine = [run for run in runs if run.row == row.key]

@@ -1,7 +1,7 @@
-"""Rows x training seeds, trained: what is there already is found by its configuration's hash.
+"""Settings x training seeds, trained; a finished training is reused.
 
-The run's folder is named by the configuration alone: code that has changed since does not start it
-anew, so a document should say the commit of each.
+A run's folder is named by the hash of its configuration. Newer code does not train it again, so
+pages name the commit of each training.
 """
 
 from __future__ import annotations
@@ -30,62 +30,62 @@ if TYPE_CHECKING:
 
 
 class Row(NamedTuple):
-    """What is trained, from every seed."""
+    """A setting that is trained from every seed."""
 
     key: str
     """Its name."""
     words: str
-    """What tables call it."""
+    """Its label in tables."""
     recipe: Any
-    """A `TrainConfig` or a `PpoConfig`, with the seed left as it is."""
+    """A `TrainConfig` or a `PpoConfig`; its seed is replaced."""
 
 
 class Unseen(NamedTuple):
-    """How policies are flown in worlds that no training has seen."""
+    """Measurement of policies in worlds that no training has seen."""
 
     measurements: int
-    """About how many during a training; 0 for one, of the finished policy."""
+    """About how many during a training; 0 measures only the finished policy."""
     trials: int
     seed: int
-    """Of the worlds."""
+    """Seed of the worlds."""
     seconds: float
-    """Of a trial, from standing start."""
+    """Length of a trial, from a standing start [s]."""
 
 
 class Trained(NamedTuple):
-    """One training of a row."""
+    """One training of a setting."""
 
     row: str
-    """Its key."""
+    """The setting's key."""
     seed: int
     policy: str
-    """The checkpoint's folder; where the training diverged, its last finite one."""
+    """The checkpoint's folder; of a diverged training the last finite checkpoint."""
     seconds: float
-    """Spent on gradient steps after those that compile [s]."""
+    """Time of the gradient steps that do not compile [s]."""
     compile_s: float
-    """What those that compile took longer than the others [s]."""
+    """Extra time of the gradient steps that compile [s]."""
     commit: str
-    """Commits that trained it; several if it was interrupted and resumed."""
+    """Commits of the code that trained it; several if it was resumed."""
     diverged: str
-    """What was said where it diverged, else ""."""
+    """The message if it diverged, else ""."""
     points: list[dict[str, float]]
-    """Numbers in unseen worlds. Those on the way have `steps`, the environment steps until then,
-    and `time`, the seconds of training until then, without measurements and compilation."""
+    """Measurements in unseen worlds. Those during the training have `steps`, the environment steps
+    before, and `time`, the seconds of training before, without measurements and compilation."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """What is trained, how often, and how it is measured."""
+    """Settings, training seeds and measurement."""
 
     rows: Sequence[Row]
     seeds: Sequence[int]
     unseen: Unseen
-    """Flights in unseen worlds of the training's dynamics."""
+    """Flights in the dynamics of the training."""
     by_seed: bool = False
-    """Whether the rows take turns, so that they meet the same load of the machine."""
+    """Whether the settings alternate, so that all see the same load of the machine."""
 
     def pieces(self) -> list[tuple[str, Any]]:
-        """Return key and whole configuration of every training, in the order they are done."""
+        """Return key and configuration of every training, in the order of the work."""
         if self.by_seed:
             return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.rows]
         return [(r.key, replace(r.recipe, seed=s)) for r in self.rows for s in self.seeds]
@@ -97,10 +97,10 @@ def trained(study: Study, place: Place, console: Console) -> list[Trained]:
     If one diverges, the others continue.
 
     Args:
-        study: what is trained.
-        place: where trainings are found again, and who trains; with no or one worker one training
-            after the other on all cores.
-        console: where progress goes.
+        study: settings and seeds.
+        place: cache of trainings, and workers; with at most one worker the trainings follow each
+            other on all cores.
+        console: shows progress.
     """
     from suite.train.ppo.run import estimate as ppo_estimate
     from suite.train.run import estimate
@@ -128,10 +128,10 @@ def _folder_of(piece: tuple[str, Any], unseen: Unseen) -> Path:
 
 
 def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dict[str, float]]]:
-    """Train one of `Study.pieces` in the job's folder, or find it, and measure it.
+    """Train one of `Study.pieces` in the job's folder unless it is finished, and measure it.
 
     Returns:
-        `Trained.diverged`, and what was measured of the finished policy alone.
+        `Trained.diverged`, and the measurement of the finished policy, if only that is measured.
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
@@ -174,7 +174,7 @@ def _read(job: Job, diverged: str, found: list[dict[str, float]]) -> Trained:
 
 
 def rewarded(config: TrainConfig) -> Note:
-    """Return the paper's reward, noted at every step of the rollout."""
+    """Return a function that records the paper's reward at every step of a rollout."""
     from suite.train.ppo.reward import make_reward
 
     reward = make_reward(config)
@@ -182,7 +182,7 @@ def rewarded(config: TrainConfig) -> Note:
 
 
 def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
-    """Return a run's measurements with their steps and time, and what compilation took [s].
+    """Return a run's measurements with their steps and time, and the time of compilation [s].
 
     Iterations that compile, the first and those after a stop, count as long as the median of the
     others.
@@ -204,9 +204,9 @@ def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
 
 
 def commit_of(policy: Path) -> str:
-    """Return the commit that trained `policy` (RUN/policy), "unknown" where nothing says so.
+    """Return the commit that trained `policy` (RUN/policy), or "unknown".
 
-    A training that was interrupted and resumed may have several: all of them.
+    A training that was interrupted and resumed may have several commits; all are returned.
     """
     path = policy.parent / "run.json"
     try:
@@ -217,7 +217,7 @@ def commit_of(policy: Path) -> str:
 
 
 def facts(config: Any, runs: Sequence[Trained]) -> dict[str, str]:
-    """Return what a page says of trainings that flew unseen worlds: seeds, commits, worlds."""
+    """Return the facts of a page on trainings: seeds, commits, unseen worlds."""
     return {
         "training seeds": " ".join(map(str, config.training_seeds)),
         "trained at commit": ", ".join(sorted({run.commit for run in runs})),

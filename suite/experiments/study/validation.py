@@ -1,7 +1,7 @@
-"""Success in the trainer's own dynamics: a policy on fixed worlds that no training has seen.
+"""Success of a policy in the trainer's dynamics, on fixed worlds that no training has seen.
 
-Flight, collision and passing are the trainer's code (`suite/train/rollout.py`): the nearest of the
-`NEAR` solids at `PATH_SAMPLES` points of a step's path, closer than `BODY_RADIUS_M`.
+Flight, collisions and passed gates are computed by the trainer's code (`suite/train/rollout.py`): a
+collision is a distance below `BODY_RADIUS_M` at one of `PATH_SAMPLES` points of a step's path.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
 
 Measure = Callable[[network.Params], dict[str, float]]
-"""Of a policy's parameters; fits `suite.train.training_loop.Watch`."""
+"""(parameters of a policy) -> numbers, as `suite.train.training_loop.Watch` calls it."""
 
 
 class Scores(NamedTuple):
-    """What each trial came to, (B,) each, until its end: a collision or the last gate."""
+    """Results of each trial, (B,) each, until its end: a collision or the last gate."""
 
     gates: jax.Array
-    """Passed."""
+    """Number of passed gates."""
     collided: jax.Array
     """Bool."""
     crossed: jax.Array
@@ -36,7 +36,7 @@ class Scores(NamedTuple):
     v_max: jax.Array
     """Largest speed [m/s]."""
     reward: jax.Array
-    """Summed; zero where there was none."""
+    """Sum over the trial; zero without a reward."""
 
 
 def scored(
@@ -48,13 +48,13 @@ def scored(
 ) -> Scores:
     """Return the trials' scores.
 
-    A step that both collides and passes a gate collides: which came first is not known.
+    A step with both a collision and a passed gate counts as a collision: their order is unknown.
 
     Args:
         passed: (T, B) bool, a gate was passed in the step.
-        clearance: (T, B) least signed distance of the body's centre in the step [m].
+        clearance: (T, B) smallest signed distance of the body's centre in the step [m].
         speed: (T, B) at the step's end [m/s].
-        gates: how many a trial has.
+        gates: number of gates of a trial.
         reward: (T, B) of the step.
     """
     hit = clearance < BODY_RADIUS_M
@@ -72,10 +72,10 @@ def scored(
 
 
 def validation_worlds(config: TrainConfig, trials: int, seed: int, seconds: float) -> TrainConfig:
-    """Return `config` with the worlds of a validation: all from rest, at full speed, for a time.
+    """Return `config` with the worlds of a validation: all start at rest and fly at full speed.
 
-    Tracks, obstacles and the spread of the dynamics stay those of the training. Its field of view,
-    which all worlds of an iteration share, is the camera's.
+    Tracks, obstacles and the spread of the dynamics are those of the training. The field of view is
+    the camera's, without its spread.
     """
     episode = replace(
         config.episode,
@@ -95,8 +95,8 @@ def make_flight(
     """Return fly(params, worlds) -> scores, compiled on its first call.
 
     Args:
-        config: of `validation_worlds`; its seed sets the images' noise.
-        reward: (worlds, before, body, target) -> (B,), of a step.
+        config: from `validation_worlds`; its seed determines the noise of the images.
+        reward: (worlds, before, after, target) -> (B,), of a step.
     """
     rollout, episode = make_rollout(config, reward), config.episode
 
@@ -113,7 +113,7 @@ def make_flight(
 
 
 def measured(scores: Scores) -> dict[str, float]:
-    """Return what the trials came to.
+    """Return the results over all trials.
 
     They are `success_cross` (all gates passed without a collision), `collision_free` (no collision,
     whatever gates were passed), `v_max` (median of the trials' largest speeds) and `v_max_most`
@@ -136,11 +136,11 @@ def make_validation(
     """Return measure(params) -> numbers of `measured`, on the same worlds at every call.
 
     Args:
-        config: the training's; its dynamics are flown.
-        trials: worlds.
-        seed: of the worlds; not one that is trained on.
-        seconds: of a trial, from standing start [s].
-        reward: (worlds, before, body, target) -> (B,), of a step.
+        config: of the training, whose dynamics are flown.
+        trials: number of worlds.
+        seed: of the worlds; not a training seed.
+        seconds: length of a trial, from a standing start [s].
+        reward: (worlds, before, after, target) -> (B,), of a step.
     """
     config = validation_worlds(config, trials, seed, seconds)
     fly, worlds = make_flight(config, reward), sample_worlds(config, 0)

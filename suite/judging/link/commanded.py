@@ -23,9 +23,8 @@ from suite.judging.flying import (
     refuse_one_name,
 )
 from suite.judging.link.companion import FINISHED, Companion
-from suite.judging.link.flights import Flight, fly_link, fly_simulated, totals, write_log
+from suite.judging.link.flights import Flight, delays, fly_link, fly_simulated, totals, write_log
 from suite.judging.link.messages import Wire, dialect
-from suite.judging.link.report import delays
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits

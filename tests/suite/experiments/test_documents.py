@@ -5,7 +5,8 @@ import json
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
-from suite.experiments.simulators import WHY, Column, Config, changes, columns
+from suite.experiments.simulators import WHY, Config, changes, conditions
+from suite.experiments.study import disturbed
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
 from tests.support.loops import trial_result
@@ -98,16 +99,18 @@ def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
 
 
 def test_why_is_told_by_the_controls(rotorpy):
-    flown_in = columns(Config(simulator=("mjx", "rotorpy")))
-    base, single, aired, other = (column.label for column in flown_in)
-    assert flown_in[2] == Column(aired, "mujoco", flown_in[2].vehicle, "rotorpy")
+    flown_in = conditions(Config(simulator=("mjx", "rotorpy")))
+    base, single, aired, other = (condition.name for condition in flown_in)
+    assert flown_in[2].simulator == "mujoco" and flown_in[2].vehicle != flown_in[0].vehicle
     won = {base: "1111", single: "0111", aired: "1011", other: "0001"}
-    results = {
-        ("p", label): [trial_result(k, digit == "1") for k, digit in enumerate(digits)]
-        for label, digits in won.items()
-    }
-    found = changes(["p"], flown_in, results)
+    tested = [
+        disturbed.Tested(
+            one, {"p": [trial_result(k, digit == "1") for k, digit in enumerate(won[one.name])]}
+        )
+        for one in flown_in
+    ]
+    found = changes(tested)
     mine = {change["trial"].seed: change["why"] for change in found if change["column"] == other}
     assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(WHY)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2
-    assert found[0]["endings"][base] == results["p", base][0].ending
+    assert found[0]["endings"][base] == tested[0].results["p"][0].ending

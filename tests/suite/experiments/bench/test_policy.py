@@ -10,7 +10,7 @@ from policies.formats.c.compiler import find_compiler
 from suite import cli
 from suite.common.errors import WorkFailed
 from suite.experiments.bench import diagnose, policy, sysid_baseline
-from suite.experiments.bench.compare import Comparison, Figure, in_turn
+from suite.experiments.bench.compare import Comparison, Figure, compared, in_turn
 from tests.support.small_policy import small_checkpoint
 
 
@@ -36,14 +36,15 @@ def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypat
 def test_bench_times_both_sides_in_turn():
     calls = []
     ticks = count()
-    ours, baseline = in_turn(
-        lambda: calls.append("ours"),
-        lambda: (calls.append("baseline"), next(ticks), next(ticks)),
-        repeats=3,
-        clock=lambda: next(ticks),
-    )
+    sides = {
+        "ours": lambda: calls.append("ours"),
+        "baseline": lambda: (calls.append("baseline"), next(ticks), next(ticks)),
+    }
+    taken = in_turn(sides, 3, clock=lambda: next(ticks))
     assert calls == ["ours", "baseline"] * 4
-    assert (ours, baseline) == (1, 3)
+    assert taken == {"ours": [1] * 3, "baseline": [3] * 3}
+    assert compared("a", taken, 6.0, "steps/s", {}).baseline == Figure(2.0, "steps/s")
+    assert in_turn(sides, 3, most_s=0.0).keys() == {"ours", "baseline"} and len(calls) == 12
     figures = Figure(6.0, "steps/s"), Figure(2.0, "steps/s")
     assert Comparison("a", *figures).ratio == pytest.approx(3.0)
 

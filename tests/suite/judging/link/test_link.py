@@ -17,7 +17,7 @@ from suite import cli
 from suite.judging.flying import read_course
 from suite.judging.link import commanded, server
 from suite.judging.link.companion import Companion, Row
-from suite.judging.link.flights import Flight, fly_link, totals, warm_up, write_log
+from suite.judging.link.flights import Flight, delays, fly_link, totals, warm_up, write_log
 from suite.judging.link.messages import (
     Note,
     Packet,
@@ -29,7 +29,6 @@ from suite.judging.link.messages import (
     turned,
     turned_quat,
 )
-from suite.judging.link.report import delays
 from suite.judging.link.simulated import LOST_S, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
