@@ -1,4 +1,4 @@
-"""Every setting of a training run, as frozen dataclasses the command line reads; their limits."""
+"""All settings of a training run, as frozen dataclasses with their limits."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from policies.spec import PolicySpec, check_network, check_spec
 from tracks.input.ranges import Iterations, Range, Seed, Share, check_ranges
 
 COM_STD_MOST, TRIM_STD_MOST = 0.02, 0.2
-"""Most of `QuadrotorConfig.com_std_m` [m] and `trim_std` [N m]."""
+"""Upper limits of `QuadrotorConfig.com_std_m` [m] and `trim_std` [N m]."""
 
 
 @dataclass(frozen=True)
 class PointMassConfig:
-    """The simulator's dynamics and their randomisation, drawn per world.
+    """The point mass and its randomisation, drawn per world.
 
-    The model is that of Zhang et al. 2025 (the recipe `paper` has its numbers), with lag, drag and
-    delay drawn from wider ranges.
+    The model is that of Zhang et al. 2025 (the recipe `paper` has its numbers), with wider ranges
+    of lag, drag and delay.
     """
 
     lag_mean: Annotated[float, Range(0.1, 1000.0)] = 12.0
@@ -30,8 +30,8 @@ class PointMassConfig:
     drag: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
     """Range of the linear drag along the body's x and y [1/s]."""
     drag_up: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
-    """Range of the linear drag along the body's z, which pushes a drone that leans forward down;
-    real rotors have more of it than of the other two [1/s]."""
+    """Range of the linear drag along the body's z, which pushes a forward-leaning drone down; real
+    rotors have more drag along z than along x and y [1/s]."""
     wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds [m/s]."""
     time_step_std: Share = 0.1
@@ -45,55 +45,55 @@ class PointMassConfig:
     depth_noise: Annotated[float, Range(0.0, 10.0)] = 0.02
     """Standard deviation of the noise on the encoded inverse depth [1]."""
     fov_scale: Annotated[tuple[float, float], Range(0.1, 10.0, ordered=True)] = (0.95, 1.05)
-    """Range by which the images' half widths, as tangents, are scaled: the field of view, drawn per
-    iteration [1]."""
+    """Range of the factor on the tangents of the half field of view, drawn per iteration [1]."""
 
 
 @dataclass(frozen=True)
 class QuadrotorConfig:
-    """The differentiable quadrotor around a vehicle file; what varies is drawn per world.
+    """The differentiable quadrotor around a vehicle file, with a randomisation drawn per world.
 
-    Images and their delay, noise and field of view are those of `PointMassConfig`.
+    Images and their delay, noise and field of view are set in `PointMassConfig`.
     """
 
     vehicle: Vehicle
     """The simulation's vehicle with its effects."""
     attitude_hz: Annotated[float, Range(1.0, 10_000.0)] = 100.0
-    """About how often the attitude loop runs: a whole number of times a policy period [Hz]."""
+    """Approximate rate of the attitude loop; it runs a whole number of times a policy period
+    [Hz]."""
     physics_hz: Annotated[float, Range(10.0, 10_000.0)] = 250.0
-    """About how often rate loop and rigid body are stepped; the judge steps at the vehicle's
-    controller.frequency [Hz]."""
+    """Approximate rate of the physics steps (rate loop and rigid body); the judge steps at the
+    vehicle's controller.frequency [Hz]."""
     mass_std: Share = 0.03
     """Standard deviation of the true mass over worlds, as a share of the vehicle's [1]."""
     lag_spread: Share = 0.3
-    """The rotors' time constant varies by up to this share of the vehicle's either way [1]."""
+    """The rotors' time constant varies by up to +- this share of the vehicle's [1]."""
     lag_spread_s: Annotated[float, Range(0.0, 0.5)] = 0.0
-    """It varies by up to this as well, and is never negative: for a vehicle whose file has none
-    [s]."""
+    """The rotors' time constant varies by up to +- this as well, but is never negative: for a
+    vehicle file without one [s]."""
     drag_spread: Annotated[float, Range(0.0, 100.0)] = 0.1
-    """Linear drag varies by up to this on each axis either way, and is never negative [1/s]."""
+    """Linear drag varies by up to +- this on each axis, but is never negative [1/s]."""
     delay_spread_s: Annotated[float, Range(0.0, 0.1)] = 0.01
-    """The delay of commands varies by up to this either way, within 0 to 0.1 s or, where that is
-    more, the vehicle's own [s]."""
+    """The delay of commands varies by up to +- this, within 0 to 0.1 s or up to the vehicle's own
+    delay if that is longer [s]."""
     gain_spread: Share = 0.1
-    """The rate loop's gain varies by up to this share either way [1]."""
+    """The rate loop's gain varies by up to +- this share [1]."""
     wind_std: Annotated[tuple[float, float, float], Range(0.0, 100.0)] = (1.0, 1.0, 0.2)
     """Standard deviation of the constant wind over worlds, around the vehicle's [m/s]."""
     thrust_spread: Share = 0.0
-    """The true thrust varies by up to this share of the vehicle's either way [1]."""
+    """The true thrust varies by up to +- this share of the vehicle's [1]."""
     com_std_m: Annotated[float, Range(0.0, COM_STD_MOST)] = 0.0
-    """Standard deviation of the centre of mass along x and along y, around the vehicle's, cut off
-    at twice that [m]."""
+    """Standard deviation of the centre of mass along x and along y, around the vehicle's,
+    truncated at twice that [m]."""
     trim_std: Annotated[float, Range(0.0, TRIM_STD_MOST)] = 0.0
-    """Standard deviation of a constant torque about x and about y, around the vehicle's, cut off at
-    twice that; about z a fifth of it [N m]."""
+    """Standard deviation of a constant torque about x and about y, around the vehicle's, truncated
+    at twice that; a fifth of it about z [N m]."""
 
 
 @dataclass(frozen=True)
 class SensorsConfig:
-    """What policies see in training, by the models that the judge has; drawn per world and model.
+    """Sensor models between the true state and the policy, as in the judge.
 
-    A model's magnitude is drawn evenly from a range: 0 is the truth, 1 what the file says.
+    The magnitude of each model is drawn evenly per world: 0 is the truth, 1 the file's values.
     """
 
     seen: SensorSet
@@ -108,7 +108,7 @@ class SensorsConfig:
 class LossConfig:
     """Weights of the losses of Su et al. 2026, Sec. III-C3, and the strength of the field.
 
-    The defaults race best on two cores; the recipe `paper` has the printed ones.
+    The defaults gave the best policy on two cores; the recipe `paper` has the printed weights.
     """
 
     clearance: Annotated[float, Range(0.0, 1e6)] = 3.0
@@ -122,20 +122,20 @@ class LossConfig:
     progress: Annotated[float, Range(0.0, 1e6)] = 1.2
     """lambda_p of L_p [s/m]."""
     speed_range: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (1.5, 7.0)
-    """Speeds that the input of a policy with `spec.speed_input` means from 0 up to 1, linearly:
-    progress counts up to it, and what is faster costs as much as progress is worth; at 1 there is
-    no limit [m/s]."""
+    """Commanded speed at an input of 0 and just below 1, for a policy with `spec.speed_input`.
+    Progress counts up to the commanded speed, and the excess costs as much; at 1 there is no limit
+    [m/s]."""
     progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_p^norm, the ablation's direction-only progress [1]."""
     projection: Annotated[float, Range(0.0, 1e6)] = 0.0
     """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
     approach_m: Annotated[float, Range(0.0, 100.0)] = 0.0
-    """Where the drone is off a gate's axis or beyond its plane, progress is measured towards a
-    point on the axis before the gate, by as much as it is off, at most this far: straight to the
-    centre the frame is in the way, and the drone hovers above it; 0: always the centre [m]."""
+    """If the drone is off a gate's axis or beyond its plane, progress is measured towards a point
+    on the axis before the gate, as far before it as the drone is off, up to this distance. On the
+    straight line to the centre the frame would be in the way. 0: always the centre [m]."""
     pass_first: bool = False
-    """Whether the step that passes a gate measures progress towards the next one already, and not
-    backwards to the one that was passed: faster, and less careful at these weights."""
+    """Whether the step that passes a gate measures progress towards the next gate instead of the
+    passed one: faster, and less careful at these weights."""
     projection_decay: Annotated[float, Range(0.0, 1000.0)] = 0.5
     """beta_3 of L_proj [1/m]."""
     safety_radius_m: Annotated[float, Range(0.0, 10.0)] = 0.2
@@ -144,14 +144,14 @@ class LossConfig:
     """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
     centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
     gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
-    """alpha, the rate at which gradients of position and velocity fade back in time [1/s]."""
+    """alpha, the decay rate of the gradients of position and velocity, back in time [1/s]."""
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
-    """A world that gets deeper than this into a solid leaves the loss for the rest of the rollout:
-    from there on its gradients say nothing about flying [m]."""
+    """A world deeper than this in a solid leaves the loss for the rest of the rollout, because its
+    gradients have no more meaning for flying [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Weight of L_tilt, which grows from 0 at a tilt of 65 degrees to 1 where body z is level: the
-    judge ends a trial beyond, and above 0 such a world leaves the loss. It has a gradient through
-    quadrotors only; a point mass has no attitude to learn [1]."""
+    """Weight of L_tilt, which grows from 0 at a tilt of 65 degrees to 1 at 90 degrees, where the
+    judge ends a trial. Above 0 a world beyond 90 degrees leaves the loss. It has a gradient through
+    quadrotors only; a point mass has no attitude [1]."""
 
 
 @dataclass(frozen=True)
@@ -161,30 +161,30 @@ class EpisodeConfig:
     batch: Annotated[int, Range(1, 10**6)] = 64
     """Worlds per iteration, over all devices; a multiple of `shards`."""
     shards: Annotated[int, Range(1, 4096)] = 2
-    """Parts of a batch whose gradients are computed apart and added in order. Up to so many cores,
-    or devices, share them, and the result is the same to the bit on any number of them. The smaller
-    a part, the more it costs a world: 4 parts of 16 worlds a fifth more than 2 of 32."""
+    """Parts of a batch whose gradients are computed separately and added in order, by up to as many
+    cores or devices; the result has the same bits on any number of them. Smaller parts cost more
+    per world: 4 parts of 16 worlds a fifth more than 2 of 32."""
     steps: Annotated[int, Range(1, 10**5)] = 90
     """Policy periods per rollout."""
     image_stride: Annotated[int, Range(1, 10**5)] = 1
-    """The encoder's gradient is taken from one in so many of a rollout's images, with a random
-    first one, and weighted accordingly: neighbours look alike. Must divide `steps`."""
+    """The encoder's gradient is taken from every N-th image of a rollout, from a random first one
+    on, and weighted by N: neighbouring images are similar. Must divide `steps`."""
     gates: Annotated[int, Range(1, 8)] = 8
-    """Gates of a track, the first so many of those that it is made with, at most 8."""
+    """Gates of a track: the first ones of the eight that it is made with."""
     difficulty: Annotated[tuple[float, float], Range(0.0, 1.0, ordered=True)] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
     rest_share: Share = 0.3
-    """Share of worlds that start at rest at the track's start; the others start on the way, with a
-    recurrent state from a random step of the last rollout."""
+    """Share of worlds that start at rest at the track's start; the others start between two gates,
+    with a recurrent state from a random step of the last rollout."""
     stop_from: Share = 0.33
-    """Worlds that start at rest leave the loss at a random step from this share of `steps` on, so
-    that the policy cannot count the steps left and go for broke at the end; 1: none leaves."""
+    """Worlds that start at rest leave the loss at a random step after this share of `steps`, so
+    that the policy cannot count the remaining steps and take risks at the end; 1: none leaves."""
     start_speed: Annotated[float, Range(0.0, 100.0)] = 6.0
-    """Largest speed towards the gate of a world that starts on the way; sideways some is added
-    [m/s]."""
+    """Largest speed towards the gate of a world that starts between two gates; a sideways speed is
+    added [m/s]."""
     missed_share: Share = 0.0
-    """Share of the worlds that start on the way which start next to or above their gate's frame, as
-    one does that has missed it."""
+    """Share of the worlds that start between two gates which start next to or above a gate's frame,
+    as after missing it."""
     sharp_share: Share = 0.55
     """Share of tracks with one or two sharp turns."""
     density: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.0, 1.3)
@@ -192,17 +192,17 @@ class EpisodeConfig:
     bare_share: Share = 0.2
     """Share of tracks without obstacles."""
     finish: bool = False
-    """Whether a world leaves the loss as it passes its last gate. If not, it is to fly on to a
-    point 10 m beyond, so that speed is worth more at the last gate than at the others."""
+    """Whether a world leaves the loss as it passes its last gate. If not, its goal becomes a point
+    10 m beyond, which makes speed worth more at the last gate than at the others."""
     height_spread: Annotated[float, Range(0.0, 100.0)] = 1.0
-    """How far gates' heights lie apart before they are held to 0.8 to 2.2 m, as a share of what is
-    usual for a difficulty: with 2 they lie about as far apart as those of circles and ellipses."""
+    """Factor on the usual spread of the gates' heights, before they are limited to 0.8 to 2.2 m; 2
+    gives about the spread of circles and ellipses [1]."""
     race_share: Share = 0.5
     """Share of worlds in which the input of a policy with `spec.speed_input` is 1; in the others it
     is drawn from 0 to 1."""
     hairpin_share: Share = 0.0
-    """Share of tracks with one or two gates that are met nearly from the side and left backwards,
-    as at the apexes of the hardest ellipses."""
+    """Share of tracks with one or two gates that are entered nearly from the side and left
+    backwards, as at the apexes of the hardest ellipses."""
 
 
 @dataclass(frozen=True)
@@ -214,9 +214,10 @@ class OptimizerConfig:
     rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
     """Peak learning rate."""
     warmup: Annotated[int, Range(0, 10**9)] = 20
-    """Iterations of linear warm-up of each phase; the first of them changes nothing."""
+    """Gradient steps of linear warm-up of each phase; the first has a learning rate of 0."""
     memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99
-    """Adam's beta_2: short, because the first crashes' gradients are ten times all later ones."""
+    """Adam's beta_2: a short memory, because gradients of the first crashes are ten times
+    larger."""
     clip: Annotated[float, Range(0.0, 1e12)] = 1.0
     """Largest global norm of a gradient; 0 does not clip."""
 
@@ -228,7 +229,8 @@ class Phase:
     share: Annotated[float, Range(0.0, 1.0, above=True)] = 1.0
     """Share of the run's gradient steps [1]."""
     set: tuple[str, ...] = ()
-    """Settings that change as the phase begins and stay so, such as "loss.progress=2.2"."""
+    """Settings that change at the beginning of the phase, such as "loss.progress=2.2"; they keep
+    their values in later phases."""
 
 
 @dataclass(frozen=True)
@@ -242,15 +244,15 @@ class TrainConfig:
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
     sensors: SensorsConfig | None = None
-    """Sensor models between the truth and the policy; None: there are none."""
+    """Sensor models between the truth and the policy; None: perfect sensors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     """Worlds and horizon."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    """Optimiser and its schedule, which every phase goes through."""
+    """Optimiser and its schedule, which begins again in every phase."""
     phases: tuple[Phase, ...] = ()
-    """What changes on the way; shares add up to 1. None: nothing does."""
+    """Phases with changed settings; their shares add up to 1. Empty: one phase without changes."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
 

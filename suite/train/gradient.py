@@ -13,7 +13,7 @@ from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
 CHUNK = 320
-"""Images encoded at a time in the backward pass: small enough to stay in the cache."""
+"""Images encoded at a time in the backward pass: few enough for the processor's cache."""
 
 
 def _chunk(count: int) -> int:
@@ -55,14 +55,14 @@ def sampled_encoder_gradient(
     stride: int,
     key: jax.Array,
 ) -> network.Params:
-    """Return the encoder's gradient from one in `stride` steps' images, weighted accordingly.
+    """Return the encoder's gradient from the images of every `stride`-th step, times `stride`.
 
     Args:
         params: the policy's parameters.
         images: (T, B, height, width).
         cotangents: (T, B, hidden) gradient of the loss with respect to the embeddings.
         stride: a divisor of T.
-        key: picks the first step.
+        key: selects the first step.
     """
     first = jax.random.randint(key, (), 0, stride)
 

@@ -25,11 +25,11 @@ TILT_FREE_DEG = 65.0
 UNIT_FIELD = 11.313708498984761
 """|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""
 MAX_PULL = 5.0
-"""Largest field pull relative to that at the centre of a 1 m gate [1]."""
+"""Limit of the field's pull, relative to that at the centre of a 1 m gate [1]."""
 
 
 Term = Callable[[LossConfig, Step], jax.Array]
-"""(shape of the term, step) -> the loss (B,), not weighted."""
+"""(parameters of the term, step) -> the loss (B,), without its weight."""
 
 
 def barrier(step: Step) -> jax.Array:
@@ -60,13 +60,13 @@ def jerk(_: LossConfig, step: Step) -> jax.Array:
 
 
 def tilt(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_tilt, the square of how far body z is down from `TILT_FREE_DEG` to level [1]."""
+    """Return L_tilt: 0 up to a tilt of `TILT_FREE_DEG`, growing to 1 at 90 degrees [1]."""
     least = math.cos(math.radians(TILT_FREE_DEG))
     return (jnp.maximum(least - step.up, 0.0) / least) ** 2
 
 
 def speed_to_goal(step: Step) -> jax.Array:
-    """Return the speed (B,) towards the point that progress is measured to [m/s]."""
+    """Return the speed (B,) towards the goal of the progress term [m/s]."""
     to_goal = step.goal_w - step.pos_w
     return (step.vel_w * to_goal).sum(-1) / norm(to_goal)
 
@@ -74,7 +74,7 @@ def speed_to_goal(step: Step) -> jax.Array:
 def progress(config: LossConfig, step: Step) -> jax.Array:
     """Return L_p, minus the speed towards the goal, up to the commanded speed [m/s].
 
-    Beyond the commanded speed more progress counts nothing, and speed in any direction costs.
+    Progress above the commanded speed does not count, and any speed above it costs.
     """
     if step.wanted is None:
         return -speed_to_goal(step)
@@ -89,7 +89,7 @@ def progress_norm(_: LossConfig, step: Step) -> jax.Array:
 
 
 def projection(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_proj, the scalar substitute for the field: how far off the gate's axis [m^2]."""
+    """Return L_proj, which replaces the field: the squared distance to the gate's axis [m^2]."""
     near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(norm(step.place_g)))
     return (step.place_g[:, 1:] ** 2).sum(-1) * near
 
@@ -97,7 +97,7 @@ def projection(config: LossConfig, step: Step) -> jax.Array:
 def guidance(_: LossConfig, step: Step) -> jax.Array:
     """Return the term whose position gradient is -u_A / u_A(centre of a 1 m gate); 0 in value.
 
-    At the wires the field has no bound, so its pull is held to MAX_PULL.
+    The field is unbounded at the gate's edges, so its pull is limited to MAX_PULL.
     """
     held_pos, held_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
     gate = step.gate
@@ -121,7 +121,7 @@ LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
     ),
     "guidance": ((guidance, "field_gain"),),
 }
-"""Name in the curve -> its terms, each with the field of `LossConfig` that is its weight."""
+"""Name in the curve -> its terms, each with the name of its weight in `LossConfig`."""
 
 
 def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:

@@ -1,8 +1,7 @@
-"""Settings of a run changed by name, `loss.progress=1.2`: by a user, and by the run's own phases.
+"""Change settings of a run by name, `loss.progress=1.2`: for a user, and for the run's phases.
 
-A phase's settings are those of the phase before with its own changes made, so that a schedule reads
-as a list of differences. A user's change holds in every phase; `phases.2.loss.progress=2` begins
-with the second phase.
+A phase has the settings of the phase before, with its own changes. A user's change holds in every
+phase; `phases.2.loss.progress=2` holds from the second phase on.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ from tracks.input.ranges import check_ranges, is_finite, shown
 T = TypeVar("T")
 
 UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay")
-"""Settings of `physics` that the point mass alone reads."""
+"""Settings of `physics` that only the point mass uses."""
 NEEDS = {
     "loss.projection_decay": "loss.projection",
     "loss.speed_range": "spec.speed_input",
     "episode.race_share": "spec.speed_input",
     "episode.stop_from": "episode.rest_share",
 }
-"""Settings that do nothing where another is 0 or False."""
+"""Settings without effect if another setting is 0 or False."""
 ABSENT = {
     "quadrotor": "quadrotor; take a recipe that trains through quadrotors (suite train: or add "
     "--model quad and --vehicle)",
     "sensors": "sensor models; suite train: add --sensors",
 }
-"""What to do where a part of a run is None."""
+"""Advice for a part of a run that is None."""
 PREFIX = "phases."
-"""What a change that comes with a phase begins with."""
+"""Prefix of a change that begins with a phase."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
@@ -60,7 +59,7 @@ def override(config: T, changes: Iterable[str]) -> T:
 
 
 def _check_heard(config: object, path: str, change: str) -> None:
-    """Refuse a setting that another one keeps from doing anything."""
+    """Refuse a setting that has no effect because of another one."""
     for name, need in NEEDS.items():
         part, _, field = need.partition(".")
         if is_within(path, name):
@@ -73,12 +72,12 @@ def _check_heard(config: object, path: str, change: str) -> None:
 
 
 def is_within(path: str, part: str) -> bool:
-    """Say whether a setting's path is that of `part`, or of something below it."""
+    """Return whether a setting's path is `part` or below it."""
     return path == part or path.startswith(f"{part}.")
 
 
 def _check_read(config: object, keys: list[str], change: str) -> None:
-    """Refuse a setting of the point mass where quadrotors fly, which have their own."""
+    """Refuse a setting of the point mass in a run through quadrotors."""
     quadrotor = getattr(config, "quadrotor", None)
     if quadrotor is not None and keys[0] == "physics" and set(keys) & set(UNREAD):
         raise ValueError(
@@ -88,12 +87,12 @@ def _check_read(config: object, keys: list[str], change: str) -> None:
 
 
 def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = "--set") -> None:
-    """Refuse changes, as --set takes them, of settings that a command sets itself.
+    """Refuse changes of settings that a command sets itself.
 
     Args:
         changes: SETTING=VALUE each.
-        owned: what to do instead, by a setting's path; that of a part stands for all below it.
-        option: that gave the changes.
+        owned: advice by path; the path of a part includes all settings below it.
+        option: the option with the changes, for the message.
 
     Raises:
         ValueError: naming the setting and what to do instead.
@@ -131,7 +130,7 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
 def _value(old: object, text: str, change: str) -> object:
     try:
         value = ast.literal_eval(text)
-    # Nested a thousand times it is none of ours, whichever way the parser gives up.
+    # The parser fails in different ways on text that is nested a thousand times.
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         value = text
     if isinstance(old, float) and value == "inf":
@@ -149,7 +148,7 @@ def _value(old: object, text: str, change: str) -> object:
 
 
 def phase_ends(config: TrainConfig) -> tuple[int, ...]:
-    """Return how many gradient steps of the run are done at the end of each phase."""
+    """Return the number of gradient steps at the end of each phase."""
     total, done = config.optimizer.iterations, 0.0
     ends = []
     for phase in config.phases or (Phase(),):
@@ -159,7 +158,7 @@ def phase_ends(config: TrainConfig) -> tuple[int, ...]:
 
 
 def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
-    """Return the settings of each phase, as runs of one phase with as many gradient steps.
+    """Return the settings of each phase, as a run of that phase alone.
 
     Raises:
         ValueError: for a change that cannot be made, naming the phase.
@@ -178,7 +177,7 @@ def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
 
 
 def check_phases(config: TrainConfig) -> None:
-    """Refuse a run with a phase that cannot be trained, before anything is compiled or written.
+    """Refuse a run with an invalid phase, before anything is compiled or written.
 
     Raises:
         ValueError: naming the setting, its value and what is allowed.
@@ -199,7 +198,7 @@ def check_phases(config: TrainConfig) -> None:
 
 
 def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
-    """Return the settings that must be the same in all phases of a run."""
+    """Return the settings that all phases must share."""
     spec = replace(config.spec, rate_hz=run.spec.rate_hz, speed=run.spec.speed)
     episode = config.episode
     return {"spec": spec, "episode.batch": episode.batch, "episode.shards": episode.shards,
@@ -207,12 +206,12 @@ def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
 
 
 def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
-    """Return a run with a user's changes made: SETTING=VALUE in every phase, or from one on.
+    """Return a run with a user's changes: SETTING=VALUE in every phase, or from one phase on.
 
     Args:
         config: the run.
-        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4" from its second phase
-            until another phase changes that.
+        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4", which holds from the
+            second phase until a later phase changes that setting.
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
@@ -235,13 +234,13 @@ def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
 
 
 def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
-    """Return a run in which settings of a part, such as "loss", have the same values always."""
+    """Return a run in which settings of a part, such as "loss", have these values in all phases."""
     config = _dropping(config, {f"{part}.{name}" for name in values})
     return replace(config, **{part: replace(getattr(config, part), **values)})
 
 
 def without_quadrotor(config: TrainConfig) -> TrainConfig:
-    """Return a run through the point mass in the place of quadrotors."""
+    """Return a run through the point mass instead of quadrotors."""
     return replace(_dropping(config, {"quadrotor"}), quadrotor=None)
 
 

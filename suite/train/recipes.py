@@ -33,10 +33,11 @@ def race_paper() -> TrainConfig:
 def race() -> TrainConfig:
     """Return the recipe of `race`, the default policy: three phases from random weights.
 
-    First it learns to fly safely at 15 decisions a second, where a gradient step costs least. Then
-    to fly fast: progress has a higher weight, acceleration and jerk cost less. Then at 30 decisions
-    a second, with a higher price on tipping over, which ends a judged trial, and with delays of up
-    to 80 ms. Its quadrotors vary widely around `racer5`, which is not the vehicle of the tables.
+    The first phase learns safe flight at 15 decisions a second, where a gradient step costs least.
+    The second learns speed: a higher weight of progress, lower ones of acceleration and jerk. The
+    third has 30 decisions a second, a higher weight of tilt, since tipping over ends a judged
+    trial, and delays of up to 80 ms. Quadrotors vary widely around `racer5`, which no result table
+    uses.
     """
     fast = (
         "loss.progress=2.2",
@@ -102,7 +103,7 @@ def race_small() -> TrainConfig:
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
-    The paper leaves open how u_A scales with batch and horizon. Here it is added as written to
+    The paper does not give the scale of u_A with batch and horizon. Here it is added as written to
     the gradient of a loss averaged over 64 worlds of 150 steps.
     """
     return TrainConfig(
@@ -131,7 +132,7 @@ def paper() -> TrainConfig:
 
 
 def quick() -> TrainConfig:
-    """Return a run of minutes on two cores, through the point mass: it flies, it does not win."""
+    """Return a run of minutes on two cores, through the point mass: it flies, but slowly."""
     base = race_paper()
     return replace(
         base,
@@ -143,21 +144,21 @@ def quick() -> TrainConfig:
 def gpu() -> TrainConfig:
     """Return the recipe of `race` with thousands of worlds at once, for one accelerator.
 
-    In one shard, because a small batch takes an accelerator as long as a large one.
+    It has one shard, because a small batch takes an accelerator as long as a large one.
     """
     base = race()
     return replace(base, episode=replace(base.episode, batch=2048, shards=1))
 
 
 def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
-    """Return `config` with so many gradient steps."""
+    """Return `config` with another number of gradient steps."""
     return replace(config, optimizer=replace(config.optimizer, iterations=iterations))
 
 
 def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
-    """Return `config` with decisions at `rate_hz`, its rollouts and delays as long in seconds.
+    """Return `config` with decisions at `rate_hz`; rollouts and delays keep their durations.
 
-    Delays of the point mass are cut off at the two decisions that it can hold.
+    Delays of the point mass are limited to two decisions.
     """
     ratio, physics, episode = rate_hz / config.spec.rate_hz, config.physics, config.episode
     stride = max(1, round(ratio * episode.image_stride))
@@ -180,14 +181,13 @@ def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
 
 
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
-    """Return how a policy that `config` trained is fine-tuned, under a Delta Action Model or not.
+    """Return the settings of fine-tuning a policy of `config`, also under a Delta Action Model.
 
-    The settings are those of its last phase. The steps are smaller, since the policy flies already,
-    and the tracks are new ones.
+    They are those of the last phase, with a lower learning rate and other tracks.
 
     Args:
-        config: how the policy was trained.
-        share: gradient steps, as a share of that phase's.
+        config: the settings of the policy's training.
+        share: gradient steps, as a share of the last phase's.
     """
     last = phase_configs(config)[-1]
     optimizer = last.optimizer
@@ -203,10 +203,10 @@ def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
 
 
 def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
-    """Return `config` through the models of a sensors file or a shipped name.
+    """Return `config` with the sensor models of a file or a shipped name.
 
     Raises:
-        ValueError: for sensors that cannot be used, or that need the judge's state estimator.
+        ValueError: for invalid sensors, or ones that need the judge's state estimator.
     """
     from eval.sensors.sensors_file import load_sensors
 
@@ -220,10 +220,10 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
 
 
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
-    """Return `config` through the quadrotor of `vehicle`, which varies as the recipe's own does.
+    """Return `config` through the quadrotor of `vehicle`, with the recipe's randomisation.
 
-    Spreads of the centre of mass and of the trim go with the vehicle's size: what is little for a
-    racer is more torque than a palm-sized quadrotor has.
+    Spreads of the centre of mass and of the trim scale with the vehicle's size: a small torque for
+    a racer is more than a palm-sized quadrotor can produce.
 
     Raises:
         ValueError: where the policy decides faster than the vehicle's controller runs.
@@ -244,14 +244,14 @@ SPREADS = (
     *("mass_std", "lag_spread_s", "drag_spread", "delay_spread_s"),
     *("gain_spread", "thrust_spread", "com_std_m", "trim_std"),
 )
-"""What `widened` widens."""
+"""Spreads that `widened` increases."""
 
 
 def widened(config: TrainConfig) -> TrainConfig:
-    """Return `config` with quadrotors that vary at least as much as a vehicle file may be wrong.
+    """Return `config` with quadrotors that vary by at least the usual errors of a vehicle file.
 
-    A policy that is fine-tuned through one exact vehicle loses its margin to what that vehicle
-    lacks: with a hidden offset of the centre of mass it flew far worse than before.
+    A policy that is fine-tuned through one exact vehicle loses its robustness: with a hidden offset
+    of the centre of mass its success fell far below that before the fine-tuning.
     """
     own = config.quadrotor
     if own is None:
@@ -280,7 +280,7 @@ def _varied() -> QuadrotorConfig:
 
 
 def _arm_m(vehicle: Vehicle) -> float:
-    """Return how far hubs lie from the origin along x and y, on the mean [m]."""
+    """Return the mean distance of the hubs from the origin in the x-y plane [m]."""
     return sum(math.hypot(x, y) for x, y, _ in vehicle.rotors.position) / 4
 
 
@@ -290,17 +290,16 @@ def _inertia(vehicle: Vehicle) -> float:
 
 
 def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
-    """Return `config` with what --model and --vehicle ask for.
+    """Return `config` with the dynamics of --model and --vehicle.
 
     Args:
         config: a recipe.
-        model: "point" or "quad"; None: what the recipe has.
-        vehicle: a vehicle file or a shipped name; with "quad", or with a recipe that has its own
-            quadrotors, which then are around this one.
+        model: "point" or "quad"; None: that of the recipe.
+        vehicle: a vehicle file or a shipped name, for "quad" or a recipe through quadrotors.
 
     Raises:
-        ValueError: where a vehicle is given and no quadrotor flies, "quad" without a vehicle, or
-            a vehicle that cannot be used.
+        ValueError: for a vehicle without quadrotors, "quad" without a vehicle, or an invalid
+            vehicle.
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
@@ -332,10 +331,10 @@ RECIPES = {
 
 
 def named_recipe(name: str) -> TrainConfig:
-    """Return the recipe called `name`.
+    """Return the recipe `name`.
 
     Raises:
-        ValueError: where there is none, with the names there are.
+        ValueError: if there is none, with the known names.
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)

@@ -1,9 +1,9 @@
 """One rollout of the policy in its dynamics, with the loss of every step.
 
-The image carries no gradient to the state (Zhang et al. 2025), so the encoder can leave the
-differentiated loop: the embeddings enter as constants plus `embedding_shift`, a zero whose gradient
-is their cotangent. Obstacles, field and gates are looked up on values without gradient for the same
-reason.
+The image has no gradient with respect to the state (Zhang et al. 2025), so the encoder is outside
+the differentiated loop: the embeddings enter as constants plus `embedding_shift`, a zero whose
+gradient is the embeddings' cotangent. Obstacles, field and gates are evaluated without gradient as
+well.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from tracks.geometry.rotation import exp_rot, to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
-"""Solids of each kind that a training image shows, nearest first; the judge shows all."""
+"""Solids of each kind in a training image, the nearest ones; the judge's images have all."""
 
 
 class RolloutCarry(NamedTuple):
-    """What a world carries from step to step."""
+    """State of a world between steps."""
 
     state: Any
     """Of the dynamics."""
@@ -50,19 +50,19 @@ class RolloutCarry(NamedTuple):
     action_b: jax.Array
     """(B, 3) the policy's last action, without correction [m/s^2]."""
     embeddings: jax.Array
-    """(B, image_delay, hidden) the images on their way, oldest first."""
+    """(B, image_delay, hidden) the delayed images, oldest first."""
     observed: jax.Array
-    """(B, state_delay, state_size) the states on their way, oldest first."""
+    """(B, state_delay, state_size) the delayed states, oldest first."""
     delta_hidden: jax.Array
     """(B, 32) of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
     sensed: Any = ()
-    """What the sensor models remember."""
+    """Memory of the sensor models."""
 
 
 class StepRecord(NamedTuple):
-    """What a step leaves behind, (B, ...) each."""
+    """Records of a step, (B, ...) each."""
 
     image: jax.Array
     """(B, height, width) encoded, with its noise."""
@@ -81,16 +81,16 @@ class StepRecord(NamedTuple):
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
     noted: Any = None
-    """What `note` returned, where there was one."""
+    """Result of `note`, if there is one."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
-"""note(worlds, before, after, target) -> arrays (B, ...) to be kept of a step; `target` is that of
-its beginning."""
+"""note(worlds, before, after, target) -> arrays (B, ...) that are recorded of a step; `target` is
+that at its beginning."""
 
 
 def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
-    """Return what drones in `state` that have passed `target` (B,) gates observe, but the image."""
+    """Return the observation, without image, of drones that have passed `target` (B,) gates."""
     gates = worlds.scene.gates
     gate, target_w = target_gate(gates, target)
     after, second_w = target_gate(gates, target, ahead=1)
@@ -101,13 +101,13 @@ def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
 
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return (the oldest entry, the queue after it left and `new` joined)."""
+    """Return (the oldest entry, the queue without it and with `new` at its end)."""
     line = jnp.concatenate([waiting, new[:, None]], axis=1)
     return line[:, 0], line[:, 1:]
 
 
 def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
-    """Return a key (B,) for each world, whichever other worlds are computed with it."""
+    """Return a key (B,) for each world, independent of the other worlds of the batch."""
     return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
 
 
@@ -115,22 +115,22 @@ class Senses(NamedTuple):
     """The sensor models of a training, as pure functions over B worlds."""
 
     start: Callable[[Worlds, View], Any]
-    """(worlds, view at the start) -> what the models remember."""
+    """(worlds, view at the start) -> memory of the models."""
     see: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
-    """(worlds, truth, keys (B,), memory) -> (what is seen, memory)."""
+    """(worlds, truth, keys (B,), memory) -> (view with errors, memory)."""
 
 
 def make_senses(config: TrainConfig) -> Senses:
     """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
 
-    The functions are the judge's own. The trainer knows states at decisions alone: in between an
-    old one is interpolated, and an old image is that of one of the two, by chance.
+    The functions are the judge's. The trainer has states only at decisions: a state in between is
+    interpolated, and an image in between is one of the two neighbours, at random.
     """
     assert config.sensors is not None
     held, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
     parts, longest = sensing(held), config.sensors.magnitude[1]
     ages = (scaled(name, held[name], longest) for name in held if name == "delay")
-    # Views kept: as many as the oldest that is ever seen is policy periods old.
+    # Number of stored views: the largest possible age in policy periods.
     periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in ages), default=0)
 
     def grown(worlds: Worlds) -> dict[str, Any]:
@@ -166,10 +166,10 @@ def make_senses(config: TrainConfig) -> Senses:
 
 
 def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
-    """Return what was seen some policy periods ago; the next gate is that of the nearer decision.
+    """Return the view of an age between decisions; the next gate is that of the nearer decision.
 
     Args:
-        views: of this decision, of the one before, and so on.
+        views: at this decision, the one before, and so on.
         age: (B,) of the state [policy periods].
         image_age: (B,) of the image, whole numbers [policy periods].
     """
@@ -189,25 +189,25 @@ def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View
 
 
 class Sight(NamedTuple):
-    """What policies see, as pure functions over B worlds; the image carries no gradient."""
+    """The observation of policies, as pure functions over B worlds; images have no gradient."""
 
     start: Callable[[Worlds, DynamicsState], Any]
-    """(worlds, state at the start) -> what the sensor models remember; nothing without models."""
+    """(worlds, state at the start) -> memory of the sensor models; () without models."""
     see: Callable[..., tuple[Observation, Any]]
-    """(worlds, state, target, last_action_b, keys (B,), memory) -> what the policy is given,
-    memory; `memory` may be left out where there are no sensor models."""
+    """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, memory); without
+    sensor models `memory` may be left out."""
 
 
 def make_sight(config: TrainConfig) -> Sight:
-    """Return what policies see in training: the image has its noise, and sensors their errors."""
+    """Return the observation in training, with image noise and sensor errors."""
     spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
-    # One ray a pixel, whatever the camera casts in flight: more cost time and gained nothing.
+    # One ray a pixel, also for a supersampling camera: more rays took time without a gain.
     rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
     senses = None if config.sensors is None else make_senses(config)
 
-    def look(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
-        # Scaling the rays across the optical axis changes the field of view; every world of an
-        # iteration shares it, so that the rays stay one array.
+    def true_view(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
+        # Scaling the rays across the optical axis changes the field of view. All worlds of an
+        # iteration share the scale, so that the rays are one array.
         axis = rays.mean(0)
         wide = axis + (rays - axis) * worlds.fov_scale[0]
         pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
@@ -218,7 +218,7 @@ def make_sight(config: TrainConfig) -> Sight:
     def start(worlds: Worlds, state: DynamicsState) -> Any:
         if senses is None:
             return ()
-        return senses.start(worlds, look(worlds, state, jnp.asarray(worlds.target)))
+        return senses.start(worlds, true_view(worlds, state, jnp.asarray(worlds.target)))
 
     def see(
         worlds: Worlds,
@@ -228,7 +228,7 @@ def make_sight(config: TrainConfig) -> Sight:
         keys: jax.Array,
         memory: Any = (),
     ) -> tuple[Observation, Any]:
-        view = look(worlds, state, target)
+        view = true_view(worlds, state, target)
         if senses is not None:
             view, memory = senses.see(worlds, view, keys, memory)
         seen = observe(spec, view, last_action_b, worlds.wanted)
@@ -239,7 +239,7 @@ def make_sight(config: TrainConfig) -> Sight:
 
 
 def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
-    """Return the states on their way at first, (B, state_delay, state_size): the start's own."""
+    """Return the delayed states at the start, (B, state_delay, state_size): copies of the first."""
     view, still = view_in(worlds, state, jnp.asarray(worlds.target)), jnp.zeros_like(state.pos_w)
     seen = observe(config.spec, view, still, worlds.wanted).state
     return jnp.repeat(seen[:, None], config.physics.state_delay, axis=1)
@@ -308,9 +308,9 @@ def make_rollout(
             goes_on = number + 1 < worlds.stop
             if config.episode.finish:
                 goes_on = goes_on & (target_after < worlds.scene.gates.center_w.shape[1])
-            unhurt = made.clearance > -weights.crash_depth_m
+            intact = made.clearance > -weights.crash_depth_m
             if weights.tilt > 0.0:
-                unhurt = unhurt & (made.up > 0.0)
+                intact = intact & (made.up > 0.0)
             record = StepRecord(
                 image=seen.image,
                 terms={name: term * carry.alive for name, term in terms.items()},
@@ -330,7 +330,7 @@ def make_rollout(
                 embeddings=embeddings,
                 observed=observed,
                 delta_hidden=delta_hidden,
-                alive=carry.alive * unhurt * goes_on,
+                alive=carry.alive * intact * goes_on,
                 sensed=sensed,
             )
             return carry, record

@@ -1,7 +1,7 @@
 """A training run in a folder, by backpropagation through its dynamics.
 
-Fresh worlds and noise depend on the seed and the iteration alone; `training_loop.py` says what the
-folder holds.
+Worlds and noise depend only on the seed and the iteration; `training_loop.py` describes the
+folder's files.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tracks.common.work import usable_cores
 from tracks.common.work.threads import threads
 
 STEPS_PER_CORE_S = 5000.0
-"""Gradient steps a second that one processor core makes, for the estimate."""
+"""Environment steps a second of a processor core, gradient included; for the estimate."""
 COMPILE_S = 15.0
 """Time to compile, for the estimate [s]."""
 
@@ -45,14 +45,14 @@ def estimate(
     passes: int = 1,
     images: int = 2,
 ) -> Estimate:
-    """Return about how long a run takes on this machine's devices and what memory it needs.
+    """Return the approximate time and memory of a run on this machine's devices.
 
     Args:
         config: the run.
         steps_per_core_s: environment steps of one processor core, gradient included [1/s].
         compile_s: time to compile [s].
-        passes: how often an iteration goes through its steps.
-        images: how many copies of its images are held at once.
+        passes: number of passes over an iteration's steps.
+        images: number of copies of its images in memory.
     """
     pixels = config.spec.camera.height * config.spec.camera.width
     cores = usable_cores() if jax.default_backend() == "cpu" else 50
@@ -67,14 +67,14 @@ def estimate(
 
 
 def started_from(policy: str, spec: PolicySpec) -> network.Params:
-    """Return the parameters of `policy` as those of a policy with `spec`, to train on.
+    """Return the parameters of `policy`, converted for a policy with `spec`.
 
     Args:
         policy: a shipped policy's name or a checkpoint's folder.
-        spec: of what is trained.
+        spec: of the policy to train.
 
     Raises:
-        ValueError: where there is none, or it sees what `spec` does not have.
+        ValueError: if it does not exist, or has an input that `spec` lacks.
     """
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.judging.flying import checkpoint_folder
@@ -92,21 +92,21 @@ def train(
     watch: Watch | None = None,
     mirror: Mirror | None = None,
 ) -> Outcome:
-    """Train until the configured iterations are done; the same call again resumes.
+    """Train for the configured iterations; the same call again resumes.
 
     Args:
         config: the whole run.
         folder: of the run; a run of the same configuration in it is resumed.
         console: for progress.
-        params: start from these instead of fresh ones.
+        params: initial parameters instead of random ones.
         delta: a frozen Delta Action network to train under.
-        watch: measures the policy on the way; in one process alone.
-        mirror: shows the curve elsewhere as well.
+        watch: measures the policy during the training; only in a single process.
+        mirror: receives the rows of the curve as well.
 
     Raises:
-        ValueError: for settings that cannot be used, where the folder holds a run of another
-            configuration, start or delta, and where processes were asked for different ones.
-        WorkFailed: where the loss or the parameters stop being finite, or another process is gone.
+        ValueError: for invalid settings, if the folder has a run of another configuration, start or
+            delta, and if processes have different settings.
+        WorkFailed: if the loss or the parameters are not finite, or another process has ended.
     """
     check_phases(config)
     check_processes(config)
@@ -133,7 +133,7 @@ def train(
 
 
 def _refitted(state: TrainState, seen: PolicySpec, spec: PolicySpec) -> TrainState:
-    """Return the state of a policy trained with spec `seen` as that of one with `spec`."""
+    """Return the state of a policy with spec `seen`, converted for a policy with `spec`."""
     if seen == spec:
         return state
     return state._replace(params=network.fitted(state.params, seen, spec))

@@ -1,8 +1,8 @@
-"""A batch in shards: computed apart, at once where there are cores, and added up in one order.
+"""A batch in shards: computed separately, in parallel where possible, and summed in a fixed order.
 
-How many shards there are is a setting of the run; how many cores, devices and processes share them
-is the machine's affair. Every shard is computed by the same compiled program, and the shards'
-gradients are added in the order of the shards, so that the sums have the same bits everywhere.
+The number of shards is a setting of the run and does not depend on the number of cores, devices and
+processes. All shards are computed by the same compiled program, and their gradients are summed in
+the order of the shards, so that the sums have the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tracks.common.work import usable_cores
 
 
 class Shard(NamedTuple):
-    """What the worlds of a shard, or of a batch, come to."""
+    """Results of the worlds of a shard, or of a batch."""
 
     gradient: network.Params
     """Mean over worlds."""
@@ -40,9 +40,9 @@ class Shard(NamedTuple):
 def flight_numbers(loss: jax.Array, records: StepRecord) -> dict[str, jax.Array]:
     """Return a shard's numbers of the curve, means over its worlds.
 
-    Gates, collisions and speeds are those of steps that count in the loss, of which `counted` is
-    the share. `memory` is the mean size of the recurrent states: near 1 they are saturated, and
-    nothing that is seen reaches the action.
+    Gates, collisions and speeds are of the steps that count in the loss; `counted` is their share.
+    `memory` is the mean size of the recurrent states: near 1 they are saturated, and the
+    observation has no influence on the action.
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
@@ -70,7 +70,7 @@ def curve_numbers(shard: Shard) -> dict[str, jax.Array]:
 def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> jax.Array:
     """Return the recurrent states (B, hidden) of a random step of each world.
 
-    A world that had left the loss by that step keeps the state `before`.
+    A world that has left the loss before that step keeps the state `before`.
 
     Args:
         keys: (B,) of the worlds.
@@ -85,7 +85,7 @@ def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> ja
 
 
 def check_processes(config: TrainConfig) -> None:
-    """Refuse shards that the processes of a training cannot share evenly.
+    """Refuse a number of shards that is no multiple of the number of processes.
 
     Raises:
         ValueError: naming both numbers.
@@ -103,7 +103,7 @@ def make_shards(
 ) -> Callable[[network.Params, jax.Array, jax.Array, Worlds], list[Shard]]:
     """Return shards(params, hidden, iteration, worlds) -> all shards of a batch, in order.
 
-    `worlds` is the whole batch, of which every process computes its share of the shards.
+    `worlds` is the whole batch; every process computes its part of the shards.
 
     Args:
         config: the run.
@@ -113,7 +113,7 @@ def make_shards(
     shards, size = config.episode.shards, config.episode.batch // config.episode.shards
     each, devices = shards // jax.process_count(), jax.local_devices()
     mine = range(each * jax.process_index(), each * (jax.process_index() + 1))
-    # Cores work where a thread waits for XLA; an accelerator needs one thread alone.
+    # On a CPU each thread keeps a core busy; an accelerator needs one thread.
     at_once = usable_cores() if jax.default_backend() == "cpu" else len(devices)
     pool, compiled = ThreadPoolExecutor(min(len(mine), at_once)), False
 
@@ -136,12 +136,12 @@ def make_shards(
         def one(shard: int) -> Shard:
             part = jax.tree.map(lambda leaf: leaf[shard * size : (shard + 1) * size], worlds)
             given = (params, hidden, iteration, part)
-            # Accelerators use fewer bits by default, which are too few for a rotation.
+            # Accelerators round products by default, too coarsely for rotations.
             with jax.default_matmul_precision("highest"):
                 found = computed(*jax.device_put(given, devices[shard % len(devices)]))
             return jax.block_until_ready(jax.device_put(found, devices[0]))
 
-        # Threads that come to a program at once would each compile it.
+        # Several threads would all compile the same program at the first call.
         found = list(pool.map(one, mine) if compiled else map(one, mine))
         compiled = True
         return hosts.gathered(found)
@@ -150,7 +150,7 @@ def make_shards(
 
 
 def added_up(shards: list[Shard]) -> Shard:
-    """Return what the whole batch comes to: means of the shards, added in their order."""
+    """Return the results of the whole batch: means of the shards, summed in their order."""
     gradient, numbers = jax.tree.map(
         lambda *leaves: functools.reduce(jnp.add, leaves) / len(leaves),
         *((shard.gradient, shard.numbers) for shard in shards),

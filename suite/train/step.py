@@ -1,4 +1,4 @@
-"""One step of worlds, as the losses and the reward read it: where to, how near to what."""
+"""One step of worlds, as losses and reward use it: the goal, the gate and the nearest solids."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from tracks.geometry.scene import Counts, Gates
 BODY_RADIUS_M = 0.08
 """Closer than this to a surface is a collision [m]."""
 NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
-"""Solids of each kind among which the nearest obstacle is looked for."""
+"""Solids of each kind among which the nearest obstacle is searched."""
 BEYOND_M = 10.0
-"""After the last gate the target is this far behind it, so that nothing is gained by braking; with
-`episode.finish` that is for the one step that passes the gate."""
+"""Distance of the goal behind the last gate after passing it, so that braking gains nothing; with
+`episode.finish` it holds only for the step that passes the gate [m]."""
 PATH_SAMPLES = 4
-"""Points of every step's path at which the nearest obstacle is looked for: at 7 m/s and 30 Hz they
-are 6 cm apart, less than the body's radius."""
+"""Points of a step's path at which the nearest obstacle is searched: at 7 m/s and 30 Hz they are 6
+cm apart, less than the body's radius."""
 APPROACH_FREE_M = 0.3
-"""So far off its axis a gate is still flown at straight [m]."""
+"""Up to this distance from the gate's axis the goal is the gate's centre [m]."""
 
 
 class Step(NamedTuple):
-    """What a term may read: one step of B worlds."""
+    """One step of B worlds: the inputs of all loss terms."""
 
     pos_w: jax.Array
     """(B, 3) at the step's end [m]."""
@@ -39,25 +39,25 @@ class Step(NamedTuple):
     acc_w: jax.Array
     """(B, 3) net acceleration [m/s^2]."""
     jerk_w: jax.Array
-    """(B, 3) change of the acceleration from the step before, over the step's time [m/s^3]."""
+    """(B, 3) change of the acceleration since the step before, divided by the time step [m/s^3]."""
     up: jax.Array
-    """(B,) z of body z at the step's end, with gradient where the attitude has one [1]."""
+    """(B,) z component of body z at the step's end, with gradient if the attitude has one [1]."""
     gap: jax.Array
     """(B, S) distance to the nearest solid beyond r_q at points of the path, with gradient [m]."""
     away_w: jax.Array
-    """(B, S, 3) unit vectors along which it grows."""
+    """(B, S, 3) unit vectors along which `gap` grows."""
     goal_w: jax.Array
-    """(B, 3) the point that progress is measured to [m]."""
+    """(B, 3) goal of the progress term [m]."""
     place_g: jax.Array
-    """(B, 3) position in the frame of the gate flown to, wherever before it the goal is [m]."""
+    """(B, 3) position in the frame of the next gate [m]."""
     gate: Gates
-    """(B, ...) whose field pulls: the one to pass when the step began."""
+    """(B, ...) next gate at the step's beginning, whose field is used."""
     passed: jax.Array
     """(B,) bool: that gate was crossed."""
     clearance: jax.Array
-    """(B,) smallest signed distance to a solid on the way [m]."""
+    """(B,) smallest signed distance to a solid on the step's path [m]."""
     wanted: jax.Array | None = None
-    """(B,) the commanded speed, 0 to 1, where the policy has that input [1]."""
+    """(B,) the commanded speed, 0 to 1, if the policy has that input [1]."""
 
 
 def norm(vector: jax.Array) -> jax.Array:
@@ -68,8 +68,7 @@ def norm(vector: jax.Array) -> jax.Array:
 def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates, jax.Array]:
     """Return each world's current gate (B, ...) and the point to fly to (B, 3).
 
-    With `ahead` it is the gate so many after that, or the last one where there is none, as the
-    judge has it.
+    With `ahead` it is the gate that many gates later, at most the last one, as in the judge.
     """
     count = gates.center_w.shape[1]
     index = jnp.minimum(target + ahead, count - 1)
@@ -79,7 +78,7 @@ def target_gate(gates: Gates, target: jax.Array, ahead: int = 0) -> tuple[Gates,
 
 
 def approach_shift(config: LossConfig, place_g: jax.Array) -> jax.Array:
-    """Return how far before the gate the point lies that progress is measured to, (B,) [m].
+    """Return the distance of the progress term's goal before the gate, (B,) [m].
 
     Args:
         config: the largest shift, `approach_m`.
@@ -95,8 +94,8 @@ def gap_beyond(
 ) -> jax.Array:
     """Return the distance to the nearest solid beyond the safety radius, (B, S) [m].
 
-    The nearest solid comes from outside the differentiated graph; the distance's gradient with
-    respect to the path is the direction away from it, which is exact.
+    The nearest solid is found outside the differentiated graph; the gradient of the distance with
+    respect to the path is the direction away from the solid, which is exact.
 
     Args:
         config: r_q.
@@ -117,15 +116,14 @@ def make_step(
 ) -> Step:
     """Return the step from `before` to `after` of worlds that have passed `target` (B,) gates.
 
-    Of `config` it takes where progress is measured to and r_q. Gates and obstacles are looked up on
-    values without gradient.
+    Gates and obstacles are evaluated without gradient.
 
     Args:
-        config: of the losses.
-        worlds: what there is.
-        before: at the step's beginning.
-        after: at its end.
-        target: (B,) gates passed.
+        config: the progress term's goal and r_q are used.
+        worlds: gates and obstacles.
+        before: state at the step's beginning.
+        after: state at its end.
+        target: (B,) number of passed gates.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)

@@ -1,9 +1,9 @@
 """A training in a folder: iterations, checkpoints that survive a kill, exact resumption, curves.
 
-The folder holds run.json (what was run), metrics.jsonl (the curve), validation.jsonl (what was
-measured on the way), policy/ (what flies) and state/ (what resumes). An iteration depends on the
-state and its number alone, so a resumed run draws the curve that it would have drawn without the
-stop.
+The folder has run.json (settings and versions), metrics.jsonl (the curve), validation.jsonl
+(measurements during the training), policy/ (the checkpoint to fly) and state/ (for resuming). An
+iteration depends only on the state and its number, so a resumed run has the same curve as one
+without a stop.
 """
 
 from __future__ import annotations
@@ -41,49 +41,49 @@ SAVE_PERIOD_S = 30.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to."""
+    """The result of a run."""
 
     policy: Path
     """The trained policy's checkpoint."""
     iterations: int
-    """Gradient steps done, over all stops."""
+    """Number of gradient steps, also those before a stop."""
     last: dict[str, Any]
-    """Means over the last tenth of the curve."""
+    """Means of the curve's numbers over its last tenth."""
 
 
 class Watch(NamedTuple):
-    """A measurement of the policy as it learns; its time does not count as training."""
+    """A measurement of the policy during the training; its time does not count as training."""
 
     every: int
-    """Gradient steps between two; there is one before the first step and one after the last."""
+    """Gradient steps between measurements; one is made before the first step and after the last."""
     measure: Callable[[network.Params], Mapping[str, float]]
-    """Of the policy's parameters; a row of validation.jsonl."""
+    """(the policy's parameters) -> a row of validation.jsonl."""
 
 
 class Method(NamedTuple):
-    """What one phase of a run iterates.
+    """The functions of one phase of a run.
 
-    A state has the policy's `params` and the `iteration` to do next.
+    A state has the policy's `params` and the number of the next `iteration`.
     """
 
     end: int
-    """The run's iterations when the phase is over; it begins where the one before it ends."""
+    """Iteration of the run at which the phase ends; it begins at the end of the phase before."""
     spec: PolicySpec
     """Of the policy during the phase."""
     frames: int
-    """Steps of worlds in one iteration."""
+    """Environment steps in one iteration."""
     worlds: Callable[[int], Worlds]
     """The fresh worlds of an iteration."""
     make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
     """Called once: update(state, worlds) -> (state', numbers of the curve)."""
     note: Callable[[Mapping[str, float]], str]
-    """A few words for people about a row of the curve."""
+    """Returns a short text about a row of the curve."""
     begin: Callable[[Any], Any] = lambda state: state
-    """What the phase makes of the state with which the one before it ends."""
+    """Returns the phase's first state from the last state of the phase before."""
 
 
 def flight_note(goal: str, row: Mapping[str, float]) -> str:
-    """Return a row's number called `goal`, and how its worlds flew, in a few words."""
+    """Return a row's number `goal`, its gates, collisions and speed as a short text."""
     return (
         f"{goal} {row[goal]:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
         f"{row['speed']:.1f} m/s"
@@ -91,38 +91,38 @@ def flight_note(goal: str, row: Mapping[str, float]) -> str:
 
 
 class Run(NamedTuple):
-    """Where a run lives and what distinguishes it from others."""
+    """Folder and identity of a run."""
 
     config: Any
     """The resolved configuration, a dataclass."""
     seed: int
     """Of the run."""
     origin: dict[str, Any]
-    """What a folder's run must have been made from for it to be resumed, "config" among it."""
+    """The inputs, such as "config", that must be the same to resume a folder's run."""
     folder: Path
-    """Where it lives."""
+    """Of the run."""
     estimate: Estimate
-    """What the whole run needs."""
+    """Time and memory of the whole run."""
     mirror: curve.Mirror | None = None
-    """Shows the curve elsewhere as well."""
+    """Receives the rows of the curve as well."""
 
 
 def train_in_folder(
     phases: Sequence[Method], run: Run, fresh: Any, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Iterate the phases' updates from the folder's state, or the `fresh` one, to their end.
+    """Run the phases' updates from the folder's state, or from the `fresh` one, to the end.
 
-    Of several processes the first reads and writes the folder, and hands the others its state.
+    The first of several processes reads and writes the folder, and sends its state to the others.
 
     Raises:
-        ValueError: where the folder holds another run.
-        WorkFailed: where a number of the curve stops being finite, or another process is gone.
+        ValueError: if the folder has another run.
+        WorkFailed: if a number of the curve is not finite, or another process has ended.
     """
     folder = run.folder
     if hosts.writes():
         refuse_other_run(folder, run.config)
         fresh = _resume(run, fresh)
-    # Where the update leaves it: placed otherwise, the second step would compile it again.
+    # On the update's device: from another place, the second step would compile it again.
     state = jax.device_put(hosts.from_the_first(fresh), jax.local_devices()[0])
     done, total = int(state.iteration), phases[-1].end
     if not hosts.writes():
@@ -181,7 +181,7 @@ def _iterate_phase(
         _check_finite(iteration, row, recorder.run.folder)
         seconds = time.monotonic() - started
         speed = method.frames / seconds
-        # A cold iteration compiles as well.
+        # A cold iteration includes compiling.
         clock = {"seconds": round(seconds, 4), "cold": iteration == first}
         row = {"iteration": iteration, **row, "steps_per_s": round(speed), **clock}
         recorder.add(method, state, row)
@@ -191,7 +191,7 @@ def _iterate_phase(
 
 
 class _Recorder:
-    """Writes a run's curve and checkpoints, from time to time and at the end."""
+    """Writes a run's curve and checkpoints, regularly and at the end."""
 
     def __init__(self, run: Run, watch: Watch | None, total: int) -> None:
         self.run, self.watch, self.total = run, watch, total
@@ -207,9 +207,9 @@ class _Recorder:
         self.save()
 
     def add(self, method: Method, state: Any, row: dict[str, Any]) -> None:
-        """Take a finite iteration's row and the state after it."""
-        # The row comes first: an interrupt between the two leaves one too many, which resuming
-        # cuts, and not one too few.
+        """Add the row of an iteration and the state after it."""
+        # The row is added first: after an interrupt between the two, resuming removes the extra
+        # row; a missing row could not be restored.
         self.rows.append(row)
         self.last = (method, state)
         self.measure_if_due(state)
@@ -237,7 +237,7 @@ class _Recorder:
 
 @contextmanager
 def _others_there(iteration: int, folder: Path) -> Iterator[None]:
-    """Say what to do where another process of the training is gone."""
+    """Raise `WorkFailed` with advice if another process of the training has ended."""
     try:
         yield
     except Exception as error:
@@ -255,7 +255,7 @@ def _is_due(watch: Watch, done: int, total: int) -> bool:
 
 
 def _is_missing(watch: Watch | None, folder: Path, done: int, total: int) -> bool:
-    """Say whether a measurement is due that a stop cut off."""
+    """Return whether a due measurement is missing because of a stop."""
     if watch is None or not _is_due(watch, done, total):
         return False
     rows = curve.read(folder, curve.WATCHED)
@@ -280,7 +280,7 @@ def _save(run: Run, method: Method, state: Any) -> None:
     }
     policy = run.folder / "policy"
     save_policy(policy, state.params, method.spec, seed=run.seed, training=described)
-    # The state comes last: what it says is done has its policy and its curve on the disk.
+    # The state is written last: then the policy and the curve of its steps are on the disk.
     save_arrays(
         run.folder / "state",
         tree_to_arrays(state),

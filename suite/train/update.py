@@ -19,14 +19,14 @@ RATE_END, WEIGHT_DECAY = 1e-5, 1e-2
 
 
 class TrainState(NamedTuple):
-    """All that a run carries from one iteration to the next."""
+    """State of a run between iterations."""
 
     params: network.Params
     """The policy's."""
     optimizer: optax.OptState
     """Of AdamW."""
     iteration: jax.Array
-    """Gradient steps done, a scalar."""
+    """Number of finished gradient steps, a scalar."""
     hidden: jax.Array
     """(B, hidden) recurrent states from random steps of the last rollout."""
 
@@ -36,7 +36,7 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
     Args:
         config: of the run, or of one of its phases.
-        begin: gradient steps of the run before that phase. AdamW's moments are carried over.
+        begin: gradient steps of the run before that phase; AdamW's moments are kept.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), RATE_END
@@ -50,7 +50,7 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
 
 def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:
-    """Return the state before the first iteration, from fresh or given parameters."""
+    """Return the state before the first iteration, from random or given parameters."""
     if params is None:
         params = network.init(jax.random.key(config.seed), config.spec)
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
@@ -79,7 +79,7 @@ def make_update(
         batch = added_up(shards)
         change, optimizer_state = optimizer.update(batch.gradient, state.optimizer, state.params)
         after = TrainState(
-            # optax types any tree of parameters; it gives back the one it was given.
+            # optax has a general type for trees; it returns the type of its argument.
             params=cast(network.Params, optax.apply_updates(state.params, change)),
             optimizer=optimizer_state,
             iteration=state.iteration + 1,

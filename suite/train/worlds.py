@@ -1,7 +1,7 @@
-"""The worlds of one iteration: fresh tracks, start states and randomised constants (numpy).
+"""The worlds of one iteration: new tracks, start states and randomised parameters (numpy).
 
-A pure function of (config, iteration), so a resumed run sees the worlds that it would have seen,
-and those of the next iterations are sampled while the devices compute.
+They are a pure function of (config, iteration): a resumed run has the same worlds, and the worlds
+of later iterations are sampled while the devices compute.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from tracks.track import Track, first_gates
 
 
 class Sensed(NamedTuple):
-    """What a batch of worlds draws for its sensor models, by the models' names."""
+    """Random numbers of the sensor models in a batch of worlds, by the models' names."""
 
     magnitude: dict[str, Array]
     """(B,) [1]."""
     trial: dict[str, Draws]
-    """(B, ...) what a model draws once; empty for one that senses nothing itself."""
+    """(B, ...) numbers that a model draws once per trial."""
 
 
 class Worlds(NamedTuple):
-    """A batch of worlds, (B, ...), ready for the device."""
+    """A batch of worlds, (B, ...)."""
 
     scene: Scene
     pos_w: Array
@@ -52,21 +52,22 @@ class Worlds(NamedTuple):
     target: Array
     """(B,) index of the first gate to pass."""
     constants: dynamics.WorldParams
-    """Of the dynamics."""
+    """Parameters of the dynamics."""
     hidden: Array
     """(B, hidden) the policy's recurrent state at the start, zero for worlds that start at rest."""
     remembers: Array
-    """(B,) 1 where a world starts on the way, with a recurrent state from an earlier rollout."""
+    """(B,) 1 if a world starts between two gates, with a recurrent state from an earlier
+    rollout."""
     stop: Array
     """(B,) step at which a world leaves the loss."""
     number: Array
-    """(B,) which world of the batch it is: its noise depends on that, not on who computes it."""
+    """(B,) number in the batch, which determines a world's noise on any device."""
     fov_scale: Array
     """(B,) this iteration's scale of the rays across the optical axis."""
     wanted: Array | None = None
-    """(B,) the commanded speed, 0 to 1, where the policy has that input [1]."""
+    """(B,) the commanded speed, 0 to 1, if the policy has that input [1]."""
     sensed: Sensed | None = None
-    """Where there are sensor models."""
+    """Random numbers of the sensor models, if there are any."""
 
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
@@ -84,7 +85,7 @@ def _roomiest(
 ) -> tuple[np.ndarray, int]:
     """Return one of up to six points that `place` draws for random next gates, and that gate.
 
-    It is the first with 0.5 m of room, or the one with the most.
+    It is the first with a clearance of 0.5 m, or the one with the largest.
     """
     best = (-np.inf, track.start_pos_w, 0)
     for _ in range(6):
@@ -102,7 +103,7 @@ def _roomiest(
 def _on_the_way(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position, velocity and next gate somewhere between two gates, clear of obstacles."""
+    """Return position, velocity and next gate between two gates, away from obstacles."""
     center_w = track.scene.gates.center_w
 
     def place(target: int) -> np.ndarray:
@@ -117,7 +118,7 @@ def _on_the_way(
     return point, rng.uniform(0, speed_limit) * (towards + sideways), target
 
 
-def _beside_a_gate(
+def _after_a_miss(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return position, velocity and next gate of a drone that has missed that gate."""
@@ -138,10 +139,10 @@ def _beside_a_gate(
 def _constants(
     config: TrainConfig, iteration: int, rng: np.random.Generator
 ) -> dynamics.WorldParams:
-    """Return what flies in an iteration; quadrotors have draws of their own: the rest is the same.
+    """Return the parameters of the dynamics in an iteration.
 
-    The point masses are drawn in any case, so that what `rng` gives afterwards does not depend on
-    the model.
+    Quadrotors have a random generator of their own. Point masses are drawn in any case, so that
+    later numbers of `rng` do not depend on the model.
     """
     physics, batch, period = config.physics, config.episode.batch, 1.0 / config.spec.rate_hz
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
@@ -156,7 +157,7 @@ def _constants(
     )
     if config.quadrotor is None:
         return point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
-    # The trainer of the point mass stays clear of the judge's physics.
+    # Training through the point mass does not load the judge's physics.
     from suite.train.dynamics.quadrotor import QuadrotorParams, draw_effects
 
     own = np.random.default_rng([config.seed, iteration, 1])
@@ -165,7 +166,7 @@ def _constants(
 
 
 def _wanted(config: TrainConfig, iteration: int) -> Array | None:
-    """Return how fast each world is to be flown, from draws of their own."""
+    """Return the commanded speed of each world, from a random generator of its own."""
     if not config.spec.speed_input:
         return None
     rng = np.random.default_rng([config.seed, iteration, 3])
@@ -175,7 +176,7 @@ def _wanted(config: TrainConfig, iteration: int) -> Array | None:
 
 
 def _sensed(config: TrainConfig, iteration: int) -> Sensed | None:
-    """Return what the sensor models of each world draw, from draws of their own."""
+    """Return the random numbers of the sensor models, from a random generator of their own."""
     if config.sensors is None:
         return None
     rng, batch = np.random.default_rng([config.seed, iteration, 4]), config.episode.batch
@@ -212,7 +213,7 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
         elif episode.missed_share > 0 and rng.random() < episode.missed_share:
-            starts.append(_beside_a_gate(track, episode.start_speed, rng))
+            starts.append(_after_a_miss(track, episode.start_speed, rng))
         else:
             starts.append(_on_the_way(track, episode.start_speed, rng))
     pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))
@@ -240,8 +241,8 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
 class WorldsAhead:
     """Samples worlds in a thread or, for an accelerator, in processes; a context manager.
 
-    One core samples faster than the others train. An accelerator is so fast that every core
-    samples for it, each the worlds of another iteration.
+    One core samples faster than the other cores train. An accelerator is so fast that all cores
+    sample for it, each the worlds of another iteration.
     """
 
     def __init__(self) -> None:
@@ -261,7 +262,7 @@ class WorldsAhead:
         """Yield each iteration from `first` on, to before `end`, with its worlds.
 
         Args:
-            sample: the worlds of an iteration; one that can be pickled.
+            sample: returns the worlds of an iteration; must be picklable.
             first: iteration.
             end: the iteration after the last.
         """

@@ -1,4 +1,4 @@
-"""What flies in a rollout: the point mass, or the quadrotor around a vehicle file."""
+"""The dynamics of a rollout: the point mass, or the quadrotor around a vehicle file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tracks.geometry.scene import Array
 
 
 class DynamicsState(Protocol):
-    """What a rollout reads of a state; all but these is the dynamics' own."""
+    """The part of a state that a rollout reads; the dynamics may have more."""
 
     @property
     def pos_w(self) -> jax.Array:
@@ -37,7 +37,7 @@ class DynamicsState(Protocol):
 
 
 class WorldParams(Protocol):
-    """What is drawn once per world."""
+    """Parameters that are drawn once per world."""
 
     @property
     def time_step(self) -> Array:
@@ -56,9 +56,9 @@ class Dynamics(NamedTuple):
 
 
 def make_dynamics(config: TrainConfig) -> Dynamics:
-    """Return what `config` trains through."""
+    """Return the dynamics that `config` trains through."""
     if config.quadrotor is not None:
-        # The trainer of the point mass stays clear of the judge's physics.
+        # Training through the point mass does not load the judge's physics.
         from suite.train.dynamics.quadrotor import quadrotor_dynamics
 
         period = 1.0 / config.spec.rate_hz

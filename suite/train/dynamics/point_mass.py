@@ -1,7 +1,7 @@
 """The differentiable point mass with first-order lag (Zhang et al. 2025; Su et al. 2026, III-B).
 
-Only position, velocity and acceleration carry gradients; attitude follows the thrust direction and
-carries none.
+Only position, velocity and acceleration have gradients; the attitude follows the thrust direction,
+without a gradient.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tracks.geometry.scene import Array
 
 
 class PointMassParams(NamedTuple):
-    """What is drawn once per world, by numpy or JAX."""
+    """Parameters that are drawn once per world, as numpy or JAX arrays."""
 
     lag: Array
     """(B,) rate at which the acceleration follows the command [1/s]."""
@@ -40,13 +40,13 @@ class PointMassState(NamedTuple):
     vel_w: jax.Array
     """(B, 3) [m/s]."""
     thrust_w: jax.Array
-    """(B, 3) lagged commanded net acceleration, drag not counted [m/s^2]."""
+    """(B, 3) commanded net acceleration after the lag, without drag [m/s^2]."""
     acc_w: jax.Array
     """(B, 3) net acceleration [m/s^2]."""
     rot_w: jax.Array
     """(B, 3, 3) body to world."""
     heading_w: jax.Array
-    """(B, 3) unit, horizontal: where the nose should point."""
+    """(B, 3) wanted heading, horizontal unit vectors."""
     commands_w: jax.Array
     """(B, 2, 3) the last commands, latest first [m/s^2]."""
 
@@ -55,7 +55,7 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
     """Return body to world (B, 3, 3): z along the specific force, x towards the heading.
 
     Args:
-        thrust_w: (B, 3) net acceleration that the thrust makes with gravity [m/s^2].
+        thrust_w: (B, 3) net acceleration by thrust and gravity [m/s^2].
         heading_w: (B, 3) unit, horizontal.
     """
     force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
@@ -67,7 +67,7 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
 
 
 def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> PointMassState:
-    """Return a body that hovers or coasts at vel_w (B, 3) [m/s] in pos_w (B, 3) [m], upright."""
+    """Return an upright body at pos_w (B, 3) [m] with constant velocity vel_w (B, 3) [m/s]."""
     zero = jnp.zeros_like(pos_w)
     rot_w = attitude(zero, heading_w)
     commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
@@ -88,14 +88,14 @@ def step(
 ) -> PointMassState:
     """Return the body one policy period later.
 
-    The command acts `delay` steps late; between two commands the mean over the step is taken.
+    The command acts `delay` steps later; for a fraction of a step the mean of two commands acts.
 
     Args:
-        body: now.
+        body: the present state.
         constants: of each world.
-        action_b: (B, 3) wanted net acceleration in the body axes of now [m/s^2].
-        target_w: (B, 3) the gate that the nose turns to [m].
-        gradient_decay: rate at which gradients of position and velocity fade back in time [1/s].
+        action_b: (B, 3) wanted net acceleration in the present body axes [m/s^2].
+        target_w: (B, 3) the gate that the heading follows [m].
+        gradient_decay: decay rate of the gradients of position and velocity [1/s].
     """
     dt = constants.time_step[:, None]
     command = to_world(jax.lax.stop_gradient(body.rot_w), action_b)

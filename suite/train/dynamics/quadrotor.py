@@ -1,10 +1,10 @@
 """The judge's quadrotor as the trainer's dynamics: one policy period with gradients.
 
 The equations are those of the judge (`eval.quadrotor`: attitude, stepper, rigid body): the
-action becomes collective thrust and body rates in the attitude loop, again at each of its steps
-with the attitude of that moment; rate loop, mixer, rotors and effects turn those into motion. A
-period holds a whole number of attitude steps and physics steps, so the steps are a little shorter
-or longer than the judge's, and by default there are half as many.
+attitude loop computes collective thrust and body rates from the action at each of its steps; rate
+loop, mixer, rotors and effects give the motion. A period has a whole number of attitude steps and
+physics steps, so a step is a little shorter or longer than configured. By default there are half as
+many steps as in the judge.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
 
 TRIM_AXES = (1.0, 1.0, 0.2)
-"""A constant torque about x, y and z as shares of that about x."""
+"""Spread of a constant torque about x, y and z, relative to that about x."""
 
 
 class QuadrotorParams(NamedTuple):
-    """What is drawn once for each world of a batch."""
+    """Parameters that are drawn once for each world of a batch."""
 
     time_step: Array
     """(B,) the policy's period [s]."""
     effects: dict[str, Values]
-    """Values (B, ...) by name, of the effects that vary; the vehicle has the others."""
+    """Values (B, ...) of the effects that vary, by name; the others are the vehicle's."""
 
 
 class QuadrotorState(NamedTuple):
@@ -55,24 +55,24 @@ class QuadrotorState(NamedTuple):
     heading_w: jax.Array
     """(B, 3) wanted heading, horizontal unit vectors."""
     plant: PlantState
-    """(B, ...): rotor speeds and the commands on their way."""
+    """(B, ...): rotor speeds and delayed commands."""
     time_s: jax.Array
     """(B,) since the start [s]."""
 
 
 class Substeps(NamedTuple):
-    """How a policy period is divided into steps."""
+    """The division of a policy period into steps."""
 
     attitude: int
     """Steps of the attitude loop."""
     physics: int
-    """Physics steps in each of them."""
+    """Physics steps in each attitude step."""
     dt: float
     """Length of a physics step [s]."""
 
 
 def whole_steps(steps: float) -> int:
-    """Return the nearest whole number, at least 1; a half is rounded down, even if inexact."""
+    """Return the nearest whole number, at least 1; a half, even an inexact one, is rounded down."""
     return max(1, round(steps - 1e-6))
 
 
@@ -121,7 +121,7 @@ def draw_effects(
         ),
         "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
     }
-    # Only where they vary: each effect that varies makes the plant's step slower.
+    # Only if they vary: each varying effect makes the plant's step slower.
     if config.thrust_spread:
         scale = 1 + config.thrust_spread * either_way()
         fields["thrust_scale"] = (own("thrust_scale").scale * scale,)
@@ -164,7 +164,7 @@ def plant_of(
 def start_state(
     plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
 ) -> QuadrotorState:
-    """Return bodies (B, ...) that hovered until now, upright, at vel_w [m/s]."""
+    """Return upright bodies (B, ...) with hovering rotors at vel_w [m/s]."""
     batch = pos_w.shape[:1]
     zero = jnp.zeros_like(pos_w)
     return QuadrotorState(
@@ -189,17 +189,17 @@ def fly_period(
     noise: jax.Array | None = None,
     yaw_rate: jax.Array | None = None,
 ) -> QuadrotorState:
-    """Return the bodies one policy period later, without decay of gradients.
+    """Return the bodies one policy period later, without gradient decay.
 
     Args:
-        vehicle: whose attitude loop flies.
+        vehicle: has the attitude loop's settings.
         plant: of B worlds, for steps of `cut.dt`.
-        cut: how the period is divided.
-        body: now.
+        cut: division of the period.
+        body: the present state.
         action_b: (B, 3) wanted net acceleration in body axes [m/s^2], held for the period.
         heading: (heading_w (B, 3), pos_w (B, 3)) -> the wanted heading an attitude step later.
         noise: (attitude, physics, B, 3) normal draws for random wind, or None.
-        yaw_rate: (B,) commanded about body z in place of what the heading asks for [rad/s].
+        yaw_rate: (B,) commanded about body z, instead of following the heading [rad/s].
     """
     controller, dt = vehicle.controller, cut.dt
 
@@ -247,9 +247,9 @@ def quadrotor_dynamics(
     """Return start and step as in `suite.train.dynamics.interface.Dynamics`.
 
     Args:
-        config: the vehicle and how finely it is stepped.
-        period_s: the policy's [s].
-        gradient_decay: rate at which gradients of the motion decay backwards in time [1/s].
+        config: the vehicle and its step rates.
+        period_s: policy period [s].
+        gradient_decay: decay rate of the motion's gradients, back in time [1/s].
     """
     cut = substeps(config, period_s)
     left = float(np.exp(-gradient_decay * period_s))
@@ -260,8 +260,8 @@ def quadrotor_dynamics(
     ) -> QuadrotorState:
         return start_state(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
 
-    # The inside of a period is computed again in the backward pass: stored, it would take many
-    # times the memory of the rest of a rollout.
+    # The steps within a period are computed again in the backward pass: storing them would take
+    # many times the memory of the rest of a rollout.
     @jax.checkpoint
     def step(
         body: QuadrotorState,

@@ -1,4 +1,4 @@
-"""What a recipe varies of its dynamics, as vehicles for environments."""
+"""The randomisation of a recipe's dynamics, as vehicles for environments."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from suite.train.overrides import phase_configs
 
 @dataclass(frozen=True)
 class DrawnVehicle:
-    """A function that draws a vehicle, as the trainer draws one for each world."""
+    """A function that draws a vehicle, as training does for each world."""
 
     config: QuadrotorConfig
-    """The vehicle and how far what varies is spread."""
+    """The vehicle and its randomisation."""
 
     def __call__(self, rng: np.random.Generator) -> Vehicle:
         """Return the vehicle with drawn values of its effects."""
-        # The trainer of the point mass stays clear of the judge's physics.
+        # Training through the point mass does not load the judge's physics.
         from suite.train.dynamics.quadrotor import draw_effects
 
         drawn = {
@@ -32,14 +32,14 @@ class DrawnVehicle:
 
 
 def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
-    """Return arguments of the environments in `eval.envs` for training as by a recipe.
+    """Return arguments of the environments in `eval.envs` for training like a recipe.
 
-    They are what its policy observes (`spec`), and vehicles (`vehicle`) that vary as in its
-    training, or by the usual spreads where it trains through a point mass.
+    They are the policy's observation (`spec`) and vehicles (`vehicle`) with the recipe's
+    randomisation, or the default one if it trains through a point mass.
 
     Args:
         recipe: a name of `suite train`.
-        vehicle: a file or a shipped name, around which is drawn.
+        vehicle: a file or a shipped name; the centre of the randomisation.
 
     Raises:
         ValueError: for an unknown recipe or vehicle.

@@ -1,4 +1,4 @@
-"""Every setting of a PPO run: what it shares with the differentiable trainer, and its own."""
+"""All settings of a PPO run: those shared with the differentiable trainer, and its own."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class PpoConfig:
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
     loss: LossConfig = field(default_factory=LossConfig)
-    """r_q, for the reward; nothing else of it is read."""
+    """Only r_q is used, by the reward."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
-    """Worlds and horizon; `stop_from` and `finish` are not read, since the value of what follows is
-    learned and a world is flown anew where it ends."""
+    """Worlds and horizon; `stop_from` and `finish` are not used, since the critic learns the value
+    of later steps and a world is reset at its end."""
     seed: Seed = 0
     """Seed of the parameters, the tracks, the randomisation and the exploration."""
     iterations: Iterations = 200
@@ -44,28 +44,27 @@ class PpoConfig:
     trace: Share = 0.95
     """lambda of generalised advantage estimation (Schulman et al. 2016) [1]."""
     clip: Annotated[float, Range(0.0, 10.0, above=True)] = 0.2
-    """Largest change of an action's probability that is rewarded, as a ratio's distance from 1."""
+    """Limit of the rewarded change of an action's probability: the ratio's distance from 1."""
     epochs: Annotated[int, Range(1, 10_000)] = 4
     """Passes of the policy over a rollout."""
     minibatches: Annotated[int, Range(1, 10_000)] = 4
-    """Gradient steps of a pass of policy or critic, each over a share of the worlds; must divide
-    `episode.batch`."""
+    """Gradient steps of a pass, each over a part of the worlds; must divide `episode.batch`."""
     rate: Annotated[float, Range(0.0, 10.0)] = 3e-3
-    """Adam's learning rate of the policy at the start; it falls linearly to zero."""
+    """Adam's initial learning rate of the policy; it falls linearly to zero."""
     gradient_clip: Annotated[float, Range(0.0, 1e12, above=True)] = 1.0
     """Largest global norm of the policy's gradient."""
     entropy: Annotated[float, Range(0.0, 1e6)] = 0.01
     """Weight of the exploration's entropy in the objective [1]."""
     deviation: Annotated[float, Range(1e-3, 100.0)] = 2.0
-    """Standard deviation of the exploration at the start, on each axis of the action [m/s^2]."""
+    """Initial standard deviation of the exploration, on each axis of the action [m/s^2]."""
     reward_scale: Annotated[float, Range(0.0, 1e6, above=True)] = 0.01
-    """The critic learns returns of rewards times this: numbers around one [1]."""
+    """Factor on rewards for the critic, which gives returns around one [1]."""
     critic_size: Annotated[int, Range(1, 8192)] = 128
     """Width of the critic's two hidden layers."""
     critic_rate: Annotated[float, Range(0.0, 10.0)] = 1e-3
     """Adam's learning rate of the critic."""
     critic_epochs: Annotated[int, Range(1, 10_000)] = 16
-    """Passes of the critic over a rollout; it sees no images, so they cost little."""
+    """Passes of the critic over a rollout; without images they cost little."""
 
     @property
     def shared(self) -> TrainConfig:

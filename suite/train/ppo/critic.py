@@ -1,7 +1,7 @@
-"""The value of a state: an MLP on what the simulator knows.
+"""The critic: an MLP that estimates the value of a state from privileged information.
 
-The critic is asymmetric (Pinto et al. 2018): it is not flown, so it sees the true state and the
-nearest obstacle instead of the image, and learns from a rollout what an image would need many for.
+The critic is asymmetric (Pinto et al. 2018): it is used only in training, so its inputs are the
+true state and the nearest obstacle instead of the image, from which it learns faster.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from tracks.geometry.rotation import to_local
 Params = dict[str, jax.Array]
 
 AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
-"""Times at which the critic sees how close a solid is, along the present velocity [s]."""
+"""Times at which the critic's inputs have the distance to solids, along the velocity [s]."""
 FEATURES = 29 + 2 * len(AHEAD_S)
-"""Numbers that the critic sees, but for how fast it is to be flown."""
+"""Number of inputs, without the commanded speed."""
 REACH_M = 2.0
-"""Obstacles further away than this look the same [m]."""
+"""Distances to obstacles are limited to this [m]."""
 TOUCH_M = 0.2
-"""Distance over which an obstacle becomes urgent [m]."""
+"""Decay length of the input that grows near obstacles [m]."""
 
 
 def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Array:
-    """Return what the critic sees of worlds that have passed `target` (B,) gates, (B, F).
+    """Return the critic's inputs (B, F) in worlds that have passed `target` (B,) gates.
 
-    Position, velocity, acceleration, the next gate, the drone's forward and up axes and the
-    direction away from the nearest obstacle, in the frame of the current gate and scaled to numbers
-    around one; the position again where it is near; how close solids are now and further on; when
-    and where the gate's plane is reached, were the velocity kept; the opening's half width, how
-    many gates are left and, where the policy has the input, how fast it is to fly: F numbers, see
-    `features_of`. Gates and obstacles are looked up on values without gradient.
+    In the frame of the current gate, scaled to about one: position, velocity, acceleration, the
+    next gate, the drone's forward and up axes, the direction away from the nearest obstacle, and
+    the position with a finer scale nearby. Then the distances to solids now and at later times; the
+    time and place at which the gate's plane is reached at constant velocity; the opening's half
+    width; the number of remaining gates; and the commanded speed, if the policy has that input. F
+    is `features_of`. Gates and obstacles are evaluated without gradient.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
@@ -74,7 +74,7 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
 
 
 def features_of(spec: PolicySpec) -> int:
-    """Return how many numbers the critic sees of worlds that a policy with `spec` flies in."""
+    """Return the number of the critic's inputs for a policy with `spec`."""
     return FEATURES + spec.speed_input
 
 

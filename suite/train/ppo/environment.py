@@ -1,7 +1,7 @@
-"""The race in the trainer's worlds and dynamics, as pure functions: what PPO learns in.
+"""The race in the trainer's worlds and dynamics, as pure functions: the environment of PPO.
 
-`make_race` has B worlds at once, for the trainer's own PPO; `JaxRace` is one world by the
-conventions of gymnax (Lange 2022), for learners that come from elsewhere. Both fly the same code.
+`make_race` has B worlds at once, for the trainer's PPO; `JaxRace` is one world with the conventions
+of gymnax (Lange 2022), for other learners. Both run the same code.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
 
 ACTION_LIMIT = 20.0
-"""What an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
+"""Acceleration of an action of 1 in `JaxRace`, as in `eval.envs` [m/s^2]."""
 
 
 class Episode(NamedTuple):
-    """What an episode carries from step to step, (B, ...)."""
+    """State of episodes between steps, (B, ...)."""
 
     state: Any
     """Of the dynamics."""
@@ -38,15 +38,15 @@ class Episode(NamedTuple):
     action_b: jax.Array
     """(B, 3) the last action [m/s^2]."""
     images: jax.Array
-    """(B, image_delay, height, width) on their way, oldest first."""
+    """(B, image_delay, height, width) delayed, oldest first."""
     observed: jax.Array
-    """(B, state_delay, state_size) on their way, oldest first."""
+    """(B, state_delay, state_size) delayed, oldest first."""
     sensed: Any = ()
-    """What the sensor models remember."""
+    """Memory of the sensor models."""
 
 
 class Flown(NamedTuple):
-    """What a policy period brought, (B,) each."""
+    """Results of a policy period, (B,) each."""
 
     reward: RewardTerms
     collided: jax.Array
@@ -61,10 +61,10 @@ class Race(NamedTuple):
     start: Callable[[Worlds], Episode]
     """worlds -> episodes."""
     observe: Callable[[Worlds, Episode, jax.Array], tuple[Observation, Episode]]
-    """(worlds, episodes, keys) -> (what the policy is given, episodes'); once before each step."""
+    """(worlds, episodes, keys) -> (observation, episodes'); called once before each step."""
     fly: Callable[[Worlds, Episode, jax.Array, jax.Array], tuple[Episode, Flown]]
-    """(worlds, episodes, action_b (B, 3) [m/s^2], keys) -> episodes a policy period later, and
-    what it brought."""
+    """(worlds, episodes, action_b (B, 3) [m/s^2], keys) -> (episodes a policy period
+    later, results)."""
 
 
 def make_race(config: TrainConfig) -> Race:
@@ -117,7 +117,7 @@ class RaceState(NamedTuple):
     """State of a `JaxRace`."""
 
     world: jax.Array
-    """Which world of the pool is flown."""
+    """Index in the pool of worlds."""
     episode: Episode
     """Of a batch of one."""
     steps: jax.Array
@@ -126,7 +126,7 @@ class RaceState(NamedTuple):
 
 @dataclass(frozen=True)
 class JaxRace:
-    """One race as gymnax has it: pure, to be compiled and mapped by the learner.
+    """One race with the interface of gymnax: pure functions, which the learner compiles and maps.
 
         env = JaxRace(TrainConfig(quadrotor=QuadrotorConfig(load_vehicle("racer5"))))
         worlds = env.worlds(256)
@@ -135,33 +135,33 @@ class JaxRace:
             keys, state, action, worlds
         )
 
-    Tracks are drawn before, as a pool of worlds (gymnax's `params`); `reset` picks one of them. An
-    observation is what policies see, with the delays and the noise of `config`. An action is -1 to
-    1 a component, as `contract` says. The motion is differentiable in the action. An episode ends
-    by a collision, by a tilt beyond 90 degrees, with the last gate or at the time limit.
+    Tracks are drawn before, as a pool of worlds (gymnax's `params`); `reset` selects one of them.
+    Observations have the delays and the noise of `config`. The components of an action are -1 to 1,
+    see `contract`. The motion is differentiable in the action. An episode ends by a collision, by a
+    tilt beyond 90 degrees, with the last gate or at the time limit.
     """
 
     config: TrainConfig
-    """Observation, dynamics, randomisation and tracks; of the losses r_q alone."""
+    """Observation, dynamics, randomisation and tracks; of the loss only r_q is used."""
     time_limit_s: float = 20.0
-    """[s]."""
+    """Longest episode [s]."""
     reward_scale: float = 0.01
     """Rewards are those of `suite.train.ppo.reward` times this [1]."""
 
     @property
     def spec(self) -> PolicySpec:
-        """What the policy is given, and that it answers with -1 to 1."""
+        """Observation of the policy, and actions of -1 to 1."""
         action = ActionSpec("acceleration", (ACTION_LIMIT,), (0.0,), clip=1.0)
         return replace(self.config.spec, action=action)
 
     @property
     def contract(self) -> Contract:
-        """What goes into the file of a policy that is trained here."""
+        """The contract for the file of a policy that is trained here."""
         return contract_of(self.spec)
 
     @functools.cached_property
     def _race(self) -> Race:
-        # First used while the learner compiles, its arrays would belong to that compilation.
+        # Without this, arrays made during a learner's compilation could not be used outside of it.
         with jax.ensure_compile_time_eval():
             return make_race(self.config)
 
@@ -183,7 +183,7 @@ class JaxRace:
     ) -> tuple[Observation, RaceState, jax.Array, jax.Array, dict[str, jax.Array]]:
         """Fly an action (3,) for a policy period; return (seen, state, reward, done, info).
 
-        After an episode's end it starts the next one, and `seen` is what is seen there. `info` has
+        At an episode's end the next one starts, and `seen` is its first observation. `info` has
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
         and `truncated` (the time limit).
         """

@@ -13,7 +13,7 @@ from suite.train.ppo.rollout import log_probability
 
 
 class Actor(NamedTuple):
-    """What acts while it learns: the policy and its exploration."""
+    """The policy and its exploration."""
 
     params: network.Params
     """The policy's."""
@@ -22,7 +22,7 @@ class Actor(NamedTuple):
 
 
 class Sequences(NamedTuple):
-    """What the objective needs of a rollout's worlds: (T, B, ...) but for the start."""
+    """The objective's inputs from a rollout: (T, B, ...), except the start."""
 
     state: jax.Array
     """(T, B, state_size)."""
@@ -35,7 +35,7 @@ class Sequences(NamedTuple):
     advantage: jax.Array
     """Normalised."""
     start: jax.Array
-    """(1, B, hidden) recurrent state with which every episode of a world starts."""
+    """(1, B, hidden) recurrent state at the start of every episode of a world."""
 
 
 def advantages(
@@ -43,13 +43,12 @@ def advantages(
 ) -> jax.Array:
     """Return the generalised advantage estimates (T, B) (Schulman et al. 2016, Eq. 16).
 
-    An episode that is cut by the rollout's end goes on with the value there; one that ended in a
-    collision is worth nothing afterwards.
+    After the rollout's end an episode has the critic's value; after a collision its value is zero.
 
     Args:
         reward: (T, B).
         value: (T + 1, B) of the states before each step, and after the last.
-        done: (T, B) bool, the step ended its episode.
+        done: (T, B) bool, the episode ended with the step.
         discount: gamma.
         trace: lambda.
     """
@@ -94,7 +93,7 @@ def clipped_loss(
     ratio = jnp.exp(log_ratio)
     held = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     gain = jnp.minimum(ratio * sequences.advantage, held * sequences.advantage).mean()
-    # A normal distribution's entropy but for a constant.
+    # The entropy of a normal distribution, without its constant.
     entropy = actor.log_deviation.sum()
     numbers = {
         # Schulman's estimate of the divergence, which is never negative.

@@ -1,8 +1,8 @@
 """The reward of one step, for any policy's rollout (Su et al. 2026, Table "Reward Function").
 
-It is the yardstick of the comparison of training schemes, so its weights are constants: no
-training's own weights change it. What the table leaves open is as the differentiable trainer has
-it: beta_2, the points of a step's path and, of `LossConfig`, r_q (`safety_radius_m`).
+It measures all training schemes alike, so its weights are constants, independent of the training's.
+Values that the table does not give are the differentiable trainer's: beta_2, the points of a step's
+path and r_q (`LossConfig.safety_radius_m`).
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ def make_reward(
 ) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
     """Return reward(worlds, before, after, target) -> (terms, clearance, passed), (B,) each.
 
-    It scores the step from `before` to `after` of worlds that have passed `target` (B,) gates: the
-    weighted terms, the smallest signed distance to a solid on the way [m] and whether a gate was
-    passed. A gate is passed where the judge says so, by crossing its opening, instead of within
-    r_th of its centre; such a step's progress is towards the next gate.
+    It returns for the step from `before` to `after` of worlds that have passed `target` (B,) gates:
+    the weighted terms, the smallest signed distance to a solid [m], and whether a gate was passed.
+    As in the judge, a gate is passed by crossing its opening (not within r_th of its centre). The
+    progress of such a step is towards the next gate.
 
     Args:
         config: r_q is that of its `loss`.

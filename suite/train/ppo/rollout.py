@@ -18,22 +18,22 @@ from suite.train.worlds import Worlds
 
 
 class Record(NamedTuple):
-    """What a step leaves behind, (B, ...) each."""
+    """Records of a step, (B, ...) each."""
 
     image: jax.Array
-    """(B, height, width) that the policy saw."""
+    """(B, height, width) of the observation."""
     state: jax.Array
-    """(B, state_size) that it saw."""
+    """(B, state_size) of the observation."""
     action_b: jax.Array
-    """(B, 3) what it did [m/s^2]."""
+    """(B, 3) action with exploration [m/s^2]."""
     log_prob: jax.Array
     """Logarithm of the density of that action."""
     seen: jax.Array
-    """(B, F) what the critic saw before the step."""
+    """(B, F) the critic's inputs before the step."""
     reward: RewardTerms
     """Of the step."""
     done: jax.Array
-    """Bool: the drone touched a solid, and the world starts again."""
+    """Bool: the drone touched a solid, and the world is reset."""
     hidden: jax.Array
     """(B, hidden) recurrent state after the step."""
     passed: jax.Array
@@ -57,8 +57,8 @@ def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:
     """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), seen (B, F)).
 
-    An episode ends where the drone touches a solid; its world then starts again as it started,
-    with the recurrent state that it had. `seen` is what the critic sees after the last step.
+    An episode ends when the drone touches a solid; its world is then reset to its start, with the
+    same recurrent state. `seen` are the critic's inputs after the last step.
     """
     race = make_race(config)
 

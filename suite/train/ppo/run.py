@@ -1,4 +1,4 @@
-"""A PPO run in a folder; `suite/train/training_loop.py` says what the folder holds."""
+"""A PPO run in a folder; `suite/train/training_loop.py` describes the folder's files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
 
 STEPS_PER_CORE_S = 8000.0
-"""Steps of worlds a second that a processor core rolls out, or learns from once; an estimate."""
+"""Environment steps a second of a processor core, in a rollout or a learning pass; a guess."""
 COMPILE_S = 20.0
 """Time to compile, for the estimate [s]."""
 
 
 def estimate(config: PpoConfig) -> Estimate:
-    """Return about how long a run takes on this machine's devices and what memory it needs."""
+    """Return the approximate time and memory of a run on this machine's devices."""
     passes = 1 + config.epochs
     return trainer.estimate(config.shared, STEPS_PER_CORE_S, COMPILE_S, passes=passes, images=3)
 
@@ -30,18 +30,17 @@ def estimate(config: PpoConfig) -> Estimate:
 def train_ppo(
     config: PpoConfig, folder: Path, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Train until the configured iterations are done; the same call again resumes.
+    """Train for the configured iterations; the same call again resumes.
 
     Args:
         config: the whole run.
-        folder: where it lives; a folder with a run of the same configuration is resumed. Its
-            policy/ is a checkpoint as any other.
-        console: where progress goes.
-        watch: measures the policy on the way; its steps are iterations.
+        folder: of the run; a run of the same configuration in it is resumed.
+        console: shows progress.
+        watch: measures the policy during the training; its steps are iterations.
 
     Raises:
-        ValueError: where settings cannot be used, and where the folder holds another run.
-        WorkFailed: where a number of the curve stops being finite.
+        ValueError: for invalid settings, and if the folder has another run.
+        WorkFailed: if a number of the curve is not finite.
     """
     shared = config.shared
     check(shared)

@@ -1,7 +1,7 @@
 """One iteration of PPO: a rollout, its advantages, passes of the policy, passes of the critic.
 
-Worlds are the units of minibatches, and a world's whole rollout is backpropagated through. As in
-the differentiable trainer, a minibatch's images are encoded at once, outside the loop over steps.
+A minibatch has whole worlds, with backpropagation through their whole rollouts. As in the
+differentiable trainer, the images of a minibatch are encoded at once, outside the loop over steps.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from suite.train.worlds import Worlds
 
 
 class PpoState(NamedTuple):
-    """All that a run carries from one iteration to the next."""
+    """State of a run between iterations."""
 
     actor: Actor
     """The policy and its exploration."""
     critic: critic.Params
-    """The value's."""
+    """Parameters of the critic."""
     optimizer: optax.OptState
     """Of the actor."""
     critic_optimizer: optax.OptState
     """Of the critic."""
     iteration: jax.Array
-    """Iterations done, a scalar."""
+    """Number of finished iterations, a scalar."""
     hidden: jax.Array
     """(B, hidden) recurrent states from random steps of the last rollout."""
 
@@ -57,9 +57,9 @@ def make_optimizers(
 
 
 def start_state(config: PpoConfig) -> PpoState:
-    """Return the state before the first iteration; the policy starts as the trainer's does."""
+    """Return the state before the first iteration; the policy starts as in the trainer."""
     params = network.init(jax.random.key(config.seed), config.spec)
-    # With its type said: a weak one would have the second iteration compiled again.
+    # With an explicit type: a weak type would compile the second iteration again.
     actor = Actor(params, jnp.full(3, math.log(config.deviation), jnp.float32))
     critic_key = jax.random.fold_in(jax.random.key(config.seed), 1)
     value = critic.init(critic_key, config.critic_size, critic.features_of(config.spec))
@@ -75,7 +75,7 @@ def start_state(config: PpoConfig) -> PpoState:
 
 
 def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
-    """Return indices (epochs * parts, count // parts): each epoch is a new order of all."""
+    """Return indices (epochs * parts, count // parts); each epoch has all in a new order."""
     orders = [jax.random.permutation(k, count) for k in jax.random.split(key, epochs)]
     return jnp.stack(orders).reshape(epochs * parts, count // parts)
 
@@ -87,10 +87,10 @@ def actor_gradient(
 
     Args:
         config: the run.
-        actor: to differentiate at.
+        actor: the point of differentiation.
         images: (T, B, height, width).
-        sequences: (T, B, ...) that go with them.
-        key: picks the images whose encoder gradient is taken, with `episode.image_stride`.
+        sequences: (T, B, ...) of the same worlds.
+        key: selects the images for the encoder's gradient, with `episode.image_stride`.
     """
     steps, batch = images.shape[:2]
     embeddings = network.encode(actor.params, images.reshape(-1, *images.shape[2:]))
@@ -125,7 +125,7 @@ def make_update(
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
     Raises:
-        ValueError: where `minibatches` does not divide `episode.batch`.
+        ValueError: if `minibatches` does not divide `episode.batch`.
     """
     batch, steps = config.episode.batch, config.episode.steps
     if config.minibatches < 1 or batch % config.minibatches:
@@ -148,7 +148,7 @@ def make_update(
             squares = [(leaf * leaf).sum() for leaf in jax.tree.leaves(gradient)]
             numbers["gradient_norm"] = jnp.sqrt(jnp.stack(squares).sum())
             change, optimizer = actor_optimizer.update(gradient, optimizer, actor)
-            # optax types any tree of parameters; it gives back the one it was given.
+            # optax has a general type for trees; it returns the type of its argument.
             return (cast(Actor, optax.apply_updates(actor, change)), optimizer), numbers
 
         rows = shuffled(key, batch, config.epochs, config.minibatches)
