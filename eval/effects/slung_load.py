@@ -2,8 +2,8 @@
 
 The load is a point without drag and without contacts; the line has no mass, pulls and never pushes.
 It is a stiff spring with a damper, whose tension is the one at the end of the step (backward Euler,
-so that no step is too long for it). Its motion is relative to the vehicle's, whose acceleration it
-therefore needs: a single precision float then resolves the line and not the place in the world.
+so that no step is too long for it). Its motion is computed relative to the vehicle, from the
+vehicle's acceleration, so that single precision is enough also far from the world's origin.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class SlungLoad(NamedTuple):
 
 
 class LoadState(NamedTuple):
-    """What is carried from step to step."""
+    """State of the load between steps."""
 
     line_w: Array
     """(..., 3) from the centre of mass to the load, r [m]."""
@@ -43,7 +43,7 @@ def start_of(values: SlungLoad, flow: Flow) -> LoadState:
     xp = flow.rate_b.__array_namespace__()
     gravity_w = flow.constants.gravity_w + xp.zeros_like(flow.rate_b)
     size = xp.sqrt(xp.sum(gravity_w**2, axis=-1, keepdims=True))
-    # The line gives way until T = m_L g, of which T (1 / m_L + 1 / M) holds the two together.
+    # The line stretches until T = m_L g; T (1 / m_L + 1 / M) is the relative acceleration by it.
     stretch = size / _share(values, flow) * _lag(flow) / STIFFNESS**2
     return LoadState(
         (per_axis(values.length) + stretch) * gravity_w / size, xp.zeros_like(flow.rate_b)

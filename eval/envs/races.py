@@ -291,7 +291,7 @@ class Races:
         return None if code == FLYING else ENDINGS[code - 1]
 
     def info(self, slot: int) -> dict[str, Any]:
-        """Return the info of an episode, besides observation and reward."""
+        """Return the info of an episode, in addition to observation and reward."""
         how = self.ended_by(slot)
         info = {
             "track_seed": int(self.track_seed[slot]),

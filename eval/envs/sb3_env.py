@@ -90,7 +90,7 @@ class RaceVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: environments in one simulator have nothing of their own."""
-        raise NotImplementedError(f"{attr_name}: make the environments anew with other settings")
+        raise NotImplementedError(f"{attr_name}: make new environments with other settings")
 
     def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Refuse: environments in one simulator have nothing of their own."""

@@ -111,7 +111,7 @@ def fly(
     An interrupt ends it at once; results passed to `on_result` before that are final.
 
     Args:
-        policy: who flies, or a function without arguments that makes it; several processes need
+        policy: the policy, or a function without arguments that returns it; several processes need
             one that can be pickled, such as `functools.partial(load_policy, name)`.
         trials: to fly.
         vehicle: that flies.

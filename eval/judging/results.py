@@ -43,8 +43,8 @@ def write_results(
         folder: made if missing.
         results: in the order of the rows.
         table_markdown: from `eval.judging.tables.markdown_table`.
-        summary: what summary.json holds besides the stamp, from `tables.summarise`.
-        seed: the seed that the trials' seeds were made from, or None.
+        summary: contents of summary.json without the stamp, from `tables.summarise`.
+        seed: the seed of the first trial, or None.
 
     Raises:
         OSError: where the folder cannot be written.
@@ -191,7 +191,8 @@ class Journal:
 
         Args:
             path: the file.
-            about: what sets the outcomes besides the trials: policy with the hash of its file,
+            about: everything but the trial that determines an outcome: policy with the hash of its
+                file,
                 vehicle, world, options. JSON must be able to hold it.
 
         Raises:

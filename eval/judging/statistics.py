@@ -190,7 +190,7 @@ def over_seeds(
 ) -> Interval:
     """Return a mean, or the difference of two, with its 95 % interval over seeds and trials.
 
-    A hierarchical bootstrap: training seeds and trials are drawn anew, the same trials for all
+    A hierarchical bootstrap: training seeds and trials are resampled, the same trials for all
     seeds of a draw. With few seeds that is too narrow (Owen 2007, The pigeonhole bootstrap), so its
     deviations are scaled to the variance of a two-way layout of random effects, and to Student's t
     with Satterthwaite's (1946) degrees of freedom.

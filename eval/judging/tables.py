@@ -44,7 +44,7 @@ PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired inte
 
 
 class Tally(NamedTuple):
-    """What the trials of one policy on one track at one level come to."""
+    """The results of one policy on one track at one level."""
 
     policy: str
     track: str
@@ -62,7 +62,7 @@ class Tally(NamedTuple):
     ended_by: dict[str, int]
     """How many trials ended how."""
     late: int = 0
-    """How many of the timeouts were a policy's that answered late, or not at all."""
+    """Number of timeouts because the policy answered late or not at all."""
     v_max_of_ten: float | None = None
     """Mean, over picks of ten trials, of their largest v_max; None with fewer trials [m/s]."""
 

@@ -60,7 +60,7 @@ class Steps(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """State of a quadrotor between steps, besides its motion."""
+    """State of a quadrotor between steps, in addition to its motion."""
 
     rotor_speed: Array
     """(..., 4) [rad/s]."""

@@ -2,7 +2,7 @@
 
 RotorPy's own constants of a vehicle are those of its rotors, body and air (Folk, Paulos and Kumar
 2023, "RotorPy: A Python-based Multirotor Simulator with Aerodynamics"). Commands, and when they
-act, are the autopilot's and not its affair. Its blade flapping has the opposite sign of the
+act, belong to the autopilot. Its blade flapping has the opposite sign of the
 catalogue's, and its drag and lift of a rotor act at the hub and go by the hub's own airspeed.
 """
 

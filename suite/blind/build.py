@@ -1,4 +1,4 @@
-"""One case from its description: flights with what it hides, their logs, and the answer."""
+"""Make one case from its description: flights with the hidden effects, their logs, the answer."""
 
 from __future__ import annotations
 
@@ -34,28 +34,28 @@ from suite.diagnose.plans.simulate import FALL_V_PER_S, SENSORS, Sensors, fly, l
 from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
 
 TRIES = 6
-"""Draws of flights and strengths before a case is given up."""
+"""Number of draws of flights and strengths before a case fails."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """A case as it is written."""
+    """The contents of a case."""
 
     nominal: Vehicle
-    """Given to the diagnosis."""
+    """The vehicle file for the diagnosis."""
     truth: Vehicle
-    """Flown."""
+    """The flown vehicle."""
     trajectories: tuple[Trajectory, ...]
     logs: tuple[FlightLog, ...]
     answer: dict[str, Any]
-    """Locked away."""
+    """The answer, which the diagnosis does not see."""
 
 
 def build(case: Case) -> Built:
-    """Return the case: the same to the bit for the same description.
+    """Return the case; it has the same bits for the same description.
 
     Raises:
-        WorkFailed: where no draw of flights and strengths gave sound flights.
+        WorkFailed: if no draw of flights and strengths gave valid flights.
     """
     reasons = []
     for attempt in range(TRIES):
@@ -67,7 +67,7 @@ def build(case: Case) -> Built:
 
 
 class _Unsuitable(Exception):
-    """This draw is not what the case is for."""
+    """A draw that does not suit the kind of case."""
 
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
@@ -77,7 +77,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     if case.kind == "outside":
         return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}
-    # A pair's truth must not hang on what is logged of it.
+    # A pair's truth must not depend on the logged channels.
     table = "capture" if case.separation >= 0 else case.sensors
     for name in case.hidden:
         change, multiple = draw_change(rng, nominal, table, name, case.multiple)
@@ -115,7 +115,7 @@ def _judged(
     sensors: Sensors,
     named: dict[str, np.ndarray],
 ) -> dict[str, dict[str, Any]]:
-    """Return for each effect in `named` how strong it is and which names may stand for it."""
+    """Return for each effect in `named` its strength and the names that may replace it."""
     info = information(nominal, logs, sensors)
     if case.kind == "pair":
         _check_pair(info, named, nominal)
@@ -145,9 +145,9 @@ def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[
 
 
 def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
-    """Return `change` scaled to `case.multiple` times what the gentle flights alone can show.
+    """Return `change` scaled to `case.multiple` times the strength detectable on gentle flights.
 
-    Gentle flights show less than those of the table, and a change that nothing shows has no name.
+    Gentle flights show less than those of the table, and a change must be detectable to be named.
     """
     sensors = SENSORS["capture"]
     ways = SEPARATIONS[case.separation].blurred
@@ -164,10 +164,10 @@ def _outside(
     ways: Sequence[Trajectory],
     rng: np.random.Generator,
 ) -> Built:
-    """Build a case whose physics no effect describes.
+    """Build a case with physics that no effect describes.
 
-    Its strength is worked out on a flight at the usual strength: `case.multiple` times what can
-    just be detected after the whole catalogue was fitted to it.
+    Its strength is computed on a flight at the usual strength: `case.multiple` times the strength
+    that is just detectable after a fit of the whole catalogue.
     """
     name, nominal = case.hidden[0], simulator.given
     kind = KINDS[name]
@@ -196,7 +196,7 @@ def _outside(
 
 
 def unnameable(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
-    """Return the log-likelihood ratio that the whole catalogue, fitted together, leaves over."""
+    """Return the log-likelihood ratio that remains after a joint fit of the whole catalogue."""
     block = linearised(nominal, logs, sensors, columns_of(bool(sensors.voltage)))
     seen, flat = block.residual.ravel(), block.slope.reshape(block.residual.size, -1)
     size = np.linalg.norm(flat, axis=0)
@@ -216,7 +216,7 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
 
 
 def _check_pair(info: Information, named: dict[str, np.ndarray], nominal: Vehicle) -> None:
-    """Refuse two effects of which either could be left out: that is another kind of case."""
+    """Refuse two effects if one alone could explain the flights: that is another kind of case."""
     first, second = named
     for mine, other in ((first, second), (second, first)):
         alone = left_over(info, {mine: named[mine]}, mine, other, nominal)
@@ -239,7 +239,7 @@ def _built(
         **({"conditions": simulator.conditions} if simulator.conditions else {}),
         "case": asdict(case),
         "trajectories": [asdict(way) for way in ways],
-        # Without it the hash of a short answer could be guessed.
+        # Without it a short answer could be guessed from its hash.
         "salt": rng.bytes(16).hex(),
     }
     return Built(simulator.given, truth, tuple(ways), logs, answer)

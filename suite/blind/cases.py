@@ -1,4 +1,4 @@
-"""Which cases a set has: drawn from its seed, in an order that says nothing of what they hide."""
+"""The cases of a set, drawn from its seed, in an order without relation to the hidden effects."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from suite.blind.outside import KINDS
 from suite.diagnose.plans.plan import SEPARATIONS
 
 MULTIPLES = (2.0, 6.0)
-"""Strengths of single effects, in the strength at which each can just be detected."""
+"""Strengths of single effects, as multiples of the just detectable strength."""
 FULL = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
-"""Cases of a full set besides the single effects."""
+"""Other cases of a full set than single effects, by kind."""
 SETS = {"tuning": 1_000_000, "published": 2_000_000}
 """Seeds of the two sets; the published one is run once."""
 ROTORPY_FULL = {"null": 24, "pair": 16}
-"""Cases of the set that RotorPy flies besides the single effects."""
+"""Other cases of the RotorPy set than single effects, by kind."""
 CONTINUOUS_FULL = {"null": 24, "single": 22, "pair": 10, "outside": 4}
-"""Cases of the set that is flown in continuous time."""
+"""Cases of the continuous-time set, by kind."""
 TOO_ROUGH = "hysteresis"
-"""Physics outside the catalogue that this set leaves out: at its usual strength the pass close to
-the ground mostly ends there."""
+"""Physics that this set leaves out: at its usual strength most flights close to the ground end in a
+crash."""
 MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
-"""Who can fly a case."""
+"""Simulators of cases."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a case hides, before strengths and flights are worked out."""
+    """The description of a case, before strengths and flights are computed."""
 
     kind: str
     """single, null, outside, pair, blurred or separated."""
     hidden: tuple[str, ...]
-    """Effects, or one kind of physics outside the catalogue."""
+    """The hidden effects, or one kind of physics outside the catalogue."""
     multiple: float
-    """Of the detectable strength."""
+    """Strength, as a multiple of the detectable one."""
     vehicle: str
-    """Given to the diagnosis."""
+    """The vehicle file for the diagnosis."""
     sensors: str
-    """What is logged."""
+    """Name of the logged channels and their noise."""
     seed: tuple[int, int]
-    """Of everything else: the set's seed and the case's number within its kind."""
+    """Seeds of all other draws: the set's, and the case's number within its kind."""
     separation: int = -1
-    """Number of the entry of `SEPARATIONS`, where there is one."""
+    """Index in `SEPARATIONS`, if there is one."""
     simulator: str = MUJOCO
-    """Who flies it."""
+    """Its simulator."""
 
 
 def full_count() -> int:
@@ -63,7 +63,7 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
     Args:
         seed: of the set.
-        count: about how many; every kind keeps its share, and at least one. All if not given.
+        count: approximate number, with the same share of every kind, at least one each. None: all.
 
     Raises:
         ValueError: for a count below 1.
@@ -81,7 +81,7 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the set that RotorPy flies: its effects at both multiples, pairs of them, and nulls.
+    """Return the RotorPy set: its effects at both multiples, pairs of them, and nulls.
 
     Arguments and errors are those of `draw_cases`.
     """
@@ -110,7 +110,7 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the set that is flown in continuous time, with single effects that all differ.
+    """Return the continuous-time set, with each single effect once.
 
     Half of them are at each multiple. Arguments and errors are those of `draw_cases`.
     """
@@ -138,7 +138,7 @@ DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
     ROTORPY: draw_rotorpy_cases,
     CONTINUOUS: draw_continuous_cases,
 }
-"""Who draws the cases of a simulator's set, from its seed and about how many there are to be."""
+"""Simulator -> function that draws its set from seed and approximate number of cases."""
 
 
 def _share_of(count: int | None, full: int) -> float:
@@ -169,7 +169,7 @@ def _drawn(rng: np.random.Generator, kind: str, index: int, number: tuple[int, i
         pair = tuple(pool[i] for i in rng.choice(len(pool), 2, replace=False))
         return Case(kind, pair, MULTIPLES[1], *_equipment(rng, pair), number)
     if kind in ("blurred", "separated"):
-        # The same pairs with the same truth in both kinds: a stream of their own by index.
+        # Both kinds have the same pairs with the same truth: a random stream by index.
         own = np.random.default_rng([seed, 3, index])
         entry = index % len(SEPARATIONS)
         pair = SEPARATIONS[entry].pair

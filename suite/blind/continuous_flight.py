@@ -1,6 +1,6 @@
 """Commanded trajectories flown in continuous time by an engine that shares no code with the fit.
 
-The pilot is the one of the other simulators, for it only gives commands.
+The tracking controller is the one of the other simulators, since it only gives commands.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Se
 from suite.diagnose.plans.trajectory import Reference, Trajectory
 
 ROLL_S = 0.25
-"""Flown before the first row and after the last, for poses that are logged late or early [s]."""
+"""Time before the first row and after the last one, for poses with a time offset [s]."""
 
 
 def with_loop(vehicle: Vehicle, frequency: float) -> Vehicle:
@@ -43,17 +43,17 @@ def fly_continuous(
     """Fly `trajectories` side by side.
 
     Args:
-        nominal: what the pilot believes.
-        truth: what is flown; its loop's frequency is that of `conditions`.
+        nominal: vehicle of the tracking controller.
+        truth: flown vehicle; its loop has the frequency of `conditions`.
         trajectories: N of them.
         conditions: rates and jitter.
         rng: of stamps and gusts.
-        extra: physics besides the effects.
+        extra: additional physics.
         step_s: longest step [s].
 
     Raises:
-        FlightFailed: where a flight tips over, leaves the air or its trajectory.
-        ValueError: for an effect that the engine has no equation for.
+        FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.
+        ValueError: for an effect without an equation in the engine.
     """
     quadrotor = quadrotor_of(with_loop(truth, conditions.loop_hz))
     last = max(way.duration_s for way in trajectories)
@@ -66,7 +66,7 @@ def fly_continuous(
     pilot = _Pilot(nominal, trajectories, stamp_s, extra)
     start = np.zeros((len(trajectories), 13))
     for index, way in enumerate(trajectories):
-        # A trajectory rests until time 0, but for its heading.
+        # Before time 0 a trajectory is constant, except for its heading.
         first = way.reference(stamp_s[:1, index])
         half = 0.5 * float(first.yaw[0])
         start[index, POS] = first.pos_w[0]
@@ -77,7 +77,7 @@ def fly_continuous(
 
 
 class _Pilot:
-    """Steers N flights along their trajectories, row by row."""
+    """Tracks the trajectories of N flights, row by row."""
 
     def __init__(
         self, nominal: Vehicle, ways: Sequence[Trajectory], stamp_s: np.ndarray, extra: Extra | None
@@ -88,7 +88,7 @@ class _Pilot:
         self._summed_w = np.zeros((len(ways), 3))
 
     def __call__(self, seen: Rows) -> tuple[np.ndarray, np.ndarray]:
-        """Return the command that is logged and the one that acts, (N, 4) each."""
+        """Return the logged command and the command that acts, (N, 4) each."""
         row = seen.number
         now = Reference(*(part[row] for part in self._wanted))
         motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
@@ -103,12 +103,12 @@ class _Pilot:
         return given.packed, acting.packed
 
     def push(self, seen: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
-        """Return what the physics besides adds in a step (N, 3) [N]."""
+        """Return the force of the additional physics in a step (N, 3) [N]."""
         assert self._extra is not None
         motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
         wrench = Wrench(force_b, np.zeros_like(force_b))
         time_s = seen.time_s[:, None]
-        # Arrays of one number a flight, where other simulators have one for all.
+        # One number per flight, unlike in other simulators.
         return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
 
 
@@ -120,7 +120,7 @@ def logs_of(
     conditions: Conditions,
     rng: np.random.Generator | None,
 ) -> tuple[FlightLog, ...]:
-    """Return the flights' logs with noise as `sensors` has it a second; `rng` None logs without."""
+    """Return the flights' logs with the noise density of `sensors`, or without if `rng` is None."""
     noise, about = Noise(*astuple(sensors)[1:]), {"source": "suite blind", "vehicle": truth.name}
     return tuple(
         log_of_flight(

@@ -1,8 +1,8 @@
-"""A set of cases on disk: what the diagnosis may see, and apart from it the answers.
+"""A set of cases on disk: the diagnosis's inputs, and the answers in a separate folder.
 
-`OUT/set.json` says what the set is drawn from. `OUT/cases/case_001/` has vehicle.toml and
-flight_1.parquet and so on, which is all that a diagnosis sees; `OUT/answers/case_001.json`, what is
-hidden; `OUT/manifest.json`, the hashes of all of them.
+`OUT/set.json` has the seed and options of the set. `OUT/cases/case_001/` has vehicle.toml,
+flight_1.parquet and so on, the inputs of a diagnosis; `OUT/answers/case_001.json` the hidden
+effects; `OUT/manifest.json` the hashes of all files.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Manifest:
     """The files of a set."""
 
     cases: dict[str, dict[str, str]]
-    """By case: SHA-256 of each file that the diagnosis sees."""
+    """By case: SHA-256 of each input file of the diagnosis."""
     answers: dict[str, str]
     """By case: SHA-256 of its answer."""
     failed: dict[str, str] = field(default_factory=dict)
-    """By case: why it could not be made."""
+    """By case: the reason for which it could not be made."""
 
 
 def make_set(
@@ -49,19 +49,19 @@ def make_set(
     simulator: str = MUJOCO,
     workers: Workers | None = None,
 ) -> Manifest:
-    """Make the cases that `out` does not have yet, and the manifest.
+    """Make the missing cases in `out`, and the manifest.
 
     Args:
         out: folder of the set.
         seed: of the set.
-        count: about how many cases; all if None.
-        console: for progress.
-        simulator: who flies them, one of `DRAWERS`; all but `mujoco` have smaller sets.
-        workers: who makes cases; this process if None.
+        count: approximate number of cases; None: all.
+        console: shows progress.
+        simulator: one of `DRAWERS`; all but `mujoco` have smaller sets.
+        workers: of the cases; None: this process.
 
     Raises:
-        ValueError: where `out` holds a set of another seed, count, simulator or table of strengths,
-            or the simulator is not installed; nothing is written then.
+        ValueError: if `out` has a set of another seed, count, simulator or table of strengths, or
+            the simulator is not installed; nothing is written then.
     """
     if simulator == ROTORPY:
         world_class(ROTORPY)
@@ -81,7 +81,7 @@ def make_set(
             if isinstance(built, str):
                 failed[name] = built
                 return
-            # The answer first: a case that is there has one.
+            # The answer first: every existing case has one.
             write_json(out / "answers" / f"{name}.json", {**stamp(SCHEMA, seed), **built.answer})
             with replacing_folder(out / "cases" / name) as temporary:
                 save_vehicle(built.nominal, temporary / "vehicle.toml")
@@ -100,13 +100,13 @@ def make_set(
         {name: "not made" for name in cases if name in failed},
     )
     write_json(out / "manifest.json", {**stamp(SCHEMA, seed), **asdict(manifest)})
-    # The reasons say what was hidden.
+    # The reasons contain the hidden effects.
     write_json(out / "answers" / "failed.json", {n: failed[n] for n in cases if n in failed})
     return manifest
 
 
 def _build(case: Case) -> Iterator[Built | str]:
-    """Yield a case as it is written, or why it cannot be made."""
+    """Yield the contents of a case, or the reason for which it cannot be made."""
     try:
         yield build(case)
     except WorkFailed as error:
@@ -117,7 +117,7 @@ def load_manifest(out: Path) -> Manifest:
     """Return the manifest of the set in `out`.
 
     Raises:
-        ValueError: where there is none.
+        ValueError: if there is none.
     """
     path = out / "manifest.json"
     if not path.is_file():
@@ -127,16 +127,16 @@ def load_manifest(out: Path) -> Manifest:
 
 
 def simulator_of(out: Path) -> str:
-    """Return who flew the set in `out`; MuJoCo where nothing says so."""
+    """Return the simulator of the set in `out`; MuJoCo if it is not recorded."""
     path = out / "set.json"
     return str(read_json(path).get("simulator", MUJOCO)) if path.is_file() else MUJOCO
 
 
 def open_answers(out: Path) -> dict[str, dict[str, Any]]:
-    """Return the answers by case, after checking that nobody changed them or the cases.
+    """Return the answers by case, after checking that no file of the set has changed.
 
     Raises:
-        ValueError: for a file that is not the one that was made.
+        ValueError: for a changed file.
     """
     manifest = load_manifest(out)
     answers = {}

@@ -1,4 +1,4 @@
-"""What a case hides: an effect of the catalogue, how strong, or physics that is in no catalogue."""
+"""Hidden physics of a case: values of an effect, or physics outside the catalogue."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
 
 
 class Outside:
-    """Nothing; a kind changes the command or adds a wrench. One object serves one `fly`."""
+    """Base class: a kind changes the command or adds a wrench. One object is for one `fly`."""
 
     def __init__(self, strength: float, mass: float) -> None:
         """Prepare for flights of a quadrotor of true `mass` [kg]; `strength` as in `KINDS`."""
@@ -38,14 +38,14 @@ class Outside:
         return Wrench(force_b, np.zeros_like(force_b))
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return an acceleration (N, 3) in the world that is added [m/s^2]."""
+        """Return an additional acceleration (N, 3), world axes [m/s^2]."""
         return np.zeros_like(motion.pos_w)
 
 
 class SlungLoad(Outside):
     """A point mass of `strength` kg on an elastic line below the centre of mass.
 
-    An engine's own law: the catalogue's load is on a stiff line, and no diagnosis fits that.
+    It differs from the catalogue's load, which has a stiff line.
     """
 
     LENGTH_M, STIFFNESS, DAMPING = 0.4, 60.0, 0.3
@@ -53,7 +53,7 @@ class SlungLoad(Outside):
     _pos_w = _vel_w = np.zeros(0)
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return the line's pull, and move the load, which hangs at rest at the start."""
+        """Return the line's force, and move the load, which is at rest at the start."""
         if not self._pos_w.size:
             stretch = self.strength * GRAVITY / self.STIFFNESS
             self._pos_w = motion.pos_w - np.array([0.0, 0.0, self.LENGTH_M + stretch])
@@ -70,12 +70,12 @@ class SlungLoad(Outside):
 
 
 class Hysteresis(Outside):
-    """Backlash of `strength` m/s^2 in the collective thrust; the play starts in its middle."""
+    """Backlash of `strength` m/s^2 in the collective thrust, centred at the start."""
 
     _acting = np.zeros(0)
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the thrust that follows only when it is pushed by the play's edges."""
+        """Return the thrust, which changes only at the edges of the backlash."""
         half = 0.5 * self.strength
         before = self._acting if self._acting.size else command.thrust
         self._acting = np.clip(before, command.thrust - half, command.thrust + half)
@@ -83,7 +83,7 @@ class Hysteresis(Outside):
 
 
 class BentThrust(Outside):
-    """A thrust curve that is bent and not only scaled."""
+    """A nonlinear thrust curve."""
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return c + s (c - g)^2 / g."""
@@ -93,7 +93,7 @@ class BentThrust(Outside):
 
 
 class Push(Outside):
-    """An acceleration in the world that follows from the state alone."""
+    """An acceleration in world axes that depends only on the state."""
 
     def __init__(self, strength: float, mass: float, law: Law) -> None:
         """Prepare; `law` takes (strength, mass, motion, wrench, time) and returns (N, 3)."""
@@ -101,7 +101,7 @@ class Push(Outside):
         self._law = law
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return what the law says."""
+        """Return the acceleration of the law."""
         return self._law(self.strength, self.mass, motion, wrench, time_s)
 
 
@@ -112,13 +112,13 @@ def _power_drag(s: float, m: float, motion: Motion, wrench: Wrench, t: float) ->
 
 
 def _heading_force(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """A sideways push that changes its sign twice a turn: s cos(2 yaw) along body y."""
+    """A sideways force that changes its sign twice per turn: s cos(2 yaw) along body y."""
     yaw = np.arctan2(motion.rot_w[:, 1, 0], motion.rot_w[:, 0, 0])
     return s * np.cos(2.0 * yaw)[:, None] * motion.rot_w[:, :, 1]
 
 
 def _wake(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """Sinking into the own wake: -s (sinking speed beyond 0.5 m/s)^2 along body z."""
+    """Descent into the own wake: -s (sinking speed beyond 0.5 m/s)^2 along body z."""
     sinking = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
     return -s * sinking**2 * motion.rot_w[:, :, 2]
 
@@ -149,9 +149,9 @@ class Kind:
     unit: str
     """Of the strength."""
     usual: float
-    """A strength at which the table of strengths looks at it."""
+    """The strength at which the table of strengths evaluates it."""
     most: float
-    """The largest strength that is flown."""
+    """The largest flown strength."""
 
 
 KINDS: dict[str, Kind] = {
@@ -180,19 +180,19 @@ def make_outside(name: str, strength: float, mass: float) -> Outside:
 
 
 INSIDE = 0.98
-"""Share of the way to a physical bound that a strength may go."""
+"""Largest share of the distance to a physical bound."""
 
 
 def draw_change(
     rng: np.random.Generator, nominal: Vehicle, sensors: str, effect: str, multiple: float
 ) -> tuple[np.ndarray, float]:
-    """Return the change of each of the effect's columns, and the multiple that came of it.
+    """Return the change of each column of the effect, and its multiple of the detectable strength.
 
-    The direction is drawn; the strength along it is `multiple` times the detectable one, cut
-    where it would pass a physical bound.
+    The direction is random; the strength along it is `multiple` times the detectable one, limited
+    by the physical bounds.
 
     Raises:
-        ValueError: where the flights of the table do not show the effect at all.
+        ValueError: if the flights of the table do not show the effect.
     """
     columns = columns_in_table(nominal.name, sensors, effect)
     room = np.array([column.room(nominal) for column in columns])
@@ -201,7 +201,7 @@ def draw_change(
         direction = columns[0].spec.signs[0] * alone
     else:
         sign = rng.choice([-1.0, 1.0], len(columns))
-        # Where there is no way down from the given value, or none that is usual, it goes up.
+        # Upwards if the given value cannot, or does not usually, become smaller.
         upwards = (room[:, 0] > -1e-9) | np.array([c.spec.upwards(nominal) for c in columns])
         direction = rng.uniform(0.5, 1.0, len(columns)) * np.where(upwards, 1.0, sign)
     unit = detectable_along(nominal.name, sensors, effect, direction)
@@ -229,7 +229,7 @@ def changed_values(
         value[(column.component,) if value.ndim else ()] += step
     for parameter in EFFECTS[effect].parameters:
         for component in parameter.unseen:
-            # Cannot be seen, so it may be anything.
+            # Not identifiable, so any value is right.
             size = 0.5 * parameter.typical[1]
             fields[parameter.name][component] = rng.uniform(-size, size)
     plain = {k: tuple(v.tolist()) if v.ndim else float(v) for k, v in fields.items()}
@@ -237,7 +237,7 @@ def changed_values(
 
 
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
-    """Return what a diagnosis should find: totals, with null for what no flight can tell."""
+    """Return the expected diagnosis: totals, with null for unidentifiable components."""
     found: dict[str, Any] = {}
     for parameter in EFFECTS[effect].identifiable(has_voltage):
         value = getattr(values, parameter.name)

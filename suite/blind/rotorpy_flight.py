@@ -1,9 +1,9 @@
 """Commanded trajectories flown in RotorPy, another simulator with equations of its own.
 
-Pilot, rate loop and mixer are ours, since they are what the vehicle file describes; rotors, air
-and rigid body are RotorPy's, as the world `rotorpy` has them.
+Tracking controller, rate loop and mixer are ours, since the vehicle file describes them; rotors,
+air and rigid body are RotorPy's, as in the simulator `rotorpy`.
 
-RotorPy's rotor drag and inflow go by each hub's own airspeed `v + w x r`, those of our catalogue by
+RotorPy's rotor drag and inflow depend on each hub's airspeed `v + w x r`, those of our catalogue on
 the body's. At rotor speed `Omega` the difference is an angular damping: a drag `k Omega` in the
 rotor plane turns against `w_z` by `k Omega (x^2 + y^2)` a rotor, an inflow along body z against
 `w_x` by `k Omega y^2` and against `w_y` by `k Omega x^2`.
@@ -29,10 +29,10 @@ from tracks.geometry.rotation import quat_to_rot
 
 
 def check_effects(truth: Vehicle) -> None:
-    """Refuse a vehicle with an effect that RotorPy does not have as it is.
+    """Refuse a vehicle with an effect that RotorPy does not have in the same form.
 
     Raises:
-        ValueError: naming the effect and what is allowed.
+        ValueError: with the effect and what is allowed.
     """
     for name in truth.effects:
         if name not in ROTORPY_EFFECTS:
@@ -47,8 +47,8 @@ def fly_rotorpy(
     """Fly `trajectories` side by side in RotorPy; the arguments are those of `fly`.
 
     Raises:
-        FlightFailed: where a flight tips over, leaves the air or its trajectory.
-        ValueError: for an effect that RotorPy does not have, and where it is not installed.
+        FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.
+        ValueError: for an effect that RotorPy does not have, and if it is not installed.
     """
     check_effects(truth)
     frequency = nominal.controller.frequency
@@ -59,7 +59,7 @@ def fly_rotorpy(
 
 
 class _RotorpyBodies:
-    """RotorPy's multirotors under our rate loop; its logs count as continuous in time."""
+    """RotorPy's multirotors with our rate loop; their logs count as continuous in time."""
 
     integrator: str | None = None
 
@@ -93,11 +93,11 @@ class _RotorpyBodies:
 
 NAME = "angular_damping"
 WITHIN = 1.5
-"""By this factor what is named may be off what hubs bring at hover: flights are no hover."""
+"""Largest ratio of a named damping to that of moving hubs in hover, since flights are no hover."""
 
 
 def damping_of_hubs(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
-    """Return the damping (3,) [1/s] that an answer's `effects` bring along at hover."""
+    """Return the damping (3,) by moving hubs in hover that an answer's `effects` cause [1/s]."""
     place = np.asarray(vehicle.rotors.position)
     inertia = np.asarray(vehicle.inertia)
     thrust = vehicle.mass * GRAVITY / len(place)
@@ -113,7 +113,7 @@ def damping_of_hubs(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> n
 
 
 def is_of_hubs(effect: Mapping[str, Any], damping: np.ndarray) -> bool:
-    """Return whether a diagnosis' `effect` is the damping (3,) that hubs bring."""
+    """Return whether a diagnosis' `effect` is the damping (3,) by moving hubs."""
     if effect["name"] != NAME or effect.get("alternatives") or not damping.any():
         return False
     value = np.asarray(effect["parameters"]["coefficient"]["value"], float)

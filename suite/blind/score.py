@@ -1,4 +1,4 @@
-"""Diagnoses against the answers: what was named, what was not there, and how well it fits."""
+"""Scores of diagnoses: named effects, false names and intervals, compared with the answers."""
 
 from __future__ import annotations
 
@@ -25,42 +25,42 @@ from tracks.common.provenance import stamp
 
 SCHEMA = 1
 GAP_LIMIT = 1.1
-"""Of the gap after over the noise floor."""
+"""Limit of the ratio of the remaining gap to the noise floor."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One case scored."""
+    """The score of one case."""
 
     case: str
     kind: str
     hidden: tuple[str, ...]
     multiple: float
     verdict: str
-    """Of the diagnosis; `failed` where there is none."""
+    """Verdict of the diagnosis; `failed` if there is none."""
     named: tuple[tuple[str, ...], ...]
-    """Sets of names of the diagnosis, the first name of each first."""
+    """Named effects, each with its alternatives."""
     found: bool
-    """Every hidden effect has its name, in the right set."""
+    """Whether every hidden effect is named, with the right alternatives."""
     extra: int
-    """Named effects of which no name is true."""
+    """Number of named effects that are false, with all alternatives."""
     covered: tuple[bool, ...]
-    """For each component with an interval: does it hold the truth?"""
+    """Whether the interval of each component contains the true value."""
     gap_ratio: float | None
     """Gap after over noise floor."""
     seconds: float | None
     brought: int = 0
-    """Named effects that the simulator has in addition to the hidden ones, by name and size."""
+    """Number of named effects that are physics of the simulator itself, by name and size."""
 
     @property
     def exact(self) -> bool:
-        """Every hidden effect has its name, and nothing was named that is not there."""
+        """Whether all hidden effects are named, and nothing else."""
         return self.found and self.extra == 0
 
 
 @dataclass(frozen=True)
 class Share:
-    """A line of the table: so many of so many, with a 95 % Wilson interval."""
+    """A line of the table: a count of cases, with a 95 % Wilson interval of the share."""
 
     what: str
     count: int
@@ -68,7 +68,7 @@ class Share:
     low: float
     high: float
     wanted: str
-    """What the suite aims at."""
+    """The goal."""
 
 
 def score_case(
@@ -78,10 +78,9 @@ def score_case(
     seconds: float | None,
     hubs: np.ndarray | None = None,
 ) -> Verdict:
-    """Return how `diagnosis` (None where it failed) does against `answer`.
+    """Return the score of `diagnosis` (None if it failed) for `answer`.
 
-    `hubs` (3,) is the angular damping [1/s] that the simulator's rotors bring along, if it is one
-    that has it.
+    `hubs` (3,) is the angular damping by moving hubs in the simulator [1/s], if it has one.
     """
     truths: Sequence[Mapping[str, Any]] = answer["effects"]
     hidden = [answer["outside"]] if answer.get("outside") else truths
@@ -91,7 +90,7 @@ def score_case(
     pairs = _matched(truths, sets)
     right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
     names, used = {truth["name"] for truth in truths}, set(pairs.values())
-    # What is not there, and what is true but another set stands for already.
+    # False names, and true names that another set already has.
     extra = [
         e not in used if names & set(group) else not brought[e] for e, group in enumerate(sets)
     ]
@@ -120,10 +119,10 @@ def score_case(
 
 
 def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
-    """Return the cases of the set in `out` that were run, scored against its answers.
+    """Return the scores of all diagnosed cases of the set in `out`.
 
     Raises:
-        ValueError: where the set is not what was made, or none of it was run.
+        ValueError: if a file of the set has changed, or no case was diagnosed.
     """
     folder = results or out / "results"
     scored, in_rotorpy = [], simulator_of(out) == ROTORPY
@@ -136,7 +135,7 @@ def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
             hubs = damping_of_hubs(answer["effects"], vehicle)
         diagnosis = _read(folder / name / "diagnosis.json")
         timing = _read(folder / name / TIMED)
-        # Without its time a diagnosis did not end well, whatever it left behind.
+        # Without its time a diagnosis did not end normally.
         good = diagnosis if timing else None
         seconds = timing["seconds"] if timing else None
         scored.append(score_case(name, answer, good, seconds, hubs))
@@ -146,19 +145,19 @@ def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
 
 
 def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
-    """Return the cases of the set in `out` that are not among those scored."""
+    """Return the cases of the set in `out` without a score."""
     scored = {v.case for v in verdicts}
     return [name for name in load_manifest(out).cases if name not in scored]
 
 
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
-    """Return the lines of the table that are shares, empty ones left out."""
+    """Return the lines of the table with shares, without empty ones."""
 
     def of(kind: str) -> list[Verdict]:
         return [v for v in verdicts if v.kind == kind]
 
     single, null, pair = of("single"), of("null"), of("pair")
-    # A failed one names nothing, which is no merit.
+    # A failed diagnosis names nothing, which must not count as correct.
     ended = [v for v in verdicts if v.verdict != "failed"]
     by_chance = {name for name, effect in EFFECTS.items() if effect.random}
     ratios = [v.gap_ratio for v in verdicts if v.found and not by_chance & set(v.hidden)]
@@ -172,16 +171,16 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
             )
             for times in MULTIPLES
         ),
-        _beside_hubs(single),
+        _without_hubs(single),
         ("single effects: named, others perhaps too", "", [v.found for v in single]),
         ("single effects: verdict `named`", "", [v.verdict == "named" for v in single]),
         ("nulls: something named", "at most 2 of 100",
          [bool(v.named) for v in ended if v.kind == "null"]),
         ("nulls: verdict `no_gap`", "", [v.verdict == "no_gap" for v in null]),
-        ("outside the catalogue: `unknown` or `partly`", "85 %", [*map(_as_hoped, of("outside"))]),
+        ("outside the catalogue: `unknown` or `partly`", "85 %", [*map(_expected, of("outside"))]),
         ("pairs: both named", "80 %", [v.found for v in pair]),
         ("pairs: both named, nothing else", "", [v.exact for v in pair]),
-        _beside_hubs(pair),
+        _without_hubs(pair),
         ("inseparable: the right set", "95 %", [v.exact for v in of("blurred")]),
         ("the same with separating flights", "95 %", [v.exact for v in of("separated")]),
         ("cases with a spurious extra name", "", [v.extra > 0 for v in ended if v.hidden]),
@@ -218,10 +217,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         [v.case, v.kind, ", ".join(v.hidden) or "–", f"{v.multiple:.1f}", v.verdict,
          "; ".join(" or ".join(group) for group in v.named) or "–"]
         for v in verdicts
-        if not _as_hoped(v)
+        if not _expected(v)
     ]  # fmt: skip
     heads = ["case", "kind", "hidden", "x detectable", "verdict", "named"]
-    title = f"{len(wrong)} of {len(verdicts)} cases are not as hoped:"
+    title = f"{len(wrong)} of {len(verdicts)} cases are not as expected:"
     waiting, failed = not_run(out, verdicts), load_manifest(out).failed
     count = len(waiting) + len(verdicts)
     notes = [
@@ -247,8 +246,8 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     return text
 
 
-def _beside_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
-    """Return the line on what is right where hubs' damping counts as not there, if it was named."""
+def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
+    """Return the line on correct cases if a named damping by moving hubs counts as false."""
     brought = any(v.brought for v in verdicts)
     flags = [v.exact and not v.brought for v in verdicts if brought]
     kind = verdicts[0].kind if verdicts else ""
@@ -258,9 +257,9 @@ def _beside_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
 def _matched(
     truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]
 ) -> dict[int, int]:
-    """Return for each true effect the named one that stands for it, each used once.
+    """Return for each true effect the index of the named effect, each used once.
 
-    First names go before alternatives, so that two sets with a name in common find their own.
+    First names have priority over alternatives, for sets with a common name.
     """
     pairs: dict[int, int] = {}
     for first_only in (True, False):
@@ -273,7 +272,7 @@ def _matched(
 
 
 def _is_right(truth: Mapping[str, Any], group: tuple[str, ...]) -> bool:
-    # Several effects that are one hypothesis are not judged: the oracle weighs single ones.
+    # Hypotheses of several effects are ignored: the oracle has only single effects.
     others = {name for name in group if len(effects_in(name)) == 1} - {truth["name"]}
     return set(truth["required"]) <= others <= set(truth["allowed"]) | set(truth["required"])
 
@@ -286,7 +285,7 @@ def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[boo
         values = value if isinstance(value, list) else [value]
         intervals = interval if isinstance(value, list) else [interval]
         if "index" in found:
-            # Components (from 1) that are given alone, such as one weak rotor.
+            # Components (from 1) that are listed alone, such as one weak rotor.
             index = found["index"]["value"]
             index, intervals = (
                 (index, interval) if isinstance(index, list) else ([index], [interval])
@@ -297,7 +296,7 @@ def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[boo
                 yield bool(span[0] <= one <= span[1])
 
 
-def _as_hoped(v: Verdict) -> bool:
+def _expected(v: Verdict) -> bool:
     if v.kind == "null":
         return v.verdict == "no_gap"
     if v.kind == "outside":

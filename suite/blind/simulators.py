@@ -1,4 +1,4 @@
-"""Who flies a case: MuJoCo, RotorPy, or the engine in continuous time."""
+"""The simulators of cases: MuJoCo, RotorPy, and the continuous-time engine."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from suite.diagnose.plans.trajectory import Trajectory
 Ways = Sequence[Trajectory]
 Random = np.random.Generator
 Logged = Callable[[Random | None], tuple[FlightLog, ...]]
-"""From the draws of the noise to the logs of a case's flights; None logs without noise."""
+"""(random generator of the noise) -> logs of a case's flights; None logs without noise."""
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulator, set up for one case."""
+    """A simulator for one case."""
 
     given: Vehicle
-    """Given to the diagnosis."""
+    """The vehicle file for the diagnosis."""
     fly: Callable[..., Logged]
-    """Flies (truth, ways, rng, extra) side by side: a vehicle on N trajectories, with what happens
-    by chance in flight, and physics besides, if any."""
+    """(truth, ways, rng, extra) -> flights of a vehicle on N trajectories, with random effects and
+    additional physics, if any."""
     conditions: dict[str, Any] = field(default_factory=dict)
-    """Under which it is flown and logged, for the answer."""
+    """Conditions of flight and log, for the answer."""
 
 
 def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
-    """Return who flies `case`; `rng` is for the conditions, where a simulator draws any."""
+    """Return the simulator of `case`; `rng` draws its conditions, if it has any."""
     given, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
 
     def stepped(truth: Vehicle, ways: Ways, rng: Random, extra: Extra | None = None) -> Logged:

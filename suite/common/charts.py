@@ -4,43 +4,20 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from suite.common.curve import METRICS
+
 GRID = "#e6e9ee"
 LINES = ("#2463c9", "#e0892b", "#2e8b57", "#b0413e", "#7a5cb8", "#8b93a1")
 """Colours of what is compared, in order."""
 DPI = 130
-
-
-class Metric(NamedTuple):
-    """A number of a training, as tables and charts show it."""
-
-    title: str
-    scale: float
-    digits: int
-
-    @property
-    def heading(self) -> str:
-        """The title over a chart."""
-        return self.title if self.title.startswith("v_max") else self.title.capitalize()
-
-
-METRICS = {
-    "reward": Metric("reward", 1, 0),
-    "success_cross": Metric("success cross [%]", 100, 0),
-    "collision_free": Metric("collision-free rate [%]", 100, 0),
-    "v_max": Metric("v_max [m/s]", 1, 1),
-    "gates": Metric("gates", 1, 2),
-    "collided": Metric("collided [%]", 100, 0),
-    "speed": Metric("mean speed [m/s]", 1, 1),
-}
-"""Numbers of a training's curve and of the measurements of its policy, by their key."""
-CURVE = ("gates", "collided", "speed")
+DRAWN = ("gates", "collided", "speed")
 """Numbers of a training's curve that are drawn."""
 
 
@@ -90,9 +67,9 @@ def curves_chart(
         follow: whether the curves after the first begin where the first one ends.
     """
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
-    panels = figure.subplots(1, len(CURVE))
+    panels = figure.subplots(1, len(DRAWN))
     first = len(next(iter(curves.values()))) if follow else 0
-    for axes, name in zip(panels, CURVE, strict=True):
+    for axes, name in zip(panels, DRAWN, strict=True):
         start = 0
         for (label, rows), colour in zip(curves.items(), colours, strict=False):
             if not rows:

@@ -1,4 +1,4 @@
-"""What people write for several tracks, levels or trials, turned into lists."""
+"""Lists of tracks and levels from the text of an option."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def parse_levels(text: str) -> list[int]:
     """Return the levels of "3", "0,3,9", "0-3", "0,5-9" or "all", in the order given.
 
     Raises:
-        ValueError: where the text is none of these or a level is not 0 to 9.
+        ValueError: for any other text, and for a level that is not 0 to 9.
     """
     if text.strip() == "all":
         return list(LEVELS)
@@ -40,7 +40,7 @@ def parse_tracks(text: str) -> list[str]:
     A name that ends in ``.toml`` is a track file; others are families.
 
     Raises:
-        ValueError: for an unknown family, with the nearest one.
+        ValueError: for an unknown family, with the most similar one.
     """
     from tracks.families import JUDGED, check_family
 
@@ -54,5 +54,5 @@ def parse_tracks(text: str) -> list[str]:
 
 
 def is_track_file(name: str) -> bool:
-    """Say whether `name` means a track file and not a family."""
+    """Return whether `name` is a track file and not a family."""
     return name.endswith(".toml")

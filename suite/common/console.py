@@ -1,4 +1,4 @@
-"""What a command says to a person: lines on standard output, progress on standard error."""
+"""A command's text output: results on standard output, progress on standard error."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ if TYPE_CHECKING:
     from rich.segment import Segment
 
 PLAIN_PERIOD_S = 10.0
-"""Where standard error is no terminal, progress is a plain line this often [s]."""
+"""Time between the plain progress lines if standard error is no terminal [s]."""
 
 
 class Update(Protocol):
-    """The function to call as work goes on."""
+    """The function that work calls to report its progress."""
 
     def __call__(self, done: float, note: str = "") -> None:
-        """Show that `done` of the total is done, with a few words."""
+        """Show that `done` of the total is finished, with a short note."""
         ...
 
 
 class Console:
-    """People's output of one command."""
+    """The text output of one command."""
 
     def say(self, text: str = "") -> None:
         """Print a line of the command's result (on standard error under --json)."""
         print(printable(text), flush=True)
 
     def show(self, table: RenderableType) -> None:
-        """Print a rich table; as wide as it needs where standard output is no terminal."""
+        """Print a rich table; its width is not limited if standard output is no terminal."""
         from rich.console import Console as RichConsole
 
         wide = None if sys.stdout.isatty() else 200
         RichConsole(file=sys.stdout, width=wide).print(_Printable(table))
 
     def note(self, text: str) -> None:
-        """Print a line about the work itself, on standard error."""
+        """Print a line about the progress, on standard error."""
         print(printable(text), file=sys.stderr, flush=True)
 
     @contextmanager
@@ -54,13 +54,13 @@ class Console:
         clock: Callable[[], float] = time.monotonic,
         begun: float = 0.0,
     ) -> Iterator[Update]:
-        """Show how far a long piece of work is; yields the function to call as it goes.
+        """Show the progress of a long piece of work; yields the function that reports it.
 
         Args:
-            label: what is being done, a few words.
-            total: the `done` at which it is finished, in any unit.
+            label: a short description of the work.
+            total: the `done` at its end, in any unit.
             clock: seconds, increasing.
-            begun: the `done` at which it starts: what was there before took no time here.
+            begun: the `done` at its beginning, which does not count for the remaining time.
         """
         if sys.stderr.isatty():
             with _bar(label, total, begun) as update:
@@ -82,7 +82,7 @@ class Console:
 
 
 class _Printable:
-    """A table whose texts are as they may be printed; rich's own control codes stay."""
+    """A table without unprintable characters; rich's own control codes are kept."""
 
     def __init__(self, table: RenderableType) -> None:
         self._table = table
@@ -93,7 +93,7 @@ class _Printable:
 
 
 class Quiet(Console):
-    """Leaves the lines of a result out and keeps progress: who called has lines of its own."""
+    """Prints progress only: the caller prints the results itself."""
 
     def say(self, text: str = "") -> None:
         """Print nothing."""
@@ -126,7 +126,7 @@ def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
 
 @contextmanager
 def stdout_kept_clean() -> Iterator[None]:
-    """Send all that is printed meanwhile to standard error, native libraries' lines included."""
+    """Send all output to standard error meanwhile, including that of native libraries."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
@@ -140,7 +140,7 @@ def stdout_kept_clean() -> Iterator[None]:
 
 
 def duration(seconds: float) -> str:
-    """Return `seconds` for people: "0.4 s", "12 s", "3 min 20 s", "2 h 05 min"."""
+    """Return `seconds` as text: "0.4 s", "12 s", "3 min 20 s", "2 h 05 min"."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
@@ -152,7 +152,7 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Return a number of bytes for people: "812 kB", "2.1 GB"."""
+    """Return a number of bytes as text: "812 kB", "2.1 GB"."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

@@ -1,4 +1,4 @@
-"""The curve of a run: one JSON object a line, cut back to the checkpoint when a run resumes."""
+"""The curve of a run: one JSON object a line, truncated at the checkpoint when a run resumes."""
 
 from __future__ import annotations
 
@@ -6,18 +6,42 @@ import importlib
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tracks.common.files import naming, to_json, write_text
 
 CURVE = "metrics.jsonl"
 """A row a gradient step."""
 WATCHED = "validation.jsonl"
-"""A row each time that the policy was measured; `iteration` is of the gradient steps done."""
+"""A row per measurement of the policy; `iteration` is the number of gradient steps before it."""
 
+
+class Metric(NamedTuple):
+    """A number of a training, as tables and charts show it."""
+
+    title: str
+    scale: float
+    digits: int
+
+    @property
+    def heading(self) -> str:
+        """The title over a chart."""
+        return self.title if self.title.startswith("v_max") else self.title.capitalize()
+
+
+METRICS = {
+    "reward": Metric("reward", 1, 0),
+    "success_cross": Metric("success cross [%]", 100, 0),
+    "collision_free": Metric("collision-free rate [%]", 100, 0),
+    "v_max": Metric("v_max [m/s]", 1, 1),
+    "gates": Metric("gates", 1, 2),
+    "collided": Metric("collided [%]", 100, 0),
+    "speed": Metric("mean speed [m/s]", 1, 1),
+}
+"""Numbers of a training's curve and of the measurements of its policy, by their key."""
 
 Mirror = Callable[[list[dict[str, Any]]], None]
-"""Takes rows of the curve as they are written, to show them elsewhere."""
+"""A function that receives the rows of the curve as they are written."""
 
 
 def append(folder: Path, rows: list[dict[str, Any]], name: str = CURVE) -> None:
@@ -27,9 +51,9 @@ def append(folder: Path, rows: list[dict[str, Any]], name: str = CURVE) -> None:
 
 
 def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
-    """Return the whole rows of the curve, each iteration once.
+    """Return the complete rows of the curve, each iteration once.
 
-    A last line cut short by a kill is left out, as are rows that an interrupted save wrote twice.
+    A truncated last line and rows that an interrupted save wrote twice are left out.
     """
     path = folder / name
     if not path.exists():
@@ -46,7 +70,7 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
 
 
 def cut(folder: Path, iteration: int, name: str = CURVE) -> None:
-    """Drop the rows from `iteration` on: they are computed again."""
+    """Remove the rows from `iteration` on, which are computed again."""
     if not (folder / name).exists():
         return
     kept = [row for row in read(folder, name) if row["iteration"] < iteration]
@@ -54,12 +78,12 @@ def cut(folder: Path, iteration: int, name: str = CURVE) -> None:
 
 
 def tensorboard(folder: Path) -> Mirror:
-    """Return what writes rows of a curve for TensorBoard, into `folder`/tensorboard.
+    """Return a function that writes rows of a curve for TensorBoard, into `folder`/tensorboard.
 
-    A resumed run writes on; steps that it computes again replace those of before.
+    A resumed run continues; steps that it computes again replace the earlier ones.
 
     Raises:
-        ValueError: where the optional package is missing.
+        ValueError: if the optional package is missing.
     """
     try:
         package = importlib.import_module("tensorboardX")

@@ -1,7 +1,7 @@
-"""Exit codes, and what is printed when a command does not end well.
+"""Exit codes, and the messages of failed commands.
 
-A mistake of the user gets one message and no traceback. What nobody foresaw keeps its traceback,
-for it is a bug and we want to see it.
+A user's mistake gives one message and no traceback. An unexpected error is a bug and keeps its
+traceback.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ FAILED = 1
 UNUSABLE = 2
 """The input cannot be used: a wrong name, value or file."""
 INTERRUPTED = 130
-"""Ctrl-C, or asked to end."""
+"""Ctrl-C, or a signal to end."""
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _UNUSABLE = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
 _OURS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, errno.ECHILD)
-"""What the system says of a mistake in the program, not of the machine that it runs on."""
+"""Errors of the operating system that are caused by a mistake in the program."""
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
 _NUL = "embedded null"
-"""In what Python says of such a name."""
+"""Part of Python's message about a name with a NUL character."""
 _NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
-"""At the start of what JAX says where JAX_PLATFORMS names what is not there."""
+"""Beginnings of JAX's message if JAX_PLATFORMS names a missing backend."""
 
 
 _NO_SETTING = "invalid value for environment variable"
-"""At the start of what MuJoCo says of MUJOCO_GL."""
+"""Beginning of MuJoCo's message about MUJOCO_GL."""
 
 
 class WorkFailed(RuntimeError):
-    """The input was fine and the work could not be done; the message says what to do next."""
+    """Work on valid input failed; the message has the next step."""
 
 
 def explain(error: BaseException) -> tuple[int, str] | None:
     """Return (exit code, message) for an error that needs no traceback, None for a bug.
 
-    A `ValueError` counts as a message to the user only where our own code raised it on purpose
-    (or its class is ours): one that numpy or a cast threw is a bug.
+    A `ValueError` counts as a message to the user only if the suite raised it with a `raise`
+    statement, or its class is the suite's: one from numpy or a conversion is a bug.
     """
     from tracks.common.work import WorkerDied
 
@@ -101,13 +101,13 @@ def _raised_on_purpose(error: ValueError) -> bool:
         last = last.tb_next
     if last is None or not last.tb_frame.f_code.co_filename.startswith(_ROOMS):
         return False
-    # A C function that fails has no frame of its own: only a raise statement is on purpose.
+    # A failing C function has no frame of its own: only a raise statement is on purpose.
     opcode = last.tb_frame.f_code.co_code[last.tb_lasti]
     return dis.opname[opcode] == "RAISE_VARARGS"
 
 
 def _remote_raise(text: str) -> bool:
-    """Say whether a worker process's traceback (as text) ends at a raise in one of our rooms."""
+    """Return whether a worker process's traceback (text) ends at a raise statement of the suite."""
     lines = text.splitlines()
     frames = [i for i, line in enumerate(lines) if line.startswith('  File "')]
     if not frames:

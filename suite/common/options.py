@@ -1,7 +1,7 @@
-"""A command's options and a training's settings: the leaves of a configuration, and their texts.
+"""A command's options and a training's settings: the fields of a configuration, and their texts.
 
-Rare options are annotated `Advanced[...]` and stand at the end of the help. A nested dataclass
-only groups options in the code: its fields are options of the command like all others.
+Rare options are annotated `Advanced[...]` and are at the end of the help. A nested dataclass only
+groups options in the code: its fields are options of the command like all others.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ GROUP = "advanced"
 Advanced = Annotated[T, GROUP]
 """A rare option."""
 VALUES = {str: "STR", int: "INT", float: "FLOAT", Path: "PATH"}
-"""Type -> what help calls a value of it."""
+"""Type -> placeholder of a value in the help."""
 NUMBERS = {int: "a whole number", float: "a number"}
-"""Types of numbers and what they are called."""
+"""Types of numbers and their names in messages."""
 SILENT = ("", "''", "None", "False")
-"""Defaults that help does not print: its text says what happens without the option."""
+"""Defaults that are not printed: the option's text describes the behaviour without it."""
 
 
 class Option(NamedTuple):
     """One option of a command."""
 
     field: str
-    """The name of its field in the configuration."""
+    """Name of its field in the configuration."""
     kind: Any
-    """The type of the field, with annotations."""
+    """Type of the field, with annotations."""
     default: Any
-    """Its default; `dataclasses.MISSING` where it is required."""
+    """Its default; `dataclasses.MISSING` if it is required."""
     about: str
-    """What it means."""
+    """Its description."""
     advanced: bool
     """Whether it is rare."""
 
@@ -58,7 +58,7 @@ class Option(NamedTuple):
 
     @property
     def repeated(self) -> bool:
-        """Return whether it is given again for each value."""
+        """Return whether it is repeated for each value."""
         return tyro.conf.UseAppendAction in self.notes
 
     @property
@@ -77,7 +77,7 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
-        """Return how it is given, such as --track; what has no name is a word in capitals."""
+        """Return the option as it is written, such as --track; a positional one is in capitals."""
         if self.positional:
             return self.field.upper()
         named = next((note.name for note in self.notes if getattr(note, "name", None)), self.field)
@@ -110,17 +110,17 @@ def options(command: type, default: Any = None, advanced: bool = False) -> Itera
 def read_options(
     kind: Any, prog: str, about: str, args: Sequence[str], all_known: bool = False
 ) -> tuple[Any, list[str]]:
-    """Return the configuration that `args` give, and the words that belong to no option.
+    """Return the configuration from `args`, and the words that belong to no option.
 
     Args:
         kind: the type of the configuration.
-        prog: what help calls the program.
-        about: the head of its help.
-        args: the words behind it.
-        all_known: end with a list of similar options where a word belongs to none.
+        prog: name of the program in the help.
+        about: beginning of the help.
+        args: the words of the command line.
+        all_known: exit with a list of similar options if a word belongs to none.
 
     Raises:
-        SystemExit: after --help (code 0), and for options that cannot be read (code 2).
+        SystemExit: after --help (code 0), and for invalid options (code 2).
     """
     registry = tyro.constructors.ConstructorRegistry()
     registry.struct_rule(_read)
@@ -141,7 +141,7 @@ def _within(value: Any) -> bool:
 def _read(
     info: tyro.constructors.StructTypeInfo,
 ) -> tyro.constructors.StructConstructorSpec | None:
-    """Return a configuration as tyro reads it, with the rare options in a group of their own."""
+    """Return the specification of a configuration for tyro, with rare options in a group."""
     command: Any = info.type
     if not hasattr(command, "__dataclass_fields__") or command.__name__ == GROUP:
         return None
@@ -166,7 +166,7 @@ def _read(
 def _number(
     info: tyro.constructors.PrimitiveTypeInfo,
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """Return how a number, or one that may be left out, is read; others are refused plainly."""
+    """Return the specification of a number for tyro, with a plain message for other words."""
     kinds = {_bare(kind) for kind in get_args(info.type) or (info.type,)} - {type(None)}
     kind: Any = kinds.pop() if len(kinds) == 1 else None
     if kind not in NUMBERS or get_origin(info.type) is tuple:
@@ -197,7 +197,7 @@ def _built(command: Any, values: dict[str, Any]) -> Any:
 
 
 def _field(option: Option) -> tyro.constructors.StructFieldSpec:
-    """Return an option as tyro reads it, with what help calls its values and its default."""
+    """Return the specification of an option for tyro, with its placeholder and default."""
     required, metavar = option.default is dataclasses.MISSING, None
     part = get_args(option.bare)[:1]
     many = part and get_origin(option.bare) is tuple and get_args(option.bare)[-1] is Ellipsis
@@ -216,16 +216,16 @@ def _field(option: Option) -> tyro.constructors.StructFieldSpec:
 
 
 class Setting(NamedTuple):
-    """One setting."""
+    """One setting of a training."""
 
     path: str
-    """As `--set` takes it, such as loss.progress."""
+    """The setting in `--set`, such as loss.progress."""
     default: Any
-    """Its value in the configuration at hand."""
+    """Its value in this configuration."""
     allowed: str
-    """Its range; "" where its type alone limits it."""
+    """Its range; "" if only its type limits it."""
     about: str
-    """What it means, with its unit."""
+    """Its description, with its unit."""
 
 
 def settings(config: Any) -> Iterator[Setting]:
@@ -246,7 +246,7 @@ def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Set
 
 @functools.cache
 def texts_of(cls: type) -> dict[str, str]:
-    """Return the text under each field of a dataclass, which Python itself does not keep."""
+    """Return the text below each field of a dataclass, read from the source."""
     found = dict[str, str]()
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
@@ -258,7 +258,7 @@ def _own_texts(cls: type) -> dict[str, str]:
     try:
         source = inspect.getsource(cls)
     except OSError:
-        return {}  # a class that was made while the program runs
+        return {}  # a class without source, made at run time
     (body,) = ast.parse(textwrap.dedent(source)).body
     assert isinstance(body, ast.ClassDef)
     found = {}

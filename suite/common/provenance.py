@@ -1,4 +1,4 @@
-"""What a run was made of: versions, machine, command and resolved configuration."""
+"""Records of a run: versions, machine, command and resolved configuration."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ PACKAGES = (
     *("dm-control", "gymnasium", "trimesh", "torch", "rotorpy", "onnx", "onnxruntime"),
     *("pyarrow", "rerun-sdk"),
 )
-"""The packages that can change a result."""
+"""Packages that can change a result."""
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the installed version of each of `PACKAGES`, None where it is missing."""
+    """Return the installed version of each of `PACKAGES`; None if it is missing."""
     versions: dict[str, str | None] = {}
     for name in PACKAGES:
         try:
@@ -54,11 +54,11 @@ def _processor() -> str:
 
 
 def run_record(config: Any, seed: int | None) -> dict[str, Any]:
-    """Return all that is needed to repeat a run: the stamp, versions, machine and `config`.
+    """Return everything that is needed to repeat a run: stamp, versions, machine and `config`.
 
     Args:
         config: the resolved configuration, a dataclass.
-        seed: the run's seed, None where it has none.
+        seed: of the run; None for none.
     """
     return {
         **stamp(schema=1, seed=seed),
@@ -76,10 +76,10 @@ def _kind_of(config: Any) -> str:
 
 
 def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
-    """Refuse a folder that holds a run of another kind, whose record would be written over.
+    """Refuse a folder with a run of another kind, whose record would be overwritten.
 
     Raises:
-        ValueError: naming the folder and what made it.
+        ValueError: with the folder and the command that made it.
     """
     path = Path(folder) / "run.json"
     try:
@@ -90,7 +90,7 @@ def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
     if kind != _kind_of(config):
         raise ValueError(
             f"{folder} holds a run of another kind (made by {command}), whose run.json would be "
-            "written over; give another --out"
+            "overwritten; give another --out"
         )
 
 
@@ -101,10 +101,10 @@ def write_run_record(
 
     Args:
         folder: of the run.
-        config: as `run_record` takes it.
-        seed: likewise.
-        goes_on: the run that the folder's record is of goes on; that record's commits are kept as
-            `earlier_commits`, since all of them made the run.
+        config: the resolved configuration, a dataclass.
+        seed: of the run; None for none.
+        goes_on: whether the folder's run continues; the commits of its record are then kept as
+            `earlier_commits`, since they made a part of the run.
     """
     path, record = Path(folder) / "run.json", run_record(config, seed)
     commits: set[str] = set()

@@ -23,7 +23,7 @@ class Picture:
     png: bytes
     """The file's bytes."""
     caption: str
-    """Below it, where there is one; also what is read out in its place."""
+    """Text below it, and its alternative text; may be empty."""
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,22 @@ class Links:
     """Files next to the report."""
 
     entries: Sequence[tuple[str, str]]
-    """Path relative to the report's folder, and what is there."""
+    """Path relative to the report's folder, and a description."""
 
 
 @dataclass(frozen=True)
 class Details:
-    """Long text, folded away."""
+    """Long text that is folded."""
 
     summary: str
-    """What is shown before it is opened."""
+    """Shown while it is folded."""
     text: str
-    """Shown as it is."""
+    """Shown unchanged when it is unfolded."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """What to do, in order."""
+    """A numbered list."""
 
     texts: Sequence[str]
 
@@ -62,23 +62,23 @@ class Section:
     title: str
     """The heading."""
     parts: Sequence[Part]
-    """One below the other."""
+    """From top to bottom."""
     folded: bool = False
-    """Whether only the heading is shown until it is opened."""
+    """Whether only the heading is shown at first."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a report says."""
+    """A report."""
 
     title: str
     """The heading."""
     lead: str
-    """What came out, in a sentence or two."""
+    """The result in one or two sentences."""
     facts: Mapping[str, str]
-    """Name and value of what was done, in a line below the lead."""
+    """Conditions by name, below the lead."""
     sections: Sequence[Section]
-    """The rest."""
+    """All other content."""
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> Path:

@@ -1,6 +1,6 @@
-"""Stages in folders of their own: done once, found again, refused for another configuration.
+"""Stages of a run, each in its own folder: done once, then reused with the same configuration.
 
-Before a stage starts it is said how long it will take and how much memory it needs.
+Time and memory of the work are estimated and printed before it starts.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from tracks.common.files import plain, write_json
 from tracks.input.reading import read_json
 
 MARK = "stage.json"
-"""Name of the file that says that a stage's folder is finished; written last."""
+"""Name of the file that marks a finished stage; written last."""
 
 
 def claim(out: Path, config: Any, seed: int) -> None:
-    """Make `out` the folder of a run of `config`, or find that it is.
+    """Make `out` the folder of a run of `config`, or check that it is.
 
     Raises:
-        ValueError: where `out` holds a run of another configuration, saying what differs.
+        ValueError: if `out` has a run of another configuration, with the differences.
     """
     path = out / "run.json"
     if not path.is_file():
@@ -44,7 +44,7 @@ def claim(out: Path, config: Any, seed: int) -> None:
 
 
 def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
-    """Return what differs between two plain values, as "name is X there, Y here"."""
+    """Return the differences of two plain values, as "name is X there, Y here"."""
     if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
         found = []
         for key in dict.fromkeys([*ours, *theirs]):
@@ -55,7 +55,7 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
 
 
 def first_of(changes: Sequence[str]) -> str:
-    """Return the first four changes, and how many more there are, for a message."""
+    """Return the first four changes and the number of further ones, for a message."""
     more = f"; and {len(changes) - 4} more" if changes[4:] else ""
     return "; ".join(changes[:4]) + more
 
@@ -65,28 +65,28 @@ class Stage:
     """One stage of a run."""
 
     name: str
-    """Of its folder below the run's."""
+    """Name of its folder in the run's folder."""
     words: str
-    """What it does, for people."""
+    """Description for the console."""
     needs: Estimate
     """Time and memory."""
     work: Callable[[Path], Any]
-    """Called with the folder; it must continue an interrupted earlier call."""
+    """Called with the folder; must continue an interrupted earlier call."""
     tell: Callable[[Path], None] = lambda folder: None
-    """Called with the folder of the finished stage, also of one found again, to say what came."""
+    """Called with the folder of every finished stage, to print its result."""
 
 
 def do_stages(out: Path, stages: Sequence[Stage], console: Console, what: str) -> dict[str, float]:
-    """Do the stages that are not finished, each in its folder, one after the other.
+    """Do the unfinished stages one after the other, each in its folder.
 
     Args:
         out: the run's folder.
         stages: all of the run's, in order.
-        console: shows what is done, after about how long all that is left will take.
-        what: the run is, in a few words.
+        console: shows the estimate of the remaining work, and each stage.
+        what: short description of the run.
 
     Returns:
-        How long each stage took when it was done, by its name [s].
+        The time that each stage took, by its name [s].
     """
     left = [stage.needs for stage in stages if not is_done(out / stage.name)]
     seconds = sum(need.seconds for need in left)
@@ -100,12 +100,12 @@ def do_stages(out: Path, stages: Sequence[Stage], console: Console, what: str) -
 
 
 def is_done(folder: Path) -> bool:
-    """Say whether the stage in `folder` is finished already."""
+    """Return whether the stage in `folder` is finished."""
     return (folder / MARK).is_file()
 
 
 def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
-    """Do a stage unless it is finished, and return how long it took [s]."""
+    """Do a stage unless it is finished, and return the time that it took [s]."""
     if is_done(folder):
         console.note(f"{number} {stage.words}: done before, in {folder}")
         try:
@@ -119,7 +119,7 @@ def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
     started = time.monotonic()
     stage.work(folder)
     seconds = time.monotonic() - started
-    # Written last: what it vouches for is on the disk.
+    # Written last, when all other files are on the disk.
     write_json(folder / MARK, {"stage": stage.words, "seconds": seconds})
     console.note(f"{number} took {duration(seconds)}")
     return seconds
@@ -127,7 +127,7 @@ def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a piece of work will need; a guess within a factor of about two."""
+    """Time and memory of a piece of work, within a factor of about two."""
 
     seconds: float
     """Time [s]."""
@@ -136,7 +136,7 @@ class Estimate:
 
 
 def available_memory_bytes() -> int:
-    """Return how much memory can be had without swapping [bytes]; all of it where unknown."""
+    """Return the memory that is available without swapping, or all memory if unknown [bytes]."""
     try:
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         return 1024 * int(text.split("MemAvailable:")[1].split()[0])
@@ -145,7 +145,7 @@ def available_memory_bytes() -> int:
 
 
 def announce(console: Console, what: str, estimate: Estimate) -> None:
-    """Say `estimate` of `what`, and warn where the memory is not there."""
+    """Print the estimate of `what`, and a warning if it exceeds the free memory."""
     free = available_memory_bytes()
     need = size(estimate.memory_bytes)
     console.note(f"{what}: about {duration(estimate.seconds)} and {need} of memory")

@@ -1,7 +1,7 @@
-"""What a command finds when it starts: streams, environment variables and names, made usable.
+"""The start of a command: standard streams, environment variables and names are checked and set.
 
-One place, before anything slow is imported: JAX reads its settings when it is imported, and a file
-that takes the number of a closed stream would get what is printed.
+This happens before anything slow is imported: JAX reads its settings at import, and a file that
+gets the number of a closed stream would receive the printed text.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ KEPT = (
     *("JAX_PLATFORM", "JAX_CUDA_", "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_"),
     *("JAX_TRACEBACK_", "JAX_LOGGING_LEVEL"),
 )
-"""Beginnings of the variables of JAX that say where work runs, what is kept, and what is logged."""
+"""Prefixes of JAX's variables on devices, caches and logging, which are kept."""
 SWITCHES = (
     *("JAX_DISABLE_JIT", "JAX_DEBUG_NANS", "JAX_DEBUG_INFS", "JAX_LOG_COMPILES"),
     *("JAX_EXPLAIN_CACHE_MISSES", "JAX_ENABLE_COMPILATION_CACHE", "JAX_CHECK_TRACER_LEAKS"),
     "JAX_DISABLE_MOST_OPTIMIZATIONS",
 )
-"""Those for people who look for a mistake; 0 or 1."""
+"""JAX's variables for debugging; 0 or 1."""
 PRECISE = ("JAX_DEFAULT_MATMUL_PRECISION", "highest")
 """Unrounded float32: accelerators multiply with fewer bits by default, too few for a rotation."""
 UNKEPT = tuple(f"Error {what} persistent compilation cache" for what in ("reading", "writing"))
-"""Beginnings of what JAX says where it cannot keep a program: it compiles that anew."""
+"""Beginnings of JAX's warnings if its cache of compiled programs cannot be used."""
 
 
 class _Unfailing(io.FileIO):
-    """Standard error on a full disk or without a reader: a line is lost, and no work with it."""
+    """Standard error that ignores a full disk or a missing reader, so that work continues."""
 
     def write(self, data: Any) -> int:
         with contextlib.suppress(OSError):
@@ -58,16 +58,16 @@ class _Named(io.FileIO):
 
 
 def open_streams() -> None:
-    """Give a process without standard input, output or error the null device in its place.
+    """Replace missing standard streams by the null device.
 
-    What cannot be printed in the terminal's encoding is printed as an escape; what cannot be
-    written to standard error is lost.
+    Characters outside the terminal's encoding are printed as escapes; text that cannot be written
+    to standard error is lost.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
     sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)
     sys.stdout = _text(_Named(1, "w", closefd=False), sys.stdout)
     sys.stderr = _text(_Unfailing(2, "w", closefd=False), sys.stderr)
@@ -82,9 +82,9 @@ def _text(raw: io.FileIO, old: TextIO | None) -> TextIO:
 
 
 def hush() -> None:
-    """Leave warnings out that are not for people, here and in processes of ours.
+    """Suppress warnings without use for the user, here and in worker processes.
 
-    They are numpy's, as errors have lines of their own, and JAX's of a cache that is full or cut.
+    They are numpy's runtime warnings, and JAX's about its cache of compiled programs.
     """
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -118,13 +118,13 @@ def check_names(args: Iterable[str]) -> None:
 
 
 def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
-    """Set aside variables of JAX that might change what is computed or end the command, in place.
+    """Remove variables of JAX that could change results or end the command, in place.
 
-    JAX has a hundred of them, so those are listed that do not. Products of matrices are computed
-    in full precision.
+    JAX has about a hundred variables, so the harmless ones are listed here. Products of matrices
+    are computed in full precision.
 
     Returns:
-        Their names.
+        The names of the removed variables.
     """
     values = os.environ if environment is None else environment
     known = ("0", "1", "true", "false")
@@ -142,32 +142,32 @@ def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
 
 
 def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
-    """Have JAX keep compiled programs in the user's cache, where nothing else was asked for.
+    """Let JAX keep compiled programs in the user's cache, unless another folder is set.
 
-    XLA takes 15 s over the model of a diagnosis and longer over a trainer; a second call of the
-    same command reads what the first one compiled.
+    XLA compiles the model of a diagnosis for 15 s and a trainer for longer; a second call of the
+    same command reads the compiled programs.
 
     Args:
-        environment: changed in place; that of this process if not given. A
-            JAX_COMPILATION_CACHE_DIR that is there, also an empty one, is left as it is.
+        environment: changed in place; by default that of this process. An existing
+            JAX_COMPILATION_CACHE_DIR, also an empty one, is not changed.
     """
     values = os.environ if environment is None else environment
     if "JAX_COMPILATION_CACHE_DIR" not in values:
-        # A home that machines share must not hand one's instructions to another.
+        # Machines with a common home folder must not share machine code.
         folder = user_cache(values) / "jax" / (platform.node() or "here")
         values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     if values["JAX_COMPILATION_CACHE_DIR"]:
         drop_cut_entries(Path(values["JAX_COMPILATION_CACHE_DIR"]))
-    # XLA complains of its own tuning hints, which are no processor feature, at every program that
-    # it loads; what goes wrong in earnest is raised as an exception.
+    # XLA warns about its own tuning hints at every program that it loads; real errors are raised
+    # as exceptions.
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def use_device(device: str | None) -> None:
-    """Have JAX compute on the CPU ("cpu") or on a GPU ("gpu"); None: a GPU where it finds one.
+    """Let JAX compute on the CPU ("cpu") or on a GPU ("gpu"); None: on a GPU if it finds one.
 
     Raises:
-        ValueError: where JAX cannot use a GPU.
+        ValueError: if JAX cannot use a GPU.
     """
     if device is None:
         return
@@ -176,7 +176,7 @@ def use_device(device: str | None) -> None:
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else device)
     try:
         jax.devices()
-    except (RuntimeError, AssertionError):  # which one depends on whether a driver is there
+    except (RuntimeError, AssertionError):  # which one depends on the driver
         raise ValueError(
             f"--device {device}: JAX finds none; leave --device out, or install JAX for your GPU: "
             "pip install 'jax[cuda12]'"
@@ -184,7 +184,7 @@ def use_device(device: str | None) -> None:
 
 
 def drop_cut_entries(folder: Path) -> None:
-    """Remove compiled programs of which a kill left no more than the name: JAX keeps such a one."""
+    """Remove empty files of compiled programs, which a kill leaves and JAX does not replace."""
     for entry in folder.glob("*-cache"):
         with contextlib.suppress(OSError):
             if not entry.stat().st_size:

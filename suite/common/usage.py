@@ -1,4 +1,4 @@
-"""What `suite --help` prints: the commands in groups, examples of each, former options."""
+"""The text of `suite --help`: commands in groups, examples; and lists and old options in `args`."""
 
 from __future__ import annotations
 

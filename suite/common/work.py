@@ -1,4 +1,4 @@
-"""Long pieces of work side by side: what `--workers` means, and folders that are their product."""
+"""Long pieces of work in parallel: the option `--workers`, and jobs whose product is a folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WorkersOption = Advanced[
 
 
 class Silent(Quiet):
-    """Says nothing: several at once would write into each other's lines."""
+    """Prints nothing: lines of parallel jobs would mix."""
 
     def note(self, text: str) -> None:
         """Print nothing."""
@@ -43,15 +43,15 @@ class Silent(Quiet):
 
 
 def workers_given(text: str | None, whole_cores: bool = False) -> Workers | None:
-    """Return what `--workers` says, None where it was not given.
+    """Return the workers of the option `--workers`; None if it was not given.
 
     Args:
         text: the option.
-        whole_cores: refuse more processes of this machine than it has cores, as work that takes
-            all of its share would only wait for another's.
+        whole_cores: refuse more processes than this machine has cores, for work that keeps its
+            cores busy.
 
     Raises:
-        ValueError: naming the option and what is allowed.
+        ValueError: with the option and what is allowed.
     """
     workers, cores = read_workers(text), usable_cores()
     if whole_cores and isinstance(workers, int) and workers > cores:
@@ -69,22 +69,23 @@ def all_done(
     console: Console,
     what: str,
 ) -> list[Result]:
-    """Return do(job, console) of every job, in order, with its folder as `do` leaves it.
+    """Return do(job, console) of every job in order; the jobs' folders are as `do` leaves them.
 
     Args:
-        do: a function at the top of a module, or a `functools.partial` of one. It keeps what it
-            has finished in the job's folder, so that an interrupted call can be made again. What
-            it returns names no path.
-        jobs: what to do.
-        workers: who; None or 1 is this process, on all cores. Several of this machine are pinned to
-            as many cores each, and none to another's; a cluster's get folders by content.
-        console: shows how many are done; `do` gets it in this process, and a silent one elsewhere.
-        what: the jobs are, in a few words.
+        do: a function at the top of a module, or a `functools.partial` of one. It saves finished
+            work in the job's folder, so that the call can be repeated after an interrupt. Its
+            result must contain no path.
+        jobs: the work.
+        workers: None or 1 is this process, on all cores. Several processes of this machine are
+            pinned to separate cores; those of a cluster get folders as content.
+        console: shows the number of finished jobs; `do` gets it in this process, and a silent one
+            in others.
+        what: short description of the jobs.
 
     Raises:
-        WorkFailed: where a process dies, and another one at the same job.
-        ValueError: where there is no cluster that can work for us.
-        Exception: what `do` raises.
+        WorkFailed: if a process dies twice at the same job.
+        ValueError: if the cluster cannot be used.
+        Exception: from `do`.
     """
     if workers is None or workers == 1:
         return [do(job, console) for job in jobs]

@@ -1,8 +1,8 @@
 """The Delta Action Model fitted by gradients through the point mass, and its rivals.
 
-Held-out flights take no part in any fit. Beside the model stand the point mass as the trainer has
-it, and one whose lag, drag and delay were fitted to the same flights: the correction has to beat
-plain system identification to be worth its network.
+Held-out flights take no part in any fit. The model is compared with the trainer's point mass, and
+with one whose lag, drag and delay are fitted to the same flights: a network is only useful if it is
+better than plain system identification.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from suite.train.config import PointMassConfig
 from tracks.input.ranges import Iterations, Range, Seed
 
 IDENTIFY_RATE = 3e-2
-"""Least learning rate of lag, drag and delay: they have further to go than a network's weights."""
+"""Least learning rate of lag, drag and delay, which change more than a network's weights."""
 WATCHED = 512
-"""About as many fitted windows, evenly chosen, make the curve's fit error."""
+"""Approximate number of fitted windows, evenly selected, for the curve's fit error."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """The fit."""
+    """Settings of the fit."""
 
     horizon_s: Annotated[float, Range(0.01, 60.0)] = 1.0
     """Length of a replayed window [s]."""
@@ -46,14 +46,14 @@ class FitConfig:
     batch: Annotated[int, Range(1, 10**6)] = 256
     """Windows per gradient step."""
     rate: Annotated[float, Range(0.0, 10.0)] = 5e-3
-    """Peak learning rate; it falls to zero as a cosine."""
+    """Peak learning rate, with cosine decay to zero."""
     velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
     """Weight of the velocity's error next to the position's [s]."""
     blank_share: Annotated[float, Range(0.0, 1.0)] = 0.5
-    """Share of a batch's windows that the network starts without a memory of what came before, as
-    it does in worlds of the trainer that start on the way."""
+    """Share of a batch's windows in which the network starts without memory, as in worlds of the
+    trainer that start between two gates."""
     size_weight: Annotated[float, Range(0.0, 1e6)] = 1e-3
-    """Weight of the correction's size, so that it is no larger than it must be [s^2]."""
+    """Weight of the correction's size, which keeps it small [s^2]."""
     seed: Seed = 0
     """Seed of the network, the split and the batches."""
 
@@ -69,10 +69,10 @@ class ReplayErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class DeltaFit:
-    """A fitted network and what it brings on held-out flights."""
+    """A fitted network and its errors on held-out flights."""
 
     params: dict[str, np.ndarray]
-    """Of the Delta Action network."""
+    """Parameters of the Delta Action network."""
     without: ReplayErrors
     """Held-out errors of the dynamics alone."""
     with_delta: ReplayErrors
@@ -169,14 +169,14 @@ def fit_network(
     held_out: Any,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> DeltaFit:
-    """Fit a network by gradients through `replay` on `known` and judge it on `held_out`.
+    """Fit a network by gradients through `replay` to `known` and evaluate it on `held_out`.
 
     Args:
         config: the fit.
-        replay: flies windows again; differentiable.
+        replay: simulates windows; differentiable.
         known: windows of the flights that are fitted.
-        held_out: windows of flights that take no part.
-        show: called with (iteration, words) as it goes.
+        held_out: windows of held-out flights.
+        show: called with (iteration, text) during the fit.
     """
     errors = jax.jit(partial(window_errors, replay))
     stride = -(-len(known.pos_w) // WATCHED)
@@ -199,7 +199,7 @@ def fit_network(
     start = delta_network.init(jax.random.key(config.seed))
 
     def loss(params: delta_network.Params, batch: Any) -> jax.Array:
-        # Batches are drawn in no order: their first windows are any.
+        # Batches are in random order, so the first windows are a random selection.
         burn_in = forgotten(batch.burn_in, config.blank_share)
         return _loss(config, replay, batch._replace(burn_in=burn_in), params)
 
@@ -223,14 +223,14 @@ def fit(
     held_out: PointMassWindows,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> PointMassFit:
-    """Fit the Delta Action Model of the point mass to `known` and judge it on `held_out`.
+    """Fit the Delta Action Model of the point mass to `known` and evaluate it on `held_out`.
 
     Args:
         config: the fit.
-        physics: the trainer's point mass, whose middle is corrected.
+        physics: the trainer's point mass; the middle of its ranges is corrected.
         known: windows of the flights that are fitted.
-        held_out: windows of flights that take no part.
-        show: called with (iteration, words) as it goes.
+        held_out: windows of held-out flights.
+        show: called with (iteration, text) during the fit.
     """
     nominal = partial(replay, nominal_model(physics))
     network = fit_network(config, nominal, known, held_out, show)

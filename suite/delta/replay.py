@@ -1,6 +1,6 @@
-"""Recorded actions flown again in the point mass, corrected or not.
+"""Replay of recorded actions in the point mass, with or without corrections.
 
-A Delta Action Model's checkpoint says what it corrects, and a training is held to it.
+The checkpoint of a Delta Action Model names the dynamics that it corrects; trainings check it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PointMassModel(NamedTuple):
 
 
 def nominal_model(config: PointMassConfig) -> PointMassModel:
-    """Return the middle of the trainer's ranges."""
+    """Return the point mass at the middle of the trainer's ranges."""
     along = (config.drag, config.drag, config.drag_up)
     return PointMassModel(
         jnp.asarray(config.lag_mean),
@@ -47,13 +47,13 @@ def replay(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return pos_w, vel_w (N, T, 3) after every decision, and the corrections (N, T, 3).
 
-    The state is the simulated one throughout (Eq. delta_action_loss); only the nose direction,
-    which the point mass does not decide, follows the record.
+    The state is the simulated one in all steps (Eq. delta_action_loss); only the heading, which the
+    point mass does not determine, is the recorded one.
 
     Args:
         model: constants of the point mass.
         windows: the record, N windows of T decisions.
-        delta: parameters of the Delta Action network; None leaves the actions as they are.
+        delta: parameters of the Delta Action network; None for no correction.
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
@@ -104,13 +104,13 @@ def replay(
 
 
 POINT, QUAD = "point", "quad"
-"""The two models, as `suite train --model` calls them."""
+"""Names of the two models in `suite train --model`."""
 
 
 def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
-    """Return what a checkpoint keeps of the dynamics that were fitted.
+    """Return the description of the corrected dynamics for a checkpoint.
 
-    The point mass's are the middle of its ranges; of a vehicle file everything but its name counts.
+    It has the middle of the point mass's ranges, or the vehicle file without its name.
     """
     if isinstance(dynamics, PointMassConfig):
         return {"model": POINT, "plant": plain(nominal_model(dynamics))}
@@ -123,17 +123,17 @@ def check_corrects(
     rate_hz: float,
     where: Path,
 ) -> None:
-    """Refuse a Delta Action Model of other dynamics than those that are trained through.
+    """Refuse a Delta Action Model of other dynamics than the training's.
 
     Args:
-        fit: of the checkpoint; one that does not say what it corrects passes for a point mass, and
-            one that does not say its rate for any.
-        dynamics: what is trained through.
-        rate_hz: of the policy that is trained: the network steps once a decision.
+        fit: from the checkpoint; without a model it counts as that of a point mass, and without a
+            rate it fits any.
+        dynamics: of the training.
+        rate_hz: of the trained policy, since the network makes one step per decision.
         where: the checkpoint, for the message.
 
     Raises:
-        ValueError: where they differ.
+        ValueError: if they differ.
     """
     mine = corrected(dynamics)
     model = fit.get("model", POINT)

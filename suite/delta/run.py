@@ -1,4 +1,4 @@
-"""From flight logs to a Delta Action checkpoint with its report."""
+"""Fit the Delta Action Model to flight logs and write its checkpoint and tables."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
-"""Steps of the quadrotor and of the point mass a second that a fit makes, for the estimate."""
+"""Steps a second of the quadrotor and of the point mass in a fit, for the estimate."""
 FLOWN = {
     "point_mass": "point mass as trained in",
     "without": "quadrotor of the vehicle file",
     "fitted_point_mass": "point mass, lag, drag and delay fitted",
     "delta_action": "with Delta Action Model",
 }
-"""What flew the held-out flights again, by its key in delta.json: the corrected dynamics first, the
-Delta Action Model last."""
+"""Models that replay the held-out flights, by their keys in delta.json: the corrected dynamics
+first, the Delta Action Model last."""
 
 
 def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
-    """Return about how long a fit takes with windows of `steps`, and what memory it needs."""
+    """Return the approximate time and memory of a fit with windows of `steps`."""
     work = config.iterations * config.batch * steps
     if through_quadrotor:
         return Estimate(40 + work / PLANT_STEPS_S, 1.5e9)
@@ -41,10 +41,10 @@ def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the flight logs among `paths`, folders standing for the logs in them, each once.
+    """Return the flight logs among `paths` and in folders among them, each once.
 
     Raises:
-        ValueError: where there is none.
+        ValueError: if there is none.
     """
     files = []
     for path in paths:
@@ -62,7 +62,7 @@ def split(
     """Return (flights to fit, held-out flights), at least one of each.
 
     Raises:
-        ValueError: where there are fewer than two flights or the share is not within (0, 1).
+        ValueError: for fewer than two flights, or a share outside (0, 1).
     """
     if not 0.0 < share < 1.0:
         raise ValueError(f"held_out is {share}, allowed is more than 0 and less than 1")
@@ -78,9 +78,9 @@ def split(
 
 
 def long_enough(logs: Sequence[FlightLog], horizon_s: float) -> tuple[list[FlightLog], list[str]]:
-    """Return the flights that last for a window, and what to say of the others.
+    """Return the flights that are long enough for a window, and warnings about the others.
 
-    All come back where fewer than two do: who cuts them says what they lack.
+    If fewer than two are long enough, all are returned; cutting them then raises the error.
     """
     needed_s = horizon_s + 2.0 / decision_rate(logs)
     long = [log for log in logs if log.duration_s >= needed_s]
@@ -104,13 +104,13 @@ def fit_delta(
 
     Args:
         config: the fit.
-        dynamics: the trainer's point mass or quadrotor, which is corrected.
+        dynamics: the corrected point mass or quadrotor of the trainer.
         paths: flight logs, and folders of them.
         out: folder for delta/, delta.json and table.md.
         console: shows the progress.
 
     Raises:
-        ValueError: where the logs cannot be used.
+        ValueError: for invalid logs.
     """
     refuse_other_run(out, config)
     logs, warnings = read_flights(flight_files(paths))
@@ -161,7 +161,7 @@ def fit_delta(
 
 
 def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
-    """Return the held-out errors by what flew, as delta.json has them."""
+    """Return the held-out errors by model, for delta.json."""
     if isinstance(result, PointMassFit):
         return {
             "point_mass": result.without,
@@ -172,7 +172,7 @@ def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
 
 
 def errors_by_name(fitted: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
-    """Return the held-out errors in delta.json by what flew, in the order of `FLOWN`."""
+    """Return the held-out errors in delta.json by model, in the order of `FLOWN`."""
     return {name: fitted[key] for key, name in FLOWN.items() if key in fitted}
 
 

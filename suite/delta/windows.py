@@ -1,9 +1,8 @@
 """Recorded flights as windows at the policy's decisions, cut for replay in the point mass.
 
-In fine-tuning the network runs for seconds, so it is not fitted from a zero state alone: before
-a window it runs over what was measured since the flight's start, up to a few seconds (burn-in). Nor
-is it fitted from such states alone: most worlds of the trainer start on the way, and what was flown
-before nobody knows there.
+In fine-tuning the network runs for seconds, so it is also fitted from states with memory: before a
+window it runs over the measurements since the flight's start, up to a few seconds (burn-in). Some
+windows start without memory, like the trainer's worlds that start between two gates.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from tracks.geometry.scene import Array
 
 T = TypeVar("T")
 RATE_SHARE = 0.05
-"""So far may rates of decisions be off each other, as a share, and count as one."""
+"""Largest relative difference of decision rates that count as equal."""
 HISTORY = 2
-"""Decisions before a window whose commands may still be on their way into it."""
+"""Decisions before a window whose delayed commands may still act in it."""
 
 
 class PointMassWindows(NamedTuple):
@@ -39,7 +38,7 @@ class PointMassWindows(NamedTuple):
     rot_w: np.ndarray
     """(N, 3, 3) measured at the start, body to world."""
     heading_w: np.ndarray
-    """(N, T + 1, 3) level direction that the nose follows, unit."""
+    """(N, T + 1, 3) heading, horizontal unit vectors."""
     action_b: np.ndarray
     """(N, T, 3) the actions flown [m/s^2]."""
     commands_w: np.ndarray
@@ -47,13 +46,14 @@ class PointMassWindows(NamedTuple):
     time_step: np.ndarray
     """(N, T) time between decisions [s]."""
     burn_in: BurnIn
-    """What the network saw before each window."""
+    """Inputs of the network before each window."""
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:
-    """Return the level direction (..., 3) from which `point_mass.attitude` makes the same nose.
+    """Return the heading (..., 3) with which `point_mass.attitude` gives the same body x.
 
-    That is the one square to body y; body x laid flat points elsewhere once the body is rolled.
+    It is horizontal and perpendicular to body y; the projection of body x differs from it if the
+    body is rolled.
     """
     left, up = rot_w[..., 1], rot_w[..., 2]
     ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
@@ -63,20 +63,20 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
 
 
 def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> PointMassWindows:
-    """Return windows of `duration_s`, one starting every `stride_s` of every flight.
+    """Return windows of `duration_s`, about one per `stride_s` of every flight.
 
     A window with a missing value is left out. The acceleration at the start is the mean over the
     row's period, from the measured velocity.
 
     Raises:
-        ValueError: where a log has no actions, or no flight is as long as a window.
+        ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     parts = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
     refuse_none(parts, logs, duration_s)
     steps = min(len(part.action_b) for part in parts)
 
     def alike(part: PointMassWindows) -> PointMassWindows:
-        """Cut a window to as many decisions as all have."""
+        """Truncate a window to the number of decisions that all have."""
         return part._replace(
             pos_w=part.pos_w[: steps + 1],
             vel_w=part.vel_w[: steps + 1],
@@ -92,7 +92,7 @@ def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: f
     """Refuse flights without a window.
 
     Raises:
-        ValueError: naming some of them, and what to do.
+        ValueError: with some of them, and what to do.
     """
     if not windows:
         names = ", ".join(log.name for log in logs[:3])
@@ -105,8 +105,8 @@ def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: f
 def stacked(windows: Sequence[T]) -> T:
     """Return windows of one shape along a new first axis, as 32-bit numbers.
 
-    Their burn-ins are cut to the latest decisions, as many as all have: flights whose decisions lie
-    a little closer have more of them in the same time.
+    Their burn-ins are truncated to the number of decisions that all have, since flights with
+    slightly shorter periods have more decisions in the same time.
     """
     parts: Sequence[Any] = windows
     back = min(len(part.burn_in.seen) for part in parts)
@@ -121,7 +121,7 @@ def decisions_of(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
     """Return a log's actions (T, 3) [m/s^2] and the rows (T,) in which the policy decided.
 
     Raises:
-        ValueError: where it has none.
+        ValueError: if it has none.
     """
     if log.action_b is None or log.policy_step is None:
         raise ValueError(
@@ -134,8 +134,8 @@ def decisions_of(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
 def decision_period(time_s: np.ndarray, row_s: float) -> float:
     """Return the time between a policy's decisions [s], NaN where there are fewer than two.
 
-    It is a mean: decisions stand on a log's rows, so that at 15 Hz every 10 ms some are 60 and
-    some 70 ms apart, and none as far as they are on average. Gaps in the record are left out.
+    It is a mean, because decisions are at a log's rows: with rows every 10 ms and 15 Hz, periods
+    are 60 or 70 ms. Gaps in the record are left out.
 
     Args:
         time_s: (T,) of the rows with a decision.
@@ -148,11 +148,11 @@ def decision_period(time_s: np.ndarray, row_s: float) -> float:
 
 
 def decision_rate(logs: Sequence[FlightLog]) -> float:
-    """Return how often the policy decided in flights with its decisions, their median [Hz].
+    """Return the median rate of the policy's decisions over the flights [Hz].
 
     Raises:
-        ValueError: where they differ, as the network remembers from one decision to the next, or
-            a log has none.
+        ValueError: if the rates differ, since the network makes one step per decision, or a log has
+            no decisions.
     """
     found = []
     for log in logs:
@@ -222,7 +222,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
 
 
 BURN_IN_S = 3.0
-"""How far back the network looks before a window [s]."""
+"""Longest burn-in before a window [s]."""
 
 
 class BurnIn(NamedTuple):
@@ -231,7 +231,7 @@ class BurnIn(NamedTuple):
     inputs: Array
     """(N, W, 9) velocity in body axes [m/s], third row of R, action [m/s^2]; oldest first."""
     seen: Array
-    """(N, W) 1 where there was a decision of the flight, 0 before its start."""
+    """(N, W) 1 for a decision of the flight, 0 before its start."""
 
 
 def burn_in_before(
@@ -257,14 +257,14 @@ def burn_in_before(
 
 
 def forgotten(burn_in: BurnIn, share: float) -> BurnIn:
-    """Return burn-ins of which the first `share` (0 to 1) of the windows have seen nothing."""
+    """Return burn-ins without inputs for the first `share` (0 to 1) of the windows."""
     count = len(burn_in.seen)
     knows = (jnp.arange(count) >= round(share * count))[:, None]
     return burn_in._replace(seen=jnp.where(knows, jnp.asarray(burn_in.seen), 0.0))
 
 
 def state_after(params: delta_network.Params | None, burn_in: BurnIn) -> jax.Array:
-    """Return the network's recurrent state (N, 32) after a burn-in; a blank one without network."""
+    """Return the network's recurrent state (N, 32) after a burn-in; zero without a network."""
     blank = delta_network.start(len(burn_in.seen))
     if params is None:
         return blank

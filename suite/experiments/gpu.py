@@ -18,7 +18,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.policy import load_policy
-from suite.common.charts import CURVE, curves_chart
+from suite.common.charts import DRAWN, curves_chart
 from suite.common.console import Console
 from suite.common.curve import read
 from suite.common.report import Picture
@@ -337,5 +337,5 @@ def short_training(
         "decisions_per_s": float(np.median([row["steps_per_s"] for row in warm])),
         "success": wilson(sum(result.success for result in results), len(results)),
         "v_max": float(np.median(fast)) if fast else None,
-        "curve": [{key: row[key] for key in ("iteration", *CURVE, "loss")} for row in curve],
+        "curve": [{key: row[key] for key in ("iteration", *DRAWN, "loss")} for row in curve],
     }

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
-from suite.common.charts import METRICS
 from suite.common.console import Console, duration
+from suite.common.curve import METRICS
 from suite.common.report import Picture
 from suite.experiments.pages.document import Made
 from suite.experiments.study import options, training

@@ -1,4 +1,4 @@
-"""What `suite check` finds: a policy's contract and actions, and the interface of flights."""
+"""The checks of `suite check`: a policy's contract and actions, and the interface of flights."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from suite.common.console import Console
 from tracks.common.files import check_no_input
 
 TIME_LIMIT_S = 5.0
-"""Of a flight [s]."""
+"""Time limit of a flight [s]."""
 
 
 def check_policy(
     name: str, trust: bool, trials: int, console: Console
 ) -> tuple[Policy, dict[str, Any]]:
-    """Return the policy, and what the command answers of its interface.
+    """Return the policy, and the command's answer about its interface.
 
     Raises:
-        ValueError: where it is refused.
+        ValueError: if it is refused.
     """
     policy = load_policy(name, trust)
     findings = policy_findings(policy, trials, console)
@@ -34,17 +34,17 @@ def check_policy(
 def check_flight_files(
     flights: Sequence[Path], vehicle: str, policy: Policy | None, out: Path | None, console: Console
 ) -> dict[str, Any]:
-    """Return what the command answers of flights and a vehicle file.
+    """Return the command's answer about flights and a vehicle file.
 
     Args:
         flights: logs, or folders of them.
         vehicle: a file or a shipped name; "" for none.
-        policy: whose rate and camera the flights should have.
-        out: folder for the flights as they are put right; None writes nothing.
+        policy: the flights should have its rate and camera.
+        out: folder for the corrected flights; None writes nothing.
         console: shows every finding.
 
     Raises:
-        ValueError: for files that cannot be used.
+        ValueError: for invalid files.
     """
     from dataclasses import replace
 
@@ -97,11 +97,11 @@ def check_flight_files(
 
 
 def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:
-    """Return what looks wrong about a policy's interface, as records of `suite check`.
+    """Return probable faults of a policy's interface, as records of `suite check`.
 
     Args:
-        policy: as it was loaded.
-        trials: short flights by which its actions are judged; 0 flies none.
+        policy: the loaded policy.
+        trials: number of short flights that show its actions; may be 0.
         console: shows the contract and the share of limited actions.
     """
     from eval.judging.outputs import probable_faults

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 LIST = "flights.json"
 """Name of the list of flights in the output folder."""
 JOURNAL = "journal.jsonl"
-"""Name of the file there that gets a line when a flight ends; deleted when the list is written."""
+"""Name of the file with a line for each finished flight; removed when the list is written."""
 
 
 def collect(

@@ -1,4 +1,4 @@
-"""A policy as the content of its files, for machines that do not have them."""
+"""A policy as the content of its files, for machines without these files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from policies.policy import Policy, load_policy
 
 
 def flown_files(name_or_path: str | Path) -> dict[str, Path]:
-    """Return the files of a policy, of a folder those that fly, by their path within its folder.
+    """Return the files that make up a policy, by their path within its folder.
 
-    A card or a curve next to them may change and the policy be the same.
+    Other files of the folder, such as its card, are no part of the policy.
     """
     from policies.formats.checkpoint import CONFIG, WEIGHTS
 
@@ -30,7 +30,7 @@ def flown_files(name_or_path: str | Path) -> dict[str, Path]:
     if path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
-        # Links are followed to the file, whose data lie next to it and not next to a link.
+        # Links are resolved: external data are next to the file and not next to a link.
         whole, *data = files_of(path)
         home = whole.resolve().parent
         return {path.name: whole, **{str(file.relative_to(home)): file for file in data}}
@@ -38,7 +38,7 @@ def flown_files(name_or_path: str | Path) -> dict[str, Path]:
 
 
 def policy_digest(name_or_path: str | Path) -> str:
-    """Return the SHA-256 of the files of a policy that fly, as hex."""
+    """Return the SHA-256 of the files that make up a policy, as hex."""
     digest = hashlib.sha256()
     for file in flown_files(name_or_path).values():
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -47,16 +47,16 @@ def policy_digest(name_or_path: str | Path) -> str:
 
 @dataclass(frozen=True)
 class PolicyContent:
-    """A policy by content; called, it returns the policy, loaded once in a process."""
+    """A policy by content; a call returns the policy, which each process loads once."""
 
     name: str
-    """Of its folder, which tables may call it by."""
+    """Name of its folder, a possible label."""
     file: str
     """Name of the file that is loaded; "" loads the folder."""
     files: tuple[tuple[str, bytes], ...] = field(repr=False)
     """Path within the folder, and content."""
     trust: bool
-    """As `load_policy` has it."""
+    """As in `load_policy`."""
 
     @classmethod
     def of(cls, name_or_path: str | Path, trust: bool = False) -> PolicyContent:
@@ -71,14 +71,14 @@ class PolicyContent:
         """Return the policy.
 
         Raises:
-            PolicyError: where it cannot be loaded.
+            PolicyError: if it cannot be loaded.
         """
         return _loaded(self)
 
 
 @functools.lru_cache(maxsize=4)
 def _loaded(content: PolicyContent) -> Policy:
-    """Return the policy; its files, which some kinds read again, stay as long as the process."""
+    """Return the policy; its files stay until the process ends, as some kinds read them again."""
     kept = tempfile.mkdtemp(prefix="suite-policy-")
     atexit.register(shutil.rmtree, kept, ignore_errors=True)
     for name, data in content.files:

@@ -1,4 +1,4 @@
-"""Judge policies: fly the trials, keep each as it ends, write the tables."""
+"""Judge policies: fly the trials, save each as it ends, write the tables."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """Who flies a share of the trials."""
+    """A policy that flies all trials in one manner."""
 
     source: str
-    """What was given: a name or a path."""
+    """The given name or path."""
     policy: Policy
-    """Loaded, in its manner."""
+    """The loaded policy, in its manner."""
     label: str
-    """What tables call it."""
+    """Its label in tables."""
     manner: Manner
 
 
@@ -55,15 +55,15 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fly all trials and write trials.parquet, table.md, summary.json and run.json into `out`.
 
-    Each trial is kept in a journal as it ends: the same call after an interruption flies the
-    rest, by the same `workers` or others. The journals go when the tables are written.
+    Each trial is saved in a journal as it ends: the same call after an interruption flies the
+    remaining ones, with any `workers`. The journals are removed when the tables are written.
 
     Returns:
         The summary: `cells` and `paired` of `eval.judging.tables.summarise`, `over_plan` of
-        `eval.judging.plans.over_plan`, and what was judged.
+        `eval.judging.plans.over_plan`, and the settings.
 
     Raises:
-        ValueError: for anything in `evaluation` that cannot be used, before the first flight.
+        ValueError: for invalid values in `evaluation`, before the first flight.
     """
     from eval.judging.outputs import notes_of
     from eval.judging.results import write_results
@@ -83,7 +83,7 @@ def evaluate(
     count = len(course.trials)
     workers = workers_for(count, workers, evaluation.simulator)
     if (out / "trials.parquet").is_file():
-        console.note(f"{out} holds an evaluation; its results will be written over")
+        console.note(f"{out} holds an evaluation; its results will be overwritten")
     flown = count * len(entries)
     needs = flying_needs(flown, workers, evaluation.simulator)
     journals = _open_journals(evaluation, course, entries, out)
@@ -115,7 +115,7 @@ def evaluate(
     )
     write_run_record(out, evaluation, evaluation.seed)
     kept = {journal.path for journal in journals if journal.others(course.trials)}
-    for path in out.glob("journal-*.jsonl"):  # those of an earlier command are done with, too
+    for path in out.glob("journal-*.jsonl"):  # also journals of an earlier command
         if path not in kept:
             path.unlink()
     for grid in grids(summary):
@@ -136,7 +136,7 @@ def evaluate(
 
 
 def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]:
-    """Return laps over planned laps, where the vehicle is the one that the plans were flown on."""
+    """Return lap times over planned lap times, if the vehicle is the one of the plans."""
     from eval.judging.plans import VEHICLE, over_plan
     from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 
@@ -146,7 +146,7 @@ def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]
 
 
 def _sentences(results: Sequence[TrialResult]) -> list[str]:
-    """Return how each other policy differs from the first one over all trials, to be quoted."""
+    """Return a sentence for each other policy on its difference to the first one."""
     import numpy as np
 
     from suite.judging.comparing import paired_sentence
@@ -162,7 +162,7 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
-    """Return what a policy's outputs were like in its trials, and print it."""
+    """Return and print the share of limited actions of a policy, and warnings."""
     from eval.judging.outputs import actions_of
 
     rows = [result for result in results if result.policy == entry.label]
@@ -180,9 +180,9 @@ def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> 
 def file_digests(
     vehicle: Vehicle, tracks: Mapping[str, Track], sensors: SensorSet
 ) -> dict[str, str]:
-    """Return the SHA-256 of what a file may describe, as it was read, by what it is.
+    """Return the SHA-256 of vehicle, sensors and tracks, by name.
 
-    Not of the file's bytes: a comment in it may change and the flights be the same.
+    It is that of the parsed content: comments in a file do not matter.
     """
     from eval.quadrotor.vehicle_file import vehicle_table
     from eval.sensors.sensors_file import sensors_table
@@ -195,7 +195,7 @@ def file_digests(
 
 
 def _refuse_twice(called: list[str]) -> None:
-    """Refuse two shares of one label, which tables would count as one with twice the trials."""
+    """Refuse two entries with one label, which tables would merge."""
     for label in called:
         if called.count(label) > 1:
             raise ValueError(
@@ -210,7 +210,7 @@ def _open_journals(
     """Return the journal in `out` of each of `entries`.
 
     Raises:
-        ValueError: where one is there that is about something else; none is made then.
+        ValueError: if an existing one is of other settings; none is made then.
     """
     from eval.judging.results import Journal
 
@@ -279,5 +279,5 @@ def _fly_one(
                 keep,
                 tracks=course.tracks,
             )
-        # Flown before, perhaps next to other policies and under another label.
+        # An earlier run may have had other policies and another label.
         return [journal.done[trial]._replace(policy=label) for trial in course.trials]

@@ -1,4 +1,4 @@
-"""What the commands that fly have in common: who flies, which trials, on what."""
+"""Shared by all commands that fly: loading policies, lists of trials, estimates of time."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     from tracks.track import Track
 
 TRIALS_A_PROCESS = 128
-"""Fewer trials than this are not worth another process, which takes seconds to start."""
+"""Least trials for another process, which takes seconds to start."""
 GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
-"""Larger ones are asked about: a file in millimetres is a thousand times as large [m]."""
+"""Larger sizes cause a note: the file may be in millimetres [m]."""
 SECONDS_A_TRIAL = 0.15
-"""Of one core in MuJoCo, for a trial of about 13 s on 70 solids."""
+"""Time of one core in MuJoCo for a trial of about 13 s with 70 solids [s]."""
 START_SECONDS = 6.0
-"""To import, compile the policy and the first scenes."""
+"""Time to import packages and to compile the policy and the first scenes [s]."""
 PROCESS_BYTES = 1.0e9
-"""Memory of one process that flies 128 trials at once."""
+"""Memory of a process that flies 128 trials at once [bytes]."""
 
 
 def default_policy() -> str:
-    """Return the name of the policy that flies when none is given.
+    """Return the name of the default policy.
 
     Raises:
-        ValueError: where no policy is shipped.
+        ValueError: if no policy is shipped.
     """
     from policies import shipped
 
@@ -50,10 +50,10 @@ def default_policy() -> str:
 
 
 def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
-    """Return the folder of a policy that can be trained on.
+    """Return the folder of a policy that can be trained further.
 
     Raises:
-        ValueError: where it is not one of our checkpoints; `option` is named.
+        ValueError: if it is no checkpoint of the suite; the message has `option`.
     """
     from policies import shipped
     from policies.formats.checkpoint import CONFIG
@@ -62,7 +62,7 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
     if not (folder / CONFIG).is_file():
         names = ", ".join(shipped.names()) or "none"
         raise ValueError(
-            f"{option} {policy}: training goes on from what was trained here and needs a "
+            f"{option} {policy}: only policies of this suite can be trained further; give a "
             "checkpoint's folder, such as the policy/ in the --out of suite train, or a shipped "
             f"policy's name ({names})"
         )
@@ -70,10 +70,10 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
 
 
 def labels(policies: Sequence[str], names: Sequence[str], option: str = "--policy") -> list[str]:
-    """Return what tables call each policy: its name, or what was given where names clash.
+    """Return each policy's label: its name, or the given path if names are equal.
 
     Raises:
-        ValueError: where one is given twice; `option` is named.
+        ValueError: if one is given twice; the message has `option`.
     """
     if len(set(policies)) < len(policies):
         twice = next(p for p in policies if list(policies).count(p) > 1)
@@ -89,7 +89,7 @@ def trial_list(
 ) -> list[TrialSpec]:
     """Return the trials of every track at every level, with the seeds seed, seed + 1, ...
 
-    A track from a file has no levels: it is flown once a seed, or `once` in all.
+    A track from a file has no levels: it is flown with every seed, or only `once`.
     """
     from eval.worlds.trial import TrialSpec
 
@@ -103,27 +103,27 @@ def trial_list(
 
 
 class Course(NamedTuple):
-    """What a command flies, read and checked."""
+    """The trials of a command, with tracks, vehicle and sensors read and checked."""
 
     trials: list[TrialSpec]
-    """In the order of the rows of results."""
+    """In the order of the results."""
     tracks: dict[str, Track]
-    """Those that come from files, by the name that trials call them."""
+    """Tracks from files, by their name in trials."""
     vehicle: Vehicle
-    """On what."""
+    """The flown vehicle."""
     sensors: SensorSet
-    """Through which sensors."""
+    """Errors in what policies see."""
     differences: list[str]
-    """What of the vehicle the world flies otherwise, in sentences."""
+    """Differences between the simulator and the vehicle file, as sentences."""
     notes: list[str]
-    """What else is printed, in sentences."""
+    """Other notes for the user, as sentences."""
 
 
 def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Course:
-    """Return what is to be flown; in `real_time` no two flights are alike, whatever acts.
+    """Return the trials to fly; in `real_time` all flights differ, also without random effects.
 
     Raises:
-        ValueError: for an unknown world or track, too few trials, or a bad track or vehicle file.
+        ValueError: for an unknown simulator or track, too few trials, or an invalid file.
     """
     from eval.effects import EFFECTS
     from eval.quadrotor.vehicle_file import load_vehicle
@@ -154,7 +154,7 @@ def read_course(wanted: Evaluation | Collection, real_time: bool = False) -> Cou
 
 
 def _in_millimetres(name: str, track: Track) -> list[str]:
-    """Return a question where gates or the whole track are of no size that is flown in metres."""
+    """Return a note if the size of the gates or the track suggests a file in millimetres."""
     gates = track.scene.gates
     opening = float((gates.opening_g.max(1) - gates.opening_g.min(1)).max())
     extent = float((gates.center_w.max(0) - gates.center_w.min(0)).max())
@@ -167,42 +167,42 @@ def _in_millimetres(name: str, track: Track) -> list[str]:
 
 
 def log_name(track: str, difficulty: int, seed: int) -> str:
-    """Return what the log of a trial is called."""
+    """Return the file name of a trial's log."""
     return f"{Path(track).stem}-{difficulty}-{seed}.parquet"
 
 
 def refuse_one_name(tracks: Iterable[str]) -> None:
-    """Refuse tracks whose logs or pictures would be written over each other."""
+    """Refuse tracks whose logs or pictures would have the same names."""
     stems = [Path(track).stem for track in tracks]
     for stem in stems:
         if stems.count(stem) > 1:
             raise ValueError(
-                f"--track: more than one is called {stem!r}, and what is written is named after "
-                "its track; rename a file, or give each an --out of its own"
+                f"--track: several tracks are called {stem!r}, and files are named after their "
+                "track; rename a file, or give each its own --out"
             )
 
 
 def say_notes(console: Console, world: str, course: Course) -> None:
-    """Print what of `course` differs from the request."""
+    """Print the differences and notes of `course`."""
     differences = [f"{world}: {difference}" for difference in course.differences]
     for sentence in [*differences, *course.notes]:
         console.note(sentence)
 
 
 def flying_needs(trials: float, workers: Workers, world: str = "mujoco") -> Estimate:
-    """Return about how long `trials` take in `world`, and their memory.
+    """Return the approximate time and memory of `trials` in `world`.
 
     Raises:
-        ValueError: where `workers` is a cluster that cannot work for us.
+        ValueError: for a cluster that cannot be used.
     """
     processes = crew(workers)
     seconds = START_SECONDS + trials * cost_of(world) * SECONDS_A_TRIAL / processes
-    # Of this machine: a cluster's is not ours to count.
+    # Memory of this machine only.
     return Estimate(seconds, PROCESS_BYTES * (workers if isinstance(workers, int) else 1))
 
 
 def cost_of(world: str) -> float:
-    """Return what a trial in `world` costs over one in MuJoCo."""
+    """Return the cost of a trial in `world`, relative to MuJoCo."""
     from eval.worlds import WORLDS
 
     return getattr(WORLDS.find(world), "cost", 1.0)
@@ -212,7 +212,7 @@ def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
     """Return the tracks of those `names` that are files.
 
     Raises:
-        ValueError: for a bad file, with its key.
+        ValueError: for an invalid file, with its key.
     """
     from tracks.formats.custom import load_track
 
@@ -220,7 +220,7 @@ def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
 
 
 def workers_for(trials: int, given: Workers | None, world: str) -> Workers:
-    """Return who flies `trials` where `given` workers were named; None takes what is worth it."""
+    """Return the `given` workers, or as many processes as shorten the work."""
     if given is not None:
         return given
     from eval.worlds import compiles
@@ -232,16 +232,16 @@ def workers_for(trials: int, given: Workers | None, world: str) -> Workers:
 def who_flies(
     policy: Policy, name_or_path: str, trust: bool, workers: Workers, manner: Manner = PLAIN
 ) -> Policy | Callable[[], Policy]:
-    """Return the loaded policy, or for several processes how each of them loads its own.
+    """Return the loaded policy, or for several processes a function that loads it.
 
-    Those of this machine read it where it is, those of a cluster are given its content.
+    Processes of this machine read its files; those of a cluster get their content.
 
     Args:
-        policy: as it was loaded, in its manner.
-        name_or_path: where from.
-        trust: as `load_policy` has it.
-        workers: who shares the trials.
-        manner: in which it flies.
+        policy: the loaded policy, in its manner.
+        name_or_path: its source.
+        trust: as in `load_policy`.
+        workers: of the trials.
+        manner: of the flights.
     """
     if workers == 1:
         return policy
@@ -258,7 +258,7 @@ def load_in_manner(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Po
     """Return a policy to fly, in its manner.
 
     Raises:
-        PolicyError: where it cannot be loaded, or not be flown so.
+        PolicyError: if it cannot be loaded, or not be flown in this manner.
     """
     from policies.policy import load_policy
 
@@ -266,7 +266,7 @@ def load_in_manner(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Po
 
 
 def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:
-    """Return what a result file says of a policy: name, source and digest."""
+    """Return name, source and digest of a policy for a result file."""
     return {
         "name": policy.name,
         "source": str(name_or_path),
@@ -275,9 +275,9 @@ def about_policy(name_or_path: str, policy: Policy) -> dict[str, Any]:
 
 
 def by_content(about: dict[str, Any]) -> dict[str, Any]:
-    """Return what a journal or a list of flights is about, without where its files lay.
+    """Return the settings of a journal or a list of flights without paths of files.
 
-    Their content is there as a digest or as it was read, so that a moved folder changes nothing.
+    The files' content or digest is included, so that files may be moved.
     """
     about = plain(about)
     paths = {"policy": ("source",), "collection": ("policy", "vehicle")}

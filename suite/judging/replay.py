@@ -1,4 +1,4 @@
-"""Fly judged trials again to see them: a trial repeats to the bit, so no flight is stored."""
+"""Fly judged trials again to show them: trials repeat to the bit, so no flight is stored."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Replay(NamedTuple):
     rollouts: list[Rollout]
     """Track, flight (with the depth images) and result of each."""
     drone: Drone
-    """How a recording shows who flew: the vehicle, with the policy's camera."""
+    """The vehicle and the policy's camera, as a recording shows them."""
 
 
 def read_evaluation(folder: Path) -> Evaluation:
-    """Return what `suite eval --out folder` judged.
+    """Return the settings of `suite eval --out folder`.
 
     Raises:
-        ValueError: where `folder` holds no finished run of suite eval.
+        ValueError: if `folder` has no finished run of suite eval.
     """
     path = folder / "run.json"
     try:
@@ -58,7 +58,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     evaluation = Evaluation(**{**config, "policies": tuple(policies), "speed": tuple(speeds)})
     for name, value in vars(evaluation).items():
         default = getattr(Evaluation, name)
-        # Those that are None by default are numbers, and JSON's are whole where Python's was.
+        # Fields with default None are numbers; JSON may have a whole number for a float.
         kind: type | tuple[type, ...] = type(default)
         if default is None or isinstance(default, float):
             kind = (int, float, type(default))
@@ -69,16 +69,16 @@ def read_evaluation(folder: Path) -> Evaluation:
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of what `suite eval --out folder` flew first, as `fly_again` takes it.
+    """Return the SHA-256 of the first policy and the files of `suite eval --out folder`.
 
     Raises:
-        ValueError: where `folder` does not say it.
+        ValueError: if `folder` does not have it.
     """
     path = folder / "summary.json"
     try:
         summary = read_json(path)
         first = summary["policies"][0]["sha256"]
-        # Those of earlier versions say it of policies alone.
+        # Earlier versions have only that of policies.
         return {"policy": str(first), **dict(summary.get("sha256", {}))}
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(
@@ -102,13 +102,13 @@ def fly_again(
     """Fly `trials` as they were judged.
 
     Args:
-        evaluation: what the trials are part of.
-        trials: which.
-        policy: one of the evaluation's; its first if None.
-        judged: the SHA-256 of what flew, as `read_digests` has it; None compares nothing.
+        evaluation: settings of the trials.
+        trials: to fly.
+        policy: one of the evaluation's; None: its first.
+        judged: expected digests, from `read_digests`; None compares nothing.
 
     Raises:
-        ValueError: where the policy, vehicle, sensors or a track is not what was judged.
+        ValueError: if the policy, vehicle, sensors or a track has changed.
     """
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, Record, fly
@@ -125,7 +125,7 @@ def fly_again(
         sensors=sensors,
     )
     name = policy or (evaluation.policies or (default_policy(),))[0]
-    pilot = load_in_manner(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
+    flown = load_in_manner(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
@@ -139,7 +139,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        pilot,
+        flown,
         trials,
         vehicle,
         evaluation.simulator,
@@ -152,15 +152,15 @@ def fly_again(
         (track_of(tracks, trial), flights[trial], result)
         for trial, result in zip(trials, results, strict=True)
     ]
-    # What is flown with is the policy's camera, whatever the vehicle's file says of one.
-    camera = pilot.spec.camera
+    # Flights use the policy's camera, not that of the vehicle file.
+    camera = flown.spec.camera
     return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
 
 
 def _refuse_changed(
     sources: Mapping[str, str], digests: Mapping[str, str], judged: Mapping[str, str]
 ) -> None:
-    """Refuse what is not what was judged: its flights would be others."""
+    """Refuse changed inputs, whose flights would differ."""
     for what, digest in digests.items():
         if judged.get(what, digest) != digest:
             called = f"{what} {sources[what]}" if what in sources else what

@@ -1,6 +1,6 @@
-"""What `suite eval` and `suite collect` are asked to fly: their options, and what runs record.
+"""The options of `suite eval` and `suite collect` on flights, which run.json records.
 
-A `Manner` says how a policy is flown: how fast it is asked to, and with a monitor or not.
+A `Manner` is a commanded speed, with the safety monitor or without.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from policies.policy import Policy
 
 TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
-"""As `eval.worlds.trial.Rules` has it [s]."""
+"""Time limit of a trial [s], as in `eval.worlds.trial.Rules`."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Which trials are flown, by whom and in what; `suite eval` has these as options."""
+    """Policies, trials and simulation; `suite eval` has these as options."""
 
     policies: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
@@ -86,25 +86,25 @@ class Collection:
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     seed: Seed = 100_000
-    """Seed of the first trial; by default far from those that suite eval flies."""
+    """Seed of the first trial; the default is far from the seeds of suite eval."""
     trust: Advanced[bool] = False
     """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
 
 @dataclass(frozen=True)
 class Manner:
-    """What is asked of a policy besides to fly; called with one, it returns it so."""
+    """Commanded speed and monitor; a call returns a policy that flies in this manner."""
 
     monitored: bool = False
-    """Whether the safety monitor is around it."""
+    """Whether the safety monitor checks its actions."""
     speed: float | None = None
-    """How fast it is asked to fly, 0 to 1 [1]; None: as its own spec says."""
+    """Commanded speed, 0 to 1 [1]; None: that of the policy's spec."""
 
     def __call__(self, policy: Policy) -> Policy:
         """Return `policy` flown in this manner.
 
         Raises:
-            PolicyError: for a speed where the policy does not take one.
+            PolicyError: for a speed if the policy has no speed input.
         """
         if self.speed is not None:
             policy = _at_speed(policy, self.speed)
@@ -115,17 +115,17 @@ class Manner:
         return policy
 
     def label(self, name: str) -> str:
-        """Return what tables call a policy called `name` flown in this manner."""
+        """Return the label of the policy `name` in this manner."""
         name += "" if self.speed is None else f"@{self.speed:g}"
         return f"{name}+monitor" if self.monitored else name
 
 
 PLAIN = Manner()
-"""As the policy's own spec says, alone."""
+"""The policy's own speed, without monitor."""
 
 
 def manners(speeds: Sequence[float], monitor: bool) -> list[Manner]:
-    """Return every manner that is asked for: each speed, then each again with the monitor."""
+    """Return all manners: each speed, then each speed with the monitor."""
     plain = [Manner(speed=speed) for speed in speeds] or [Manner()]
     return plain + [dataclasses.replace(manner, monitored=True) for manner in plain if monitor]
 

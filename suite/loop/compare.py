@@ -1,7 +1,7 @@
 """Three policies on the same trials: before, fine-tuned without and with Delta Action Model.
 
-Fine-tuning without it takes the same gradient steps, so that the gain of more training alone is
-not credited to the model: the difference that counts is `with` minus `without`.
+Fine-tuning without the model has the same number of gradient steps and is the control: the effect
+of the model is `with` minus `without`.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from tracks.common.grid import Cell, Grid
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)
-"""The policies that are compared, in the order of the tables."""
+"""The compared policies, in the order of the tables."""
 OVERALL = "all"
 """Name of the line over all cells, in place of a track."""
 CAVEAT = (
     "Intervals are 95 % over trials, for these three policies: another training seed gives other "
     "policies. The cells' intervals are not corrected for there being several."
 )
-"""Note below the tables: what the intervals leave out."""
+"""Note below the tables on the intervals."""
 
 
 class Measure(NamedTuple):
-    """One number of the three policies on the same trials."""
+    """A quantity of the three policies on the same trials."""
 
     before: Interval
     without: Interval
-    """Fine-tuned without the Delta Action Model, for as many iterations."""
+    """Fine-tuned without the Delta Action Model, with the same number of gradient steps."""
     with_delta: Interval
     with_minus_without: Interval
     """On the same trials, trial by trial."""
@@ -70,13 +70,13 @@ class Line(NamedTuple):
 
 
 def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[Line]:
-    """Return a line for every track and level, and as the last one that over all of them.
+    """Return a line for every track and level, and one for all trials at the end.
 
     Args:
         results: of each of `VARIANTS`, on the same trials in the same order.
 
     Raises:
-        ValueError: where the trials are not the same.
+        ValueError: if the trials differ.
     """
     trials = same_trials({name: results[name] for name in VARIANTS})
     lines = []
@@ -88,10 +88,10 @@ def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[Line]:
 
 
 def same_trials(results: Mapping[str, Sequence[TrialResult]]) -> list[TrialSpec]:
-    """Return the trials that all policies flew, in order.
+    """Return the common trials of all policies, in order.
 
     Raises:
-        ValueError: where the trials are not the same.
+        ValueError: if the trials differ.
     """
     first, *others = results
     trials = [row.trial for row in results[first]]
@@ -159,14 +159,14 @@ def _grid(title: str, lines: Sequence[Line], field: str, scale: float, digits: i
     for line in lines:
         measure: Measure = getattr(line, field)
         level = "all" if line.difficulty is None else str(line.difficulty)
-        merit, gain = (difference_cell(d, scale, digits) for d in measure[3:])
+        to_control, to_before = (difference_cell(d, scale, digits) for d in measure[3:])
         rows.append(
             [
                 *(Cell(text) for text in (line.track, level, str(line.trials))),
                 *(Cell(value_text(interval, scale, digits)) for interval in measure[:3]),
-                merit,
+                to_control,
                 *([Cell(f"{line.p_value:.2g}")] if test else []),
-                gain,
+                to_before,
             ]
         )
     return Grid(title, headers, rows, strong_last=True)
@@ -185,14 +185,14 @@ def difference_cell(
 
     By default it is one of rates, in percentage points.
     """
-    # Adding zero turns a rounded -0, which looks like a loss, into +0.
+    # Adding zero turns a rounded -0 into +0.
     value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
     tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
     return Cell(f"{value} [{low}, {high}]", tone)
 
 
 def significance(difference: Interval) -> str:
-    """Return in words whether one policy succeeds significantly more often than another."""
+    """Return a text on whether one policy succeeds significantly more often than another."""
     if difference.low > 0:
         return "more than"
     return "fewer than" if difference.high < 0 else "not significantly different from"
@@ -205,7 +205,7 @@ def points(difference: Interval) -> str:
 
 
 def verdict(overall: Line) -> str:
-    """Return in one sentence what fine-tuning under the Delta Action Model changed."""
+    """Return a sentence on the effect of fine-tuning under the Delta Action Model."""
     success = overall.success
     return (
         f"Fine-tuned with the Delta Action Model, {100 * success.with_delta.value:.0f} % of "

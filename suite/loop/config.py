@@ -1,4 +1,4 @@
-"""What a loop does, resolved from a recipe and options, and which seeds it flies."""
+"""The configuration of a loop, resolved from a recipe and options."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from tracks.common.files import digest_of
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
 RECORDED_FROM = 100_000
-"""Recorded flights have seeds this far above the judged trials', so that none is both."""
+"""Difference of the seeds of recorded flights and judged trials, which keeps them separate."""
 OWN = ("mujoco", "mjx")
-"""Simulators that fly a vehicle as its file says."""
+"""Simulators that fly a vehicle exactly as its file describes."""
 LOOP_SEEDS = Range(0, SEED_MOST - 10 * RECORDED_FROM)
-"""A loop's seed: those of its fine-tunings and recorded flights are above."""
+"""Range of a loop's seed; those of fine-tunings and recorded flights are larger."""
 
 
 @dataclass(frozen=True)
 class LoopSize:
-    """How much a loop flies and fits."""
+    """Numbers of trials, flights and gradient steps of a loop."""
 
     trials: Trials
     """Judged trials of each policy on every track at every level."""
@@ -47,19 +47,19 @@ class LoopSize:
 
 
 SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
-"""Sizes by recipe; "" is that of the others."""
+"""Sizes by recipe; "" is that of all others."""
 HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
-"""The same of a loop with a hidden vehicle."""
+"""Sizes of a loop with a hidden vehicle."""
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """What every loop has."""
+    """Settings of every loop."""
 
     tuning: TrainConfig
-    """The fine-tunings, alike but for what flies in them."""
+    """The fine-tunings, which differ only in their dynamics."""
     fit: FitConfig
-    """The fit of a Delta Action Model."""
+    """The fit of Delta Action Models."""
     policy: str | None
     """The policy to start from: a shipped name or a checkpoint's folder; None trains one."""
     track: str
@@ -71,13 +71,13 @@ class LoopConfig:
     flights: Trials
     """Recorded flights on every track at every level."""
     vehicle: str
-    """What the simulation knows: a shipped vehicle's name or a vehicle file."""
+    """The nominal vehicle of the simulation: a shipped name or a vehicle file."""
     sensors: str
-    """What policies see of the truth in every flight: shipped sensors' name or a sensors file."""
+    """Errors in what policies see, in every flight: a shipped name or a sensors file."""
     seed: Annotated[int, LOOP_SEEDS]
-    """Seed of what is trained and of the first judged trial."""
+    """Seed of the trainings and of the first judged trial."""
     digests: dict[str, str]
-    """SHA-256 of what comes from files: vehicles, sensors and, where one is given, the policy."""
+    """SHA-256 of vehicles, sensors and the given policy, if there is one."""
 
     @property
     def recorded_from(self) -> int:
@@ -91,51 +91,50 @@ class LoopConfig:
 
     @property
     def true_vehicle(self) -> str:
-        """What is judged and recorded: a shipped vehicle's name or a vehicle file."""
+        """The vehicle of trials and recorded flights: a shipped name or a vehicle file."""
         return self.vehicle
 
     @property
     def true_simulator(self) -> str:
-        """The simulator in which the true vehicle flies."""
+        """The simulator of the true vehicle."""
         return OWN[0]
 
 
 @dataclass(frozen=True)
 class DeltaLoopConfig(LoopConfig):
-    """A loop through the recipe's own dynamics, the point mass or a quadrotor."""
+    """A loop with the recipe's dynamics: the point mass or a quadrotor."""
 
     training: TrainConfig
-    """The first training; its dynamics are what the Delta Action Model corrects."""
+    """The first training; the Delta Action Model corrects its dynamics."""
 
 
 @dataclass(frozen=True)
 class HiddenLoopConfig(LoopConfig):
-    """A loop whose true vehicle the simulation's vehicle file does not describe."""
+    """A loop whose true vehicle differs from the simulation's vehicle file."""
 
     hidden_vehicle: str
-    """The true vehicle's file; the loop reads nothing of it but its flights."""
+    """The true vehicle's file; the loop uses only its flights."""
     simulator: str = OWN[0]
     """The simulator in which it flies."""
     delta: bool = True
-    """Whether Delta Action Models are fitted, too, and policies fine-tuned under them."""
+    """Whether Delta Action Models are fitted as well, and policies fine-tuned under them."""
 
     @property
     def true_vehicle(self) -> str:
-        """What is judged and recorded: the hidden vehicle's file."""
+        """The hidden vehicle's file."""
         return self.hidden_vehicle
 
     @property
     def true_simulator(self) -> str:
-        """The simulator in which the true vehicle flies."""
+        """The simulator of the true vehicle."""
         return self.simulator
 
 
 def loop_by_content(config: LoopConfig) -> LoopConfig:
-    """Return the loop without where its files lie: what they hold is in `digests`.
+    """Return the loop without paths of files, whose content is in `digests`.
 
-    So a loop that is moved, or called from another folder or machine, is no other loop. A name
-    means what it means to who loads it: a shipped policy's goes before a folder called so, a
-    vehicle's after a file.
+    So a loop can be moved, or continued from another folder or machine. As in loading, a shipped
+    policy's name has priority over a folder of that name, and a file over a shipped vehicle's name.
     """
 
     def vehicle(given: str) -> str:
@@ -152,7 +151,7 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
 
 
 def recipe_of(policy: str | None) -> str:
-    """Return the recipe that a policy is fine-tuned by: the shipped one's own, else `race`."""
+    """Return the recipe for fine-tuning a policy: that of a shipped policy, else `race`."""
     return policy if policy in RECIPES else "race"
 
 
@@ -175,14 +174,14 @@ def resolve(
     delta: bool = True,
     changes: Sequence[str] = (),
 ) -> LoopConfig:
-    """Return the loop that a recipe and options ask for; None takes the recipe's size.
+    """Return the loop of a recipe and options; None takes the recipe's size.
 
-    Without a recipe it is the policy's own. With a hidden vehicle or another simulator nothing is
-    trained from scratch: without a policy the shipped default flies. Where a policy is given,
-    `changes` are of its fine-tuning as it is, else of the recipe that the fine-tuning follows from.
+    The default recipe is the policy's. With a hidden vehicle or another simulator nothing is
+    trained from scratch, and the default policy is the shipped one. With a policy, `changes` apply
+    to its fine-tuning, else to the recipe.
 
     Raises:
-        ValueError: for an option that cannot be used, naming it and what is allowed.
+        ValueError: for an invalid option, with what is allowed.
     """
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors.sensors_file import load_sensors, sensors_table
@@ -269,10 +268,10 @@ def resolve(
 
 
 def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
-    """Refuse options of a training where none is made, and settings that the loop sets itself.
+    """Refuse options of a training if there is none, and settings that the loop sets itself.
 
     Raises:
-        ValueError: naming the option and what to do instead.
+        ValueError: with the option and what to do instead.
     """
     owned = {"seed": "give --seed"}
     if policy is None:
@@ -293,8 +292,7 @@ def check_simulator(name: str) -> None:
     """Refuse a simulator that cannot fly a true vehicle.
 
     Raises:
-        ValueError: where there is no such simulator, where it lacks a package, or where it records
-            no flights.
+        ValueError: for an unknown simulator, a missing package, or one that records no flights.
     """
     from eval.judging.judge import check_records
     from eval.worlds import world_class
@@ -304,10 +302,10 @@ def check_simulator(name: str) -> None:
 
 
 def _check_seeds(config: LoopConfig) -> None:
-    """Check that recorded flights and judged trials can be kept apart.
+    """Check that recorded flights and judged trials differ.
 
     Raises:
-        ValueError: naming the option and what is allowed.
+        ValueError: with the option and what is allowed.
     """
     files = [name for name in parse_tracks(config.track) if is_track_file(name)]
     if files:

@@ -1,7 +1,6 @@
-"""The loop that shows what the Delta Action Model brings: fine-tuned with it and without.
+"""The loop that shows the effect of the Delta Action Model: fine-tuning with it and without.
 
-The control is fine-tuned as long, so that what more training alone brings is not taken for the
-model's merit.
+The control is fine-tuned for as many steps, so that the effect of more training alone is visible.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seed
 
 
 def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]) -> Findings:
-    """Return what the finished loop in `out` came to."""
+    """Return the results of the finished loop in `out`."""
     assert isinstance(config, DeltaLoopConfig)
     lines = compare(results)
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))

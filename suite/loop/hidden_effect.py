@@ -1,7 +1,7 @@
-"""The loop with an effect that the simulation lacks: named, and trained for.
+"""The loop with an effect that the simulation lacks: it is diagnosed, and trained for.
 
-The hidden vehicle's file is read by the judge alone. The simulation learns of it through the
-measured flights only.
+Only the judge reads the hidden vehicle's file. The simulation is corrected from measured flights
+alone.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ LABELS = {
     NAMED: "with the named effect",
     BOTH: "with both",
 }
-"""What tables call the policies."""
+"""Labels of the policies in tables."""
 REFERENCES = (BEFORE, CONTROL, NOMINAL)
-"""What the others are held against."""
+"""Policies that the others are compared with."""
 MODELS = {CONTROL: "simulation's", NAMED: "corrected"}
-"""Whose Delta Action Models are fitted, in delta-NAME/."""
+"""Variants with a Delta Action Model in delta-NAME/, and the quadrotor that it corrects."""
 JUDGED = "judging the one fine-tuned {}, on the same seeds"
 
 
 def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]) -> Findings:
-    """Return what the finished loop in `out` came to."""
+    """Return the results of the finished loop in `out`."""
     assert isinstance(config, HiddenLoopConfig)
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
     stand = standings(results, REFERENCES)
@@ -81,7 +81,7 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
 
 
 def place(config: HiddenLoopConfig) -> str:
-    """Return what a sentence calls the hidden vehicle."""
+    """Return the name of the hidden vehicle in sentences."""
     return "the hidden vehicle" if config.simulator in OWN else f"the simulator {config.simulator}"
 
 
@@ -91,7 +91,7 @@ def verdict(
     trials: int,
     where: str = "the hidden vehicle",
 ) -> str:
-    """Return in a few sentences what the loop showed; `where` the policies were judged."""
+    """Return the loop's result in a few sentences; `where` names the judged vehicle."""
     by_name = {one.name: one for one in stand}
     apart = {other.against: other.success for other in by_name[NAMED].differences}
 
@@ -142,7 +142,7 @@ def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Sectio
 
 
 def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
-    """Return in sentences what is true of the hidden vehicle and the simulation does not know."""
+    """Return sentences on the differences of the hidden vehicle to the simulation's."""
     simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
     more = hidden_effects(simulated, true)
     hidden = [f"What the hidden vehicle's file holds and the simulation's does not: {more}."]
@@ -155,7 +155,7 @@ def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
 
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
-    """Return the effects that `true` has and `simulated` has not, or has otherwise, in words."""
+    """Return the effects of `true` that `simulated` lacks or has with other values, as text."""
     parts = []
     for name, value in true.effects.items():
         if simulated.effects.get(name) != value:
@@ -256,7 +256,7 @@ LOOP = Loop(
     files=(
         ("table.md", "the tables on this page"),
         ("loop.json", "the same as numbers, with the configuration"),
-        ("diagnosis/report.html", "how the diagnosis came to its answer"),
+        ("diagnosis/report.html", "the report of the diagnosis"),
         ("diagnosis/vehicle.toml", "the corrected vehicle file"),
         ("recording.rrd", "trials before and after, for rerun"),
         ("flights/flights.json", "the recorded flights"),
@@ -274,4 +274,4 @@ WITHOUT_DELTA = replace(
     "the hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
     "quadrotor as it is, the other through the quadrotor corrected by the named effect.",
 )
-"""The same without Delta Action Models, in half the time."""
+"""The loop without Delta Action Models, which takes half the time."""

@@ -1,7 +1,7 @@
-"""Recorded flights as a state estimator would have logged them, cut before they touch anything.
+"""Recorded flights with the noise of a state estimator, cut before the first contact.
 
-The simulation's own record is exact. Noise of the size of an estimator's is added, so that what
-the diagnosis finds does not rest on digits that no one measures.
+The simulation's record is exact. With noise the diagnosis cannot use a precision that real logs do
+not have.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tracks.common.files import write_json
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 CONTACT_MARGIN_S = 0.1
-"""This much is cut off the end of a flight that did not finish [s]."""
+"""Time that is cut off the end of an unfinished flight [s]."""
 SHORTEST_S = 1.5
 """Shorter flights are left out [s]."""
 
@@ -41,14 +41,13 @@ class Noise:
 
 
 def measure(flights: Path, out: Path, seed: int) -> list[Path]:
-    """Write the flights of `suite collect` in `flights` as they would be measured into `out`.
+    """Write the flights of `suite collect` in `flights` with measurement noise into `out`.
 
     Returns:
-        The files, one cell of track and level after the other in turn, so that the first of them
-        are of all kinds.
+        The files, in turn from each track and level, so that the first ones cover all of them.
 
     Raises:
-        ValueError: where no flight is long enough.
+        ValueError: if no flight is long enough.
     """
     rows = json.loads((flights / LIST).read_text(encoding="utf-8"))["flights"]
     rng = np.random.default_rng([seed, 7])
@@ -89,7 +88,7 @@ def _rows(log: FlightLog, kept: np.ndarray) -> FlightLog:
 
 
 def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
-    """Return a log with white noise on what is measured; commands and actions are known."""
+    """Return a log with white noise on all measurements, not on commands and actions."""
 
     def with_noise(values: np.ndarray, sigma: float) -> np.ndarray:
         return values + sigma * rng.standard_normal(values.shape)
@@ -107,7 +106,7 @@ def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
 
 
 def enough(files: Sequence[Path], duration_s: float) -> list[Path]:
-    """Return the first of `files` that hold `duration_s` of flight together, at least five."""
+    """Return the first of `files` with `duration_s` of flight in total, at least five."""
     logs, _ = read_flights(list(files))
     length = {Path(log.name).name: log.duration_s for log in logs}
     chosen, total = [], 0.0

@@ -17,7 +17,7 @@ from tracks.common.provenance import VERSION, git_commit
 def write_loop_report(
     out: Path, loop: Loop, config: LoopConfig, found: Findings, seconds: Mapping[str, float]
 ) -> None:
-    """Write report.html of the finished loop in `out`; `seconds` is how long each stage took."""
+    """Write report.html of the finished loop in `out`; `seconds` are the times of the stages."""
     report = Report(
         title=loop.title,
         lead=found.verdict,
@@ -73,9 +73,9 @@ def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = No
     """Return a row of a Delta Action Model's errors on held-out flights.
 
     Args:
-        name: of what was flown again.
+        name: of the model.
         errors: `position_m` and `velocity_m_s`.
-        base_m: the position error of which a share is printed, if any.
+        base_m: position error to which a share is printed, if any.
     """
     texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
     if base_m is not None:

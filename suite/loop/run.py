@@ -27,21 +27,21 @@ FILES = ("table.md", "report.html", "recording.rrd")
 def run_loop(
     config: LoopConfig, out: Path, console: Console, workers: Workers | None = None
 ) -> dict[str, Any]:
-    """Run the loop, or what is left of it, and print what it showed.
+    """Run the loop, or its remaining stages, and print its results.
 
     Args:
         config: the whole loop.
         out: its folder; an unfinished loop of the same configuration there continues.
-        console: where progress and results go.
-        workers: who shares the flights and the fine-tunings; no part of what the loop is.
+        console: shows progress and results.
+        workers: of flights and fine-tunings; may change between calls.
 
     Returns:
-        What loop.json holds, and `out`.
+        The contents of loop.json, and `out`.
 
     Raises:
-        ValueError: where `out` holds a run of another configuration.
-        WorkFailed: where a training diverges, its policy cannot be recorded, the flights cannot be
-            used, or the diagnosis names nothing to correct.
+        ValueError: if `out` has a run of another configuration.
+        WorkFailed: if a training diverges, the flights cannot be used, or the diagnosis names
+            nothing to correct.
     """
     loop = delta_action.LOOP
     if isinstance(config, HiddenLoopConfig):

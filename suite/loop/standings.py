@@ -26,7 +26,7 @@ class Difference(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """What one policy's trials come to."""
+    """The results of one policy."""
 
     name: str
     success: Interval
@@ -48,10 +48,10 @@ def standings(
 
     Args:
         results: by policy, of the same trials in the same order.
-        references: policies against which the others are held.
+        references: policies that the others are compared with.
 
     Raises:
-        ValueError: where the trials are not the same.
+        ValueError: if the trials differ.
     """
     trials = same_trials(results)
     won = {name: np.array([row.success for row in rows]) for name, rows in results.items()}

@@ -1,6 +1,6 @@
-"""A loop as data: the policies that it compares, what each is tuned through and judged in.
+"""A loop as data: the compared policies, with the dynamics of their fine-tuning and judging.
 
-A loop's folder holds train/ (or given/), eval-X/ of the first policy, flights/, in a hidden vehicle
+A loop's folder has train/ (or given/), eval-X/ of the first policy, flights/, with a hidden vehicle
 measured/ and diagnosis/, a folder for each Delta Action Model, tuned-X/ and eval-X/ of each
 fine-tuned policy X, and replays/; then table.md, loop.json, report.html and recording.rrd.
 """
@@ -25,81 +25,81 @@ class Variant:
     name: str
     """Of its folders."""
     judged: str
-    """The judging, in words."""
+    """Description of the judging."""
     tuned: str | None = None
-    """The fine-tuning in tuned-NAME/, in words; None: it is the first policy."""
+    """Description of the fine-tuning in tuned-NAME/; None for the first policy."""
     delta: str | None = None
-    """Folder of the Delta Action Model that corrects what it is fine-tuned through."""
+    """Folder of the Delta Action Model in the fine-tuning."""
     diagnosed: bool = False
-    """Whether it is fine-tuned through the vehicle that the diagnosis corrected."""
+    """Whether the fine-tuning is through the vehicle that the diagnosis corrected."""
     simulated: bool = False
-    """Whether the simulation's vehicle flies when it is judged, not the true one."""
+    """Whether it is judged with the simulation's vehicle instead of the true one."""
 
 
 @dataclass(frozen=True)
 class DeltaModel:
-    """A Delta Action Model that is fitted."""
+    """A fit of a Delta Action Model."""
 
     folder: str
-    """Where."""
+    """Its folder."""
     words: str
-    """The fitting, in words."""
+    """Description of the fit."""
     diagnosed: bool = False
     """Whether it corrects the vehicle that the diagnosis corrected."""
 
 
 class Shown(NamedTuple):
-    """A policy that is in the recording and the pictures."""
+    """A policy in the recording and the pictures."""
 
     variant: str
     """Its name."""
     label: str
-    """What the recording calls it."""
+    """Its label in the recording."""
     heading: str
-    """Over its picture."""
+    """Heading of its picture."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What a loop came to."""
+    """The results of a loop."""
 
     verdict: str
-    """In a few sentences."""
+    """The result in a few sentences."""
     tables: Sequence[Grid]
-    """Of the policies."""
+    """Tables of the policies."""
     errors: Sequence[str]
-    """Of the Delta Action Models, as Markdown."""
+    """Errors of the Delta Action Models, as Markdown."""
     numbers: Mapping[str, Any]
-    """What loop.json holds of them."""
+    """Numbers for loop.json."""
     facts: Mapping[str, str]
-    """What flew, by name, for the report."""
+    """Conditions by name, for the report."""
     chart: Picture
-    """Of the policies."""
+    """Chart of the policies."""
     sections: Sequence[Section]
-    """The report's, between the policies and the flights."""
+    """Sections of the report between the policies and the flights."""
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A declaration."""
+    """A kind of loop."""
 
     title: str
     """Of the report."""
     hidden: bool
-    """Whether the flights are measured and diagnosed before anything is fitted to them."""
+    """Whether the flights get measurement noise and are diagnosed before a fit."""
     variants: Sequence[Variant]
     """In the order of tables and stages."""
     models: Sequence[DeltaModel]
-    """In the order of stages."""
+    """Fits, in the order of stages."""
     shown: Sequence[Shown]
-    """First the one before, then the one after."""
+    """First the policy before, then the one after."""
     find: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
     """Makes the findings from the configuration, the folder and the results by variant."""
     reading: str
     """How to read the tables."""
     caveat: str
-    """What their intervals do not say."""
+    """What the intervals do not include."""
     advice: str
-    """What to do where the flights are too short to be fitted."""
+    """Advice if the flights are too short for a fit."""
     files: Sequence[tuple[str, str]]
-    """Paths that the report links to, with what is there."""
+    """Paths of the report's links, with descriptions."""

@@ -1,4 +1,4 @@
-"""What the stages of a loop do, and the list of them that a declaration asks for."""
+"""The stages of a loop, and their list for a kind of loop."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from tracks.common.files import replacing_folder, write_json
 from tracks.common.work import Workers
 
 DIAGNOSED_S = 80.0
-"""The diagnosis gets about this much flight, of all tracks and levels in turn [s]."""
+"""Approximate length of the diagnosed flights, in turn from all tracks and levels [s]."""
 INPUT_SOURCE = "commands"
-"""The judge's rate loop is the vehicle file's, so the diagnosis need not ask whose it is; driven by
-rotor speeds a wrong torque runs away within a second."""
+"""Input of the diagnosed model: the judge's rate loop is that of the vehicle file. With rotor
+speeds as input, a wrong torque diverges within a second."""
 DIAGNOSIS = Estimate(90.0, 1.5e9)
-"""What a diagnosis needs."""
+"""Time and memory of a diagnosis."""
 PHYSICS_HZ = 200.0
-"""Steps of the quadrotor in which a Delta Action Model is fitted, for the estimate [Hz]."""
+"""Physics steps of the quadrotor in a fit of the Delta Action Model, for the estimate [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -53,20 +53,20 @@ class LoopRun:
     """A loop in its folder."""
 
     loop: Loop
-    """The declaration."""
+    """The kind of loop."""
     config: LoopConfig
-    """What it is run with."""
+    """Its settings."""
     out: Path
     """The folder."""
     console: Console
-    """Where progress goes."""
+    """Shows progress."""
     workers: Workers | None = None
-    """Who shares the flights and the fine-tunings; None flies in as many processes as are worth it
-    and fine-tunes one policy after the other."""
+    """Of flights and fine-tunings; None flies in as many processes as shorten the work and
+    fine-tunes one policy after the other."""
 
     @property
     def logs(self) -> Path:
-        """The folder of the flights to which Delta Action Models are fitted."""
+        """The folder of the flights for fits and diagnosis."""
         return self.out / ("measured" if self.loop.hidden else "flights")
 
     def policy(self, variant: Variant) -> Path:
@@ -119,7 +119,7 @@ def _begin(run: LoopRun) -> Stage:
 
 
 def _flying(run: LoopRun, trials: int, simulator: str) -> Estimate:
-    """Return about how long `trials` take in `simulator`, and their memory."""
+    """Return the approximate time and memory of `trials` in `simulator`."""
     return flying_needs(trials, workers_for(trials, run.workers, simulator), simulator)
 
 
@@ -217,7 +217,7 @@ def _diagnose(run: LoopRun) -> Stage:
                 f"{folder / 'report.html'}; record more flights (--flights) with another --out"
             )
 
-    words = "asking the diagnosis what the vehicle file lacks"
+    words = "diagnosing what the vehicle file lacks"
     return Stage("diagnosis", words, DIAGNOSIS, work, tell)
 
 

@@ -2,8 +2,8 @@
 
 The air itself moves by a steady wind, and by gusts that are coloured to first order.
 
-A `Moment` is what they see of N flights. Thrusts are changed in the order of `THRUSTS`: what adds
-to a rotor's thrust, then what scales it.
+A `Moment` has their inputs for N flights. Thrusts are changed in the order of `THRUSTS`: first
+additions to a rotor's thrust, then factors.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class Wind:
         return self._steady_w + self._gust_w
 
     def step(self, vel_w: np.ndarray, length_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the wind (N, 3) at the start and at the end of a step, and go there [m/s].
+        """Return the wind (N, 3) at the start and at the end of a step, and advance it [m/s].
 
         dw/dt = -w / tau + noise with tau = length / max(airspeed, 1), exact for a constant tau.
 

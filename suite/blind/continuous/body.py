@@ -52,22 +52,22 @@ class Body:
         return self._ends[0]
 
     def begin_row(self, time_s: np.ndarray, speed: np.ndarray) -> None:
-        """Note how fast the air is now, and the voltage of the first row."""
+        """Set the wind at the start of a step, and the voltage of the first row."""
         self._ends = self._wind.now_w, self._wind.now_w
         if self._first_drop is None and (time_s >= 0.0).all():
             self._first_drop = self.drop(time_s, speed)
 
     def blow(self, state: np.ndarray, length_s: np.ndarray) -> None:
-        """Move the air on by a step."""
+        """Advance the wind by a step."""
         if not self._wind.still:
             self._ends = self._wind.step(state[:, VEL], length_s)
 
     def ask(self, speed: np.ndarray, wanted: np.ndarray, length_s: np.ndarray) -> None:
-        """Note what the rotors, at `speed` (N, 4), are asked for in a step of `length_s` (N, 1)."""
+        """Set the commanded rotor speeds for a step of `length_s` (N, 1) from `speed` (N, 4)."""
         if self.quadrotor.time_constant > 0.0:
             self._asked = wanted
         else:
-            # Rotors that follow at once do so within the step.
+            # Rotors without lag reach the command within the step.
             self._jump = (wanted - speed) / np.maximum(length_s, 1e-9)
 
     def spin_up(self, speed: np.ndarray) -> np.ndarray | float:
@@ -77,12 +77,12 @@ class Body:
         return (self._asked - speed) / self.quadrotor.time_constant
 
     def wind_w(self, share: float) -> np.ndarray:
-        """Return the wind (N, 3) at `share` of the present step [m/s]."""
+        """Return the wind (N, 3) at a fraction `share` of the present step [m/s]."""
         before, after = self._ends
         return before + share * (after - before)
 
     def drop(self, time_s: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return how far the voltage is below that of a full battery in a hover (N, 1) [V]."""
+        """Return the voltage drop below a full battery in hover (N, 1) [V]."""
         power = (speed * speed).sum(axis=1, keepdims=True) / self._hover_power
         fallen = self._battery.fall_v_per_s * np.maximum(time_s, 0.0)
         return fallen + self._battery.sag_v * (power - 1.0)
@@ -114,7 +114,7 @@ class Body:
         self, state: np.ndarray, speed: np.ndarray, time_s: np.ndarray, share: float,
         push_b: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Return d state / dt (N, 13); `share` is that of the present step."""
+        """Return d state / dt (N, 13) at a fraction `share` of the present step."""
         q = self.quadrotor
         force_b, torque_b, rot_w = self.forces(state, speed, time_s, self.wind_w(share))
         rate_b = state[:, RATE]

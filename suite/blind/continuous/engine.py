@@ -21,7 +21,7 @@ class Rows(NamedTuple):
     """N flights at one row."""
 
     number: int
-    """Of the row."""
+    """Number of the row."""
     time_s: np.ndarray
     """(N,) [s]."""
     pos_w: np.ndarray
@@ -45,11 +45,11 @@ class Flown(NamedTuple):
     speed: np.ndarray
     """(S + 1, N, 4) of the rotors [rad/s]."""
     push_b: np.ndarray
-    """(S, N, 3) force of physics from outside in each step, body axes [N]."""
+    """(S, N, 3) additional force in each step, body axes [N]."""
     command: np.ndarray
-    """(R, N, 4) as the pilot gave it: thrust [m/s^2], body rates [rad/s]."""
+    """(R, N, 4) logged commands: thrust [m/s^2], body rates [rad/s]."""
     acting: np.ndarray
-    """(R, N, 4) what acted of it, before its delay."""
+    """(R, N, 4) commands that act, before their delay."""
     acc_b: np.ndarray
     """(R, N, 3) specific force [m/s^2]."""
     voltage: np.ndarray
@@ -57,10 +57,10 @@ class Flown(NamedTuple):
 
 
 Pilot = Callable[[Rows], tuple[np.ndarray, np.ndarray]]
-"""Rows to the command (N, 4) that is logged and the one that acts."""
+"""(row) -> the logged command (N, 4) and the command that acts (N, 4)."""
 Push = Callable[[Rows, np.ndarray, np.ndarray], np.ndarray]
-"""Physics from outside: (state at the start of a step, force_b (N, 3), length (N, 1)) to the force
-(N, 3) that is added during the step, body axes [N]."""
+"""Additional physics: (state at the start of a step, force_b (N, 3), length (N, 1)) -> force (N, 3)
+that is added during the step, body axes [N]."""
 
 
 def fly(
@@ -75,13 +75,13 @@ def fly(
     """Fly N flights from the states `start` (N, 13), rotors at their hovering speed.
 
     Args:
-        quadrotor: what flies.
-        plan: when.
+        quadrotor: the true vehicle.
+        plan: rows and steps.
         start: states at the first row.
-        pilot: gives the command of each row.
+        pilot: returns the command of each row.
         rng: of gusts.
         battery: its voltage.
-        push: physics besides.
+        push: additional physics.
     """
     count, steps, rows = len(start), len(plan.start_s), len(plan.stamp_s) - 1
     believed = quadrotor.believed
@@ -100,7 +100,7 @@ def fly(
     for row in range(rows):
         now = plan.stamp_s[row][:, None]
         seen = _rows(row, now[:, 0], state)
-        # Before the row's command acts, as a sensor would have it.
+        # Before the row's command acts, like a sensor.
         body.begin_row(now, speed)
         force_b = body.forces(state, speed, now, body.blowing)[0]
         pushed_b = pushes[plan.block[row] - 1] if row else np.zeros((count, 3))

@@ -1,4 +1,4 @@
-"""What is logged of a flight: the faults of a log, noise white and coloured, rows that are lost."""
+"""The log of a flight: faults of the log, white and coloured noise, lost rows."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from suite.blind.continuous.engine import Flown
 from suite.blind.continuous.timing import Conditions
 
 IN_A_ROW = 3
-"""Rows without a pose follow each other in such stretches."""
+"""Numbers of consecutive rows without a pose."""
 
 
 class Noise(NamedTuple):
-    """Of rows at `rate_hz`, standard deviations; 0 leaves a channel out."""
+    """Standard deviations of the noise of rows at `rate_hz`; 0 leaves a channel out."""
 
     rate_hz: float
     pos: float
@@ -56,16 +56,16 @@ def log_of_flight(
         flown: all flights.
         index: of the flight.
         duration_s: of the log.
-        faults: values of effects by name; those that are no fault of a log are passed over.
-        noise: for its own rate. Rows at another get as much noise a second: its deviations times
-            the root of the rates' ratio, of which a part may be coloured.
+        faults: values of effects by name; only faults of a log are used.
+        noise: at its own rate. Rows at another rate have the same noise density: deviations are
+            multiplied by the root of the rates' ratio. A part may be coloured.
         conditions: of the case.
-        rng: of noise, of stamps and of lost rows; None logs every row as it was.
+        rng: of noise, stamps and lost rows; None logs all rows without errors.
         name: of the log.
         about: its metadata.
     """
     stamps = flown.schedule.stamp_s[:-1, index]
-    # A stamp's rounding must not cost the first row.
+    # Rounding of a stamp must not remove the first row.
     rows = np.flatnonzero((stamps > -1e-9) & (stamps < duration_s))
     time_s = stamps[rows]
     step = flown.schedule.block[rows]
@@ -103,7 +103,7 @@ def log_of_flight(
         acc_b=acc_b[kept] if noise.acc else None,
         voltage=voltage[kept] if noise.voltage else None,
         about=dict(about),
-        # Not written to a file, as if it had not been measured.
+        # Not in the log, as if it had not been measured.
         velocity_derived=not noise.vel,
     )
 
@@ -111,13 +111,13 @@ def log_of_flight(
 def state_at(flown: Flown, index: int, time_s: np.ndarray) -> np.ndarray:
     """Return the states (T, 13) of flight `index` at any times within it [s].
 
-    Between two ends of a step the position is the cubic that has their velocities, the rest is
-    linear, over at most a millisecond.
+    Within a step (at most a millisecond) the position is a cubic with the velocities at both ends,
+    and all else is linear.
     """
     ends = flown.time_s[:, index]
     time_s = np.clip(time_s, ends[0], ends[-1])
     after = np.clip(np.searchsorted(ends, time_s, side="right"), 1, len(ends) - 1)
-    # Steps of no length share their ends; the last of them starts the one that counts.
+    # Steps of zero length have equal ends; the last of them starts the next real step.
     before = after - 1
     span = ends[after] - ends[before]
     share = np.where(span > 0.0, (time_s - ends[before]) / np.where(span > 0.0, span, 1.0), 1.0)
@@ -141,7 +141,7 @@ def turned(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
 
 
 class _Draws:
-    """Draws of one flight's noise."""
+    """The random noise of one flight."""
 
     def __init__(
         self, rng: np.random.Generator, time_s: np.ndarray, noise: Noise, conditions: Conditions
@@ -150,12 +150,12 @@ class _Draws:
         self._rate_hz, self._conditions = noise.rate_hz, conditions
 
     def white(self, sigma: float, size: int, share: float = 1.0) -> np.ndarray:
-        """Return (T, size) of `share` of the noise a second that rows of the table have."""
+        """Return white noise (T, size) with a share of the noise density."""
         root = np.sqrt(share * self._conditions.row_hz / self._rate_hz)
         return sigma * root * self._rng.standard_normal((len(self._time_s), size))
 
     def estimated(self, sigma: float) -> np.ndarray:
-        """Return (T, 3), a part of it coloured, with the same density at low frequencies."""
+        """Return noise (T, 3) with a coloured part, of the same density at low frequencies."""
         share, colour_s = self._conditions.coloured, self._conditions.colour_s
         white = self.white(sigma, 3, 1.0 - share)
         # The density of a first-order process at zero frequency is 2 tau sigma^2.

@@ -1,8 +1,8 @@
-"""What flies: the true constants of a vehicle with its effects, and what its controller believes.
+"""The true constants of a vehicle with its effects, and its controller with nominal constants.
 
-Read off the numbers of a vehicle by shared definitions alone: the nominal quadrotor's five steps
-and the catalogue's table of equations. No hook of the catalogue is called. The controller
-turns body rates to torque, and torque to rotor speeds within their range.
+Only definitions are shared with the suite: the nominal quadrotor's five steps and the catalogue's
+equations. No function of the catalogue is called. The controller computes torque from body rates,
+and rotor speeds within their range from torque.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ CONSTANTS = (
     "motor_lag", "command_delay", "thrust_scale", "mass_offset", "com_offset", "inertia_scale",
     "rate_gain", "weak_motor", "thrust_tilt", "frame_tilt",
 )  # fmt: skip
-"""Effects that change a constant of the vehicle or of the world."""
+"""Effects that change a constant of the vehicle or its environment."""
 OF_LOGS = ("gyro_bias", "accelerometer_bias", "clock_offset")
-"""Effects that change what is logged, and nothing in flight."""
+"""Effects that change only the log."""
 
 
 class Believed(NamedTuple):
-    """What the rate loop and the mixer go by: the vehicle file's nominal values."""
+    """Constants of the rate loop and the mixer: the vehicle file's nominal values."""
 
     mass: float
     """[kg]."""
     inertia: np.ndarray
     """(3,) [kg m^2]."""
     rate_gain: np.ndarray
-    """(3,) K, as it truly is: the catalogue's `rate_gain` is an error of the loop [1/s]."""
+    """(3,) true K, since the catalogue's `rate_gain` is an error of the loop [1/s]."""
     shares: np.ndarray
     """(4, 4) thrust of each rotor for a unit of (collective, torque about x, y, z)."""
     thrust_max: float
@@ -45,7 +45,7 @@ class Believed(NamedTuple):
 
 
 class Quadrotor(NamedTuple):
-    """The truth."""
+    """The true constants."""
 
     believed: Believed
     mass: float
@@ -65,18 +65,18 @@ class Quadrotor(NamedTuple):
     thrust_axis: np.ndarray
     """(3,) along which the total thrust pushes, body axes."""
     time_constant: float
-    """Of the rotors [s]; 0 follows at once."""
+    """Time constant of the rotors [s]; 0 for no lag."""
     delay: float
-    """By which commands act late [s]."""
+    """Delay of commands [s]."""
     effects: dict[str, Any]
     """Values of every effect, by name."""
 
 
 def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
-    """Return what the numbers of `vehicle` say.
+    """Return the true vehicle and its controller from the numbers of `vehicle`.
 
     Raises:
-        ValueError: for an effect that this engine has no equation for.
+        ValueError: for an effect without an equation in this engine.
     """
     effects = dict(vehicle.effects)
     known = {*CONSTANTS, *OF_LOGS, *THRUSTS, *FORCES, *TORQUES, *WINDS}
@@ -129,16 +129,16 @@ def leaning_z(angle: np.ndarray) -> np.ndarray:
 
 
 TINY = 1e-12
-"""Thrusts below this are rounding [N]."""
+"""Smaller thrusts are rounding errors [N]."""
 
 
 def wanted_speeds(believed: Believed, command: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
-    """Return the rotor speeds (N, 4) that the loop asks for [rad/s].
+    """Return the rotor speeds (N, 4) that the rate loop commands [rad/s].
 
     Args:
-        believed: what the controller knows.
+        believed: the controller's constants.
         command: (N, 4) thrust per nominal mass [m/s^2], body rates [rad/s].
-        rate_b: (N, 3) as the loop measured them [rad/s].
+        rate_b: (N, 3) measured by the loop [rad/s].
     """
     inertia = believed.inertia
     x, y, z = inertia
@@ -152,8 +152,9 @@ def wanted_speeds(believed: Believed, command: np.ndarray, rate_b: np.ndarray) -
 def allotted(believed: Believed, collective: np.ndarray, torque_b: np.ndarray) -> np.ndarray:
     """Return each rotor's thrust (N, 4) for a collective (N,) [N] and a torque (N, 3) [N m].
 
-    Where a rotor would be out of [0, f_max]: roll and pitch shrink by one factor until their spread
-    is f_max, the collective goes to the nearest feasible one, yaw takes what room is left.
+    If a rotor would exceed [0, f_max], roll and pitch are scaled by one factor until their spread
+    is f_max, the collective is set to the nearest feasible value, and yaw is scaled to the
+    remaining range.
     """
     lift, most = believed.shares[:, 0], believed.thrust_max
     tilt = torque_b[:, :2] @ believed.shares[:, 1:3].T

@@ -1,7 +1,7 @@
-"""A flight's conditions, and when things happen: rows, rate loop ticks, late commands, and steps.
+"""The conditions of a flight and its schedule: rows, rate loop ticks, delayed commands, steps.
 
-Every event is the end of a step, so that nothing jumps inside one. The steps of N flights are laid
-side by side row by row; a flight with fewer steps between two rows waits in steps of no length.
+Every event is the end of a step, so that nothing jumps within a step. The steps of N flights are
+aligned row by row; a flight with fewer steps between two rows has steps of zero length at the end.
 """
 
 from __future__ import annotations
@@ -14,25 +14,24 @@ import numpy as np
 STEP_S = 1e-3
 """Longest step [s]."""
 SAME_S = 1e-9
-"""Events nearer than this are one [s]."""
+"""Events closer than this are merged [s]."""
 
 
 class Schedule(NamedTuple):
     """R rows and S steps of N flights."""
 
     stamp_s: np.ndarray
-    """(R + 1, N) when each row is measured and its command given; the last entry ends the flight
-    [s]."""
+    """(R + 1, N) times of rows and their commands; the last is the end of the flight [s]."""
     block: np.ndarray
-    """(R + 1,) the first step from each row on."""
+    """(R + 1,) index of the first step after each row."""
     start_s: np.ndarray
-    """(S, N) of each step [s]."""
+    """(S, N) start of each step [s]."""
     length_s: np.ndarray
-    """(S, N) [s]."""
+    """(S, N) length of each step [s]."""
     is_tick: np.ndarray
-    """(S, N) whether the rate loop measures at the start of the step."""
+    """(S, N) whether the rate loop runs at the start of the step."""
     acting: np.ndarray
-    """(S, N) the row whose command acts in the step; -1 before the first."""
+    """(S, N) row of the command that acts in the step; -1 before the first."""
 
 
 def jittered_stamps(
@@ -41,8 +40,8 @@ def jittered_stamps(
 ) -> np.ndarray:  # fmt: skip
     """Return the stamps (R + 1, N) of rows from `start_s` past `end_s` [s].
 
-    Rows are nominally 1 / rate apart, with one at 0, which does not jitter; the others do by up to
-    `jitter` of a row, evenly.
+    Rows are nominally 1 / rate apart. The one at 0 has no jitter; the others have a uniform one of
+    up to `jitter` rows.
     """
     period = 1.0 / rate_hz
     number = np.arange(int(np.ceil(start_s / period)), int(np.ceil(end_s / period)) + 2)
@@ -57,9 +56,9 @@ def schedule(
     """Return the steps of flights with rows at `stamp_s` (R + 1, N).
 
     Args:
-        stamp_s: when rows are measured [s].
-        loop_s: period of the rate loop, which starts anew at every row [s].
-        delay_s: by which commands act late [s].
+        stamp_s: times of the rows [s].
+        loop_s: period of the rate loop, which restarts at every row [s].
+        delay_s: delay of commands [s].
         step_s: longest step [s].
     """
     flights = [_one(stamps, loop_s, delay_s, step_s) for stamps in stamp_s.T]
@@ -67,7 +66,7 @@ def schedule(
     counts = np.stack([np.bincount(row, minlength=rows) for row, *_ in flights], axis=1)
     most = counts.max(axis=1)
     block = np.concatenate([[0], np.cumsum(most)])
-    # What waits, waits at the end of its row.
+    # Steps of zero length are at the end of a row.
     ends = np.repeat(stamp_s[1:], most, axis=0)
     parts = [ends, np.zeros_like(ends), np.zeros(ends.shape, bool), np.zeros(ends.shape, int)]
     for index, (row, start, length, tick, acting) in enumerate(flights):
@@ -85,7 +84,7 @@ def schedule(
 def _one(
     stamps: np.ndarray, loop_s: float, delay_s: float, step_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return of one flight's steps: row, start, length, whether the loop ticks, acting row."""
+    """Return the steps of one flight: row, start, length, loop tick, row of the acting command."""
     span = np.diff(stamps)
     ticks = np.maximum(np.ceil(span / loop_s - SAME_S / loop_s), 1.0).astype(int)
     first = np.concatenate([[0], np.cumsum(ticks)])[:-1]
@@ -114,13 +113,13 @@ def _one(
 
 
 LOOP_HZ = (200.0, 2000.0)
-"""Rate loops run at these or between them."""
+"""Range of the rate loops' frequency [Hz]."""
 ROW_HZ = (50.0, 1000.0)
-"""Rows come at these or between them, and no faster than the loop that they start."""
+"""Range of the rows' rate, at most the loop's frequency [Hz]."""
 USUAL_LOOPS = (200.0, 250.0, 400.0, 500.0, 800.0, 1000.0, 1600.0, 2000.0)
-"""Half of the cases have one of these."""
+"""Frequencies of half of the cases [Hz]."""
 USUAL_ROWS = (50.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0)
-"""Half of the cases have one of these, as far as the loop is fast enough."""
+"""Row rates of half of the cases, if the loop is fast enough [Hz]."""
 JITTER = 0.3
 """Largest jitter of a stamp, in rows."""
 CLOCK_S = 1e-4
@@ -133,21 +132,21 @@ COLOUR_S = (0.02, 0.2)
 
 @dataclass(frozen=True)
 class Conditions:
-    """Of one case; the answer holds them."""
+    """Conditions of one case, which are in its answer."""
 
     loop_hz: float
-    """Of the rate loop; the vehicle file says it."""
+    """Frequency of the rate loop, which is in the vehicle file [Hz]."""
     row_hz: float
-    """Nominal, of commands and rows."""
+    """Nominal rate of commands and rows [Hz]."""
     jitter: float
-    """Of the true stamps, evenly to both sides, in rows."""
+    """Largest jitter of the true stamps, uniform to both sides [rows]."""
     clock_s: float
-    """Error of a logged stamp, evenly to both sides [s]."""
+    """Largest error of a logged stamp, uniform to both sides [s]."""
     dropped: float
-    """Share of rows that the log lacks; their commands acted."""
+    """Share of lost rows; their commands act."""
     coloured: float
-    """Share of the slow noise of poses and velocities that is first-order Gauss-Markov; the rest is
-    white."""
+    """Coloured share (first-order Gauss-Markov) of the noise of poses and velocities; the other
+    part is white."""
     colour_s: float
     """Its correlation time [s]."""
 

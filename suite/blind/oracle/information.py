@@ -1,13 +1,12 @@
-"""What the flights of a case can say about every parameter of the catalogue, without noise.
+"""The Fisher information of a case's flights about all parameters of the catalogue.
 
-With g the whitened change of all logged channels for a unit of each parameter, the matrix
-G = g^T g decides everything to first order: parameters theta away from the given vehicle raise the
-expected log-likelihood ratio to theta^T G theta / 2, and what another effect leaves of it when it
-is fitted in its place is a Schur complement of G.
+g is the whitened Jacobian of all logged channels, and G = g^T g. To first order a parameter change
+theta from the given vehicle has the expected log-likelihood ratio theta^T G theta / 2. The part of
+it that remains after a fit of another effect is a Schur complement of G.
 
-g is the linearisation of the diagnosis's own rollouts at the given vehicle, along flights without
-noise. An error of that linearisation is in the oracle, too; what flies the cases is independent of
-it.
+g is the linearisation of the diagnosis's rollouts at the given vehicle, along flights without
+noise. The oracle shares errors of this linearisation; the simulators of the cases are independent
+of it.
 """
 
 from __future__ import annotations
@@ -35,16 +34,17 @@ from suite.diagnose.thresholds import THRESHOLDS
 SHORT_S, LONG_S = 0.5, LENGTH_S
 """Lengths of rollouts [s]; an error of force grows with the square of time."""
 THRESHOLD = 12.5
-"""Expected log-likelihood ratio at which an effect can just be detected: five sigma."""
+"""Expected log-likelihood ratio of a just detectable effect: five sigma."""
 REQUIRED = 0.125
-"""A name that leaves less log-likelihood ratio than this (half a sigma) in long rollouts, two sigma
-in some of twice their length, must be among the alternatives."""
+"""A name with a smaller remaining log-likelihood ratio in long rollouts (half a sigma; two sigma in
+rollouts of twice their length) must be among the alternatives."""
 ALLOWED = THRESHOLD
-"""A name that leaves less than this in short ones may be among them, any other may not."""
+"""Only a name with a smaller remaining ratio in short rollouts may be among the alternatives."""
 MOSTLY = 0.25
-"""A name may stand for another only where it leaves less than this share of what that explains."""
+"""A name can replace another only if its remaining ratio is below this share of the explained
+one."""
 GUST_DRAWS = 24
-"""Flights with random wind on each trajectory."""
+"""Number of flights with random wind on each trajectory."""
 LIMITS = replace(THRESHOLDS, most_windows=100_000)
 """Every stretch counts."""
 
@@ -55,7 +55,7 @@ class Column(NamedTuple):
     effect: str
     parameter: str
     component: int
-    """0 for plain numbers."""
+    """Index of the component; 0 for a plain number."""
 
     @property
     def spec(self) -> Parameter:
@@ -68,7 +68,7 @@ class Column(NamedTuple):
         return float(np.ravel(getattr(values, self.parameter))[self.component])
 
     def room(self, nominal: Vehicle) -> tuple[float, float]:
-        """Return how far down and up it may go from its value in the given vehicle."""
+        """Return the allowed change down and up from its value in the given vehicle."""
         given = self.value(all_values(nominal)[self.effect])
         return at(self.spec.low, nominal) - given, at(self.spec.high, nominal) - given
 
@@ -82,7 +82,7 @@ class Information:
     """(P, P), in the order of `columns`, per unit of each parameter."""
 
     def rows_of(self, effect: str) -> list[int]:
-        """Return the numbers of the columns of `effect`."""
+        """Return the indices of the columns of `effect`."""
         return [i for i, column in enumerate(self.columns) if column.effect == effect]
 
     def block(self, effect: str) -> np.ndarray:
@@ -92,7 +92,7 @@ class Information:
 
 
 def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
-    """Return every component that is identifiable, of `names` or of all, but for random wind."""
+    """Return all identifiable components of `names`, or of all effects, without random wind."""
     return tuple(
         Column(name, parameter.name, component)
         for name, effect in EFFECTS.items()
@@ -108,7 +108,7 @@ def information(
     names: Sequence[str] | None = None,
     horizon_s: float = SHORT_S,
 ) -> Information:
-    """Return what flights say about effects (all, or `names`), from the `nominal` vehicle on.
+    """Return the information of flights about effects (all, or `names`) at the `nominal` vehicle.
 
     Arguments are those of `linearised`.
     """
@@ -124,14 +124,14 @@ def linearised(
     columns: Sequence[Column],
     horizon_s: float = SHORT_S,
 ) -> Block:
-    """Return rollouts of `nominal` along logs, over the noise, less what unknown starts explain.
+    """Return whitened rollouts of `nominal` along logs, with unknown starts projected out.
 
     Args:
         nominal: the given vehicle.
         logs: without noise.
-        sensors: their noise; rows at another rate than theirs count as much a second.
-        columns: the block is along these.
-        horizon_s: length of a rollout, and from the start of one to the next's [s].
+        sensors: their noise; rows at another rate have the same weight per second.
+        columns: parameters of the Jacobian.
+        horizon_s: length of a rollout, and distance of their starts [s].
     """
     space = make_space(nominal)
     place = [Column(entry.effect, entry.parameter, entry.component or 0) for entry in space.entries]
@@ -182,12 +182,12 @@ def gust_strength(
 
 
 def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
-    """Return the expected log-likelihood ratio of a `change` (P,) under information (P, P)."""
+    """Return the expected log-likelihood ratio of a `change` (P,) for information (P, P)."""
     return float(0.5 * change @ matrix @ change)
 
 
 def detectable(matrix: np.ndarray, direction: np.ndarray) -> float:
-    """Return how often `direction` (P,) can just be detected; infinite where it does not show."""
+    """Return the multiple of `direction` (P,) that is just detectable; infinite if never."""
     ratio = log_ratio(matrix, direction)
     return float(np.sqrt(THRESHOLD / ratio)) if ratio > 1e-12 else float("inf")
 
@@ -200,13 +200,13 @@ def left_over(
     nominal: Vehicle,
     one: int | None = None,
 ) -> float:
-    """Return the log-likelihood ratio that is left where `other` is fitted for `instead_of`.
+    """Return the log-likelihood ratio that remains if `other` is fitted instead of `instead_of`.
 
     Args:
         info: of the case's flights.
         truth: change of each true effect's columns from the given vehicle, by name.
         instead_of: the true effect that is left out; the other true ones are fitted too.
-        other: takes its place, within its physical bounds; only its column `one` if that is given.
+        other: fitted in its place, within its physical bounds; only its column `one` if given.
         nominal: the given vehicle.
         one: number of a column.
     """
@@ -228,7 +228,7 @@ def left_over(
 def alternatives(
     info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle
 ) -> dict[str, dict[str, float]]:
-    """Return for each true effect the names that may stand for it, with what they leave over."""
+    """Return for each true effect the names that may replace it, with their remaining ratios."""
     found: dict[str, dict[str, float]] = {name: {} for name in truth}
     for other in nameable_effects():
         if other in truth or EFFECTS[other].random:

@@ -1,9 +1,9 @@
-"""How strong each effect must be to be detected at all: worked out without noise, and kept.
+"""The just detectable strength of each effect, from flights without noise.
 
-It comes from noise-free flights of the given vehicles and says nothing of any diagnosis. A
-direction in an effect's parameters is just detectable where the expected log-likelihood ratio of
-its flights against the given vehicle is `information.THRESHOLD`. The committed table keeps what
-`suite blind strengths` found; an effect that is not in it is worked out when it is asked for.
+It depends only on the flights, not on a diagnosis. A direction in an effect's parameters is just
+detectable if the expected log-likelihood ratio against the given vehicle is
+`information.THRESHOLD`. `suite blind strengths` writes the committed table; an effect that is not
+in it is computed when it is needed.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ SCHEMA = 1
 TABLE = Path(__file__).parent / "strengths.json"
 VEHICLES = Path(__file__).parents[1] / "vehicles"
 FLIGHTS_SEED = 7_000_000
-"""Of the flights that the table is made from; no case uses it."""
+"""Seed of the table's flights; no case uses it."""
 
 
 def given_vehicle(name: str) -> Vehicle:
-    """Return a vehicle as cases give it to the diagnosis: `bare` or `dragged`."""
+    """Return a nominal vehicle of the cases: `bare` or `dragged`."""
     return load_vehicle(VEHICLES / f"{name}.toml")
 
 
@@ -65,7 +65,7 @@ def write_table(console: Console) -> Path:
 
 
 def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return the table's entries of the effects `names`, worked out on flights of the vehicle."""
+    """Return the table's entries of the effects `names`, computed on flights of the vehicle."""
     given, found, about = given_vehicle(vehicle), {}, SENSORS[sensors]
     rng = np.random.default_rng(FLIGHTS_SEED)
     ways = ordinary_flights(rng), long_flights(rng)
@@ -85,12 +85,12 @@ def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any
 
 
 def columns_in_table(vehicle: str, sensors: str, effect: str) -> list[Column]:
-    """Return the columns of `effect` in which its strength is given."""
+    """Return the columns of `effect` that define its strength."""
     return [Column(effect, str(p), int(c)) for p, c in _entry(vehicle, sensors, effect)["columns"]]
 
 
 def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndarray) -> float:
-    """Return how often `direction` (in the table's columns) is just detectable; inf for never."""
+    """Return the multiple of `direction` (table's columns) that is detectable, or inf."""
     entry = _entry(vehicle, sensors, effect)
     if "matrix" in entry:
         return detectable(np.array(entry["matrix"]), direction)

@@ -1,7 +1,7 @@
-"""Work whose product is a folder, on a machine that has none of our folders: they go as content.
+"""Work whose product is a folder, on another machine: folders are sent as content.
 
-There it is done in the user's cache, in a folder named by what is to be done, so that what a killed
-worker had saved is continued by the next worker that finds it.
+The other machine works in a folder of the user's cache that is named by the digest of the work. So
+the next worker continues from the files of a killed one.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from tracks.common.work.travel import pack
 
 Result = TypeVar("Result")
 Content = dict[str, bytes]
-"""Of a folder's files, by their path within."""
+"""Content of a folder's files, by relative path."""
 
 
 class Job(NamedTuple):
     """Work whose product is a folder."""
 
     task: Any
-    """What is to be done there."""
+    """Description of the work."""
     folder: Path
-    """Its own, with what an earlier call left in it, which it goes on with."""
+    """Folder of the product; the work continues from files of an earlier call."""
     reads: Path | None = None
-    """Another folder that it reads."""
+    """Another folder that the work reads."""
 
 
 class Parcel(NamedTuple):
-    """A job as it travels."""
+    """A job with the content of its folders."""
 
     task: Any
     name: str
-    """Of its folder."""
+    """Name of its folder."""
     folder: Content
     reads: Content | None
 
 
 def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
-    """Yield jobs with the content of their folders, read as they are asked for."""
+    """Yield jobs with the content of their folders, each read when it is needed."""
     for job in jobs:
         reads = None if job.reads is None else content(job.reads)
         yield Parcel(job.task, job.folder.name, content(job.folder), reads)
@@ -70,7 +70,7 @@ def do_apart(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[Resu
 
 
 def content(folder: Path) -> Content:
-    """Return the content of a folder, nothing where there is none."""
+    """Return the content of a folder, empty if it does not exist."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {
         str(path.relative_to(folder)): path.read_bytes()
@@ -80,7 +80,7 @@ def content(folder: Path) -> Content:
 
 
 def fill(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make `folder` one of these files, whole or not at all."""
+    """Replace `folder` by one with these files, completely or not at all."""
     with replacing_folder(folder) as new:
         for name, data in files.items():
             (new / name).parent.mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,7 @@ def fill(folder: Path, files: Mapping[str, bytes]) -> None:
 
 @contextmanager
 def _place(name: str) -> Iterator[Path]:
-    """Be alone in a folder of that name in the user's cache, or else in one for this once."""
+    """Lock a folder of that name in the user's cache, or make a temporary one."""
     place = user_cache() / "pieces" / name
     with ExitStack() as stack:
         try:

@@ -1,7 +1,7 @@
-"""One command in several JAX processes, on one machine or many: found, joined, and who writes.
+"""One command in several JAX processes, on one machine or many.
 
-All of them are given the same command. JAX connects them through the first one, the coordinator,
-whose process writes the files; the others need no folder of its.
+All processes run the same command. JAX connects them through the first one, the coordinator, which
+writes the files; the others need no access to its folders.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from tracks.common.files import to_json
 from tracks.input.ranges import Range
 
 COME_S = 300
-"""All processes have this long to come [s]."""
+"""Time for all processes to connect [s]."""
 SILENT_S = 60
-"""A process that nothing was heard of for so long counts as gone [s]."""
+"""A process without a heartbeat for this time counts as ended [s]."""
 ENVIRONMENTS = (
     ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_STEP_NODELIST"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE", "OMPI_MCA_orte_hnp_uri"),
 )
-"""By scheduler: this process, how many there are, and what JAX finds the coordinator by."""
+"""By scheduler: variables with this process, the number of processes, and the coordinator."""
 MOST = 100_000
 
 
 @dataclass(frozen=True)
 class Joined:
-    """Which of several processes this one is; srun of SLURM and mpirun of Open MPI say it."""
+    """This process among several; srun of SLURM and mpirun of Open MPI set it."""
 
     coordinator: str | None = None
     """For a training on several hosts: HOST:PORT at which the others reach the first process."""
@@ -52,10 +52,10 @@ class Member(NamedTuple):
 
 
 def member(asked: Joined, environment: Mapping[str, str] | None = None) -> Member:
-    """Return which process this is, by what was asked for or the environment; (0, 1) for one alone.
+    """Return this process's number from the options or the environment; (0, 1) if it is alone.
 
     Raises:
-        ValueError: for options that do not go together, or numbers that cannot be.
+        ValueError: for incomplete options, or numbers out of range.
     """
     given = (asked.coordinator, asked.processes, asked.process)
     if asked.processes == 1 and asked.coordinator is None and not asked.process:
@@ -82,10 +82,10 @@ def member(asked: Joined, environment: Mapping[str, str] | None = None) -> Membe
 
 
 def join(one: Member) -> None:
-    """Become one of several JAX processes; before JAX first looks for devices.
+    """Connect to the other JAX processes; must be called before JAX searches for devices.
 
     Raises:
-        WorkFailed: where the others do not come.
+        WorkFailed: if the others do not connect in time.
     """
     if one.of == 1:
         return
@@ -121,10 +121,10 @@ def writes() -> bool:
 
 
 def agree(what: Mapping[str, Any]) -> None:
-    """Find out that all processes were asked for the same, and run the same software.
+    """Check that all processes have the same settings and software.
 
     Raises:
-        ValueError: where they do not.
+        ValueError: if they differ.
     """
     if not several():
         return
@@ -147,7 +147,7 @@ def agree(what: Mapping[str, Any]) -> None:
 
 
 def from_the_first(tree: Any) -> Any:
-    """Return the first process's arrays, in all of them."""
+    """Return the first process's arrays in all processes."""
     if not several():
         return tree
     from jax.experimental import multihost_utils
@@ -156,7 +156,7 @@ def from_the_first(tree: Any) -> Any:
 
 
 def gathered(trees: list[Any]) -> list[Any]:
-    """Return the trees of arrays of all processes, each of which gives as many, in their order."""
+    """Return the trees of arrays of all processes in order; each gives the same number."""
     if not several():
         return trees
     import jax
@@ -172,7 +172,7 @@ def gathered(trees: list[Any]) -> list[Any]:
 
 
 def is_gone(error: Exception) -> bool:
-    """Say whether an error of JAX says that another process is gone."""
+    """Return whether an error of JAX means that another process has ended."""
     import jax
 
     words = str(error)

@@ -1,13 +1,13 @@
-"""Ctrl-C and a polite kill: a command ends in seconds with 130, whatever it is in the middle of.
+"""Ctrl-C and SIGTERM: a command ends within seconds with code 130, at any point of its work.
 
-Python hears of a signal between two of its own instructions. XLA compiles for half a minute within
-one, and an interpreter that ends while XLA's threads are at work crashes (it frees what they use).
-So a second thread listens: where the main thread has not heard of the signal in time, the process
-ends at once. That is as safe as kill -9: every file is written whole or not at all, the lock of a
-folder is the system's, and what lies about half-written is swept by the next command.
+Python handles a signal between two of its own instructions, but XLA may compile for half a minute
+within one. An interpreter that exits while XLA's threads work crashes, since it frees their memory.
+So a second thread waits for signals: if the main thread does not handle one in time, the process
+ends at once. This is as safe as kill -9: files are written completely or not at all, folder locks
+belong to the system, and the next command removes partial files.
 
-What is raised within a destructor or a callback of the garbage collector goes nowhere:
-Python reports it and goes on. An interrupt that was lost so is sent again.
+An exception in a destructor or a callback of the garbage collector is lost: Python only reports it.
+An interrupt that is lost in this way is sent again.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from typing import NoReturn
 from suite.common.errors import INTERRUPTED
 
 AGAIN_S = 0.05
-"""Until an interrupt that was lost is sent again [s]."""
+"""Time before a lost interrupt is sent again [s]."""
 PATIENCE_S = 3.0
-"""The main thread has this long to hear of a signal [s]."""
+"""Time for the main thread to handle a signal [s]."""
 WORDS = (
     "suite: interrupted in a step that cannot be stopped (mostly the compiler), so ended at once; "
     "what was saved is kept\n"
@@ -37,18 +37,18 @@ _SHOW_CURSOR = "\x1b[?25h"
 
 @contextmanager
 def ends_in_seconds() -> Iterator[None]:
-    """Turn SIGINT and SIGTERM into a KeyboardInterrupt, or where none comes up, into an end.
+    """Turn SIGINT and SIGTERM into a KeyboardInterrupt, or end the process if none is raised.
 
-    Outside of the main thread signals are someone else's business, as is one that is ignored.
+    Outside of the main thread, and for ignored signals, nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard, left = threading.Event(), threading.Event()
+    handled, left = threading.Event(), threading.Event()
     report = sys.unraisablehook
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
-        heard.set()
+        handled.set()
         raise KeyboardInterrupt
 
     def again() -> None:
@@ -66,7 +66,7 @@ def ends_in_seconds() -> Iterator[None]:
     mine = [s for s in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(s) != signal.SIG_IGN]
     source, sink = os.pipe()
     os.set_blocking(sink, False)
-    listener = threading.Thread(target=_listen, args=(source, mine, heard), daemon=True)
+    listener = threading.Thread(target=_listen, args=(source, mine, handled), daemon=True)
     before = {number: signal.signal(number, interrupt) for number in mine}
     fd_before = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
     sys.unraisablehook = lost
@@ -80,23 +80,23 @@ def ends_in_seconds() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         os.close(sink)
-        heard.set()
+        handled.set()
         listener.join()
         os.close(source)
 
 
 def end_at_once(code: int) -> NoReturn:
-    """End the process without taking the interpreter down, which crashes while XLA compiles."""
+    """End the process without the interpreter's shutdown, which crashes while XLA compiles."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(code)
 
 
-def _listen(source: int, mine: list[signal.Signals], heard: threading.Event) -> None:
-    """Read the numbers of signals until the pipe is closed; end the process if none hears."""
+def _listen(source: int, mine: list[signal.Signals], handled: threading.Event) -> None:
+    """Read the numbers of signals until the pipe closes; end the process at an unhandled one."""
     while numbers := os.read(source, 1):
-        if numbers[0] in mine and not heard.wait(PATIENCE_S):
+        if numbers[0] in mine and not handled.wait(PATIENCE_S):
             words = (_SHOW_CURSOR if os.isatty(2) else "") + WORDS
             os.write(2, words.encode())
             os._exit(INTERRUPTED)

@@ -1,9 +1,8 @@
-"""One writer a folder: a lock that is the system's, with a word about who holds it.
+"""One writer per folder: a lock of the operating system, with a description of its holder.
 
-The lock is `flock` on a file in the folder, so it ends with the process that holds it, however that
-ends. Nothing is written into that file, which may be another program's by its name; who holds it
-stands in a second one, which is written under another name and renamed. What a killed process
-leaves of both says nothing any more.
+The lock is `flock` on an empty file in the folder, so it ends with the process that holds it. The
+holder is described in a second file, which is written under another name and renamed. Both files
+have no meaning after the process has ended.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ from tracks.common.files import folder_while_used, sweep_parts, write_json
 from tracks.input.reading import InputError, read_json
 
 LOCK, HOLDER = ".suite-lock", ".suite-lock.json"
-"""Names of the two files in the folder; gone when the command ends."""
+"""Names of the two files in the folder; removed when the command ends."""
 _UNKNOWN = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 @contextmanager
 def one_writer(folder: Path) -> Iterator[None]:
-    """Be the only command that writes into `folder`; what killed ones left half-written is swept.
+    """Be the only command that writes into `folder`; partial files of killed commands are removed.
 
-    The folder is made, and taken away again where nothing came into it. Where the file system knows
-    no locks nothing is held.
+    The folder is made, and removed again if it stays empty. On a file system without locks nothing
+    is locked.
 
     Raises:
-        ValueError: where another command writes there: which, since when, and what to do.
-        OSError: where the folder cannot be made or written.
+        ValueError: if another command writes there: which one, since when, and what to do.
+        OSError: if the folder cannot be made or written.
     """
     from filelock import FileLock, Timeout
 
@@ -63,15 +62,15 @@ def one_writer(folder: Path) -> Iterator[None]:
             write_json(folder / HOLDER, _about())
             yield
         finally:
-            # Gone before it is free: whoever waits for it finds that it is not there and begins
-            # anew. The other way round, it would take away the lock of who came next.
+            # Removed before the release: a waiting command then makes a new file. In the other
+            # order this would remove the next command's lock.
             for name in (HOLDER, LOCK):
                 (folder / name).unlink(missing_ok=True)
             lock.release()
 
 
 def _is_foreign(path: Path) -> bool:
-    """Say whether what stands at `path` is no lock of ours; another command may just remove its."""
+    """Return whether the file at `path` is no lock of the suite; it may vanish at any moment."""
     try:
         found = path.stat()
     except FileNotFoundError:
@@ -83,7 +82,7 @@ def _is_foreign(path: Path) -> bool:
 def one_writer_each(folders: list[Path]) -> Iterator[None]:
     """Be the only command that writes into any of `folders`; see `one_writer`."""
     with contextlib.ExitStack() as stack:
-        # Path.resolve raises what is no error of the system where a link leads to itself.
+        # Path.resolve raises no OSError for a link to itself.
         for folder in dict.fromkeys(Path(os.path.realpath(path)) for path in folders):
             stack.enter_context(one_writer(folder))
         yield

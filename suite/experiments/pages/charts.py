@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from eval.judging.statistics import wilson
 from eval.judging.tables import Tally
-from suite.common.charts import LINES, METRICS, dots, legend, plain_axes, png, titled
+from suite.common.charts import LINES, dots, legend, plain_axes, png, titled
+from suite.common.curve import METRICS
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
 from suite.experiments.study.disturbed import Tested

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from suite.common.charts import METRICS
+from suite.common.curve import METRICS
 from suite.experiments.study.training import Row, Trained
 
 

@@ -1,4 +1,4 @@
-"""How long a policy thinks: single steps on one thread, engine after engine, in turn."""
+"""Times of a policy's single steps on one thread, with several engines in turn."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from policies.formats.policy_file import PolicyCheckpoint
 from policies.spec import PolicySpec
 
 Step = Callable[[], Any]
-"""Makes one step with memory on the inputs that it was built with; may return the action (1, 3)."""
+"""Makes one step on fixed inputs, with memory; may return the action (1, 3)."""
 BLOCK = 100
-"""Steps of one engine before the next has its turn."""
+"""Steps of one engine before the next engine."""
 WARM = 10
-"""Steps before those that count: the weights come into the processor's cache."""
+"""Untimed steps before a block, which load the weights into the processor's cache."""
 
 
 class Timing(NamedTuple):
     """Times of single steps [s]."""
 
     median_s: float
-    """The usual."""
+    """Median."""
     p99_s: float
-    """One step in a hundred takes longer."""
+    """99th percentile."""
     max_s: float
-    """The longest: what the operating system did meanwhile is in it."""
+    """Longest step, which includes interruptions by the operating system."""
 
 
 def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timing]:
@@ -51,7 +51,7 @@ def _timing(seconds: np.ndarray) -> Timing:
 
 
 def c_step(policy: CPolicy) -> Step:
-    """Return a step of a policy.c, called in this process as a flight controller calls it."""
+    """Return a step of a policy.c, called as on a flight controller."""
     state, image = _inputs(policy.spec)
     memory, action = policy.start(1), np.zeros((1, 3), np.float32)
     held = (memory, state, image, action)
@@ -68,7 +68,7 @@ def c_step(policy: CPolicy) -> Step:
 
 
 def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
-    """Return a step of ONNX Runtime on one thread, called as usual and with its memory bound."""
+    """Return a step of ONNX Runtime on one thread, as usual and with memory bound beforehand."""
     import onnxruntime
 
     from policies.formats.export import onnx_file

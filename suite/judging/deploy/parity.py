@@ -1,6 +1,6 @@
-"""How far an export in C is from the policy that it came from, step after step with memory.
+"""Differences between an export in C and its policy over many steps with memory.
 
-What a policy is given on flights of the judge scales its 8-bit export, and is what both are given.
+Observations from flights of the judge set the scales of an int8 export, and are the inputs of both.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ STEPS = 1000
 
 
 class Parity(NamedTuple):
-    """An export and its policy, both given the same and each with a memory of its own."""
+    """Differences of an export and its policy on the same inputs, each with its own memory."""
 
     steps: int
-    """Steps in turn; 0 where no compiler is here and nothing was measured."""
+    """Number of steps; 0 if there is no compiler and nothing was measured."""
     given: str
-    """What observations."""
+    """Description of the observations."""
     worst: float
-    """Largest difference of an action's number [m/s^2]."""
+    """Largest difference of an action's component [m/s^2]."""
     median: float
-    """The middle one [m/s^2]."""
+    """Median difference [m/s^2]."""
     timing: Timing | None
-    """Of a step on this machine."""
+    """Times of a step on this machine."""
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """The result as a sentence."""
         if not self.steps or self.timing is None:
             return "not compiled and not compared here: no C compiler (cc, or what CC names)"
         return (
@@ -55,12 +55,12 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
     """Compile the export in `folder` and compare it with its checkpoint.
 
     Args:
-        folder: with policy.c and policy.h.
-        checkpoint: where it came from.
-        observed: what both are given; drawn at random where there is nothing.
+        folder: has policy.c and policy.h.
+        checkpoint: the exported policy.
+        observed: inputs of both; None draws them at random.
 
     Raises:
-        PolicyError: where it does not compile.
+        PolicyError: if it does not compile.
     """
     given = "on flights" if observed else "inputs drawn at random"
     if find_compiler() is None:
@@ -77,43 +77,43 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
 
 
 TRACK = "random"
-"""The training distribution: an export is not scaled by the tracks that it is judged on."""
+"""The training distribution: the tracks of the result tables do not set an export's scales."""
 LEVELS = tuple(range(10))
 SEED = 900_000
-"""Of the first flight; no table is flown from it."""
+"""Seed of the first flight; no result table uses it."""
 
 
-class Listener:
-    """A policy that keeps what it was given, row by row of the judge's slots."""
+class Recorder:
+    """A policy that records its inputs, for each of the judge's slots."""
 
     def __init__(self, policy: Policy) -> None:
-        """Listen to what `policy` is given."""
+        """Record the inputs of `policy`."""
         self._policy = policy
         self._given: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """The policy's label."""
         return self._policy.name
 
     @property
     def spec(self) -> PolicySpec:
-        """The policy's own."""
+        """The policy's spec."""
         return self._policy.spec
 
     def start(self, n: int) -> Hidden:
-        """Return the policy's memory of n trials."""
+        """Return the policy's memory for n trials."""
         return self._policy.start(n)
 
     def act(
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
-        """Return what the policy answers."""
+        """Return the policy's actions and memory."""
         self._given.append((state.copy(), image.copy(), fresh.copy()))
         return self._policy.act(hidden, state, image, fresh)
 
-    def heard(self) -> Observed:
-        """Return all of it, flight after flight; rows in which nothing flew are left out."""
+    def observed(self) -> Observed:
+        """Return all inputs, flight by flight, without rows of idle slots."""
         state, image, fresh = (np.stack(each, 1) for each in zip(*self._given, strict=True))
         flew = np.abs(state).max(-1) > 0
         parts: list[Any] = [x[flew] for x in (state, image, fresh)]
@@ -123,9 +123,9 @@ class Listener:
 def observed_flights(
     policy: Policy, vehicle: str = "reference", levels: tuple[int, ...] = LEVELS
 ) -> Observed:
-    """Return what `policy` is given on one flight of a random track at each level."""
-    listener = Listener(policy)
+    """Return the inputs of `policy` on one flight of a random track at each level."""
+    recorder = Recorder(policy)
     trials = [TrialSpec(TRACK, level, SEED + k) for k, level in enumerate(levels)]
     options = JudgeOptions(slots=len(trials), workers=1)
-    fly(listener, trials, load_vehicle(vehicle), options=options)
-    return listener.heard()
+    fly(recorder, trials, load_vehicle(vehicle), options=options)
+    return recorder.observed()

@@ -1,4 +1,4 @@
-"""`suite fly` from its options to its answer: simulated flights and the judge's, or one link."""
+"""`suite fly`: simulated flights compared with the judge's, or one flight over a real link."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ FLY = "fly.json"
 
 @dataclass(frozen=True)
 class LinkFlights:
-    """What is flown over a link, as run.json has it."""
+    """The settings of flights over a link, for run.json."""
 
     evaluation: Evaluation
     """The trials."""
     policy: dict[str, Any]
-    """Name, source and digest of who flies."""
+    """Name, source and digest of the policy."""
     limits: Limits
     """Of the watchdog."""
     link: str
@@ -62,8 +62,8 @@ def fly_commanded(
     """Fly and write logs and fly.json into `out`.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
-        WorkFailed: where pymavlink is missing, or no vehicle answered.
+        ValueError: for invalid options, before the first flight.
+        WorkFailed: if pymavlink is missing, or no vehicle answers.
     """
     dialect()
     course = read_course(evaluation, real_time=True)
@@ -71,22 +71,22 @@ def fly_commanded(
     name = policy or default_policy()
     (plain,) = manners(evaluation.speed, monitor=False)
     loaded = load_in_manner(name, evaluation.trust, plain)
-    pilot = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
+    flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if evaluation.monitor:
-        loaded, pilot = Monitored(loaded), Monitored(pilot)
+        loaded, flying = Monitored(loaded), Monitored(flying)
     flown = LinkFlights(evaluation, about_policy(name, loaded), limits, link or "simulated")
     refuse_other_run(out, flown)
     rules = Rules(time_limit_s=evaluation.time_limit_s)
-    # Before the flights: what the judge refuses is not flown.
+    # Before the flights, since the judge may refuse the policy.
     judged = [] if link else _judged(loaded, course, rules)
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
     if link:
-        found = _real(pilot, course, link, limits, out, console, key)
+        found = _real(flying, course, link, limits, out, console, key)
     else:
         flights: list[Flight] = []
         try:
-            for flight in fly_simulated(pilot, course, rules, limits, out, console):
+            for flight in fly_simulated(flying, course, rules, limits, out, console):
                 flights.append(flight)
         except KeyboardInterrupt as error:
             interrupt = error
@@ -94,8 +94,8 @@ def fly_commanded(
         found["flights"] = [flight.row for flight in flights]
         _show(found, flights, console)
     about = {"policy": flown.policy, "limits": limits, "link": flown.link}
-    if isinstance(pilot, Monitored):
-        found["interventions"] = pilot.interventions
+    if isinstance(flying, Monitored):
+        found["interventions"] = flying.interventions
     answer = {**stamp(1, evaluation.seed), **about, **found}
     write_json(out / FLY, answer)
     write_run_record(out, flown, evaluation.seed)

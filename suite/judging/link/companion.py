@@ -1,8 +1,8 @@
 """The companion computer: states and images in, body rates and thrust out, and its watchdog.
 
-It knows the course, keeps its own count of gates, and is driven by what arrives: the newest state
-is answered with a set point at once, and where the policy's next decision is due it decides first.
-Time is handed in, so that a test can hold the clock.
+It has the course, counts gates itself, and reacts to messages: it answers the newest state with a
+set point at once, after a decision of the policy if one is due. The clock is an argument, for
+tests.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 FINISHED = "all gates passed"
-"""The reason of a hand-over that is none to worry about."""
+"""The reason of the hand-over after a complete flight."""
 _SLACK_S = 1e-3
-"""A decision is due this much before its time: stamps are rounded [s]."""
+"""A decision is due this much earlier, because time stamps are rounded [s]."""
 
 
 class Companion:
@@ -56,14 +56,14 @@ class Companion:
         clock: Clock,
         limits: Limits | None = None,
     ) -> None:
-        """Be ready to fly; the flight begins when a state and an image are there.
+        """Prepare a flight, which begins with the first state and image.
 
         Args:
-            policy: who decides.
+            policy: the policy.
             track: the course, in the frame of the vehicle's states.
-            vehicle: what is flown: mass, thrust, attitude gains.
+            vehicle: gives mass, thrust and attitude gains.
             wire: this end of the link.
-            clock: seconds that only go forward.
+            clock: monotonic time [s].
             limits: of the watchdog.
         """
         self._policy, self._vehicle, self._wire, self._clock = policy, vehicle, wire, clock
@@ -94,12 +94,12 @@ class Companion:
 
     @property
     def flying(self) -> bool:
-        """Whether it has begun and not handed over."""
+        """Whether the flight has begun and has not ended."""
         return bool(self.rows) and self.over is None
 
     @property
     def misfit(self) -> str:
-        """What to say of depth images of another size than the policy's; empty without any."""
+        """A message about depth images of another size than the policy's; empty without any."""
         if self._picture.misfit is None:
             return ""
         camera, (width, height) = self._policy.spec.camera, self._picture.misfit
@@ -109,7 +109,7 @@ class Companion:
         )
 
     def receive(self, datagrams: list[bytes]) -> list[bytes]:
-        """Return what is to be sent, now that `datagrams` have come (or none have)."""
+        """Return the datagrams to send after receiving `datagrams` (may be none)."""
         heard_s = self._clock()
         before = self._wire.broken, self._wire.foreign
         messages = self._wire.decoded(datagrams)
@@ -133,18 +133,18 @@ class Companion:
         return self._answer(states)
 
     def alive(self) -> bytes:
-        """Return the datagram that says that this end is there."""
+        """Return the heartbeat datagram."""
         return self._wire.encoded(Alive())
 
     def end(self, reason: str) -> list[bytes]:
-        """Return the datagrams that hand over for `reason`, none where that has happened."""
+        """Return the datagrams of a hand-over for `reason`; none after an earlier one."""
         return self._hand_over(reason) if self.over is None else []
 
     def _event(self, text: str) -> None:
         self.events.append(f"{self._clock():.3f}: {text}")
 
     def _hand_over(self, reason: str) -> list[bytes]:
-        """Stop sending set points, which the vehicle's own failsafe sees, and say why."""
+        """Stop sending set points, which triggers the vehicle's failsafe, and send the reason."""
         self.over = reason
         self._event(f"handed over: {reason}")
         return [self._wire.encoded(Note(f"policy hands over: {reason}"))]
@@ -157,7 +157,7 @@ class Companion:
             self._depth, self._depth_at = found, self._clock()
 
     def _answer(self, states: list[State]) -> list[bytes]:
-        """Check the states that have come together, and fly on the newest: no backlog is flown."""
+        """Check all received states, and answer only the newest one."""
         for state in states:
             trouble = trouble_with_state(state, self._box, self._limits)
             if trouble:
@@ -176,7 +176,7 @@ class Companion:
             self._begun_s = states[0].time_s
             self._heading_w = level_heading(quat_to_rot(states[0].quat_wxyz)[None])
             self._event("begun")
-        # Others were overtaken on the way.
+        # Others arrived out of order.
         news = [s for s in states if self._last is None or s.time_s > self._last.time_s]
         for state in news:
             trouble = self._last and trouble_between(self._last, state, self._limits)
@@ -195,7 +195,7 @@ class Companion:
         self._last = state
 
     def _fly(self, state: State) -> list[bytes]:
-        # At the first state by the autopilot's own period: the judge's heading begins so.
+        # One period of the autopilot at the first state, as in the judge.
         since_s = state.time_s - self.rows[-1].state.time_s if self.rows else 1.0 / ATTITUDE_HZ
         decided = self._is_due(state)
         rot_w = quat_to_rot(state.quat_wxyz)[None]
@@ -210,7 +210,8 @@ class Companion:
             force_w = action_to_force(self._action_b, rot_w)
             command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)
         thrust, rate_b = float(command.thrust[0]), command.rate_b[0]
-        # A real autopilot's thrust is a share of its own; docs/fly.md says how to measure it.
+        # A real autopilot's thrust is a share of its own maximum; docs/fly.md describes its
+        # measurement.
         share = min(1.0, thrust / self._vehicle.full_thrust)
         sent = self._wire.encoded(SetPoint(rate_b, share))
         now = self._clock()
@@ -223,10 +224,10 @@ class Companion:
         return [sent]
 
     def _is_due(self, state: State) -> bool:
-        """Say whether to decide on a state; what states came too late for is not made up for.
+        """Return whether a decision is due at a state; missed decisions are not repeated.
 
-        The policy's memory knows one distance between decisions: several in a burst after a gap
-        would be more time to it than has passed.
+        The policy's memory assumes a fixed time between decisions: several at once after a gap
+        would count as more time than has passed.
         """
         since_s = state.time_s - self._begun_s + _SLACK_S
         now = int(since_s * self._policy.spec.rate_hz)
@@ -259,7 +260,7 @@ class Companion:
             answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
             took_s = self._clock() - self._heard_at
             guarded = guard_action(limits, answer, self._action_b, took_s, self._policy.name)
-        except Exception as error:  # whatever it is, the vehicle must hear of it
+        except Exception as error:  # on any error the vehicle must be handed over
             return f"the policy failed: {type(error).__name__}: {error}"
         self._action_b, self._fresh = guarded.action_b, False
         late = bool(guarded.late[0])
@@ -278,7 +279,7 @@ def _row(gates: Gates, number: int) -> Gates:
 
 
 class Row(NamedTuple):
-    """What the companion knew and did at one state."""
+    """State, decision and set point of the companion at one time."""
 
     state: State
     thrust: float
@@ -286,14 +287,14 @@ class Row(NamedTuple):
     rate_b: np.ndarray
     """(3,) wanted body rates [rad/s]."""
     action_b: np.ndarray
-    """(3,) the policy's action in use [m/s^2]."""
+    """(3,) the policy's current action [m/s^2]."""
     decided: bool
     """Whether the policy decided on this state."""
     gate: int
     """Number of the next gate."""
     answered_s: float
-    """From the state's arrival to its set point [s]."""
+    """Time from the state's arrival to its set point [s]."""
     state_age_s: float
-    """From the state's stamp to its set point, where both ends have one clock [s]."""
+    """Time from the state's stamp to its set point, if both ends have one clock [s]."""
     image_age_s: float
-    """From the image's arrival to the decision [s]."""
+    """Time from the image's arrival to the decision [s]."""

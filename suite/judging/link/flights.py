@@ -1,4 +1,4 @@
-"""Flights over the link in real time: many against a simulated vehicle, or one of whoever calls."""
+"""Flights over the link in real time: many with a simulated vehicle, or one with a real link."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 
 ALIVE_S = 1.0
-"""How often a companion says that it is there [s]."""
+"""Period of the companion's heartbeat [s]."""
 POLL_S = 0.002
-"""How often the watchdog looks where nothing comes [s]."""
+"""Period of the watchdog without messages [s]."""
 AFTER_S = 0.5
-"""A vehicle whose companion has seen the last gate says so within this [s]."""
+"""Time for the vehicle's process to report the end after the last gate [s]."""
 
 
 class Flight(NamedTuple):
     """One flight over the link."""
 
     row: dict[str, Any]
-    """What a table says of it."""
+    """Its result."""
     rows: list[Row]
-    """Its set points."""
+    """Its states and set points."""
 
 
 def warm_up(policy: Policy) -> None:
-    """Let a policy answer once, so that nothing is compiled in flight."""
+    """Run a policy a few times, so that nothing is compiled in flight."""
     spec = policy.spec
     size = (1, spec.camera.height, spec.camera.width)
     seen = Observation(np.zeros((1, spec.state_size), np.float32), np.zeros(size, np.float32))
@@ -111,7 +111,7 @@ def _one(
 
 
 def exchange(companion: Companion, link: UdpLink) -> None:
-    """Let what has come reach the companion, and what it answers leave."""
+    """Pass received datagrams to the companion, and send its answers."""
     link.send(companion.receive(link.receive(POLL_S)))
 
 
@@ -123,8 +123,7 @@ def fly_link(
 ) -> None:
     """Fly a vehicle at the other end of `link` until the companion hands over.
 
-    Where no vehicle is heard of within `wait_s`, it ends as well. An interrupt hands over at once:
-    no set point is sent any more.
+    It also ends if no vehicle answers within `wait_s`. After an interrupt no set point is sent.
     """
     begin, called = clock(), -math.inf
     with _no_collection():
@@ -138,7 +137,7 @@ def fly_link(
 
 
 def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | None:
-    """Write a flight's log into `out` and return its name; None where it is too short for one."""
+    """Write a flight's log into `out` and return its name; None if it is too short."""
     log = log_of(companion, about)
     name = log_name(about["track"], about["difficulty"], about["seed"])
     try:
@@ -151,7 +150,7 @@ def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | N
 
 
 def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
-    """Return what the flights came to together."""
+    """Return the summary of all flights."""
     rows = [row for flight in flights for row in flight.rows]
     return {
         "trials": len(flights),
@@ -166,7 +165,7 @@ def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _no_collection() -> Iterator[None]:
-    """Python's collector of garbage would stop a flight for milliseconds."""
+    """Disable Python's garbage collector, which would stop a flight for milliseconds."""
     gc.collect()
     gc.disable()
     try:
@@ -176,11 +175,11 @@ def _no_collection() -> Iterator[None]:
 
 
 def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
-    """Return what is to be known of the times of set points, in ms.
+    """Return statistics of the delays of set points [ms].
 
     Args:
-        rows: of one flight or of many.
-        deadline_s: what counts as missed.
+        rows: of one flight or several.
+        deadline_s: a longer answer counts as missed.
     """
     if not rows:
         return {}
@@ -206,7 +205,7 @@ def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
 
 
 def log_of(companion: Companion, about: dict[str, Any]) -> FlightLog | None:
-    """Return a flight as the companion saw it, None where it had under two states."""
+    """Return the companion's log of a flight; None with fewer than two states."""
     rows = companion.rows
     if len(rows) < 2:
         return None

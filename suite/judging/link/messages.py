@@ -1,19 +1,19 @@
-"""What travels on the link, as MAVLink 2 of the dialect `common`, and as our own values.
+"""The link's messages: MAVLink 2 of the dialect `common`, converted to our values.
 
-| what | message |
+| content | message |
 |---|---|
 | state of the vehicle | ODOMETRY (331): LOCAL_NED, velocity there or in BODY_FRD |
 | depth image | DATA_TRANSMISSION_HANDSHAKE (130) and ENCAPSULATED_DATA (131): a 16-bit PGM in mm |
 | body rates and thrust | SET_ATTITUDE_TARGET (82), attitude ignored, thrust 0 to 1 |
-| what happened | STATUSTEXT (253) |
-| that the companion is there | HEARTBEAT (0) |
+| text for the operator | STATUSTEXT (253) |
+| heartbeat of the companion | HEARTBEAT (0) |
 
 MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
-transmission is made for small pictures, and 24 x 32 pixels fit into seven packets; a packet that
-is lost loses its image and nothing else.
+transmission is made for small pictures: 24 x 32 pixels need seven packets. A lost packet loses only
+its image.
 
-MAVLink's world is NED and its body FRD, ours z up and FLU: north is our x, east minus our y, down
-minus our z, and forward, right and down likewise. Both changes are the same half turn about x.
+MAVLink's world frame is NED and its body frame FRD, ours are z up and FLU. Both conversions are the
+same half turn about x.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 from tracks.input.reading import read_bytes, reason
 
 PACKET = 253
-"""Bytes of an image in one message."""
+"""Image bytes in one message."""
 MOST_PACKETS = 65535
-"""Of one image."""
+"""Most packets of an image."""
 IGNORE_ATTITUDE = 128
 """Bit of SET_ATTITUDE_TARGET's type mask."""
 SIGNING_EPOCH_S = 1420070400
-"""Begin of 2015, from which signatures count their time [s]."""
+"""Beginning of 2015, the epoch of MAVLink's signatures [s]."""
 LOCAL_NED, BODY_FRD = 1, 12
 """MAVLink's numbers of the frames."""
 _HEAD = b"P5\n%d %d\n65535\n"
 
 
 class State(NamedTuple):
-    """The vehicle's state as it was measured; arrays in our frames."""
+    """The vehicle's measured state; arrays in our frames."""
 
     time_s: float
-    """By the vehicle's clock [s]."""
+    """Time of the vehicle's clock [s]."""
     pos_w: np.ndarray
     """(3,) [m]."""
     quat_wxyz: np.ndarray
@@ -59,13 +59,13 @@ class State(NamedTuple):
     rate_b: np.ndarray
     """(3,) [rad/s]."""
     resets: int = 0
-    """The vehicle's own count of jumps of its estimate."""
+    """The vehicle's counter of jumps of its estimate."""
     fault: str = ""
-    """Why it cannot be flown on, as the message itself says."""
+    """Reason for which the message cannot be used, or ""."""
 
 
 class SetPoint(NamedTuple):
-    """What the vehicle shall do until the next one."""
+    """Commands for the vehicle until the next set point."""
 
     rate_b: np.ndarray
     """(3,) wanted body rates [rad/s]."""
@@ -74,17 +74,17 @@ class SetPoint(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Words for the operator."""
+    """A text for the operator."""
 
     text: str
 
 
 class Alive(NamedTuple):
-    """That the companion computer is there: a vehicle that waits to be called hears of it so."""
+    """A heartbeat of the companion; a waiting vehicle learns its address from it."""
 
 
 class Packet(NamedTuple):
-    """A part of an image: its place among `parts`, or -1 for the announcement."""
+    """A part of an image: its number among `parts`, or -1 for the announcement."""
 
     place: int
     parts: int
@@ -110,10 +110,10 @@ def dialect() -> Any:
 
 
 def signing_key(path: Path | None) -> bytes | None:
-    """Return the key (32 bytes) of a passphrase's file, as ground stations make it; None without.
+    """Return the key (32 bytes) of a file with a passphrase, as in ground stations; None without.
 
     Raises:
-        ValueError: where the file cannot be read or is empty.
+        ValueError: if the file cannot be read or is empty.
     """
     if path is None:
         return None
@@ -127,20 +127,19 @@ def signing_key(path: Path | None) -> bytes | None:
 
 
 class Wire:
-    """One end of a link: our values to bytes, bytes to our values.
+    """One end of a link: converts our values to bytes and back.
 
-    What comes from another system, is cut off or is none of ours is left out and counted: `foreign`
-    and `broken`.
+    Messages of other systems (`foreign`) and damaged ones (`broken`) are left out and counted.
     """
 
     def __init__(self, own: int, other: int, key: bytes | None = None) -> None:
         """Make an end of a link.
 
         Args:
-            own: MAVLink's system number of itself.
-            other: that of whom it listens to.
-            key: 32 bytes; with it messages are signed as MAVLink 2 says, and those that are not, or
-                were sent before, count as broken.
+            own: MAVLink's system number of this end.
+            other: system number of the other end.
+            key: 32 bytes; with it messages are signed (MAVLink 2), and received messages that are
+                unsigned or repeated count as broken.
         """
         self._dialect = dialect()
         self._out = self._dialect.MAVLink(None, srcSystem=own, srcComponent=1)
@@ -184,7 +183,7 @@ class Wire:
         return made.pack(mav)
 
     def speaks(self, datagram: bytes) -> bool:
-        """Say whether a datagram is of whom this end listens to."""
+        """Return whether a datagram comes from the other end."""
         messages, _ = self._parsed(datagram, keep=False)
         return any(
             message.get_type() != "BAD_DATA" and message.get_srcSystem() == self._other
@@ -192,7 +191,7 @@ class Wire:
         )
 
     def decoded(self, datagrams: Iterable[bytes]) -> list[Message]:
-        """Return what arrived, in order."""
+        """Return the received messages in order."""
         found: list[Message] = []
         for datagram in datagrams:
             messages, cut_off = self._parsed(datagram)
@@ -203,19 +202,19 @@ class Wire:
                 elif message.get_srcSystem() != self._other:
                     self.foreign += 1
                 else:
-                    with np.errstate(invalid="ignore"):  # the watchdog finds infinities
+                    with np.errstate(invalid="ignore"):  # the watchdog checks for infinities
                         found += self._ours(message)
         return found
 
     def _parsed(self, datagram: bytes, keep: bool = True) -> tuple[list[Any], bool]:
-        """Return a datagram's messages, and whether its end is cut off."""
-        # A parser of its own for each: what is cut off must not swallow what comes next.
+        """Return a datagram's messages, and whether it is truncated."""
+        # A new parser for each: a truncated message must not affect the next datagram.
         parser = self._dialect.MAVLink(None)
         parser.robust_parsing = True
         parser.signing = copy.deepcopy(self._signing)
         messages = parser.parse_buffer(datagram) or []
         if keep and not any(message.get_type() == "BAD_DATA" for message in messages):
-            # The times of what was signed rightly; a forged one must not move them.
+            # Time stamps of valid signatures only; a forged one must not change them.
             self._signing = parser.signing
         return messages, parser.buf_len() > 0
 
@@ -269,7 +268,7 @@ def _state_of(message: Any) -> State:
 
 
 def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
-    """Return a planar depth image (H, W) [m] as packets; what is at the range or beyond is 0."""
+    """Return a planar depth image (H, W) [m] as packets; depths from the range on are 0."""
     height, width = depth_m.shape
     millimetres = np.where(depth_m < range_m, np.rint(depth_m * 1e3), 0).clip(0, 65535)
     data = _HEAD % (width, height) + millimetres.astype(">u2").tobytes()
@@ -280,13 +279,13 @@ def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
 
 
 class Picture:
-    """Packets gathered to images."""
+    """Assembles packets to images."""
 
     def __init__(self, height: int, width: int, range_m: float) -> None:
-        """Gather images of this size; what the camera does not see counts as `range_m`.
+        """Assemble images of this size; pixels without depth get `range_m`.
 
         Raises:
-            ValueError: for images that MAVLink's numbers of packets do not reach.
+            ValueError: for images with more packets than MAVLink can number.
         """
         self._shape, self._range_m = (height, width), range_m
         self._head = _HEAD % (width, height)
@@ -299,7 +298,7 @@ class Picture:
         self._parts: dict[int, bytes] = {}
         self._wanted = 0
         self.misfit: tuple[int, int] | None = None
-        """Width and height of the last image that was announced and is of another size."""
+        """Width and height of the last announced image of another size."""
 
     def add(self, packet: Packet) -> np.ndarray | None:
         """Return the depth image (H, W) [m] that this packet completes, else None."""
@@ -310,7 +309,7 @@ class Picture:
             if (height, width) != self._shape:
                 self.misfit = (width, height)
             return None
-        if packet.place in self._parts:  # of the next image, whose announcement was lost
+        if packet.place in self._parts:  # from the next image, whose announcement was lost
             self._parts, self._wanted = {}, 0
         if packet.place >= self._wanted:
             return None

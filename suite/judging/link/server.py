@@ -1,4 +1,4 @@
-"""A process that is the vehicle's end of the link: simulated flights in real time, on request."""
+"""A process with a simulated vehicle at its end of the link, which flies in real time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tracks.track import Track
 VEHICLE, COMPANION = 1, 2
 """MAVLink system numbers of the two ends."""
 WAIT_S = 30.0
-"""Without a first set point for so long the vehicle gives up [s]."""
+"""Time after which the vehicle gives up without a first set point [s]."""
 SLIP_S = 0.02
-"""A step that is this late moves the steps after it, instead of a burst that catches up [s]."""
+"""A step with a longer delay shifts the later steps, instead of a burst to catch up [s]."""
 
 
 class Request(NamedTuple):
-    """A flight that the vehicle shall make."""
+    """A flight for the vehicle."""
 
     track: Track
     trial: TrialSpec
@@ -40,18 +40,18 @@ class Request(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """What the vehicle says of a flight."""
+    """The vehicle's result of a flight."""
 
     result: TrialResult
     slips: int
-    """Steps that came more than `SLIP_S` late: the machine was busy."""
+    """Number of steps with a delay above `SLIP_S`, on a busy machine."""
 
 
 class VehicleProcess:
-    """The process; `start` a flight, ask for `flown`, `stop` one that goes on."""
+    """The process: `start` a flight, get its result by `flown`, `stop` a running one."""
 
     def __init__(self) -> None:
-        """Start it."""
+        """Start the process."""
         let_views_travel()
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
@@ -60,14 +60,14 @@ class VehicleProcess:
         other.close()
 
     def start(self, request: Request) -> None:
-        """Let it fly."""
+        """Start a flight."""
         self._pipe.send(request)
 
     def flown(self, wait_s: float = 0.0) -> Flown | None:
-        """Return what came of the flight, None while it goes on.
+        """Return the flight's result, or None while it runs.
 
         Raises:
-            WorkFailed: where the process has died.
+            WorkFailed: if the process has died.
         """
         try:
             return self._pipe.recv() if self._pipe.poll(wait_s) else None
@@ -75,7 +75,7 @@ class VehicleProcess:
             raise WorkFailed("the simulated vehicle's process died; run again") from None
 
     def stop(self) -> Flown | None:
-        """End the flight where it stands and return it."""
+        """Stop the flight and return its result."""
         self._pipe.send("stop")
         return self.flown(WAIT_S)
 
@@ -87,8 +87,8 @@ class VehicleProcess:
 
 
 def serve(pipe: Connection) -> None:
-    """Be the process: fly what is asked for until the pipe closes."""
-    # Ctrl-C goes to the terminal's whole group; when to end is the companion's to say.
+    """Run in the process: fly all requests until the pipe closes."""
+    # Ctrl-C reaches all processes of the terminal; the companion ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -100,7 +100,7 @@ def serve(pipe: Connection) -> None:
 
 
 def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
-    """Fly one trial against the clock, until it ends or something comes by the pipe."""
+    """Fly one trial in real time, until it ends or the pipe has a message."""
     link = UdpLink(request.address)
     try:
         wire = Wire(VEHICLE, COMPANION)
@@ -119,7 +119,7 @@ def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
             if not vehicle.begun and now - begin > WAIT_S:
                 break
             link.send(vehicle.step(link.receive(), clock_s=due))
-        # A companion that was kept waiting may have handed over meanwhile, which ends the loop.
+        # The companion may have handed over during a delay, which ends the loop.
         slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
     finally:
         link.close()

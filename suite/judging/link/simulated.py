@@ -1,8 +1,7 @@
-"""A vehicle in MuJoCo behind a link, as a flight controller with a depth camera would be.
+"""A vehicle in MuJoCo at the end of a link, like a flight controller with a depth camera.
 
-It measures, sends, listens, and flies the set points that come; where they stop it brakes and
-hovers by itself. Until the first one it stands in the air where the trial starts. Its physics are
-the judge's, step by step.
+It sends its state and images, and flies the received set points; without them it brakes and hovers.
+Before the first one it stays at the trial's start. Its physics are the judge's.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 LOST_S = 0.2
-"""Without a set point for so long the vehicle brakes by itself [s]."""
+"""Time without a set point after which the vehicle brakes [s]."""
 BRAKE = 2.0
-"""Wanted deceleration for each m/s while it does [1/s]."""
+"""Deceleration per speed while braking [1/s]."""
 BRAKE_MOST = 6.0
-"""[m/s^2]."""
+"""Largest deceleration [m/s^2]."""
 
 
 class SimulatedVehicle:
@@ -58,16 +57,16 @@ class SimulatedVehicle:
         wire: Wire,
         rules: Rules | None = None,
     ) -> None:
-        """Stand at the start of `track`.
+        """Place the vehicle at the start of `track`.
 
         Args:
             track: the trial's.
-            trial: its seed sets the wind, where there is any.
-            vehicle: what flies.
+            trial: its seed determines gusts.
+            vehicle: the flown vehicle.
             camera: of the depth images.
-            image_hz: how many of them a second.
+            image_hz: rate of the images.
             wire: this end of the link.
-            rules: when the trial ends.
+            rules: end of the trial.
         """
         self._vehicle, self._wire, self._trial = vehicle, wire, trial
         self._rules = rules or Rules()
@@ -99,20 +98,20 @@ class SimulatedVehicle:
 
     @property
     def begun(self) -> bool:
-        """Whether a set point has come."""
+        """Whether a set point has been received."""
         return self._command is not None
 
     @property
     def time_s(self) -> float:
-        """Of its own clock, from when it was switched on [s]."""
+        """Time of its own clock since its start [s]."""
         return self._ticks * self.dt
 
     def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
-        """Fly one physics step and return what was sent before it.
+        """Fly one physics step and return the datagrams sent before it.
 
         Args:
-            datagrams: what has come.
-            clock_s: what stamps say; its own clock if not given [s].
+            datagrams: received ones.
+            clock_s: time for the stamps; None: its own clock [s].
         """
         for message in self._wire.decoded(datagrams):
             if (
@@ -177,7 +176,7 @@ class SimulatedVehicle:
         return attitude_command(self._vehicle.controller, force_w, motion.rot_w, heading_w)
 
     def result(self, policy: str) -> TrialResult:
-        """Return how the trial went so far; one that did not end is out of time."""
+        """Return the trial's result so far; an unfinished one counts as a timeout."""
         progress = self._progress
         ended = int(progress.ended[0])
         how = ENDINGS[ended - 1] if ended else "timeout"

@@ -1,4 +1,4 @@
-"""Datagrams by UDP: `udpin:HOST:PORT` waits to be called, `udpout:HOST:PORT` calls."""
+"""UDP datagrams: `udpin:HOST:PORT` waits for the other end, `udpout:HOST:PORT` sends first."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import socket
 from collections.abc import Callable
 
 MOST_BYTES = 2048
-"""Of a datagram; a MAVLink message has 280 at most."""
+"""Most bytes of a datagram; a MAVLink message has at most 280."""
 
 
 class UdpLink:
-    """One end of a link. One that waits answers whoever called first, and nobody else."""
+    """One end of a link; a waiting end answers only the first valid sender."""
 
     def __init__(self, address: str, speaks: Callable[[bytes], bool] = lambda _: True) -> None:
         """Open an end.
 
         Args:
             address: udpin:HOST:PORT or udpout:HOST:PORT.
-            speaks: whether a datagram is a call; who sends another one does not take the link.
+            speaks: whether a datagram is valid; senders of others are ignored.
 
         Raises:
             ValueError: for an address of another form, a port that is taken, an unknown host.
@@ -37,7 +37,7 @@ class UdpLink:
         self._peer: tuple[str, int] | None = None
         self._speaks = speaks
         self.strangers = 0
-        """Datagrams of others, which were left out."""
+        """Number of ignored datagrams of other senders."""
         try:
             resolved = (socket.gethostbyname(host), int(port))
             if kind == "udpin":
@@ -53,11 +53,11 @@ class UdpLink:
 
     @property
     def port(self) -> int:
-        """The port that this end waits on."""
+        """The local port."""
         return int(self._socket.getsockname()[1])
 
     def receive(self, wait_s: float = 0.0) -> list[bytes]:
-        """Return the datagrams that have come, after at most `wait_s`; none where it is silent."""
+        """Return the received datagrams, after waiting for at most `wait_s`; may be none."""
         if wait_s > 0:
             select.select([self._socket], [], [], wait_s)
         found = []
@@ -66,7 +66,7 @@ class UdpLink:
                 data, sender = self._socket.recvfrom(MOST_BYTES)
             except BlockingIOError:
                 return found
-            except OSError:  # the other end is gone, and its machine said so
+            except OSError:  # the other end is closed
                 continue
             if self._peer is None and self._speaks(data):
                 self._peer = sender
@@ -76,7 +76,7 @@ class UdpLink:
                 self.strangers += 1
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams; what nobody listens to, or the system has no room for, is lost."""
+        """Send datagrams; errors are ignored, as UDP may lose datagrams anyway."""
         if self._peer is None:
             return
         for datagram in datagrams:
@@ -86,5 +86,5 @@ class UdpLink:
                 continue
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self._socket.close()

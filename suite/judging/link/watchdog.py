@@ -1,6 +1,6 @@
-"""When a policy must hand over: limits of the vehicle's states and of the link, and the reasons.
+"""The watchdog: limits of the vehicle's states and of the link, beyond which a policy hands over.
 
-Only what arrives is checked here. The judge's own guard limits the policy's actions, and with
+Only received messages are checked here. The judge's guard limits the policy's actions, and with
 `--monitor` the safety monitor does too (`eval/judging/monitor.py`).
 """
 
@@ -17,7 +17,7 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.input.ranges import Range
 
 DRIFT = 1e-3
-"""Seconds that two clocks drift apart in a second, at most; a quartz does a tenth of it."""
+"""Largest relative drift of two clocks; a quartz has a tenth of it [1]."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Box:
-    """Where the vehicle may be, world [m]."""
+    """The allowed region of the vehicle, world [m]."""
 
     low: np.ndarray
     high: np.ndarray
@@ -61,7 +61,7 @@ def box_of(points_w: np.ndarray, limits: Limits) -> Box:
 
 
 def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
-    """Return why a state is none to fly on from, or None."""
+    """Return the reason for which a state cannot be used, or None."""
     if state.fault:
         return state.fault
     numbers = np.concatenate([state.pos_w, state.quat_wxyz, state.vel_w, state.rate_b])
@@ -77,10 +77,9 @@ def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
 
 
 def trouble_between(last: State, state: State, limits: Limits) -> str | None:
-    """Return why a state does not follow from the one before it, or None.
+    """Return the reason for which a state does not continue the last one, or None.
 
-    A vehicle does not jump, its estimator does: through a gate that nobody flew through, or back
-    behind one that was passed.
+    A jump of the estimator could count a gate that was not passed, or miss one.
     """
     if state.resets != last.resets:
         return "the vehicle's estimator reset its state"
@@ -93,7 +92,7 @@ def trouble_between(last: State, state: State, limits: Limits) -> str | None:
 
 
 class ClockCheck:
-    """Whether the vehicle's clock goes as ours does, and its states come no later than they did."""
+    """Checks that the vehicle's clock runs like ours, and that states do not arrive later."""
 
     def __init__(self, limits: Limits) -> None:
         self._most = limits.clock_jump_s
@@ -101,10 +100,10 @@ class ClockCheck:
         self._at = 0.0
 
     def add(self, stamp_s: float, now_s: float) -> str | None:
-        """Return why a stamp cannot be, or None.
+        """Return the reason for which a time stamp is wrong, or None.
 
-        What is compared with is the promptest state, let go by no more than clocks drift apart: a
-        delay that creeps in is found as a jump is.
+        It is compared with that of the state with the shortest delay, allowing for the drift of
+        clocks: a slowly growing delay is found like a jump.
         """
         offset = now_s - stamp_s
         if self._offset is None:
@@ -122,4 +121,4 @@ class ClockCheck:
 
 
 Clock = Callable[[], float]
-"""Seconds that only go forward."""
+"""Monotonic time [s]."""

@@ -114,7 +114,7 @@ def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):
         (tmp_path / name / "course.toml").write_text(COURSE)
     tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
     for args, words in (
-        (["--track", tracks], "more than one is called 'course'"),
+        (["--track", tracks], "several tracks are called 'course'"),
         (["--simulator", "reference"], "'reference' records no flights; record in 'mujoco'"),
     ):
         asked = ["--policy", pilots["diver"], "--out", str(tmp_path / "out")]

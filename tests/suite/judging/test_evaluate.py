@@ -54,9 +54,9 @@ def test_laps_are_compared_with_the_plans_of_their_tracks(pilots, tmp_path, capf
 def test_what_a_folder_holds_is_not_written_over_without_a_word(pilots, tmp_path, capsys):
     asked = ["--track", "zigzag", "--policy", pilots["diver"]]
     assert _eval(tmp_path, *asked, "--trials", "1") == 0
-    assert "written over" not in capsys.readouterr().err
+    assert "overwritten" not in capsys.readouterr().err
     assert _eval(tmp_path, *asked, "--trials", "2") == 0
-    assert "holds an evaluation; its results will be written over" in _told(capsys)
+    assert "holds an evaluation; its results will be overwritten" in _told(capsys)
     assert cli.main(["collect", "--out", str(tmp_path), "--policy", pilots["diver"]]) == 2
     assert "holds a run of another kind" in _told(capsys)
 

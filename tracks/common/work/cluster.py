@@ -197,7 +197,7 @@ def _next(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]:
             if client.status != "running" or not client.nthreads():
                 raise WorkerDied(
                     f"the cluster at {address} has had no worker for {ALONE_S:.0f} s; what was "
-                    "finished is kept, the same command goes on"
+                    "finished is kept, the same command continues"
                 ) from None
     while not ended.empty():
         futures.append(ended.get())
@@ -218,7 +218,7 @@ def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
         why = f": {error}" if error else ", or its scheduler is gone"
         raise WorkerDied(
             f"the cluster at {address} gave up piece {in_air[future]}{why}; what was finished is "
-            "kept, the same command goes on"
+            "kept, the same command continues"
         )
 
 

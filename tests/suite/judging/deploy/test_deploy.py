@@ -140,16 +140,16 @@ def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
 
 
 def test_rows_in_which_nothing_flies_are_no_observations():
-    listener = parity.Listener(Steady())
-    hidden = listener.start(2)
+    recorder = parity.Recorder(Steady())
+    hidden = recorder.start(2)
     for k, flying in enumerate(((1, 1), (1, 0), (1, 0))):
         state = np.full((2, 12), float(k + 1)) * np.array(flying)[:, None]
         fresh = np.array([k == 0, k == 0])
-        _, hidden = listener.act(hidden, state, np.zeros((2, 24, 32)), fresh)
-    heard = listener.heard()
+        _, hidden = recorder.act(hidden, state, np.zeros((2, 24, 32)), fresh)
+    observed = recorder.observed()
     # Flight after flight: three steps of the first, one of the second.
-    assert heard.state[:, 0].tolist() == [1.0, 2.0, 3.0, 1.0]
-    assert heard.fresh.tolist() == [True, False, False, True]
+    assert observed.state[:, 0].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert observed.fresh.tolist() == [True, False, False, True]
 
 
 @needs_cc

@@ -330,7 +330,7 @@ def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsy
     shutil.copytree(yard.parent, tmp_path / "other")
     both = f"{yard},{tmp_path / 'other' / 'yard.toml'}"
     assert cli.main(["fly", "--track", both, "--out", str(tmp_path / "out")]) == 2
-    assert "more than one is called 'yard'" in printed(capsys)
+    assert "several tracks are called 'yard'" in printed(capsys)
 
 
 @pytest.mark.slow
