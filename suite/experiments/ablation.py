@@ -23,8 +23,12 @@ PROGRESS = (0.4, 0.8, 1.6, 3.2)
 own, is trained with and without it, so that a pair differs in nothing but the field."""
 NORMALISED = (1.6, 3.2, 6.4)
 """lambda_p of L_p^norm without the field."""
-KINDS = ("field", "progress", "normalised")
-"""First words of rows' keys."""
+KINDS = {
+    "field": "with the field, L_p",
+    "progress": "without, L_p",
+    "normalised": "without, L_p^norm",
+}
+"""Kinds of settings, the first words of their keys, with their labels."""
 RATES = ("success_cross", "collision_free")
 SPREADS = ("success_cross", "collision_free", "v_max", "v_max_most", "gates")
 
@@ -52,7 +56,8 @@ def document(config: Config, place: Place, console: Console) -> Made:
     whole = {row.key: row.at[-1] for row in rows if row.at}
     steps = config.iterations * recipe.episode.batch * recipe.episode.steps
     each = duration(float(np.median([run.seconds for run in runs])))
-    chart = bars_chart(whole, paper.ablation()[1], KINDS)
+    trained = f"{len(config.training_seeds)} training seeds, {config.trials} trials each"
+    chart = bars_chart(whole, paper.ablation()[1], KINDS, trained)
     facts = {
         "recipe": f"{' '.join([config.recipe, *config.set])} episode.gates={recipe.episode.gates}",
         "a training": f"{config.iterations} gradient steps of {recipe.episode.batch} worlds x "
@@ -102,16 +107,16 @@ def settings(config: Config) -> list[training.Row]:
     check_owned(config.set, {f"loss.{name}": "it is compared" for name in fixed})
     base = options.four_gate_recipe(config)
 
-    def row(key: str, words: str, weight: float, **changes: float) -> training.Row:
+    def row(kind: str, weight: float, **changes: float) -> training.Row:
         weights = {"progress": weight, "progress_norm": 0.0, **changes}
-        return training.Row(f"{key} {weight:g}", words, in_every_phase(base, "loss", **weights))
+        recipe = in_every_phase(base, "loss", **weights)
+        return training.Row(f"{kind} {weight:g}", KINDS[kind], recipe)
 
     weights = sorted({float(f"{weight:g}") for weight in (*PROGRESS, base.loss.progress)})
-    rows = [row("field", "with the field, L_p", w) for w in weights]
-    rows += [row("progress", "without, L_p", w, field_gain=0.0) for w in weights]
+    rows = [row("field", w) for w in weights]
+    rows += [row("progress", w, field_gain=0.0) for w in weights]
     rows += [
-        row("normalised", "without, L_p^norm", w, progress=0.0, progress_norm=w, field_gain=0.0)
-        for w in NORMALISED
+        row("normalised", w, progress=0.0, progress_norm=w, field_gain=0.0) for w in NORMALISED
     ]
     return list(options.chosen({row.key: row for row in rows}, config.only, "setting").values())
 

@@ -27,7 +27,7 @@ class Delayed(NamedTuple):
 
 
 def wait(state: FilterState, samples: int) -> Delayed:
-    """Return filters that start from `state`, for a delay of so many IMU samples."""
+    """Return filters that start from `state`, for a delay of `samples` IMU samples."""
     xp = state.pos_w.__array_namespace__()
     return Delayed(state, xp.zeros((state.pos_w.shape[0], samples, 7)))
 

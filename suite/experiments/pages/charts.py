@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -86,8 +87,12 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
 
 
 def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
-    """Return success against the size of each disturbance, a panel each."""
-    names = list(next(iter(grown.values()))[0].results)
+    """Return success against the size of each disturbance, a panel each.
+
+    Only measured sizes are drawn; dots of several policies stand next to each other.
+    """
+    results = next(iter(grown.values()))[0].results
+    names = list(results)
     rows = -(-len(grown) // 4)
     columns = -(-len(grown) // rows)
     figure = Figure(figsize=(10.4, 0.5 + 2.5 * rows), layout="constrained")
@@ -96,11 +101,13 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
         axes.set_visible(False)
     for axes, (sweep, points) in zip(panels, grown.items(), strict=False):
         sizes = [point.condition.size for point in points]
+        apart = 0.03 * (max(sizes) - min(sizes))
         for number, name in enumerate(names):
+            at = np.array(sizes) + apart * (number - (len(names) - 1) / 2)
+            label = f"{short_name(name)}, {len(results[name])} trials a point"
             colour = LINES[number % len(LINES)]
-            value, low, high = 100 * np.array([point.success(name) for point in points]).T
-            axes.fill_between(sizes, low, high, color=colour, alpha=0.15, lw=0)
-            axes.plot(sizes, value, "o-", ms=3.5, lw=1.6, color=colour, label=name)
+            found = [point.success(name) for point in points]
+            dots(axes, at, found, 100, ms=3.5, lw=1.2, color=colour, label=label)
         titled(axes, sweep.name)
         axes.set_xlabel(sweep.axis, fontsize=8)
         axes.set_ylabel("success [%]", fontsize=8)
@@ -109,25 +116,35 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
     return png(figure)
 
 
+def short_name(policy: str) -> str:
+    """Return a policy's label for a legend: of a checkpoint RUN/policy the name of the run."""
+    path = PurePath(policy)
+    return path.parent.name if path.name == "policy" and path.parent.name else policy
+
+
 def bars_chart(
-    rows: Mapping[str, Mapping[str, Spread]], printed: Mapping[str, Ablated], kinds: Sequence[str]
+    rows: Mapping[str, Mapping[str, Spread]],
+    printed: Mapping[str, Ablated],
+    kinds: Mapping[str, str],
+    trained: str,
 ) -> bytes:
     """Return means over training seeds as bars, least and most as dots, the paper's as diamonds.
 
     Args:
-        rows: numbers by key; the key's first word sets the colour.
+        rows: numbers by key: a kind and its weight, such as "field 0.4".
         printed: the paper's, of some keys.
-        kinds: all first words of keys, in the colours' order.
+        kinds: label of each kind, in the colours' order.
+        trained: the seeds and trials, for the legend.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     every = figure.subplots(1, 3, sharey=True)
     for axes, name in zip(every, ("success_cross", "collision_free", "v_max"), strict=True):
         scale = METRICS[name].scale
         for at, (key, numbers) in enumerate(rows.items()):
-            colour = LINES[kinds.index(key.split()[0])]
+            colour = LINES[list(kinds).index(key.split()[0])]
             mean, least, most = (scale * value for value in numbers[name])
             axes.barh(at, mean, height=0.55, color=colour, alpha=0.6)
-            label = "least and most of the training seeds" if at == 0 else None
+            label = f"mean, least and most of {trained}" if at == 0 else None
             axes.plot([least, most], [at, at], "o-", ms=4, lw=1.2, color=colour, label=label)
             if key in printed:
                 theirs = scale * getattr(printed[key], name)
@@ -136,25 +153,29 @@ def bars_chart(
         titled(axes, METRICS[name].title)
         if scale == 100:
             axes.set_xlim(-3, 103)
-    every[0].set_yticks(range(len(rows)), list(rows))
+    labels = [f"{kinds[kind]} {weight}" for kind, weight in map(str.split, rows)]
+    every[0].set_yticks(range(len(rows)), labels)
     every[0].invert_yaxis()
     legend(figure, every[0])
     return png(figure)
 
 
 def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
-    """Return numbers over steps and over time, a column each, with bands over training seeds."""
+    """Return numbers over steps and over time, a column each; bands span the training seeds."""
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, len(names), sharey="col")
     for column, name in enumerate(names):
         scale = METRICS[name].scale
-        for axes, x, words in ((upper[column], "steps", "environment steps"),
+        for axes, x, words in ((upper[column], "steps", "environment steps [thousands]"),
                                (lower[column], "time", "training [s]")):  # fmt: skip
+            unit = 1e3 if x == "steps" else 1.0
             for colour, row in zip(LINES, rows, strict=False):
-                at = [point[x].mean for point in row.at]
+                at = [point[x].mean / unit for point in row.at]
                 mean, least, most = scale * np.array([point[name] for point in row.at]).T
                 axes.fill_between(at, least, most, color=colour, alpha=0.15, lw=0)
-                axes.plot(at, mean, color=colour, label=row.words)
+                axes.plot(
+                    at, mean, "o-", ms=3, color=colour, label=f"{row.words}, {row.seeds} seeds"
+                )
             axes.set_xlabel(words, fontsize=9)
             titled(axes, METRICS[name].heading)
         if scale == 100:

@@ -205,5 +205,5 @@ def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_
     begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(30)]
     # What it was at, and what it had done and not handed over yet.
     assert sum(begun) - 30 <= 3 and max(begun) <= 2 and crew(found.address) == 1
-    with pytest.raises(WorkerDied, match="gave up piece 0.*same command goes on"):
+    with pytest.raises(WorkerDied, match="gave up piece 0.*same command continues"):
         work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)
