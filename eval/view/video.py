@@ -1,4 +1,4 @@
-"""A short video of a trial from behind the drone, temporary the depth image it saw.
+"""A short video of a trial from behind the drone, next to its depth image.
 
 The frames are painted by `scene3d.py` and encoded by `video_file.py`, so neither a display nor a
 GPU is needed.
