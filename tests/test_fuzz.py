@@ -63,15 +63,13 @@ MEMORY_BYTES = 2 * 2**30
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
 WITHIN_S = 10.0
 """None takes longer."""
-MAPPING = """
-[time]
-column = "t"
-unit = "us"
-[position]
-columns = ["x", "y", "z"]
-frame = "ned"
-unit = "m"
-"""
+TOML = {
+    "vehicle": ("examples/hidden.toml", load_vehicle),
+    "sensors": (PRESETS / "all.toml", load_sensors),
+    "track": ("tracks/examples/yard.toml", load_track),
+    "mapping": ("eval/importers/mappings/nanobench.toml", read_map),
+}
+"""A kind of TOML file: a valid one, and its reader."""
 
 
 def answered(use, *given):
@@ -163,16 +161,11 @@ def drawn_and_used(kind, folder):
         return mutated_bytes(valid), read
     if kind == "set":
         return changes(recipe), lambda change: check(override(recipe, [change]))
-    if kind == "vehicle":
-        text = (ROOT / "examples" / "hidden.toml").read_text()
-        return mutated_toml(text), filed(load_vehicle, "odd.toml")
-    if kind == "sensors":
-        return mutated_toml((PRESETS / "all.toml").read_text()), filed(load_sensors, "odd.toml")
-    if kind == "track":
-        text = (ROOT / "tracks" / "examples" / "yard.toml").read_text()
-        return mutated_toml(text), filed(load_track, "odd.toml")
-    if kind == "mapping":
-        return mutated_toml(MAPPING), filed(read_map, "odd.toml")
+    if kind in TOML:
+        valid, read = TOML[kind]
+        text = (ROOT / valid).read_text("utf-8")
+        read(ROOT / valid)
+        return mutated_toml(text), filed(read, "odd.toml")
     if kind == "checkpoint":
         source = shipped.folder("race-paper")
         (folder / "weights.safetensors").write_bytes((source / "weights.safetensors").read_bytes())

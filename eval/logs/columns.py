@@ -125,7 +125,7 @@ def check_columns(
     """
     needed = ("time",) if partial else NEEDED
     present = _present_groups(columns, name, needed)
-    values = {c: _numbers(columns[c], c, name) for group in present for c in GROUPS[group]}
+    values = {c: as_numbers(columns[c], c, name) for group in present for c in GROUPS[group]}
     for column, data in values.items():
         _refuse_where(np.isinf(data), name, column, data, "infinite")
     present = [group for group in present if _has_values(group, values, name, needed)]
@@ -216,7 +216,12 @@ def _did_you_mean(column: str, columns: Mapping[str, np.ndarray]) -> str:
     return ""
 
 
-def _numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
+def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
+    """Return the cells (N,) of a column as numbers, NaN where one is empty.
+
+    Raises:
+        FlightLogError: where they are something else.
+    """
     values = np.asarray(values)
     if values.ndim == 1 and values.dtype.kind in "fiub":
         return values.astype(np.float64)
@@ -225,9 +230,10 @@ def _numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
         raise FlightLogError(name, column, None, reason)
     numbers = np.full(len(values), np.nan)
     for k, value in enumerate(values):
+        text = value.strip() if isinstance(value, str) else value
         try:
-            if value is not None:
-                numbers[k] = float(value)
+            if text is not None and text != "":
+                numbers[k] = float(text)
         except (TypeError, ValueError):
             raise FlightLogError(name, column, k + 1, f"{value!r} is not a number") from None
     return numbers

@@ -18,7 +18,7 @@ from eval.importers.mapping import recording_of
 from eval.importers.mapping_file import LogMap, own_map, read_map
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import FlightLogError, as_numbers
 from eval.logs.faults.finding import Finding
 from eval.logs.files import first_line, read_columns
 from eval.logs.flight_log import flight_metadata
@@ -99,15 +99,7 @@ def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.nda
     values = np.asarray(columns[column])
     if values.dtype.kind in "fiub":
         return values
-    out = np.full(len(values), np.nan)
-    for k, value in enumerate(values):
-        text = value.strip() if isinstance(value, str) else value
-        try:
-            if text is not None and text != "":
-                out[k] = float(text)
-        except (TypeError, ValueError):
-            raise FlightLogError(name, column, k + 1, f"{value!r} is not a number") from None
-    return out
+    return as_numbers(values, column, name)
 
 
 def _missing(columns: Mapping[str, np.ndarray], column: str) -> str:
@@ -133,8 +125,10 @@ def _cells(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndar
 
 
 def _holds_lists(values: np.ndarray) -> bool:
+    if values.dtype.kind != "O":
+        return False
     first = next((v for v in values if isinstance(v, str) and v.strip()), "")
-    return np.asarray(values).dtype.kind not in "fiub" and first.strip()[:1] in "[("
+    return first.strip().startswith(("[", "("))
 
 
 def _lists(values: np.ndarray, column: str, name: str) -> np.ndarray:

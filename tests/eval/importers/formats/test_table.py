@@ -8,11 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
+from eval.importers.formats import table
 from eval.importers.options import ImportOptions
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight
 from tests.support.imported import TRUE, same_flight
 
+NAMES = "time,pos_x,pos_y,pos_z,quat_w,quat_x,quat_y,quat_z,rate_x,rate_y,rate_z"
 MAP = """
 [frames]
 world = "ned"
@@ -134,11 +136,19 @@ def test_columns_that_are_not_there_are_refused_by_name(tmp_path, old, new, reas
 
 def test_text_among_numbers_is_refused_with_its_row(tmp_path):
     path = tmp_path / "log.csv"
-    names = "time,pos_x,pos_y,pos_z,quat_w,quat_x,quat_y,quat_z,rate_x,rate_y,rate_z"
     rows = [f"{k / 100},0,0,1,1,0,0,0,0,{'broken' if k == 7 else 0},0" for k in range(200)]
-    path.write_text("\n".join([names, *rows]) + "\n")
+    path.write_text("\n".join([NAMES, *rows]) + "\n")
     with pytest.raises(FlightLogError, match=r"column rate_y, row 8: 'broken' is not a number"):
         import_log(path)
+
+
+def test_dates_are_refused_as_such_and_empty_cells_are_no_lists():
+    dates = {"t": np.array(["2026-01-01T00:00:01"], "M8[ns]")}
+    with pytest.raises(FlightLogError, match=r"column t: a date or a span .*write it as a number"):
+        table._cells(dates, "t", "log")
+    texts = {"names": np.array(["", None, " "], object), "lists": np.array(["[1 2]", ""], object)}
+    assert np.isnan(table._cells(texts, "names", "log")).tolist() == [[True]] * 3
+    np.testing.assert_array_equal(table._cells(texts, "lists", "log"), [[1, 2], [np.nan] * 2])
 
 
 def test_a_table_without_a_map_says_what_it_needs(tmp_path):
