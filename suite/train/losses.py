@@ -51,12 +51,12 @@ def collide(_: LossConfig, step: Step) -> jax.Array:
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:
     """Return L_a [m^2/s^4]."""
-    return (step.acc_w * step.acc_w).sum(-1)
+    return (step.acc_w * step.acc_w).sum(1)
 
 
 def jerk(_: LossConfig, step: Step) -> jax.Array:
     """Return L_j [m^2/s^6]."""
-    return (step.jerk_w * step.jerk_w).sum(-1)
+    return (step.jerk_w * step.jerk_w).sum(1)
 
 
 def tilt(_: LossConfig, step: Step) -> jax.Array:
@@ -68,7 +68,7 @@ def tilt(_: LossConfig, step: Step) -> jax.Array:
 def speed_to_goal(step: Step) -> jax.Array:
     """Return the speed (B,) towards the goal of the progress term [m/s]."""
     to_goal = step.goal_w - step.pos_w
-    return (step.vel_w * to_goal).sum(-1) / norm(to_goal)
+    return (step.vel_w * to_goal).sum(1) / norm(to_goal)
 
 
 def progress(config: LossConfig, step: Step) -> jax.Array:
@@ -91,7 +91,7 @@ def progress_norm(_: LossConfig, step: Step) -> jax.Array:
 def projection(config: LossConfig, step: Step) -> jax.Array:
     """Return L_proj, which replaces the field: the squared distance to the gate's axis [m^2]."""
     near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(norm(step.place_g)))
-    return (step.place_g[:, 1:] ** 2).sum(-1) * near
+    return (step.place_g[:, 1:] ** 2).sum(1) * near
 
 
 def guidance(_: LossConfig, step: Step) -> jax.Array:
@@ -105,7 +105,7 @@ def guidance(_: LossConfig, step: Step) -> jax.Array:
     pull = attractive_field(field, held_vel, FIELD_DECAY)
     pull = pull / (CURRENT * UNIT_FIELD) ** (1 - FIELD_DECAY)
     pull = pull * jnp.minimum(1.0, MAX_PULL / norm(pull))[:, None]
-    return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(-1)
+    return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(1)
 
 
 LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {

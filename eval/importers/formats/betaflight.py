@@ -33,8 +33,6 @@ MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
 DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 """Least and largest motor output, in steps of DShot or as pulses [us]."""
-RAW_HEAD = 512
-"""A raw log begins within so many bytes."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
 DEG = np.pi / 180.0
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
@@ -51,7 +49,7 @@ _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
 
 def detect(head: bytes, options: ImportOptions) -> bool:
     """Return whether a file with these first bytes is a Blackbox log, decoded or not."""
-    if MARKER in head[:RAW_HEAD]:
+    if MARKER in head:
         return True
     # Blackbox Explorer writes the log's settings before the header.
     explorer = head.lstrip(b'\xef\xbb\xbf"').startswith(b'Product","Blackbox')
@@ -67,7 +65,7 @@ class Blackbox:
         self.name = str(path)
         self.header: Mapping[str, Any] = {}
         self.findings: list[Finding] = []
-        if MARKER in read_head(path)[:RAW_HEAD]:
+        if MARKER in read_head(path):
             self.columns, self.header, findings = decode(path)
             self.findings += findings
         else:
@@ -183,9 +181,9 @@ def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
 def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.ndarray]:
     """Return rotor speeds [rad/s] from eRPM, which is logged in hundreds."""
     columns = {match[1]: c for c in box.columns if (match := _ERPM.match(c))}
-    turning = [np.nanmax(numbers(box.columns, c, box.name), initial=0.0) for c in columns.values()]
-    findings += check_count(sum(top > 0.0 for top in turning), "of the log")
-    if set(columns) < set("0123"):
+    turning = [(numbers(box.columns, c, box.name) > 0.0).any() for c in columns.values()]
+    findings += check_count(int(sum(turning)), "of the log")
+    if not set(columns) >= set("0123"):
         return {}
     if poles < 2 or poles % 2:
         raise FlightLogError(box.name, None, None, f"motor_poles is {poles}: even, 2 or more")

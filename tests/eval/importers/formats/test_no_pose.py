@@ -1,6 +1,8 @@
 """Logs without a pose: raw Blackbox, ArduPilot's .bin, PX4 and Crazyflie without a position."""
 
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,6 +87,19 @@ def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):
         log, _ = import_log(path, None, PARTIAL)
         assert log.partial == lacks
         np.testing.assert_allclose(log.rate_b, known_flight.fly(log.time_s).rate, atol=0.1)
+
+
+def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
+    """Logs may have columns for eight rotors; 700 eRPM of 14 poles are 100 turns a minute."""
+    columns = {f"eRPM[{k}]": np.full(3, 7.0 if k < 4 else 0.0) for k in range(8)}
+    box: Any = SimpleNamespace(columns=columns, name="log")
+    findings: list[Any] = []
+    found = betaflight._motors(box, 14, findings)
+    assert [finding.status for finding in findings] == ["note"]
+    np.testing.assert_allclose(found["motor"], np.full((3, 4), 100.0 / 60.0 * 2.0 * np.pi))
+    columns["eRPM[4]"][1] = 1.0
+    betaflight._motors(box, 14, findings)
+    assert "motor_count" in {finding.fault for finding in findings}
 
 
 @pytest.mark.parametrize(
