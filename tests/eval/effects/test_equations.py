@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS
+from eval.effects import EFFECTS, weak_motor
 from eval.effects.log_faults import apply_log_faults
 from eval.quadrotor.plant import Command, Motion, accelerations, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
@@ -248,6 +248,13 @@ def test_weak_motor():
     vehicle = with_effects(weak_motor=((1.0, 0.9, 1.0, 1.0),))
     near(wrench(vehicle).force_b, [0.0, 0.0, 6.24])
     near(wrench(vehicle).torque_b, [0.016, -0.012, -0.0022])
+    for scale, table in (
+        ((1.0, 1.0, 0.9, 1.0), {"index": 3, "scale": 0.9}),
+        ((0.8, 1.0, 1.0, 0.9), {"index": [1, 4], "scale": [0.8, 0.9]}),
+        ((1.0, 1.0, 1.0, 1.0), {"index": 1, "scale": 1.0}),
+    ):
+        assert weak_motor.write(weak_motor.WeakMotor(scale)) == table
+        assert weak_motor.read(table) == weak_motor.WeakMotor(scale)
 
 
 def test_thrust_tilt():
