@@ -18,12 +18,13 @@ import ast
 import json
 import random
 import re
+import resource
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from plant_faults import ROOT, copied, run_tests
+from plant_faults import LONGEST_S, ROOT, copied, run_tests
 
 IMPORTERS = (
     "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
@@ -140,8 +141,8 @@ def named(copy: Path, mutant: Mutant) -> tuple[str, bool]:
     return name, not choice
 
 
-def fail(copy: Path, tests: str) -> bool:
-    """Say whether tests fail.
+def fail(copy: Path, tests: str, cpu_s: float = LONGEST_S) -> bool:
+    """Say whether tests fail, or take more than `cpu_s` of processor time.
 
     Raises:
         SystemExit: where they did not run.
@@ -150,10 +151,16 @@ def fail(copy: Path, tests: str) -> bool:
              for part in tests.split()]  # fmt: skip
     paths = [f"tests/{name}" if (copy / "tests" / name).is_dir() else f"tests/{name}.py"
              for name in names]  # fmt: skip
-    code, said = run_tests(copy, paths)
+    code, said = run_tests(copy, paths, cpu_s)
     if code > 2:
         raise SystemExit(f"{tests}: pytest ended with {code} ({said})")
     return code != 0  # 2: with this mutant nothing can be imported
+
+
+def children_s() -> float:
+    """Return the processor time of processes that have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main() -> int:
@@ -177,16 +184,18 @@ def main() -> int:
         named_order = [(*named(copy, mutant), mutant) for mutant in order]
         # First those with a result: a line changed elsewhere draws no other ones.
         queue = sorted((one for one in named_order if one[1]), key=lambda one: one[0] not in known)
-        intact = set()
+        most_s: dict[str, float] = {}
         for name, _, mutant in queue[: asked.count]:
             if not known.get(name):
-                if mutant.tests not in intact and fail(copy, mutant.tests):
-                    raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
-                intact.add(mutant.tests)
+                if mutant.tests not in most_s:
+                    before = children_s()
+                    if fail(copy, mutant.tests):
+                        raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
+                    most_s[mutant.tests] = 20.0 + 3.0 * (children_s() - before)
                 path = copy / mutant.file
                 right = path.read_bytes()
                 path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])
-                done[name] = fail(copy, mutant.tests)
+                done[name] = fail(copy, mutant.tests, most_s[mutant.tests])
                 path.write_bytes(right)
                 asked.out.write_text(json.dumps(done, indent=1), "utf-8")
             if not done[name]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import resource
 import shutil
 import subprocess
 import sys
@@ -178,13 +179,18 @@ def tests_of(fault: Fault, names: list[str]) -> list[str]:
     return found
 
 
-def run_tests(copy: Path, tests: list[str]) -> tuple[int, str]:
-    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line."""
+def run_tests(copy: Path, tests: list[str], cpu_s: float = LONGEST_S) -> tuple[int, str]:
+    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line.
+
+    They end after `cpu_s` of processor time, and after `LONGEST_S` in all.
+    """
+    most = (int(cpu_s), int(cpu_s) + 5)
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
     try:
         ended = subprocess.run(
             [sys.executable, "-m", "pytest", *options, *tests],
             cwd=copy, capture_output=True, text=True, timeout=LONGEST_S,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, most),
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return FAILED, f"not done after {LONGEST_S:g} s"
