@@ -77,7 +77,7 @@ class RaceConfig:
     """Seed of one track for all episodes; None draws one for each episode."""
     vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
     """A shipped name, a file, a vehicle, or a function that draws one for each episode, all with
-    other values of the same effects (`suite.train.dynamics.spreads.race_settings` has the
+    other values of the same effects (`suite.train.recipes.race_settings` has the
     trainer's). The judge's own is `reference`: training on it makes a comparison unfair."""
     spec: PolicySpec | str | None = None
     """Rate, camera, encoding and extras of the observation: a spec, or that of a shipped policy or

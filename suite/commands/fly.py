@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from suite.common.console import Console
 from suite.common.options import Advanced
 from suite.judging.link.watchdog import Limits
-from suite.judging.requests import Evaluation, TimeLimit
-from tracks.input.ranges import Range, Seed, Trials
+from suite.judging.requests import Evaluation, Flights
+from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,8 @@ class Config:
     policy: str = ""
     """A shipped policy's name, a checkpoint's folder, or a policy file. Without it the policy race
     flies."""
-    track: str = "zigzag"
-    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
-    difficulty: str = "0"
-    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
-    trials: Trials = 1
-    """Flights on every track at every level."""
-    seed: Seed = 0
-    """Seed of the first trial."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml)."""
-    time_limit_s: Advanced[TimeLimit] = 20.0
-    """A simulated flight ends at this time [s]."""
+    flown: Flights = Flights(track="zigzag", difficulty="0", trials=1)
+    """What is flown."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     monitor: bool = False
@@ -46,8 +36,6 @@ class Config:
     """Required with --link: you have done the checks of docs/fly.md. Set points are sent."""
     limits: Advanced[Limits] = Limits()
     """Beyond any of these the policy hands over to the autopilot."""
-    trust: Advanced[bool] = False
-    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
     out: Path = Path("runs/fly")
     """Folder for the flight logs and fly.json."""
     json: bool = False
@@ -69,17 +57,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from suite.judging.link.commanded import fly_commanded
     from suite.judging.link.messages import signing_key
 
-    evaluation = Evaluation(
-        track=config.track,
-        difficulty=config.difficulty,
-        trials=config.trials,
-        seed=config.seed,
-        vehicle=config.vehicle,
-        time_limit_s=config.time_limit_s,
-        trust=config.trust,
-        speed=() if config.speed is None else (config.speed,),
-        monitor=config.monitor,
-    )
+    speed = () if config.speed is None else (config.speed,)
+    evaluation = Evaluation(**vars(config.flown), speed=speed, monitor=config.monitor)
     if config.link and not config.confirm:
         raise ValueError(
             f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do what it "

@@ -91,13 +91,16 @@ def _bare(kind: Any) -> Any:
 def options(command: type, default: Any = None, advanced: bool = False) -> Iterator[Option]:
     """Yield the options of a command's configuration and of the dataclasses within.
 
+    Inherited ones follow the class's own.
+
     Args:
         command: the dataclass.
         default: an instance with the defaults, in place of those of `command`.
         advanced: whether all of them are rare.
     """
     hints, texts = get_type_hints(command, include_extras=True), texts_of(command)
-    for field in dataclasses.fields(command):
+    own = command.__dict__.get("__annotations__", {})
+    for field in sorted(dataclasses.fields(command), key=lambda field: field.name not in own):
         kind = hints[field.name]
         rare = advanced or GROUP in getattr(kind, "__metadata__", ())
         value = field.default if default is None else getattr(default, field.name)

@@ -24,14 +24,9 @@ TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Policies, trials and simulation; `suite eval` has these as options."""
+class Flights:
+    """Trials on tracks with a vehicle: options of all commands that fly a policy."""
 
-    policies: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
-    ] = ()
-    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; may be
-    given several times. Without it the policy race flies."""
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0,3"
@@ -42,53 +37,56 @@ class Evaluation:
     """Seed of the first trial; the others follow by one."""
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
+    time_limit_s: Advanced[TimeLimit] = 20.0
+    """A trial ends at this time [s]; a long course of your own needs more than the tables' 20."""
+    trust: Advanced[bool] = False
+    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
+
+
+@dataclass(frozen=True)
+class SimulatedFlights(Flights):
+    """Flights in a simulator that can be chosen."""
+
     simulator: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (needs
     pip install 'diffracing-suite[rotorpy]'), or the simulator of an installed package."""
     sensors: str = "perfect"
     """Errors in what the policy sees: a shipped name (perfect, vio, stereo-depth, ...) or a sensors
-    file (.toml)."""
+    file (.toml). Recorded logs have the true state."""
+
+
+@dataclass(frozen=True)
+class Evaluation(SimulatedFlights):
+    """Policies, trials and simulation; `suite eval` has these as options."""
+
+    policies: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="policy")
+    ] = ()
+    """A shipped policy's name, a checkpoint's folder, or a .onnx, .pt2, .pt or .c file; may be
+    given several times. Without it the policy race flies."""
     speed: Annotated[tuple[float, ...], Range(0.0, 1.0)] = ()
     """For policies with a speed input: 0 (careful) to 1 (a race); with several values all trials
     are flown at each. Without it each policy flies at its own default speed."""
-    time_limit_s: Advanced[TimeLimit] = 20.0
-    """A trial ends at this time [s]; a long course of your own needs more than the tables' 20."""
     deadline_s: Advanced[Annotated[float, Range(0.0, 3600.0, above=True)] | None] = None
     """A policy that takes longer than this for an answer ends the trials of that answer (up to 128,
     in one batch) as timed out [s]. Without it a policy may take any time."""
-    trust: Advanced[bool] = False
-    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
     monitor: Advanced[bool] = False
     """Fly every policy a second time with the safety monitor around it, on the same trials."""
 
 
 @dataclass(frozen=True)
-class Collection:
+class Collection(SimulatedFlights):
     """Which flights are recorded; `suite collect` has these as options."""
 
     policy: str = ""
     """A shipped policy's name, a checkpoint's folder, or a policy file. Without it the policy race
     flies."""
-    track: str = "all"
-    """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
-    difficulty: str = "0,3"
-    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     trials: Trials = 5
     """Flights on every track at every level."""
-    vehicle: str = "reference"
-    """A shipped vehicle's name or a vehicle file (.toml)."""
-    simulator: str = "mujoco"
-    """What simulates the flight, as in suite eval."""
-    sensors: str = "perfect"
-    """Errors in what the policy sees, as in suite eval; the logs hold the true state."""
-    time_limit_s: Advanced[TimeLimit] = 20.0
-    """A flight ends at this time [s]."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     seed: Seed = 100_000
     """Seed of the first trial; the default is far from the seeds of suite eval."""
-    trust: Advanced[bool] = False
-    """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
 
 @dataclass(frozen=True)

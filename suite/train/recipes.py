@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 from eval.vehicles.vehicle import Vehicle
 from policies.spec import PolicySpec
@@ -339,3 +340,25 @@ def named_recipe(name: str) -> TrainConfig:
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
     return RECIPES[name]()
+
+
+def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
+    """Return arguments of the environments in `eval.envs` for training like a recipe.
+
+    They are the policy's observation (`spec`) and vehicles (`vehicle`) with the recipe's
+    randomisation, or the default one if it trains through a point mass.
+
+    Args:
+        recipe: a name of `suite train`.
+        vehicle: a file or a shipped name; the centre of the randomisation.
+
+    Raises:
+        ValueError: for an unknown recipe or vehicle.
+    """
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from suite.train.dynamics.quadrotor import DrawnVehicle
+
+    last = phase_configs(named_recipe(recipe))[-1]
+    config = with_quadrotor(last, load_vehicle(vehicle))
+    assert config.quadrotor is not None
+    return {"spec": config.spec, "vehicle": DrawnVehicle(config.quadrotor)}

@@ -102,7 +102,7 @@ def trained(study: Study, place: Place, console: Console) -> list[Trained]:
             other on all cores.
         console: shows progress.
     """
-    from suite.train.ppo.run import estimate as ppo_estimate
+    from suite.train.ppo.update import estimate as ppo_estimate
     from suite.train.run import estimate
 
     pieces = study.pieces()
@@ -135,7 +135,7 @@ def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dic
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
-    from suite.train.ppo.run import train_ppo
+    from suite.train.ppo.update import train_ppo
     from suite.train.run import started_from, train
     from suite.train.training_loop import Watch
 

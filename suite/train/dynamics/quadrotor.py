@@ -10,6 +10,7 @@ many steps as in the judge.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from eval.effects.interface import Values, at
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
 from eval.quadrotor.plant import Command, Motion, Plant, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, step
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.train.config import QuadrotorConfig
 from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
@@ -135,6 +136,22 @@ def draw_effects(
         name: EFFECTS[name].values(*(np.asarray(x, np.float32) for x in values))
         for name, values in fields.items()
     }
+
+
+@dataclass(frozen=True)
+class DrawnVehicle:
+    """A function that draws a vehicle, as training does for each world."""
+
+    config: QuadrotorConfig
+    """The vehicle and its randomisation."""
+
+    def __call__(self, rng: np.random.Generator) -> Vehicle:
+        """Return the vehicle with drawn values of its effects."""
+        drawn = {
+            name: type(values)(*(np.asarray(value, float)[0].tolist() for value in values))
+            for name, values in draw_effects(self.config, 1, rng).items()
+        }
+        return with_effects(self.config.vehicle, drawn)
 
 
 def longest_delay(config: QuadrotorConfig) -> float:

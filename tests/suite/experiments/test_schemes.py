@@ -32,7 +32,11 @@ def test_schemes_share_all_but_how_they_learn():
 
 @pytest.mark.slow
 def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
-    for module in ("suite.train.run", "suite.train.ppo.run", "suite.experiments.study.validation"):
+    for module in (
+        "suite.train.run",
+        "suite.train.ppo.update",
+        "suite.experiments.study.validation",
+    ):
         monkeypatch.setattr(f"{module}.sample_worlds", boxes_worlds)
     args = [*TINY, "--only", "ours", "ppo", "--training-seeds", "4"]
     assert reproduce(tmp_path, "schemes", *args) == 0
@@ -46,7 +50,7 @@ def test_the_comparison_from_one_command_and_again(tmp_path, monkeypatch):
     one, two = (row["curves"]["reward"][0] for row in numbers["rows"])
     assert one["mean"] == pytest.approx(two["mean"]) and one["mean"] != 0
     assert "not reached" in text
-    for module in ("suite.train.run", "suite.train.ppo.run"):
+    for module in ("suite.train.run", "suite.train.ppo.update"):
         monkeypatch.setattr(f"{module}.make_update", None)
     assert reproduce(tmp_path, "schemes", *args) == 0, "nothing is trained again"
     assert (tmp_path / "docs" / "schemes.md").read_text() == text

@@ -88,7 +88,7 @@ def test_a_run_of_an_earlier_version_is_held_to_its_policy(pilots, tmp_path, cap
 
 
 def test_a_run_from_python_with_a_whole_number_of_seconds_is_seen_again(pilots, tmp_path):
-    asked = Evaluation((pilots["diver"],), track="zigzag", trials=1, time_limit_s=1)
+    asked = Evaluation(policies=(pilots["diver"],), track="zigzag", trials=1, time_limit_s=1)
     evaluate(asked, tmp_path / "out", Quiet())
     assert read_evaluation(tmp_path / "out") == asked
     assert cli.main(["view", str(tmp_path / "out"), "--out", str(tmp_path / "seen")]) == 0

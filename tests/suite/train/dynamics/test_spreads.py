@@ -9,7 +9,7 @@ import pytest
 from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
-from suite.train.dynamics.spreads import race_settings
+from suite.train.recipes import race_settings
 
 
 def test_environments_draw_their_vehicles_as_the_trainer_does():

@@ -13,7 +13,7 @@ from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from suite.common import curve
 from suite.common.console import Console
-from suite.train.ppo import run
+from suite.train.ppo import update as run
 from suite.train.ppo.config import PpoConfig, ppo_like
 from suite.train.ppo.objective import Actor, Sequences, action_means
 from suite.train.ppo.rollout import log_probability, make_rollout
