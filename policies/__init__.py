@@ -1,1 +1,1 @@
-"""Who flies: the observation, the networks, checkpoints and the policies that are shipped."""
+"""Policies: the observation, the networks, checkpoints and the shipped policies."""

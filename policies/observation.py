@@ -1,7 +1,7 @@
-"""What a policy sees: the paper's 12 numbers (Su et al. 2026, Eq. 1) or more, and a depth image.
+"""The observation of a policy: the paper's 12 numbers (Su et al. 2026, Eq. 1), extras, an image.
 
-`observe` is the one place that assembles it, for trainer, judge, worlds and environments. A vector
-more is a key in `policies.spec.EXTRAS` and a line in `EXTRA_VECTORS`.
+Only `observe` assembles it, for trainer, judge, simulators and environments. A further vector is a
+key in `policies.spec.EXTRAS` and a line in `EXTRA_VECTORS`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tracks.geometry.scene import Array, Gates
 
 
 class View(NamedTuple):
-    """What can be observed of drones and their gates; arrays (..., ) of NumPy or JAX."""
+    """The observable state of drones and their gates; arrays (..., ) of NumPy or JAX."""
 
     pos_w: Any
     """(..., 3) [m]."""
@@ -26,27 +26,27 @@ class View(NamedTuple):
     gate_w: Any
     """(..., 3) centre of the next gate [m]."""
     second_w: Any
-    """(..., 3) centre of the gate after it, or of the last gate where there is none [m]."""
+    """(..., 3) centre of the gate after it, at most the last gate [m]."""
     axis_w: Any
-    """(..., 3) unit vector along which the next gate is flown through."""
+    """(..., 3) unit vector through the next gate, in flight direction."""
     second_axis_w: Any
-    """(..., 3) that of the gate of `second_w`."""
+    """(..., 3) unit vector through the gate of `second_w`."""
     depth_m: Any = None
     """(..., H, W) planar depth, clipped to the camera's range [m]; None without a camera."""
     gate_number: Any = None
-    """(...,) number of the next gate from 0; None where no sensor model needs it."""
+    """(...,) number of the next gate from 0; None if no sensor model needs it."""
 
 
 class Observation(NamedTuple):
-    """What a policy is given."""
+    """The inputs of a policy."""
 
     state: Any
     """(..., spec.state_size): velocity in body axes [m/s], the third row of R (world z in body
-    axes, free of yaw), the next gate's centre in body axes [m], the last action as it was flown
-    (SI units of its kind) and then the spec's extras."""
+    axes, free of yaw), the next gate's centre in body axes [m], the last action (SI units of its
+    kind), and the spec's extras."""
     image: Any
-    """(..., *spec.image_shape) inverse depth as the spec encodes it [1]; None where the view has
-    none."""
+    """(..., *spec.image_shape) inverse depth, encoded by the spec [1]; None without a depth
+    image."""
 
 
 def view_of(
@@ -71,12 +71,11 @@ def observe(
     """Return the observation of a policy with `spec`.
 
     Args:
-        spec: the policy's; its extras and its depth encoding count.
-        view: what there is to see.
+        spec: the policy's, with its extras and depth encoding.
+        view: the observable state.
         last_action_b: (..., spec.action.size) the previous action in SI units, in the body axes of
             its own time.
-        speed: (...,) how fast each is to fly, 0 to 1, where the spec has that input; the spec's own
-            if None.
+        speed: (...,) commanded speed, 0 to 1, if the spec has that input; None: the spec's value.
     """
     rot_w = view.rot_w
     vel_b, gate_b = to_local(rot_w, view.vel_w), to_local(rot_w, view.gate_w - view.pos_w)
@@ -94,7 +93,7 @@ def observe(
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:
-    """Return planar depths [m] as the inverse depths that the network sees, of the same shape."""
+    """Return the network's inverse depths for planar depths [m], of the same shape."""
     xp = depth_m.__array_namespace__()
     encoded = encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
     if not encoding.uint8:

@@ -1,1 +1,1 @@
-"""What is flown through: gates, obstacles, track families and the geometry of a scene."""
+"""Tracks: gates, obstacles, track families and the geometry of a scene."""

@@ -1,4 +1,4 @@
-"""How late and how strongly the vehicle follows its commands."""
+"""Delay, lag and gain between commands and the vehicle's response."""
 
 from __future__ import annotations
 

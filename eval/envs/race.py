@@ -39,9 +39,9 @@ ACTION_LIMIT = 20.0
 STATE_LIMIT = 1e4
 """Limit to which components of the state are clipped; flights are far below it."""
 GATE_REWARD = 5.0
-"""For a gate passed; the way that is left earns 1 a metre as it gets shorter."""
+"""Reward of a passed gate; a shorter remaining way earns 1 per metre."""
 CRASH_REWARD = -1.0
-"""For an end other than all gates passed or time over; where it costs 5, PPO learns to hover."""
+"""Reward of a failed episode (not of the time limit); with -5, PPO learns to hover."""
 
 
 class Race:

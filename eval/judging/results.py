@@ -1,4 +1,4 @@
-"""What a judgement leaves behind: trials.parquet, table.md, summary.json, and the journal.
+"""The files of an evaluation: trials.parquet, table.md, summary.json, and the journal.
 
 The journal is a file of lines, one a finished trial, flushed as it comes: what was flown survives
 a kill, and the same command again flies the rest.
@@ -22,7 +22,7 @@ from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 SCHEMA = 1
 """Version of the result files."""
 MOST_TRIALS = 1_000_000
-"""Of a trials.parquet: some gigabyte in memory."""
+"""Most rows of a trials.parquet: some gigabyte in memory."""
 MOST_TEXT = 1000
 """Characters of a name in a trials.parquet."""
 JOURNAL = "trials.journal.jsonl"

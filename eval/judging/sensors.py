@@ -37,8 +37,8 @@ class Sensors:
         self._models, self._dt_s, self._camera = sensors.sensing(wanted.models), 1 / rate_hz, camera
         used = (SENSORS[name] for name in self._models)
         self._trial, self._draws = blank_of_each(used, slots, camera)
-        nobody = np.random.default_rng(0)
-        self._generators = {name: [nobody] * slots for name in self._models}
+        idle = np.random.default_rng(0)
+        self._generators = {name: [idle] * slots for name in self._models}
         self._memory: dict[str, Any] | None = None
 
     def start(self, slot: int, trial: TrialSpec) -> None:

@@ -60,7 +60,7 @@ class Tally(NamedTuple):
     lap_s: Interval
     """Median over finished trials [s]; NaN where there is none."""
     ended_by: dict[str, int]
-    """How many trials ended how."""
+    """Number of trials by ending."""
     late: int = 0
     """Number of timeouts because the policy answered late or not at all."""
     v_max_of_ten: float | None = None
@@ -68,7 +68,7 @@ class Tally(NamedTuple):
 
 
 class Pairing(NamedTuple):
-    """How much a policy differs from the first one on the same trials."""
+    """The differences of a policy to the first one on the same trials."""
 
     policy: str
     against: str

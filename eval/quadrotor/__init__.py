@@ -1,1 +1,1 @@
-"""What flies: controllers, mixer, rotors and body, with every effect of the vehicle."""
+"""The quadrotor: controllers, mixer, rotors and body, with every effect of the vehicle."""

@@ -15,7 +15,7 @@ from tracks.geometry.rotation import cross, to_local, to_world
 from tracks.geometry.scene import Array
 
 HEADING_RATE = 6.0
-"""Of the first-order blend of the heading [1/s]."""
+"""Rate of the first-order blend of the heading [1/s]."""
 LEAST_FORCE = 0.1
 """Below this wanted specific force its direction is undefined and the tilt is held [m/s^2]."""
 SMALL = 1e-6

@@ -33,7 +33,7 @@ class SensorSet:
     """A set of sensor models; without models the observation is the truth."""
 
     name: str = "perfect"
-    """For people."""
+    """Its name in tables."""
     models: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Values (the model's NamedTuple of numbers) by the model's name, see
     `eval.sensors.SENSORS`."""

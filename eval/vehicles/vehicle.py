@@ -49,7 +49,7 @@ class Controller:
     rate_gain: Vector
     """K of the rate loop [1/s]; a firmware's loop uses its settings instead."""
     frequency: float
-    """Of the rate loop, which is the physics rate too [Hz]."""
+    """Rate of the rate loop, and of the physics [Hz]."""
     attitude_gain: Vector = (8.0, 8.0, 4.0)
     """Body rate per attitude error [1/s]."""
     rate_max: Vector = (6.0, 6.0, 6.0)

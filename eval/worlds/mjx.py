@@ -56,7 +56,8 @@ with contextlib.redirect_stdout(io.StringIO()):  # its import prints what option
 
 
 PRECISION = "highest"
-"""Of products of matrices: accelerators round to fewer bits by default, and a rotation is one."""
+"""Precision of matrix products: by default accelerators round to fewer bits, too few for
+rotations."""
 FARTHEST_M = 1000.0
 """Largest coordinate, at which a float32's resolution is 0.06 mm [m]."""
 

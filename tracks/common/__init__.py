@@ -1,1 +1,1 @@
-"""What every room leans on: files, names, provenance, TOML."""
+"""Shared by all rooms: files, names, provenance, TOML."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _START_BEHIND_M = 2.5
 FARTHEST_M = 1e5
-"""Of a place from the origin, along each axis: as far as a flight log may go."""
+"""Largest coordinate, as in a flight log [m]."""
 LEAST_M, MOST_M = 1e-3, 1e5
 """Of a length."""
 MOST_TABLES = 1000

@@ -12,8 +12,8 @@ covariance P (Solà 2017, "Quaternion kinematics for the error-state Kalman filt
     update    P' = (P^-1 + H^T H / r)^-1,  dx = P' H^T z / r    of residuals z with variance r
     reset     dtheta -> (I - [dtheta / 2]x) dtheta              as R takes the correction
 
-An update costs the same however many corners there are, as H has the columns of dp and dtheta
-alone. Arrays have N leading rows, a drone each; every row is computed by itself.
+The cost of an update does not grow with the number of corners, as H has only columns of dp and
+dtheta. Arrays have N leading rows, a drone each; every row is computed by itself.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ImuNoise(NamedTuple):
 
 
 class FilterSettings(NamedTuple):
-    """What an estimator in the loop is run with: of the filter and of the gate detections."""
+    """Settings of a state estimator in the loop: of the filter and of the gate detections."""
 
     corner_sigma: float
     """Noise of a corner in the image, of each tangent, over the camera's width [pixels]."""
@@ -51,15 +51,15 @@ class FilterSettings(NamedTuple):
     """Pixels across the camera's field of view."""
     frame_hz: float
     dropout: float
-    """Share of the frames in which no gate is found [1]."""
+    """Share of the frames without a gate detection [1]."""
     dropout_s: float
-    """How long that lasts on average [s]."""
+    """Mean duration of such a gap [s]."""
     delay_s: float
-    """From a frame to the filter [s]."""
+    """Delay from a frame to the filter [s]."""
     range_m: float
-    """Corners further away are not found [m]."""
+    """Corners further away are not detected [m]."""
     start_sigma: Array
-    """(15,) of the error at the start, in the order of the filter's."""
+    """(15,) standard deviations of the error at the start, in the filter's order."""
     imu: ImuNoise
     """The IMU's errors as assumed by the filter."""
 
@@ -82,14 +82,14 @@ class FilterState(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Corners of gates as a camera at the body's origin sees them, K for each drone."""
+    """Gate corners in the image of a camera at the body's origin, K for each drone."""
 
     image: Array
     """(N, K, 2) tangents (left, up) from the optical axis [1]."""
     corner_w: Array
-    """(N, K, 3) where the map has them [m]."""
+    """(N, K, 3) positions in the map [m]."""
     seen: Array
-    """(N, K) bool; the others count for nothing."""
+    """(N, K) bool: whether a corner is detected; others are ignored."""
 
 
 def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState:

@@ -26,7 +26,7 @@ class CPolicy:
     """A `Policy` around the two functions of policy.h."""
 
     name: str
-    """What tables call it."""
+    """Its label in tables."""
     spec: PolicySpec
     """The rate, camera and scaling it expects of the world."""
     library: Path
@@ -36,7 +36,7 @@ class CPolicy:
     state_bytes: int
     """Size of `policy_state`."""
     notes: tuple[Note, ...] = ()
-    """What is assumed of it."""
+    """Assumptions about it, as sentences."""
 
     def start(self, n: int) -> np.ndarray:
         """Return the `policy_state` of n trials, reset: its bytes as (n, k) float32 words."""

@@ -23,7 +23,7 @@ HERE = ("-march=native",)
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 """Options under which the suite's policy.c compiles without warnings."""
 TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
-"""What a compiler says of the machine, not of the file."""
+"""Parts of compiler messages about the machine, not about the file."""
 COMPILE_S = 600.0
 """Time limit of the compiler [s]."""
 

@@ -18,7 +18,7 @@ Layer = Callable[[str, np.ndarray], np.ndarray]
 
 
 class Observed(NamedTuple):
-    """What a policy was given in flights, one after another."""
+    """The inputs of a policy in flights, one after another."""
 
     state: np.ndarray
     """(T, spec.state_size) float32."""

@@ -3,7 +3,7 @@
 Weights have a scale for each output (symmetric), activations one for each layer with a zero point,
 so that their smallest and largest values measured on flights are the smallest and largest bytes.
 After Jacob et al. 2018, "Quantization and Training of Neural Networks for Efficient
-Integer-Arithmetic-Only Inference"; what follows each layer stays in floats.
+Integer-Arithmetic-Only Inference"; all operations between the layers use floats.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from policies.formats.c.forward import Observed
 from policies.spec import PolicyError, PolicySpec
 
 SUM_MOST = 2**31 - 1
-"""Of a layer's integer sums, which C adds up in 32 bits."""
+"""Limit of a layer's integer sums, which C computes in 32 bits."""
 
 
 class Quantised(NamedTuple):
     """A layer of 8 bits: out = (bytes(x) @ weight) * scale + offset."""
 
     weight: np.ndarray
-    """(inputs, outputs) int8 from -127 on."""
+    """(inputs, outputs) int8, at least -127."""
     scale: np.ndarray
     """(outputs,) float32, value of one unit of the integer sum."""
     offset: np.ndarray
@@ -34,7 +34,7 @@ class Quantised(NamedTuple):
     inverse: float
     """Bytes in one unit of the input."""
     zero: int
-    """The byte of an input of 0."""
+    """The byte for an input of 0."""
 
 
 def quantise(

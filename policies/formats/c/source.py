@@ -21,7 +21,7 @@ from tracks.common.provenance import VERSION
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 TANH_TERMS = 12
-"""Of the continued fraction; with the inputs clipped to 8, within 4e-7 of tanh."""
+"""Terms of the continued fraction; with inputs clipped to 8, the error to tanh is below 4e-7."""
 _OBSERVATION = (
     ("velocity in body axes", "m/s"),
     ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
