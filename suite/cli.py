@@ -1,10 +1,9 @@
 """The command line: a table of subcommands, each imported only when it is called.
 
-A command is a module with `Config`, a frozen dataclass that becomes its options (one docstring
-line under each field is its help), and `run(config, console)`, which does the work and returns
-what --json prints. `written(config)`, where it has one, returns the folders that no other command
-may write into meanwhile. `config_of(args)`, where it has one, returns the configuration that the
-first word selects, that word, and the other words.
+A command is a module with `Config`, a frozen dataclass whose fields become its options (the text
+under a field is its help), and `run(config, console)`, which does the work and returns what --json
+prints. If it has `config_of(args)`, this returns the configuration that the first word selects,
+that word, and the other words.
 """
 
 from __future__ import annotations
@@ -156,8 +155,7 @@ def _run(name: str, args: list[str]) -> int:
 
     with stdout_kept_clean() if config.json else nullcontext():
         check_ranges(config, options=True)
-        folders = command.written(config) if hasattr(command, "written") else []
-        with one_writer_each(folders):
+        with one_writer_each(config.written()):
             answer = command.run(config, Console())
     if config.json:
         from tracks.common.files import to_json

@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.experiments.bench import BENCHES
 from tracks.common.files import plain
 from tracks.common.grid import rich_table
@@ -16,7 +17,7 @@ from tracks.common.names import unknown_name
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Time a hot path against a plain implementation of the same; without a name, list them."""
 
     name: tyro.conf.Positional[str] = ""
@@ -24,8 +25,6 @@ class Config:
     policy: str | None = None
     """For the benchmark `policy`: a shipped policy's name or a checkpoint's folder. Without it the
     policy race."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.common.work import WorkersOption, workers_given
 from tracks.input.ranges import Range, Seed
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Make cases with hidden effects, run the diagnosis on them, score it against the answers."""
 
     what: tyro.conf.Positional[Literal["make", "run", "score", "strengths", "plan"]]
@@ -40,8 +41,10 @@ class Config:
     workers: WorkersOption = None
     """For make and run: share the cases among N processes of this machine, or on the cluster at
     HOST:PORT, whose owner can run code here. Without it one case follows the other."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
+
+    def written(self) -> list[Path]:
+        """Return the folders into which no other command may write meanwhile."""
+        return [self.out] if self.what in ("make", "run") else []
 
 
 TAKEN = {
@@ -54,11 +57,6 @@ TAKEN = {
     "workers": ("make", "run"),
 }
 """Which of the command's works take an option."""
-
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out] if config.what in ("make", "run") else []
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Check flights, a vehicle file and a policy for mistakes of unit, frame, sign and scale."""
 
     flights: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -32,13 +32,10 @@ class Config:
     """Short flights of --policy on easy tracks, which show the size of its actions."""
     trust: Advanced[bool] = False
     """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out] if config.fix else []
+    def written(self) -> list[Path]:
+        """Return the folders into which no other command may write meanwhile."""
+        return [self.out] if self.fix else []
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Collection
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Fly a policy and record every flight as a log (Parquet)."""
 
     flown: Collection = Collection()
@@ -22,13 +23,8 @@ class Config:
     workers: WorkersOption = None
     """Share the flights among N processes of this machine, or on the cluster at HOST:PORT, whose
     owner can run code here. Without it as many cores are used as give a gain."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Command
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Compare the success rates of evaluations on the same trials; each RUN is a suite eval --out.
 
     Each run is compared with the first one; with --seeds all are training seeds of one method, and
@@ -25,8 +26,6 @@ class Config:
     """Folders with training seeds of another method; the differences are to it."""
     seeds: bool = False
     """Take the runs as training seeds of one method: print mean, spread and interval."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

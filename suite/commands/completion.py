@@ -9,6 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.common.usage import COMMANDS
 
 BASH = """_suite() {{
@@ -32,7 +33,7 @@ ZSH = "#compdef suite\nautoload -U +X bashcompinit && bashcompinit\n"
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Print a script that completes commands and options, for bash or zsh.
 
     Put what it prints into ~/.local/share/bash-completion/completions/suite (bash), or into a file
@@ -41,8 +42,6 @@ class Config:
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
     """For which shell."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

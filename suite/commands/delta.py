@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.input.ranges import Iterations, Range, Seed
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Fit the Delta Action Model by gradients through the point mass, or through a quadrotor."""
 
     flights: tyro.conf.Positional[tuple[Path, ...]]
@@ -33,13 +33,8 @@ class Config:
     """Gradient steps."""
     seed: Seed = 0
     """Seed of the network, the split and the batches."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.common.files import check_no_input
 from tracks.input.ranges import Range, Seed
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Find where flights and a vehicle file disagree, and name the missing effect."""
 
     flights: tyro.conf.Positional[tuple[Path, ...]]
@@ -49,13 +49,8 @@ class Config:
     the command."""
     seed: Advanced[Seed] = 0
     """Seed of the permutation test, the intervals and simulated noise."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from suite.common.console import Console
+from suite.common.options import Command
 
 if TYPE_CHECKING:
     from eval.effects.interface import Effect
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """List the physical effects that a vehicle file may hold, or describe one."""
 
     name: tyro.conf.Positional[str] = ""
     """Name of an effect; without it, all are listed."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

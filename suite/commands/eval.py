@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from suite.common.work import WorkersOption, workers_given
 from suite.judging.requests import Evaluation
 from tracks.common.files import check_place
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Fly trials and write the result tables; two policies or more are compared in pairs."""
 
     flown: Evaluation = Evaluation()
@@ -26,13 +26,8 @@ class Config:
     workers: WorkersOption = None
     """Share the trials among N processes of this machine, or on the cluster at HOST:PORT, whose
     owner can run code here. Without it as many cores are used as give a gain."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

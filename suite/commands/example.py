@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console
+from suite.common.options import Command
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Copy short flights into a folder, to try suite diagnose, import and identify on."""
 
     out: Path = Path("example")
     """Folder for flight_1.parquet to flight_3.parquet and vehicle.toml, or for what is real."""
     real: bool = False
     """Instead: two raw logs of a real quadrotor with their mapping, licence and a README."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

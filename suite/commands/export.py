@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import tyro
 
 from suite.common.console import Console, size
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Write a policy of ours as torch program (.pt2), ONNX (.onnx) and C (policy.h, policy.c)."""
 
     name: tyro.conf.Positional[str] = ""
@@ -26,8 +26,6 @@ class Config:
     """Type of the weights in C: float32 or int8."""
     out: Path = Path("runs/export")
     """Folder for the files."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from suite.judging.link.watchdog import Limits
 from suite.judging.requests import Evaluation, Flights
 from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Fly a policy in real time over MAVLink; without --link against a simulated vehicle."""
 
     policy: str = ""
@@ -38,13 +38,8 @@ class Config:
     """Beyond any of these the policy hands over to the autopilot."""
     out: Path = Path("runs/fly")
     """Folder for the flight logs and fly.json."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
+    LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from typing import Any
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.common.files import check_no_input
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Find thrust, inertia, lag, delay, rate gains and drag of a quadrotor in its flight logs.
 
     With --sensors, the errors of its state estimate instead.
@@ -35,13 +35,10 @@ class Config:
     accept: Advanced[tuple[str, ...]] = ()
     """Faults of the logs (names that suite check prints) which you know, and which then do not stop
     the command."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [_out(config).parent]
+    def written(self) -> list[Path]:
+        """Return the folders into which no other command may write meanwhile."""
+        return [_out(self).parent]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

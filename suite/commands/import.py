@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.common.files import check_no_input
 from tracks.input.ranges import Range
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Read and check a log of PX4, ArduPilot, Betaflight, a Crazyflie, ROS 2 or a table."""
 
     file: tyro.conf.Positional[Path]
@@ -61,8 +61,6 @@ class Config:
     quat=xyzw, time=ms or motor=2,1,4,3; may be given several times."""
     no_fix: Advanced[bool] = False
     """Print what looks wrong, but correct nothing."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from suite.common.console import Console, size
+from suite.common.options import Command
 from suite.common.provenance import machine, package_versions
 from suite.common.stages import available_memory_bytes
 from tracks.common.provenance import VERSION, git_commit
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Show versions, devices, memory and commit."""
-
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -11,12 +11,13 @@ import tyro
 
 from suite.commands.tracks import family_text
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.common.usage import first_paragraph
 from tracks.common.names import unknown_name
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """List what other commands take by name.
 
     Kinds: tracks, vehicles, policies, recipes, effects, sensors (files), sensor-models, simulators,
@@ -27,8 +28,6 @@ class Config:
     """Which kind. Without it the names of all kinds but the settings."""
     recipe: str = "race"
     """For the kind settings: of which recipe."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from suite.common.work import WorkersOption, workers_given
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Close the loop and show what the Delta Action Model changes, on the same seeds.
 
     The same command again continues where it was stopped.
@@ -65,17 +65,12 @@ class Config:
     """Share flights and fine-tunings among N processes of this machine, or on the cluster at
     HOST:PORT, whose owner can run code here. Without it flights use as many cores as give a gain,
     and one process fine-tunes."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
+
+    LOCKED = ("out",)
 
 
 OTHER = ("set", "no_delta", "out", "workers", "json")
 """Options that `suite.loop.config.resolve` does not take by these names."""
-
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from suite.common.work import WorkersOption, workers_given
 from suite.experiments import EXPERIMENTS, OVER_ALL
 from tracks.common.grid import rich_table
@@ -17,7 +17,7 @@ from tracks.common.names import unknown_name
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Make one of the pages of docs/results; the same command again continues where it stopped.
 
     Pages: table2, robustness, perception, ablation, schemes, faults, gpu, simulators. `all` makes
@@ -36,8 +36,10 @@ class Config:
     """Share trainings and flights among N processes of this machine, each with its share of the
     cores, or on the cluster at HOST:PORT, whose owner can run code here. Without it one training
     follows the other."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
+
+    def written(self) -> list[Path]:
+        """Return the folders into which no other command may write meanwhile."""
+        return [self.out, self.cache] if hasattr(self, "experiment") else []
 
 
 def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
@@ -65,11 +67,6 @@ def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
     kind = make_dataclass("Config", [field], bases=(Config,), namespace=about, frozen=True)
     at = list(args).index(name)
     return kind, name, [*args[:at], *args[at + 1 :]]
-
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into."""
-    return [config.out, config.cache] if hasattr(config, "experiment") else []
 
 
 def run(config: Any, console: Console) -> dict[str, Any]:

@@ -11,12 +11,13 @@ import tyro
 
 from suite.common.choices import is_track_file, parse_levels
 from suite.common.console import Console
+from suite.common.options import Command
 from suite.common.usage import first_paragraph
 from tracks.input.ranges import Seed
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """List the track families, or draw one track as a picture."""
 
     track: tyro.conf.Positional[str] = ""
@@ -27,8 +28,6 @@ class Config:
     """The track's seed."""
     out: Path = Path("runs/tracks")
     """Folder for the pictures (PNG); several levels also share one."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from suite.commands.list import list_settings
 from suite.common.console import Console
 from suite.common.curve import tensorboard
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from suite.common.running.hosts import Joined, join, member
 from suite.common.startup import use_device
 from suite.common.work import Silent
@@ -27,7 +27,7 @@ from tracks.input.ranges import Iterations, Range, Seed
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Train a policy; the same command again resumes where it was stopped."""
 
     recipe: str = "race"
@@ -74,14 +74,11 @@ class Config:
     """Print every setting that --set takes, with value, range and meaning, and train nothing."""
     joined: Advanced[Joined] = Joined()
     """Which of several processes this one is."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
-
-def written(config: Config) -> list[Path]:
-    """Return the folders that the command writes into: of several processes the first."""
-    first = member(config.joined).number == 0
-    return [config.out] if first and not config.list_settings else []
+    def written(self) -> list[Path]:
+        """Return the folders into which no other command may write meanwhile."""
+        first = member(self.joined).number == 0
+        return [self.out] if first and not self.list_settings else []
 
 
 def resolve(config: Config) -> TrainConfig:

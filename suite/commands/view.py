@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from suite.common.console import Console
-from suite.common.options import Advanced
+from suite.common.options import Advanced, Command
 from tracks.common.files import check_place
 from tracks.input.ranges import Range, Seed
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """Fly trials of a run again and write a rerun recording, pictures and a video of them."""
 
     run: tyro.conf.Positional[str]
@@ -51,8 +51,6 @@ class Config:
     trust: Advanced[bool] = False
     """Also load policy files that can run code on this machine (.pt2, .pt, .c), those of a run
     included."""
-    json: bool = False
-    """Print one JSON object to standard output and nothing else."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -32,6 +32,21 @@ SILENT = ("", "''", "None", "False")
 """Defaults that are not printed: the option's text describes the behaviour without it."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Command:
+    """The options of a command; its `Config` adds its own."""
+
+    json: bool = False
+    """Print one JSON object to standard output and nothing else."""
+
+    LOCKED = ()
+    """Names of the options with folders into which no other command may write meanwhile."""
+
+    def written(self) -> list[Path]:
+        """Return these folders."""
+        return [getattr(self, name) for name in self.LOCKED]
+
+
 class Option(NamedTuple):
     """One option of a command."""
 

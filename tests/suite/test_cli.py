@@ -15,20 +15,18 @@ from dataclasses import dataclass
 import pytest
 
 from suite import cli
-from suite.common.options import options
+from suite.common.options import Command, options
 from tracks.common.provenance import VERSION
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Command):
     """A command for these tests."""
 
     fault: str = ""
     """What goes wrong."""
     seed: int = 0
     """A number."""
-    json: bool = False
-    """Print one JSON object."""
 
 
 def _run(config, console):
@@ -194,10 +192,11 @@ def test_ctrl_c_at_the_program_itself_is_code_130():
         "import os, signal, sys, types\n"
         "from dataclasses import make_dataclass\n"
         "from suite import cli\n"
+        "from suite.common.options import Command\n"
         # A shell that starts the tests in the background has them ignore Ctrl-C.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "module = types.ModuleType('suite.commands.wait')\n"
-        "module.Config = make_dataclass('Config', [('json', bool, False)], frozen=True)\n"
+        "module.Config = make_dataclass('Config', [], bases=(Command,), frozen=True)\n"
         "module.run = lambda config, console: os.kill(os.getpid(), signal.SIGINT) or input()\n"
         "sys.modules['suite.commands.wait'] = module\n"
         "cli.COMMANDS['wait'] = 'for tests'\n"
