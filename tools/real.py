@@ -74,13 +74,13 @@ def names_of(found: dict[str, Any]) -> str:
     return "; ".join(named) or "–"
 
 
-def nanobench(logs: Path, out: Path) -> list[str]:
-    """Return the lines on nanobench."""
-    flights = imported(logs.glob("*.csv"), out / "flights", "--map", "nanobench")
+def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
+    """Return the lines on nanobench: what is diagnosed with and without the drag it shows."""
+    flights = imported(logs.glob("*.csv"), out / "flights", "--map", "nanobench", *options)
     given = [flights[name] for name in FITTED]
     others = [path for name, path in flights.items() if name not in FITTED]
     vehicle, bare = out / "identified.toml", out / "without_drag.toml"
-    suite("identify", *given, "--vehicle", "crazyflie21", "--out", vehicle)
+    numbers = suite("identify", *given, "--vehicle", "crazyflie21", "--out", vehicle)["parameters"]
     whole = load_vehicle(str(vehicle))
     effects = {name: values for name, values in whole.effects.items() if "drag" not in name}
     save_vehicle(replace(whole, effects=MappingProxyType(effects)), bare, "without its drag")
@@ -93,14 +93,23 @@ def nanobench(logs: Path, out: Path) -> list[str]:
     ]
     for label, file in (("identified, its drag left out", bare), ("identified", vehicle)):
         found = suite("diagnose", *others, "--vehicle", file, "--out", out / file.stem)
-        force = found["gap"]["channels"]["force"]
+        force = found["gap"]["channels"].get("force", {})
         shares = ", ".join(
-            f"{100 * force[a]['closed']:.0f} ({100 * force[a]['explainable']:.0f}) %" for a in "xy"
+            f"{100 * force[a]['closed']:.0f} ({100 * force[a]['explainable']:.0f}) %"
+            for a in "xy"
+            if a in force
         )
         lines.append(
-            f"| {label} | {names_of(found)} | {found['verdict']} | {shares} "
+            f"| {label} | {names_of(found)} | {found['verdict']} | {shares or '–'} "
             f"| {found['seconds']:.0f} |"
         )
+    lines += ["", "| identified | value | 95 % interval | unit |", "|---|---|---|---|"]
+    for key, entry in numbers.items():
+        several = isinstance(entry["value"], list)
+        values, spans = (entry[k] if several else [entry[k]] for k in ("value", "ci95"))
+        shown = [", ".join(f"{v:.3g}" for v in values)]
+        shown += [", ".join(f"{s[0]:.3g} to {s[1]:.3g}" if s else "–" for s in spans)]
+        lines.append(f"| {key} | {' | '.join(shown)} | {entry['unit']} |")
     return lines
 
 
@@ -114,16 +123,19 @@ def changed(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> s
     return names_of(found)
 
 
-def crazypad(logs: Path, out: Path) -> list[str]:
-    """Return the lines on crazypad: each condition's flights together, and each flight alone."""
+def crazypad(logs: Path, out: Path, *options: Any) -> list[str]:
+    """Return the lines on crazypad: each condition's flights together, and each flight alone.
+
+    Without a pose only the controller logs hold something to diagnose: the rates.
+    """
     lines = [
         "| logs, vehicle | condition | all flights together | each alone |",
         "|---|---|---|---|",
     ]
-    for kind in ("motor", "controller"):
+    for kind in ("controller",) if options else ("motor", "controller"):
         folder = out / kind
         flights = imported((logs / kind).iterdir(), folder / "flights", "--map", "crazypad",
-                           "--partial")  # fmt: skip
+                           "--partial", *options)  # fmt: skip
         for vehicle in ("E8", "E9"):
             own = {n: path for n, path in flights.items() if f"__{vehicle}_" in n}
             normal = [path for name, path in own.items() if name.startswith("normal")]
@@ -163,11 +175,22 @@ def crazyswarm2(logs: Path, out: Path) -> list[str]:
 
 
 def write_page(logs: Path, out: Path) -> None:
-    """Diagnose all three sets and write the page."""
-    parts = {"nanobench": nanobench, "crazypad": crazypad, "crazyswarm2": crazyswarm2}
+    """Diagnose all three sets, two of them also without a pose, and write the page."""
+    no_pose = [word for name in ("pos", "quat", "vel") for word in ("--read", f"{name}=drop")]
+    parts = {
+        "nanobench": lambda: nanobench(logs / "nanobench", out / "nanobench"),
+        "nanobench without a pose": lambda: nanobench(
+            logs / "nanobench", out / "nanobench-no-pose", "--partial", *no_pose
+        ),
+        "crazypad": lambda: crazypad(logs / "crazypad", out / "crazypad"),
+        "crazypad without a pose": lambda: crazypad(
+            logs / "crazypad", out / "crazypad-no-pose", *no_pose
+        ),
+        "crazyswarm2": lambda: crazyswarm2(logs / "crazyswarm2", out / "crazyswarm2"),
+    }
     page = []
     for name, of in parts.items():
-        page += [f"## {name}", "", *of(logs / name, out / name), ""]
+        page += [f"## {name}", "", *of(), ""]
         (out / "real.md").write_text("\n".join(page), encoding="utf-8")
 
 

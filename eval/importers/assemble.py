@@ -15,6 +15,7 @@ from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, run_checks
 from eval.logs.faults.finding import Finding, finding_lines
+from eval.logs.faults.reading import MOTORS, read_rows
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
@@ -68,7 +69,9 @@ def assemble(
 
         recording, more = with_pose(recording, options)
         findings += more
-    recording = with_readings(recording, options.read)
+    # Orders of motors are relative to the vehicle's order, which `order_motors` makes.
+    orders = tuple(one for one in options.read if one[0] in MOTORS and "," in one[1])
+    recording = with_readings(recording, tuple(r for r in options.read if r not in orders))
     _need(recording, options.partial, findings)
     against = CheckContext(options.vehicle)
     more, readings, _ = run_checks(
@@ -92,6 +95,7 @@ def assemble(
     findings += _rates(recording, time_s)
     rows = rows_at(recording, time_s)
     findings += order_motors(rows, recording.motor_side, options.vehicle)
+    rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
     more, readings, right = run_checks(rows, DRIVE, against, options.fix)
     findings += more

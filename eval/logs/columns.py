@@ -63,14 +63,14 @@ ESTIMATE = "est_"
 KNOWN = frozenset(column for group in GROUPS.values() for column in group)
 """All columns that this file defines."""
 
-POSITION_MAX = 100e3
-"""Positions beyond this are refused [m]."""
-RATE_MAX = 200.0
-"""Body rates beyond this are refused [rad/s]."""
+LIMITS = {
+    "pos": (-100e3, 100e3, "beyond 100 km; positions are in m"),
+    "rate": (-200.0, 200.0, "beyond 200 rad/s; rates are in rad/s"),
+    "pwm": (-0.05, 1.05, "not from 0 to 1; a motor command is a share of the full one"),
+}
+"""Group -> least and largest value, and the reason for which others are refused."""
 QUATERNION_TOLERANCE = 0.05
 """Quaternions further than this from unit norm are refused."""
-PWM_MAX = 1.05
-"""Motor commands above this, or below 1 minus this, are refused."""
 DURATION_MIN = 1.0
 """Shorter flights are refused [s]."""
 
@@ -107,7 +107,7 @@ def quoted(error: Exception) -> str:
 
 
 def check_columns(
-    columns: Mapping[str, np.ndarray], name: str, partial: bool = False
+    columns: Mapping[str, np.ndarray], name: str, partial: bool = False, limits: bool = True
 ) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
     """Check `columns` (column name to values, one a row) by the rules of a flight log.
 
@@ -115,6 +115,8 @@ def check_columns(
         columns: by name.
         name: the file, for messages.
         partial: accept a log without position, attitude, rates or commands.
+        limits: refuse values that no flight has. Checks of a log read it without, to name the
+            fault.
 
     Returns:
         The known columns as float64 without the rows that have no time, NaN where a value is
@@ -141,18 +143,8 @@ def check_columns(
     if not rows.all():
         warnings.append(f"{name}: {np.sum(~rows)} rows without a time are left out")
     _check_time(kept["time"], row_number, name)
-    for column in GROUPS["pos"] if "pos" in present else ():
-        bad = np.abs(kept[column]) > POSITION_MAX
-        reason = "beyond 100 km; positions are in m"
-        _refuse_where(bad, name, column, kept[column], reason, row_number)
-    for column in GROUPS["rate"] if "rate" in present else ():
-        bad = np.abs(kept[column]) > RATE_MAX
-        reason = "beyond 200 rad/s; rates are in rad/s (suite import corrects deg/s and raw counts)"
-        _refuse_where(bad, name, column, kept[column], reason, row_number)
-    for column in GROUPS["pwm"] if "pwm" in present else ():
-        bad = (kept[column] > PWM_MAX) | (kept[column] < 1.0 - PWM_MAX)
-        reason = "not from 0 to 1; a motor command is a share of the full one"
-        _refuse_where(bad, name, column, kept[column], reason, row_number)
+    if limits:
+        _check_limits(kept, name, row_number)
     if "quat" in present:
         _check_quaternion(kept, row_number, name)
     step = float(np.median(np.diff(kept["time"])))
@@ -259,6 +251,14 @@ def _check_time(time: np.ndarray, row_number: np.ndarray, name: str) -> None:
     if time[-1] - time[0] < DURATION_MIN:
         reason = f"{time[-1] - time[0]:.3g} s of flight; at least {DURATION_MIN:g} s is needed"
         raise FlightLogError(name, "time", int(row_number[-1]), reason)
+
+
+def _check_limits(kept: Mapping[str, np.ndarray], name: str, row_number: np.ndarray) -> None:
+    for group, (low, high, reason) in LIMITS.items():
+        for column in GROUPS[group] if GROUPS[group][0] in kept else ():
+            bad = (kept[column] > high) | (kept[column] < low)
+            reason_of = f"{reason}; suite check names the fault and its fix"
+            _refuse_where(bad, name, column, kept[column], reason_of, row_number)
 
 
 def _check_quaternion(kept: Mapping[str, np.ndarray], row_number: np.ndarray, name: str) -> None:

@@ -192,17 +192,18 @@ def log_from_flight(flight: Flight, name: str = "flight") -> FlightLog:
 
 
 def log_from_columns(
-    columns: Mapping[str, np.ndarray], about: Mapping[str, Any], name: str
+    columns: Mapping[str, np.ndarray], about: Mapping[str, Any], name: str, limits: bool = True
 ) -> FlightLog:
     """Return `columns` (column name to (T,) values) as a log.
 
     Rows without a time are left out. Quaternions are normalised. A missing velocity is computed
-    (`eval/logs/velocity.py`). Where `about` has `partial`, missing required groups are NaN.
+    (`eval/logs/velocity.py`). Where `about` has `partial`, missing required groups are NaN. Without
+    `limits` values are accepted that no flight has (`columns.LIMITS`).
 
     Raises:
         FlightLogError: where the columns break a rule; it names column, row and reason.
     """
-    checked, rows, warnings = check_columns(columns, name, bool(about.get("partial")))
+    checked, rows, warnings = check_columns(columns, name, bool(about.get("partial")), limits)
 
     values: dict[str, np.ndarray] = {
         _FIELDS[key]: np.full((len(checked["time"]), len(GROUPS[key])), np.nan)
@@ -267,8 +268,10 @@ def flight_metadata(text: str | None, name: str) -> tuple[dict[str, Any], list[s
     return about, []
 
 
-def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
+def read_flight(path: str | Path, partial: bool = False, limits: bool = True) -> FlightLog:
     """Read a flight from a Parquet or CSV file; `partial` allows a partial log.
+
+    `limits` is as in `log_from_columns`.
 
     Raises:
         FlightLogError: where the file cannot be read or breaks a rule; the message has the file,
@@ -277,7 +280,7 @@ def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
     columns, text, warnings = read_columns(Path(path))
     about, more = flight_metadata(text, str(path))
     warnings += more
-    log = log_from_columns(columns, about, str(path))
+    log = log_from_columns(columns, about, str(path), limits)
     if log.partial and not partial:
         reason = f"a partial log, without {', '.join(log.partial)}; this command needs whole ones"
         raise FlightLogError(str(path), None, None, reason)
@@ -285,13 +288,14 @@ def read_flight(path: str | Path, partial: bool = False) -> FlightLog:
 
 
 def read_flights(
-    paths: Iterable[str | Path], partial: bool = False
+    paths: Iterable[str | Path], partial: bool = False, limits: bool = True
 ) -> tuple[list[FlightLog], list[str]]:
     """Read many flights; the warnings name files that cannot be used.
 
     Args:
         paths: of the files.
         partial: accept partial logs as well.
+        limits: as in `log_from_columns`.
 
     Returns:
         The flights in the order of `paths`, and the warnings of all files.
@@ -304,7 +308,7 @@ def read_flights(
     refused: list[str] = []
     for path in paths:
         try:
-            flights.append(read_flight(path, partial))
+            flights.append(read_flight(path, partial, limits))
             warnings.extend(flights[-1].warnings)
         except FlightLogError as error:
             refused.append(str(error))

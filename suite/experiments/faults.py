@@ -82,19 +82,15 @@ def document(config: Config, place: Place, console: Console) -> Made:
         Case("", FORMATS[k % len(FORMATS)], path, k) for k, path in enumerate(good[: config.clean])
     ]
     real = real_logs(config.real)
-    on_real = [
-        Case(kind, "real", path, k)
-        for kind in KINDS
-        for k, path in enumerate(_share(kind, real, config.flights))
-    ]
+    on_real = list(_on_real(real, config.flights))
     intact = [Case("", "real", path, 0) for path in real]
     cases = [*faulty, *clean, *on_real, *intact]
     done = _checked(cases, config, folder, console, place)
     groups = {"simulated": faulty, "real": on_real}
     parts = {
-        f"Faults in {name} logs": [_kinds_grid([(c, done[c]) for c in held if done[c]])]
+        f"Faults in {name} logs": [_kinds_grid([(c, done[c]) for c in held])]
         for name, held in groups.items()
-        if any(done[c] for c in held)
+        if held
     }
     parts["Logs without a fault"] = [_clean_grid([(c, done[c]) for c in (*clean, *intact)])]
     facts = {
@@ -107,10 +103,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "teams of a vision race their flights",
         "seed": str(config.seed),
     }
-    numbers = {
-        name: Counter(_outcome(c, done[c]) for c in held if done[c])
-        for name, held in groups.items()
-    }
+    numbers = {name: Counter(_outcome(c, done[c]) for c in held) for name, held in groups.items()}
     accused = [c for c in clean if _reported(done[c])]
     return Made(facts, parts, {"outcomes": numbers, "clean": len(clean), "accused": len(accused)})
 
@@ -135,7 +128,7 @@ def _flights(config: Config, vehicle: Vehicle, folder: Path, console: Console) -
 
 def _faulty(config: Config, good: Sequence[Path]) -> Iterator[Case]:
     for number, (name, kind) in enumerate(KINDS.items()):
-        able = [f for f in FORMATS if kind.needs() <= _holds(f)]
+        able = [f for f in FORMATS if kind.fits(_holds(f))]
         for k in range(config.flights):
             at = (number * config.flights + k) % len(good)
             yield Case(name, able[k % len(able)], good[at], at)
@@ -143,17 +136,24 @@ def _faulty(config: Config, good: Sequence[Path]) -> Iterator[Case]:
 
 def _holds(format: str) -> set[str]:
     both = {"time", "pos", "quat", "rate", "acc", "motor", "cmd_rate", "throttle", "voltage"}
-    return both | {"betaflight": set(), OWN: {"vel", "baro"}}.get(format, {"vel"})
+    return both | {"betaflight": set(), OWN: {"vel", "baro", "cmd_thrust"}}.get(format, {"vel"})
 
 
-def _share(kind: str, real: Sequence[Path], count: int) -> list[Path]:
-    """Return `count` of the real logs, spread over all of them by kind."""
-    start = list(KINDS).index(kind) * 3
-    return [real[(start + 7 * k) % len(real)] for k in range(min(count, len(real)))]
+def _on_real(real: Sequence[Path], count: int) -> Iterator[Case]:
+    """Yield `count` real logs a kind, of all sets of logs that hold the signals of the fault."""
+    sets: dict[Path, list[Path]] = {}
+    for path in real:
+        sets.setdefault(path.parent, []).append(path)
+    holds = {folder: set(rows_of(_real(paths[0])[0])) for folder, paths in sets.items()}
+    for number, (name, kind) in enumerate(KINDS.items()):
+        able = [paths for folder, paths in sets.items() if kind.fits(holds[folder])]
+        for k in range(count if able else 0):
+            paths = able[(number + k) % len(able)]
+            yield Case(name, "real", paths[(3 * number + k // len(able)) % len(paths)], k)
 
 
-Answer = list[dict[str, Any]] | str | None
-"""Records of findings; the reason of a refusal; None if the log lacks the fault's signals."""
+Answer = list[dict[str, Any]] | str
+"""Records of findings, or the reason of a refusal."""
 
 
 def _checked(
@@ -185,14 +185,10 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
     if case.format == "real":
         log, vehicle = _real(case.path)
         parts = rows_of(log)
-        lacks = not kind.needs() <= parts.keys() or (kind.fov != 1.0)
     else:
         vehicle = load_vehicle(vehicle_name)
-        parts, lacks = flight_parts(read_flight(case.path), vehicle, rng), False
-    if lacks:
-        yield None
-        return
-    wrong = inject(kind, parts, rng) if kind.names else parts
+        parts = flight_parts(read_flight(case.path), vehicle, rng)
+    wrong = inject(kind, parts, vehicle) if kind.names else parts
     vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
     fov = tuple(kind.fov * angle for angle in vehicle.camera.fov_deg)
     hz = POLICY_HZ if case.format != "real" else None
@@ -228,7 +224,7 @@ def _reported(answer: Answer) -> list[str]:
     """Return the names of the reported faults, or "refused"."""
     if isinstance(answer, str):
         return ["refused"]
-    return [f["fault"] for f in answer or () if f["status"] != "not identifiable"]
+    return [f["fault"] for f in answer if f["status"] != "not identifiable"]
 
 
 def _outcome(case: Case, answer: Answer) -> str:
@@ -237,7 +233,7 @@ def _outcome(case: Case, answer: Answer) -> str:
         return "refused"
     if reported & names:
         return "named"
-    if names & {f["fault"] for f in answer or ()}:
+    if names & {f["fault"] for f in answer}:
         return "not identifiable"
     return "another name" if reported else "silent"
 

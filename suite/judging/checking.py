@@ -48,6 +48,7 @@ def check_flight_files(
     """
     from dataclasses import replace
 
+    from eval.logs.columns import FlightLogError
     from eval.logs.faults.check import (
         CheckContext,
         check_files,
@@ -67,7 +68,8 @@ def check_flight_files(
         None if spec is None else spec.camera.fov_deg,
     )
     found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
-    logs, warnings = read_flights(flight_files(flights), partial=True) if flights else ([], [])
+    files = flight_files(flights) if flights else []
+    logs, warnings = read_flights(files, partial=True, limits=False) if files else ([], [])
     for warning in warnings:
         console.note(f"warning: {warning}")
     written = []
@@ -79,8 +81,11 @@ def check_flight_files(
             check_no_input(path, flights, "--out")
             records = [finding._asdict() for finding in findings]
             fixed = with_fixes(log, readings)
-            write_flight(path, replace(fixed, about={**fixed.about, "findings": records}))
-            written.append(str(path))
+            fixed = replace(fixed, about={**fixed.about, "findings": records})
+            try:
+                written.append(str(write_flight(path, fixed)))
+            except FlightLogError as error:
+                console.note(f"warning: not written: {error}")
     for name in (None, *(log.name for log in logs)):
         named = [finding for finding, flight in found if flight == name and finding.status != "ok"]
         for text in finding_lines(named):

@@ -122,7 +122,7 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
         elif group in rows and group != "time":
             columns |= dict(zip(names, turned[group].T, strict=True))
     columns["time"] = turned["time"]
-    return log_from_columns(columns, log.about, log.name)
+    return log_from_columns(columns, log.about, log.name, limits=False)
 
 
 def check_before_diagnosis(

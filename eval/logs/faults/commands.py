@@ -10,7 +10,7 @@ from eval.logs.faults.motors import over_force, within
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
-from eval.logs.faults.vectors import DEG
+from eval.logs.faults.vectors import DEG, RATES
 from eval.vehicles.vehicle import Vehicle
 
 REACH_S, STEP_S = 0.3, 0.01
@@ -35,9 +35,9 @@ RANGES = (
     ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
 """Range of a throttle, its span, its usual median in flight, and the step to 0 to 1."""
-THRUST_FITS, THRUST_EFFECT = 1.35, 2.0
+THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.07
 """A ratio within the first factor of a unit's is that unit. One within the second factor of 1 may
-be a physical effect or a wrong mass."""
+be a physical effect or a wrong mass, one within the third is certainly of that unit."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -81,7 +81,12 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
-    near = within(units, THRUST_FITS, ratio)
+    near, exact = within(units, THRUST_FITS, ratio), within(units, THRUST_SAME, ratio)
+    if exact == ["in newtons"] and "in m/s^2" in near and sign > 0.0:
+        text = f"{figures}: it may be in newtons, as the mass is {units['in newtons']:.3g} kg, or "
+        text += "thrust is off by so much"
+        fix = option(("cmd_thrust", f"{1.0 / units['in newtons']:.6g}"))
+        return [Finding("doubt", subject, text, "thrust_command_unit", ratio, 0.6, fix)]
     name = near[0] if near and (len(near) == 1 or near[0] == "in m/s^2") else ""
     if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
         text = f"{figures}: an effect, or a mass that is off"
@@ -134,6 +139,12 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
             text = f"{figures}, by {gain:.3g} of it: it is {words}"
             fix = option(("cmd_rate", f"{1.0 / factor:.10g}"))
             return [Finding("corrected", subject, text, "rate_command_unit", factor, 0.98, fix)]
+    units = {words: factor for words, factor in RATES.items() if factor > 1.0}
+    name = next((w for w, f in units.items() if abs(np.log(gain / f)) < np.log(1.4)), None)
+    if name is not None:
+        text = f"{figures}, by {gain:.3g} of it: the gyro is in {name}"
+        fix = option(("rate", f"{1.0 / units[name]:.10g}"))
+        return [Finding("doubt", "gyro", text, "gyro_scale", units[name], 0.95, fix)]
     findings = []
     bent = bend(time_s, command, rate)
     if np.isfinite(gain) and (high < GAIN[0] or low > GAIN[1] or bent > BENT):

@@ -81,7 +81,7 @@ def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
         return [Finding("doubt", "motors", text, "motor_dead", float(len(still)), 0.97,
                         "the columns of the motors in --map")]  # fmt: skip
     if "rate" not in rows:
-        return []
+        return unseen("motors", "the log has no gyro", "motor_order", "motor_spin")
     return _order(rows, name, vehicle)
 
 
@@ -94,7 +94,7 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     thrust = _thrust(rows[name], name, vehicle, rows.get("voltage"))
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
     if len(time_s) < 20 * count:
-        return []
+        return unseen("motors", "the flight is too short", "motor_order", "motor_spin")
     inertia = np.array([1.0, 1.0, 1.0] if vehicle is None else vehicle.inertia)
     momentum = rate * inertia
     change = (momentum[count:] - momentum[:-count]) / (time_s[count:] - time_s[:-count])[:, None]
@@ -139,7 +139,9 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
         text = f"{figures}: all of them turn the other way round"
         fix = "rotors.spin of the vehicle file, with the other signs"
         return [Finding("doubt", "motors", text, "motor_spin", -1.0, 0.95, fix)]
-    return [Finding("ok", "motors", figures)]
+    text = f"{figures}: yaw shows too little of their spin"
+    weak = [] if given[2] > RIGHT else unseen("motors", text, "motor_spin")
+    return [Finding("ok", "motors", figures), *weak]
 
 
 Scores = dict[tuple[int, ...], np.ndarray]

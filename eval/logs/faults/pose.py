@@ -7,7 +7,7 @@ attitude turns at the gyro's rates, in any axes and unit of the gyro.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +83,8 @@ class PoseFits(NamedTuple):
     best: Reading
     second: float
     """Misfit of the second best reading."""
+    rivals: tuple[Reading, ...]
+    """Other readings than the given one that fit about as well as the best."""
     level: float
     """Horizontal acceleration or tilt times gravity, root mean square [m/s^2]."""
     rate: float
@@ -128,8 +130,10 @@ def fit_pose_readings(rows: Rows) -> PoseFits | None:
     best = min(found, key=lambda one: one.misfit + EACH * one.steps)
     others = [one for one in found if one is not best and one.steps <= best.steps + 1]
     second = min((o.misfit + EACH * (o.steps - best.steps) for o in others), default=np.inf)
+    alike = (one for one in others if one.misfit < best.misfit + 0.5 * EACH)
+    rivals = tuple(one for one in alike if one is not found[0])
     rate = 0.0 if gyro is None else rms(gyro)
-    return PoseFits(found[0], best, second, level, rate)
+    return PoseFits(found[0], best, second, rivals, level, rate)
 
 
 def _is_right(one: Reading) -> bool:
@@ -156,7 +160,8 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
     if not (best.quat or best.pos or best.length != 1.0):
         if given.misfit < BAD or (given.gyro is not None and given.gyro.is_turned):
             noisy = given.misfit > GOOD
-            return [Finding("note" if noisy else "ok", "attitude", figures)]
+            found = Finding("note" if noisy else "ok", "attitude", figures)
+            return [found, *_same_fit([r for r in fits.rivals if r.quat in _ANGLES])]
         text = f"{figures}: no other order, direction, sign or frame of it fits"
         sure = 0.9 if given.misfit > 1.0 else 0.6
         return [Finding("doubt", "attitude", text, "attitude", given.misfit, sure, "see --pose")]
@@ -168,12 +173,22 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
     if given.misfit < BAD and not sure:
         return [Finding("ok", "attitude", figures)]
     confidence = 0.99 if sure and clear > 2.0 * EACH else 0.95 if better > TIMES_BETTER else 0.7
-    return [
+    names = list(_names(best))
+    found = [
         Finding("corrected" if sure else "doubt", signal, text, name, None, confidence,
                 option(*(r for r in readings if r[0] in of)))
-        for name, signal, of in _names(best)
+        for name, signal, of in names
         if any(r[0] in of for r in readings)
     ]  # fmt: skip
+    more = _same_fit([one for one in fits.rivals if one.steps <= best.steps])
+    return found + [one for one in more if one.fault not in {name for name, *_ in names}]
+
+
+def _same_fit(rivals: Sequence[Reading]) -> list[Finding]:
+    """Return the names of readings that fit as well, which the flight does not distinguish."""
+    words = {name: _words(one) for one in rivals for name, *_ in _names(one)}
+    text = "it fits as well if {}"
+    return [one for name, w in words.items() for one in unseen("attitude", text.format(w), name)]
 
 
 def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:

@@ -4,7 +4,7 @@
 |---|---|---|
 | `0.01` | multiply by this | all |
 | `x,-y,-z` | take these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
-| `2,1,4,3` | motors in this order | motor motor_cmd pwm |
+| `2,1,4,3` | these motors of the vehicle's order, in this order | motor motor_cmd pwm |
 | `xyzw` | the file's columns have this order | quat cmd_quat |
 | `inverse` | the file's quaternion maps world to body | quat cmd_quat |
 | `ned`, `frd` | the file's world points down; its body is forward-right-down | quat cmd_quat |

@@ -11,6 +11,9 @@ ALIKE = 0.8
 """Axes with a higher correlation are the same."""
 UNLIKE = 0.5
 """An axis is another one if the best correlation exceeds that with its own axis by this."""
+LEFT, TIMES_LEFT = 0.5, 20.0
+"""So it is if its own axis leaves more than the first share of its variance unexplained, and more
+than the second factor times what the best axis leaves."""
 CLEAR = 0.1
 """Another order of axes is taken where its squared correlations exceed those of the given order by
 this in all: on a straight line two axes are proportional, and noise alone would decide."""
@@ -39,12 +42,17 @@ class Match(NamedTuple):
     """... largest scale consistent with noise in either of them (Frisch 1934)."""
     level: np.ndarray
     """(3,) standard deviation of `wanted`."""
+    rival: str
+    """Other axes that fit about as well, since two of them move in proportion; "" for none."""
 
     @property
     def is_turned(self) -> bool:
         """Whether the evidence for other axes than the given ones is overwhelming."""
-        worse = self.seen & (self.alike - self.as_given > UNLIKE)
-        return bool(worse.any() and (self.alike[self.seen] > ALIKE).all())
+        left, left_as_given = 1.0 - self.alike**2, 1.0 - self.as_given**2
+        far = (left_as_given > LEFT) & (left_as_given > TIMES_LEFT * left)
+        worse = self.seen & ((self.alike - self.as_given > UNLIKE) | far)
+        changed = np.array([axis != "xyz"[k] for k, axis in enumerate(self.axes.split(","))])
+        return bool((worse & changed).any() and (self.alike[changed & self.seen] > ALIKE).all())
 
     @property
     def is_mirrored(self) -> bool:
@@ -67,10 +75,8 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     wanted, given = wanted - wanted.mean(axis=0), given - given.mean(axis=0)
     size = np.outer(np.maximum(level, 1e-12), np.maximum(other, 1e-12)) * max(len(wanted), 1)
     corr = (wanted.T @ given) / size
-    order = max(
-        permutations(range(3)),
-        key=lambda p: float(np.sum(corr[range(3), p] ** 2)) + CLEAR * (p == (0, 1, 2)),
-    )
+    score = {p: float(np.sum(corr[range(3), p] ** 2)) for p in permutations(range(3))}
+    order = max(score, key=lambda p: score[p] + CLEAR * (p == (0, 1, 2)))
     best = corr[range(3), order]
     seen = np.abs(best) > SEEN
     if not seen[[k for k in range(3) if order[k] != k]].all():
@@ -78,10 +84,19 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
         seen = np.abs(best) > SEEN
     sign = np.where(seen & (best < 0.0), -1.0, 1.0)
     names = [("-" if s < 0 else "") + "xyz"[k] for k, s in zip(order, sign, strict=True)]
+    rivals = [
+        p
+        for p in score
+        if p != order
+        and score[p] > score[order] - CLEAR
+        and all(abs(corr[k, p[k]]) > ALIKE for k in range(3) if p[k] != order[k])
+    ]
+    rival = ",".join("xyz"[k] for k in max(rivals, key=lambda p: score[p])) if rivals else ""
     ratio = other[list(order)] / np.maximum(level, 1e-12)
     r = np.clip(np.abs(best), 1e-3, 1.0)
     alike = best * sign
-    return Match(",".join(names), seen, alike, np.diag(corr), ratio, ratio * r, ratio / r, level)
+    as_given = np.diag(corr)
+    return Match(",".join(names), seen, alike, as_given, ratio, ratio * r, ratio / r, level, rival)
 
 
 def pooled_scale(found: Match) -> tuple[float, float, float]:

@@ -26,6 +26,8 @@ RATES = {
     "mrad/s": 1000.0,
 }
 """Unit -> factor by which its numbers are too large."""
+GYRO_TOP = 75.0
+"""Largest body rate that a gyro of a drone measures: a range of 4000 deg/s [rad/s]."""
 SPEEDS = {"cm/s": 100.0, "mm/s": 1000.0, "km/h": 3.6, "knots": 1.0 / 0.514444}
 FORCES = {
     "g": 1.0 / GRAVITY,
@@ -56,14 +58,16 @@ def check_gyro(rows: Rows) -> list[Finding]:
     if "rate" not in rows:
         return []
     if "quat" not in rows:
-        return unseen("gyro", "the log has no attitude", "gyro_scale", "gyro_axes", "gyro_frame")
+        unknown = unseen("gyro", "the log has no attitude", "gyro_axes", "gyro_frame")
+        return [*unknown, *_gyro_scale_alone(rows, "the log has no attitude")]
     time_s = rows["time"]
     turns = smooth(time_s, turns_of(time_s, rows["quat"]), WIDTH_S)
     gyro = smooth(time_s, rows["rate"], WIDTH_S)
     size = rms(turns)
     if size < CALM_RATE:
         text = f"turns of {size:.2g} rad/s are too small to check it by"
-        return unseen("gyro", text, "gyro_scale", "gyro_axes", "gyro_frame", "body_frame")
+        unknown = unseen("gyro", text, "gyro_axes", "gyro_frame", "body_frame")
+        return [*unknown, *_gyro_scale_alone(rows, text)]
     found = match(turns, gyro)
     world = match(turn(rows["quat"], turns), gyro)
     in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
@@ -84,10 +88,23 @@ def check_gyro(rows: Rows) -> list[Finding]:
         findings.append(_turned(found, "rate", "gyro"))
     elif not found.seen.any():
         text = "its noise hides how the attitude turns"
-        return unseen("gyro", text, "gyro_scale", "gyro_axes", "gyro_frame", "body_frame")
+        unknown = unseen("gyro", text, "gyro_axes", "gyro_frame", "body_frame")
+        return [*unknown, *_gyro_scale_alone(rows, text)]
     findings += _unseen_axes(found, "gyro", "gyro_axes", "body_frame")
     findings += _unit(found, RATES, "rate", "gyro", "gyro_scale", "the attitude's turns")
     return findings
+
+
+def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
+    """Return a gyro's scale where no attitude shows it: rates that no vehicle has are a fault."""
+    size = np.linalg.norm(rows["rate"], axis=1)
+    known = size[np.isfinite(size)]
+    top = float(np.quantile(known, 0.99)) if len(known) else 0.0
+    if top < GYRO_TOP:
+        return unseen("gyro", why, "gyro_scale")
+    text = f"it reads up to {top:.4g} rad/s, and no gyro of a drone measures that; {why}"
+    fix = f"{option(('rate', f'{DEG:.6g}'))} for deg/s, or {DEG / COUNTS:.6g} for raw counts"
+    return [Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
 
 
 def _turned(found: Match, signal: str, subject: str) -> Finding:
@@ -103,10 +120,12 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
 
 
 def _unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
-    """Return findings for axes without motion, which cannot be checked."""
+    """Return findings for axes without motion of their own, which cannot be checked."""
     axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
     text = f"along {axes} there is too little to check its sign by"
-    return unseen(subject, text, *faults) if axes else []
+    findings = unseen(subject, text, *faults) if axes else []
+    text = f"two axes move in proportion, so that the order {found.rival} fits about as well"
+    return findings + (unseen(subject, text, faults[0]) if found.rival else [])
 
 
 def _unit(
@@ -121,10 +140,11 @@ def _unit(
     """Return the finding for a scale: a wrong unit, another factor, or correct."""
     scale, low, high = pooled_scale(found)
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
-    if not np.isfinite(scale) or low / same < 1.0 < high * same:
+    if not np.isfinite(scale) or low < 1.0 < high or 1.0 / same < scale < same:
         return [Finding("ok", subject, figures)]
-    if low / FAR < 1.0 < high * FAR:
-        return [Finding("note", subject, f"{figures}: filters, or a range that is a little off")]
+    if low / max(FAR, same) < 1.0 < high * max(FAR, same):
+        text = f"{figures}: filters of the log may cause as much"
+        return [Finding("note", subject, text), *unseen(subject, text, fault)]
     off = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
     words, *others = sorted(off, key=lambda name: off[name])
     if low / NEAR < units[words] < high * NEAR and off[words] < np.log(1.3):

@@ -61,7 +61,7 @@ def as_log(parts: Mapping[str, np.ndarray], name: str) -> FlightLog:
             columns |= dict(zip(names, np.asarray(parts[group]).T, strict=True))
     columns |= {n: parts[n][:, 0] for n in ("throttle", "baro") if n in parts}
     lacks = [group for group in ("pos", "quat", "rate") if group not in parts]
-    return log_from_columns(columns, {"partial": lacks} if lacks else {}, name)
+    return log_from_columns(columns, {"partial": lacks} if lacks else {}, name, limits=False)
 
 
 def real_logs(folder: Path) -> list[Path]:

@@ -29,7 +29,7 @@ class Kind:
     """Names in `eval.logs.faults.catalogue`, of which one must be reported."""
     readings: tuple[str, ...] = ()
     """Readings that corrupt the flight."""
-    change: Callable[[Parts, np.random.Generator], Parts] | None = None
+    change: Callable[[Parts, Vehicle], Parts] | None = None
     """A change that no reading describes."""
     vehicle: Callable[[Vehicle], Vehicle] | None = None
     """A change of the vehicle file."""
@@ -39,30 +39,40 @@ class Kind:
     """Whether it has cost teams of a vision race of 2026 their flights."""
     of: tuple[str, ...] = ()
     """Signals that `change` needs, and those without which the fault is not identifiable."""
+    drive: bool = False
+    """The motors' commands (`pwm`) do where a log has no rotor speeds (`motor`)."""
 
-    def needs(self) -> set[str]:
-        """Return the signals that a log must have for this fault."""
+    def fits(self, signals: set[str]) -> bool:
+        """Return whether the fault can be put into a log of these signals."""
         turned = {"quat"} if any("from-" in text for text in self.readings) else set()
-        return {*self.of, *turned, *(text.partition("=")[0] for text in self.readings)}
+        needs = {*self.of, *turned, *(text.partition("=")[0] for text in self.readings)}
+        return needs <= (signals | {"motor"} if self.drive and "pwm" in signals else signals)
 
 
-def inject(kind: Kind, parts: Mapping[str, np.ndarray], rng: np.random.Generator) -> Parts:
-    """Return a good flight with the fault in it."""
-    wrong = read_rows(dict(parts), parse_readings(kind.readings))
-    return kind.change(wrong, rng) if kind.change is not None else wrong
+def inject(kind: Kind, parts: Mapping[str, np.ndarray], vehicle: Vehicle) -> Parts:
+    """Return a good flight of `vehicle` with the fault in it."""
+    wrong = dict(parts)
+    instead = kind.drive and "motor" not in wrong
+    if instead:
+        wrong["motor"] = wrong.pop("pwm")
+    wrong = read_rows(wrong, parse_readings(kind.readings))
+    wrong = kind.change(wrong, vehicle) if kind.change is not None else wrong
+    if instead:
+        wrong["pwm"] = wrong.pop("motor")
+    return wrong
 
 
-def _without_gravity(parts: Parts, _: np.random.Generator) -> Parts:
+def _without_gravity(parts: Parts, _: Vehicle) -> Parts:
     down = turn(conjugate(parts["quat"]), np.array([0.0, 0.0, GRAVITY]))
     return {**parts, "acc": parts["acc"] - down}
 
 
-def _biased_by_throttle(parts: Parts, _: np.random.Generator) -> Parts:
+def _biased_by_throttle(parts: Parts, _: Vehicle) -> Parts:
     bias = -0.46 * GRAVITY * parts["throttle"] ** 2
     return {**parts, "acc": parts["acc"] + bias * [0.0, 0.0, 1.0]}
 
 
-def _curved(parts: Parts, _: np.random.Generator) -> Parts:
+def _curved(parts: Parts, _: Vehicle) -> Parts:
     """A linear stick map; the firmware's curve gives 0.62 to 2.4 times as much."""
     command = parts["cmd_rate"]
     most = np.maximum(np.quantile(np.abs(command), 0.98, axis=0), 1e-6)
@@ -71,18 +81,22 @@ def _curved(parts: Parts, _: np.random.Generator) -> Parts:
     return {**parts, "cmd_rate": np.sign(command) * stick * most}
 
 
-def _dead(parts: Parts, _: np.random.Generator) -> Parts:
+def _dead(parts: Parts, _: Vehicle) -> Parts:
     return {**parts, "motor": parts["motor"] * [1.0, 1.0, 0.0, 1.0]}
 
 
-def _ahead(parts: Parts, _: np.random.Generator) -> Parts:
+def _newtons(parts: Parts, vehicle: Vehicle) -> Parts:
+    return {**parts, "cmd_thrust": vehicle.mass * parts["cmd_thrust"]}
+
+
+def _ahead(parts: Parts, _: Vehicle) -> Parts:
     """Commands act 150 ms later than logged."""
     count = round(0.15 / float(np.median(np.diff(parts["time"]))))
     moved = {n: np.roll(parts[n], -count, axis=0) for n in ("cmd_rate", "throttle", "cmd_thrust")}
     return {**parts, **moved}
 
 
-def _held(parts: Parts, _: np.random.Generator) -> Parts:
+def _held(parts: Parts, _: Vehicle) -> Parts:
     """Commands at two thirds of the policy's rate: 20 instead of 30 Hz."""
     step = float(np.median(np.diff(parts["time"])))
     first = np.floor(parts["time"] * 20.0 + 1e-6) / 20.0
@@ -90,13 +104,13 @@ def _held(parts: Parts, _: np.random.Generator) -> Parts:
     return {**parts, **{n: parts[n][index] for n in ("cmd_rate", "throttle", "cmd_thrust")}}
 
 
-def _late(parts: Parts, _: np.random.Generator) -> Parts:
+def _late(parts: Parts, _: Vehicle) -> Parts:
     count = round(0.06 / float(np.median(np.diff(parts["time"]))))
     kept = {n: v[count:] for n, v in parts.items() if n not in ("pos", "vel", "quat")}
     return {**kept, **{n: parts[n][:-count] for n in ("pos", "vel", "quat")}}
 
 
-def _drifting(parts: Parts, _: np.random.Generator) -> Parts:
+def _drifting(parts: Parts, _: Vehicle) -> Parts:
     """The pose's clock runs 0.5 % fast."""
     time_s = parts["time"]
     at = time_s - 0.005 * (time_s - time_s.mean())
@@ -109,7 +123,7 @@ def _drifting(parts: Parts, _: np.random.Generator) -> Parts:
     return {**parts, **moved}
 
 
-def _sunk(parts: Parts, _: np.random.Generator) -> Parts:
+def _sunk(parts: Parts, _: Vehicle) -> Parts:
     """Two seconds on the ground; then the barometer falls by 1.6 m as the motors start."""
     step = float(np.median(np.diff(parts["time"])))
     count = round(2.0 / step)
@@ -178,14 +192,24 @@ KINDS: dict[str, Kind] = {
     "rotor speeds in rpm": Kind(("motor_unit",), (f"motor={RPM}",)),
     "electrical rotor speeds": Kind(("motor_unit",), ("motor=7",)),
     "12 poles declared of 14": Kind(("motor_poles",), (f"motor={14.0 / 12.0}",)),
-    "motors in the order 2, 1, 4, 3": Kind(("motor_order",), ("motor=2,1,4,3",)),
-    "motors in the order 4, 1, 2, 3": Kind(("motor_order",), ("motor=4,1,2,3",)),
-    "motors 3 and 4 swapped": Kind(("motor_order",), ("motor=1,2,4,3",)),
-    "motor 3 never turns": Kind(("motor_dead",), change=_dead, of=("motor",)),
+    "motors in the order 2, 1, 4, 3": Kind(("motor_order",), ("motor=2,1,4,3",), drive=True),
+    "motors in the order 4, 1, 2, 3": Kind(("motor_order",), ("motor=4,1,2,3",), drive=True),
+    "motors 3 and 4 swapped": Kind(("motor_order",), ("motor=1,2,4,3",), drive=True),
+    "motor 3 never turns": Kind(("motor_dead",), change=_dead, of=("motor",), drive=True),
     "spin of all motors": Kind(
         ("motor_spin",),
         vehicle=lambda v: _rotors(v, spin=tuple(-s for s in v.rotors.spin)),
         of=("motor", "rate"),
+        drive=True,
+    ),
+    "thrust command in g": Kind(
+        ("thrust_command_unit",), (f"cmd_thrust={1.0 / GRAVITY}",), of=("quat", "pos")
+    ),
+    "thrust command in newtons": Kind(
+        ("thrust_command_unit",), of=("cmd_thrust", "quat", "pos"), change=_newtons
+    ),
+    "thrust command with down positive": Kind(
+        ("thrust_command_unit",), ("cmd_thrust=-1",), of=("quat", "pos")
     ),
     "throttle from 0 to 1000": Kind(("throttle_range",), ("throttle=1000",)),
     "throttle in percent": Kind(("throttle_range",), ("throttle=100",)),

@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.logs.columns import FlightLogError
 from eval.logs.faults.check import not_examined
 from eval.logs.faults.finding import Finding, findings_of
-from eval.logs.flight_log import read_flight, write_flight
+from eval.logs.files import write_columns
+from eval.logs.flight_log import columns_from_log, read_flight, write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
 from suite import cli
 from suite.experiments.injected.flights import as_log
@@ -48,6 +50,19 @@ def test_a_fault_is_reported_with_its_fix_and_put_right(tmp_path, capsys, flight
     np.testing.assert_allclose(fixed.rate_b, good(end=10.0)["rate"], rtol=1e-6, atol=1e-9)
     again = checked(tmp_path, capsys, answer["written"][0])
     assert not [f for f in again["findings"] if f["status"] == "doubt"]
+
+
+def test_a_log_beyond_all_limits_is_checked_and_corrected_but_not_diagnosed(tmp_path, capsys):
+    save_vehicle(PLAIN, tmp_path / "plain.toml")
+    parts, counts = good(end=10.0), 16.384 / 0.0174532925
+    log = as_log({**parts, "rate": counts * parts["rate"]}, "flight")
+    path = write_columns(tmp_path / "flight.csv", columns_from_log(log), "{}")
+    with pytest.raises(FlightLogError, match="200 rad/s.*suite check names the fault"):
+        read_flight(path)
+    answer = checked(tmp_path, capsys, path, "--fix", "--out", str(tmp_path / "checked"))
+    assert "corrected" in {f["status"] for f in answer["findings"] if f["fault"] == "gyro_scale"}
+    fixed = read_flight(answer["written"][0])
+    np.testing.assert_allclose(fixed.rate_b, parts["rate"], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("command", ["diagnose", "identify"])

@@ -1,9 +1,12 @@
 """Injected faults: every format brings a good flight back, and what is found is counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.logs.faults.reading import readings_in
 from eval.logs.flight_log import FlightLog, write_flight
 from suite.experiments import faults
 from suite.experiments.injected.flights import flight_parts
@@ -33,6 +36,18 @@ def test_a_written_flight_comes_back(tmp_path, judged, format):
     rows = known_flight.fly(truth.time[0] + back.time_s)
     near(back.rate_b, rows.rate, 0.3)
     near(back.rotor_speed, rows.motor, 40.0)
+
+
+def test_the_printed_order_of_motors_corrects_an_import(tmp_path, judged):
+    _, log, _ = judged
+    parts = flight_parts(log, PLAIN, np.random.default_rng(0))
+    parts["motor"] = parts["motor"][:, [1, 3, 2, 0]]
+    written = WRITERS["px4"](tmp_path, parts, PLAIN.full_thrust)
+    options = replace(written.options, vehicle=PLAIN, fix=False)
+    _, findings = import_log(written.path, "px4", options)
+    (found,) = (f for f in findings if f.fault == "motor_order")
+    _, findings = import_log(written.path, "px4", replace(options, read=readings_in(found.fix)))
+    assert "motor_order" not in {f.fault for f in findings}
 
 
 def test_outcomes_are_counted_by_name(judged):

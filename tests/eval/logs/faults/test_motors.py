@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.logs.faults.motors import check_lift
+from eval.logs.faults.motors import check_lift, check_motors
 from tests.support.vehicles import PLAIN
 
 HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))
@@ -50,3 +50,9 @@ def test_a_factor_without_a_name_is_a_doubt():
     assert found(1.0, None).status == "note"
     assert found(14 / 12).fault == "motor_poles" and "14" in found(14 / 12).fix
     assert found(5**-0.5).fault == "vehicle_mass"
+
+
+def test_without_a_gyro_order_and_spin_are_not_identifiable():
+    found = check_motors({"motor": np.full((50, 4), HOVER), "time": np.arange(50.0)}, PLAIN)
+    assert {one.fault for one in found} == {"motor_order", "motor_spin"}
+    assert {one.status for one in found} == {"not identifiable"}
