@@ -106,6 +106,7 @@ def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path,
     with Journal(path, about) as journal:
         left = journal.missing(trials)
         assert len(left) == 3
+        options = JudgeOptions(slots=2, rules=SHORT)
         fly(Pursuit(), left, VEHICLE, options=options, on_result=lambda r, _: journal.append(r))
         assert [journal.done[trial] for trial in trials] == expected
 

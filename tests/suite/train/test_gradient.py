@@ -11,6 +11,9 @@ from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import KEY, boxes_worlds, fresh_params, largest_difference, loss_of
 
 
+whole_gradient = jax.jit(encoder_gradient)
+
+
 @pytest.fixture(scope="module")
 def two_pass():
     """Return (config, worlds, params, gradient, loss, records) of the trainer's own method."""
@@ -34,17 +37,20 @@ def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypat
     rng = np.random.default_rng(0)
     images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
     cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
-    whole = encoder_gradient(params, images, cotangents)
+    inputs = params, images, cotangents
+    whole = whole_gradient(*inputs)
     monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
-    assert largest_difference(encoder_gradient(params, images, cotangents), whole) < 1e-5
+    in_chunks = jax.jit(lambda *inputs: encoder_gradient(*inputs))
+    assert largest_difference(in_chunks(*inputs), whole) < 1e-5
 
 
 def test_the_encoders_gradient_from_every_other_image_is_right_on_average(two_pass):
     params, rng = two_pass[2], np.random.default_rng(1)
     images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
     cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
-    whole = encoder_gradient(params, images.reshape(12, 20, 20), cotangents.reshape(12, 8))
+    whole = whole_gradient(params, images.reshape(12, 20, 20), cotangents.reshape(12, 8))
     keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
-    halves = [sampled_encoder_gradient(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
+    sampled = jax.jit(sampled_encoder_gradient, static_argnums=3)
+    halves = [sampled(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
     mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
     assert largest_difference(mean, whole) < 1e-5

@@ -1,6 +1,7 @@
 """The whole rollout: gradients, what is cut out of them, and how the field enters."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -63,15 +64,19 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
 
     def spy(scene, pos_w, rot_w, rays, *_):
-        cast.append(np.array(rays))
+        cast.append(rays)
         return jnp.ones((len(pos_w), len(rays)))
 
     monkeypatch.setattr(rollout, "depth_image", spy)
-    for rays in (1, 2):
+
+    @partial(jax.jit, static_argnums=0)
+    def rays_of(rays, state):
         camera = replace(SPEC.camera, rays=rays)
         sight = rollout.make_sight(replace(config, spec=replace(SPEC, camera=camera)))
         sight.see(worlds, state, jnp.asarray(worlds.target), state.pos_w, jax.random.split(KEY, 4))
-    one, two = cast
+        return cast[-1]
+
+    one, two = rays_of(1, state), rays_of(2, state)
     assert one.shape == (SPEC.camera.height * SPEC.camera.width, 3)
     np.testing.assert_array_equal(one, two)
 
@@ -129,6 +134,7 @@ def fly(params, worlds):
     return jnp.stack(positions), jnp.stack(velocities)
 
 
+@jax.jit
 def pull_at(worlds, pos_w, vel_w):
     """Return u_A of every world's first gate, 1 across the centre of a gate of 1 m."""
     gate, _ = target_gate(worlds.scene.gates, worlds.target)
@@ -258,7 +264,7 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     worlds = sample_worlds(config, 0)
     worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    found = rollout.observed_at_start(worlds, state, config)
+    found = jax.jit(lambda *start: rollout.observed_at_start(*start, config))(worlds, state)
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)

@@ -30,7 +30,7 @@ def test_no_module_of_the_engine_imports_the_model_that_fits():
                 assert name.startswith(ALLOWED), f"{path.name} imports {name}"
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.02])
+@pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_a_finer_step_changes_a_flight_by_far_less_than_the_noise(lag):
     truth = with_effects(
         with_lag(PLAIN, lag),

@@ -19,17 +19,16 @@ ACTION, TARGET = jnp.asarray([[1.0, 0.5, 2.0]] * 2), jnp.asarray([[9.0, 1.0, 2.0
 
 def started(config):
     worlds, dynamics = sample_worlds(config, 0), make_dynamics(config)
-    body = dynamics.start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    body = jax.jit(dynamics.start)(worlds.constants, *worlds[1:4])
     return worlds, dynamics, body
 
 
 def test_the_point_mass_is_stepped_with_the_runs_settings():
     worlds, dynamics, body = started(CONFIG)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
-    found = dynamics.step(
-        body, worlds.constants, ACTION, TARGET, jax.random.split(jax.random.key(0), 2)
-    )
-    expected = point_mass.step(body, worlds.constants, ACTION, TARGET, 0.4)
+    now = body, worlds.constants, ACTION, TARGET
+    found = jax.jit(dynamics.step)(*now, jax.random.split(jax.random.key(0), 2))
+    expected = jax.jit(point_mass.step)(*now, 0.4)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
