@@ -39,7 +39,9 @@ def test_advantages_are_those_of_a_plain_loop():
                 expected[first, world] += (discount * trace) ** (step - first) * error
                 if done[step, world]:
                     break
-    found = jax.jit(advantages)(jnp.asarray(reward), jnp.asarray(value), jnp.asarray(done), discount, trace)
+    found = jax.jit(advantages)(
+        jnp.asarray(reward), jnp.asarray(value), jnp.asarray(done), discount, trace
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
