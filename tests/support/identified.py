@@ -17,7 +17,7 @@ from tests.support.fleets import Fleet, logs_of, recordings_of
 DRAG, DELAY = (0.3, 0.4, 0.2), 0.012
 MOTORS = MotorMap(thrust=(1.1, 4.4), voltage=16.0, voltage_exponent=1.2)
 SENSORS = Sensors(
-    "tracked", 125.0, pos=0.004, attitude=0.01, gyro=0.06, vel=0.1, rotor=2.0, voltage=0.02
+    "tracked", 250.0, pos=0.004, attitude=0.01, gyro=0.06, vel=0.1, rotor=2.0, voltage=0.02
 )
 WAYS = (
     Trajectory("figure_eight", 6.5, 4.0, turn="sweep"),
