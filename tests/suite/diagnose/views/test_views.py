@@ -45,6 +45,7 @@ def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
     assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
+@pytest.mark.slow
 def test_a_drag_that_only_the_file_has_is_named_and_goes():
     found = diagnose(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)), by="views")
     assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
@@ -81,6 +82,7 @@ def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
     assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.004, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_mass_is_an_alternative_of_a_thrust_though_it_is_not_linear():
     logs = flights(4, seed=8, speed=4.0)
     rivals, _ = names(logs, with_effects(VEHICLE, mass_offset=(0.15,)))
