@@ -45,7 +45,7 @@ def one_of_each() -> Scene:
         Spheres(np.array([[15.0, 0, 5]]), np.array([0.5])),
         np.zeros((0, 3, 3)),
     )
-    return jax.tree.map(lambda x: jnp.asarray(x)[None], scene)
+    return jax.tree.map(lambda x: np.asarray(x)[None], scene)
 
 
 def a_step(batch, **known):
@@ -266,7 +266,7 @@ def unit_gate(count, yaw=0.4):
     gates = square_gates(
         np.tile([1.0, -2.0, 1.5], (count, 1)), yaw * ones, ones, 0.2 * ones, 0.1 * ones
     )
-    return Gates(*(jnp.asarray(x) for x in gates))
+    return Gates(*map(np.asarray, gates))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -89,7 +89,8 @@ def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient():
     (_, numbers), gradient = loss_and_slope(CONFIG, actor, embeddings, sequences)
     assert float(numbers["clipped"]) == 0 and float(numbers["divergence"]) == pytest.approx(0)
     rng = np.random.default_rng(3)
-    way = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), actor)
+    actor, gradient = jax.tree.map(np.asarray, (actor, gradient))
+    way = jax.tree.map(lambda x: rng.normal(size=x.shape), actor)
     moved = [jax.tree.map(lambda x, d, h=h: x + h * d, actor, way) for h in (1e-6, -1e-6)]
     slope = float(surrogate(moved[0]) - surrogate(moved[1])) / 2e-6
     along = sum(jax.tree.leaves(jax.tree.map(lambda g, d: (g * d).sum(), gradient, way)))

@@ -40,7 +40,7 @@ def worlds_with(sphere_w, radius=0.5):
     scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
     constants = worlds.constants._replace(time_step=np.full(1, DT))
-    return jax.tree.map(jnp.asarray, worlds._replace(scene=scene, constants=constants))
+    return jax.tree.map(np.asarray, worlds._replace(scene=scene, constants=constants))
 
 
 def body_at(pos_w, vel_w=(0.0, 0, 0), acc_w=(0.0, 0, 0)):
