@@ -25,7 +25,7 @@ VEHICLE = load_vehicle("reference")
 SPEC = PolicySpec(rate_hz=31.25, camera=Camera(width=4, height=4))
 DELAY_S = 1.0 / SPEC.rate_hz
 """One period: the truth at the filter's horizon is what was seen at the decision before."""
-TRIALS = [TrialSpec(track, 0, seed) for track in ("circular", "zigzag") for seed in range(12)]
+TRIALS = [TrialSpec(track, 0, seed) for track in ("circular", "zigzag") for seed in range(20)]
 
 
 def sensors(**changed: float) -> SensorSet:
@@ -38,7 +38,7 @@ def flown(
     wanted: SensorSet,
     trials: list[TrialSpec],
     monkeypatch: Any,
-    slots: int = 24,
+    slots: int = 40,
     seconds: float = 1.6,
 ) -> tuple[list[TrialResult], np.ndarray]:
     """Return the results, and the NEES (T, N) of position, velocity and attitude."""

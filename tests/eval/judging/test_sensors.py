@@ -89,7 +89,7 @@ def flown():
 
 
 def test_every_model_reaches_the_policy():
-    few = TRIALS[::3]
+    few = TRIALS[:3]
     true = results(few, PERFECT)
     flying = {**load_sensors("all").models, **load_sensors("tof-depth").models}
     for model in set(flying) - {"imu"}:

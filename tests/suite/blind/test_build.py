@@ -52,7 +52,7 @@ BARE = given_vehicle("bare")
 
 
 def test_physics_outside_the_catalogue_moves_the_vehicle():
-    way = Trajectory("climb", duration_s=1.0, speed=3.0, size=1.0)
+    way = Trajectory("climb", duration_s=2.0, speed=3.0, size=1.0)
     plain = fly(BARE, BARE, [way])[0]
     for name, kind in OUTSIDE.items():
         moved = fly(BARE, BARE, [way], extra=make_outside(name, kind.usual, BARE.mass))[0]

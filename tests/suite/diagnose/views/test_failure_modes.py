@@ -30,7 +30,7 @@ def pushed(extra, seed, duration_s=6.0):
 def test_a_battery_that_sags_with_its_voltage_is_named_with_its_size():
     logs = [
         replace(log, voltage=16.8 - FALL * (log.time_s - log.time_s[0]))
-        for log in flights(3, seed=6, battery_sag=(0.006, 0.0))
+        for log in flights(4, seed=6, duration_s=12.0, battery_sag=(0.006, 0.0))
     ]
     label, names, found = found_in(logs)
     assert label == "named" and set(names) == {"battery_sag"}
