@@ -107,7 +107,7 @@ FAULTS = (
           "(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos))", "test_losses"),
     Fault("suite/train", "return x * factor + jax.lax.stop_gradient(x * (1 - factor))",
           "return x * (1 - factor) + jax.lax.stop_gradient(x * factor)", "test_point_mass"),
-    Fault("suite/train", "stride * cotangents)", "1.0 * cotangents)", "test_gradient"),
+    Fault("suite/train", "stride * cotangents)", "1.0 * cotangents)", "test_rollout"),
     Fault("suite/train", "error = reward + discount * going * value[1:] - value[:-1]",
           "error = reward + discount * value[1:] - value[:-1]", "test_objective test_ppo"),
     # suite: Delta Action Model

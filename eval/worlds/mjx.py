@@ -109,15 +109,17 @@ class MjxWorld:
         self._tracks: list[Track | None] = [None] * slots
         self._scene: Scene | None = None
         self._on_device: tuple[Course, Scene] | None = None
-        nothing = Motion(
-            jnp.zeros((slots, 3)), jnp.tile(jnp.eye(3), (slots, 1, 1)), jnp.zeros((slots, 3)),
-            jnp.zeros((slots, 3)),
-        )  # fmt: skip
+        self._state = self._idle()
+
+    @functools.partial(jax.jit, static_argnums=0)  # one program instead of one an operation
+    def _idle(self) -> Flying:
+        still = jnp.zeros((self.slots, 3))
+        nothing = Motion(still, jnp.tile(jnp.eye(3), (self.slots, 1, 1)), still, still)
         progress = start_progress(nothing.pos_w)
-        progress = progress._replace(ended=jnp.full(slots, -1, jnp.int32))
-        qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (slots, 1))
+        progress = progress._replace(ended=jnp.full(self.slots, -1, jnp.int32))
+        qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (self.slots, 1))
         loops = start_autopilot(self._autopilot, nothing, self._no_draws())
-        self._state = Flying(qpos, jnp.zeros((slots, 6)), loops, progress)
+        return Flying(qpos, jnp.zeros((self.slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:

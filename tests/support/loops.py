@@ -29,7 +29,7 @@ class Small:
 
     def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
         # Flights that are recorded are measured and fitted, which takes longer ones.
-        seconds = 2.0 if rest or more.get("record") else 0.6
+        seconds = 2.0 if rest or more.get("record") else 0.3
         options = replace(options, slots=4, rules=Rules(time_limit_s=seconds))
 
         def keep(result, flight):

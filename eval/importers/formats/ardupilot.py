@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -118,10 +119,10 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         raise FlightLogError(str(path), None, None, MISSING) from None
     table: dict[str, list[dict[str, Any]]] = {name: [] for name in MESSAGES}
     try:
-        # The reader prints messages about damaged files.
         with (
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(io.StringIO()),
+            _native_lines_dropped(),
             contextlib.ExitStack() as opened,
         ):
             reader = DFReader_binary.__new__(DFReader_binary)
@@ -138,6 +139,23 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
     return messages, parameters, {"firmware": texts[0]} if texts else {}
+
+
+@contextlib.contextmanager
+def _native_lines_dropped() -> Iterator[None]:
+    """Drop what compiled code writes to standard error: the reader's, a line a damaged byte."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed: nothing can be written there
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as null:
+            os.dup2(null.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _close(reader: Any, kind: object, error: object, trace: TracebackType | None) -> None:

@@ -30,9 +30,9 @@ def _poses(span, rate, offset, drift, noise=0.0, turn=None):
 
 
 @pytest.mark.parametrize(
-    ("offset", "drift"), [(0.0, 0.0), (12.3456, 50e-6), (-7.77, -200e-6), (1.7e6, 30e-6)]
+    ("offset", "drift", "rate"),
+    [(0.0, 0.0, 240.0), (12.3456, 50e-6, 60.0), (-7.77, -200e-6, 240.0), (1.7e6, 30e-6, 60.0)],
 )
-@pytest.mark.parametrize("rate", [60.0, 240.0])
 def test_offset_and_drift_come_back(offset, drift, rate):
     found = align(_poses((5, 45), rate, offset, drift), _gyro((0, 60), bias=0.02), "pose")
     at = (np.array([5.0, 25.0, 45.0]) - offset) / (1 + drift)

@@ -100,12 +100,14 @@ def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path,
     options = JudgeOptions(slots=2, rules=SHORT, workers=workers)
     expected = fly(Pursuit(), trials, VEHICLE, options=JudgeOptions(rules=SHORT))
     path, about = tmp_path / "journal", {"policy": "pursuit"}
+    policy = Pursuit() if workers == 1 else Pursuit  # made anew in each process
     with Journal(path, about) as journal, pytest.raises(KeyboardInterrupt):
-        fly(Pursuit(), trials, VEHICLE, options=options, on_result=Interrupt(journal))
+        fly(policy, trials, VEHICLE, options=options, on_result=Interrupt(journal))
     assert multiprocessing.active_children() == []
     with Journal(path, about) as journal:
         left = journal.missing(trials)
         assert len(left) == 3
+        options = JudgeOptions(slots=2, rules=SHORT)
         fly(Pursuit(), left, VEHICLE, options=options, on_result=lambda r, _: journal.append(r))
         assert [journal.done[trial] for trial in trials] == expected
 
@@ -117,9 +119,9 @@ TRIALS = [
 RULES = Rules(time_limit_s=0.5)
 
 
-def results(trials, slots=64, threads=1, workers=1, policy=None):
-    options = JudgeOptions(slots, threads, workers, RULES)
-    return fly(policy or network(), trials, VEHICLE, "mujoco", options)
+def results(trials, slots=64, threads=1):
+    options = JudgeOptions(slots, threads, rules=RULES)
+    return fly(network(), trials, VEHICLE, "mujoco", options)
 
 
 _made = {}
@@ -153,11 +155,6 @@ def test_repetition_order_subset_and_threads(expected):
 def test_number_of_slots(expected, slots):
     # With 3 slots trials start in the middle of others, each in any slot.
     same(TRIALS, results(TRIALS, slots), expected)
-
-
-def test_processes(expected):
-    policy = RandomNetwork  # made anew in each process
-    same(TRIALS[:4], results(TRIALS[:4], workers=2, policy=policy), expected)
 
 
 def test_reference_world_flies_the_same(expected):

@@ -89,12 +89,13 @@ def flown():
 
 
 def test_every_model_reaches_the_policy():
-    true = results(TRIALS, PERFECT)
+    few = TRIALS[:3]
+    true = results(few, PERFECT)
     flying = {**load_sensors("all").models, **load_sensors("tof-depth").models}
     for model in set(flying) - {"imu"}:
         # Grown, as rare faults would not come within so short a flight.
         strong = grown(sensor_set({model: flying[model]._asdict()}), 1e3)
-        changed = zip(results(TRIALS, strong), true, strict=True)
+        changed = zip(results(few, strong), true, strict=True)
         assert any(one.v_mean != two.v_mean for one, two in changed), model
 
 

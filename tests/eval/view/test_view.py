@@ -1,13 +1,29 @@
-"""Pictures show track, path, gates and end, also of flights that went wrong."""
+"""Pictures show track, path, gates and end; solids are as a pinhole camera sees them."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.spatial import ConvexHull
 
 from eval.view import colours
 from eval.view.picture import write_grid, write_picture
 from eval.view.recording import Drone, write_recording
+from eval.view.scene3d import (
+    LONGEST_M,
+    MOST_FACES,
+    Faces,
+    Lines,
+    cut_up,
+    look_at,
+    paint,
+    to_camera,
+    to_pixels,
+)
+from eval.view.solids import flat_normals, joined, outline, track_solids
 from eval.view.video import VideoOptions, write_video
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
@@ -86,3 +102,94 @@ def test_a_grid_has_a_panel_a_trial(tmp_path):
     assert three.size[0] > 1.6 * one.size[0] and three.size[1] > 1.6 * one.size[1]
     with pytest.raises(ValueError, match="at least one trial"):
         write_grid(tmp_path / "none.png", [])
+
+
+NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.01)
+
+
+def test_painted_solids_stand_where_a_pinhole_puts_them_and_the_near_hides_the_far():
+    view = look_at(np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.0]), 90.0, (200, 100))
+    ahead = to_pixels(view, to_camera(view, np.array([[2.0, 0, 1], [2, 1, 1], [2, 0, 1.5]])))
+    # Left (y > 0) is left of the middle and up is above it; at 90 deg, 2 m to 2 m is the edge.
+    np.testing.assert_allclose(ahead, [[100, 50], [50, 50], [100, 25]], atol=1e-9)
+    # A sheet of 2 m by 2 m that faces the eye, which is at smaller x.
+    y0z0, y1z0, y1z1, y0z1 = ([0.0, y, z] for y, z in ((-1, 0), (1, 0), (1, 2), (-1, 2)))
+    sheet = np.array([[y0z0, y1z1, y1z0], [y0z0, y0z1, y1z1]])
+    far, near = sheet + [4.0, 0, 0], 0.5 * sheet + [2.0, 0, 0.5]
+    red, blue = np.tile([[255.0, 0, 0]], (2, 1)), np.tile([[0.0, 0, 255]], (2, 1))
+    both = Faces(np.concatenate([near, far]), np.concatenate([blue, red]))
+    pixels = np.asarray(paint(view, both, NO_LINES)).astype(int)
+    red_there = pixels[..., 0] > 1.5 * pixels[..., 2]
+    blue_there = pixels[..., 2] > 1.5 * pixels[..., 0]
+    assert blue_there[50, 100] and blue_there.sum() == pytest.approx(
+        50 * 50, rel=0.07
+    )  # edges are drawn, too
+    assert red_there.sum() < 60  # the far sheet is exactly as large to the eye, and hidden
+    behind = Faces(far[:, ::-1], red)
+    assert not (np.asarray(paint(view, behind, NO_LINES)).astype(int)[..., 0] > 250).any()
+    around = Faces(sheet * 0.1 + [-0.05, 0, 0.9], red)  # behind the eye
+    paint(view, around, NO_LINES)
+
+
+def sheet_and_box():
+    """A floor of 30 m by 30 m, and a box of 1 m on it, 8 m ahead: what faces the eye of it."""
+    x0, x1, y0, y1 = -15.0, 15.0, -15.0, 15.0
+    floor = [[[x0, y0, 0], [x1, y0, 0], [x1, y1, 0]], [[x0, y0, 0], [x1, y1, 0], [x0, y1, 0]]]
+    front = [[[8, 1, 0], [8, -1, 1], [8, 1, 1]], [[8, 1, 0], [8, -1, 0], [8, -1, 1]]]
+    return np.array(floor, float), np.array(front, float)
+
+
+def test_a_large_floor_does_not_hide_what_stands_on_it():
+    floor, front = sheet_and_box()
+    view = look_at(np.array([-1.0, 0.0, 1.8]), np.array([8.0, 0.0, 0.5]), 60.0, (200, 100))
+    red, blue = [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]
+    seen = []
+    for cut in (False, True):
+        parts = cut_up(floor)[0] if cut else floor
+        colour = np.array([blue] * len(parts) + [red] * 2)
+        painted = paint(view, Faces(np.concatenate([parts, front]), colour), NO_LINES)
+        pixels = np.asarray(painted).astype(int)
+        seen.append(int((pixels[..., 0] > 1.5 * pixels[..., 2]).sum()))
+    assert seen[1] > 500 and seen[1] > 1.5 * seen[0]
+
+
+def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
+    floor, front = sheet_and_box()
+    corners = np.concatenate([front, floor])
+    parts, whose = cut_up(corners)
+    side = np.linalg.norm(parts - np.roll(parts, -1, axis=1), axis=-1)
+    assert side.max() <= LONGEST_M and (whose == 0).sum() >= 1
+
+    def areas(triangles):
+        cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        return cross / 2  # with its direction: the winding stays
+
+    for number, whole in enumerate(areas(corners)):
+        np.testing.assert_allclose(areas(parts[whose == number]).sum(0), whole, atol=1e-9)
+    assert len(cut_up(1e4 * floor)[0]) <= MOST_FACES
+
+
+def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
+    track = small_track()
+    solids = track_solids(track)
+    assert [solid.gate for solid in solids] == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 4 + [None] * 4
+    for solid in solids:
+        corners = solid.vertices[solid.faces]
+        outward = corners.mean(axis=1) - solid.vertices.mean(axis=0)
+        assert (np.einsum("fi,fi->f", flat_normals(corners), outward) > 0).all()
+    vertices, faces = joined(solids[:4])
+    np.testing.assert_array_equal(vertices[faces][:12], solids[0].vertices[solids[0].faces])
+    assert len(faces) == 48 and faces.max() == len(vertices) - 1
+
+
+@given(npst.arrays(np.float64, (30, 2), elements=st.floats(-10, 10, width=16)))
+def test_outlines_are_the_convex_hulls(points):
+    corners = outline(points)
+    if len(np.unique(points, axis=0)) < 3 or np.linalg.matrix_rank(points - points[0]) < 2:
+        assert len(corners) <= 2
+        return
+    hull = ConvexHull(points)
+    assert {tuple(c) for c in corners} == {tuple(points[k]) for k in hull.vertices}
+    x, y = corners.T
+    area = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
+    assert area == pytest.approx(hull.volume)

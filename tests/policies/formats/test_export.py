@@ -12,6 +12,7 @@ import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
 
+from policies.formats import onnx_file, torch_file
 from policies.formats.export import export_policy
 from policies.formats.onnx_graph import IR_VERSION, OPSET, onnx_model
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
@@ -21,6 +22,7 @@ from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import PolicyError
 from tests.policies.conftest import SPEC, lively
+from tests.support.in_process import InProcess
 
 
 def rollout(policy, n, steps):
@@ -99,7 +101,9 @@ def test_what_cannot_be_exported_is_refused(tmp_path, checkpoint, exported):
         pytest.param({"channels": (6, 64, 32)}, marks=pytest.mark.slow),
     ],
 )
-def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, changes):
+def test_policies_of_other_inputs_and_sizes_are_one_policy_as_well(tmp_path, monkeypatch, changes):
+    for where in (torch_file, onnx_file):
+        monkeypatch.setattr(where, "ModelProcess", InProcess)
     spec = replace(SPEC, **changes)
     folder = save_policy(tmp_path / "other", lively(spec, 3), spec, seed=1)
     ours = load_policy(folder)

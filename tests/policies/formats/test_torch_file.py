@@ -53,7 +53,7 @@ class Payload:
         return os.mkdir, (str(self.path),)
 
 
-def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path):
+def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path, here):
     mark, pickled = tmp_path / "it_ran", io.BytesIO()
     torch.save((Payload(mark),), pickled, pickle_module=pickle)
     path = rewrite(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from suite.blind import build as module
 from suite.blind.build import build
 from suite.blind.cases import Case
 from suite.blind.continuous.timing import draw_conditions
@@ -16,8 +17,10 @@ NULL = Case("null", (), 0.0, "dragged", "capture", (6, 70_002), simulator="conti
 pytestmark = pytest.mark.usefixtures("short_flights")
 
 
-def test_a_continuous_cases_vehicle_has_the_loop_that_flew():
+def test_a_continuous_cases_vehicle_has_the_loop_that_flew(monkeypatch):
     """That a flight is the same to the bit again, test_continuous_flight.py asks."""
+    judged = []
+    monkeypatch.setattr(module, "_judged", lambda *given: judged.append(given) or {})
     first = build(SINGLE)
     conditions = first.answer["conditions"]
     assert first.nominal.controller.frequency == conditions["loop_hz"]
@@ -26,8 +29,17 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_flew():
     assert about == {"source": "suite blind", "vehicle": "bare"}, "nothing of the conditions"
     spacing = np.median(np.diff(first.logs[0].time_s))
     assert spacing == pytest.approx(1.0 / conditions["row_hz"], rel=0.1)
-    # Thirty sigma on flights like those of the table; this one is short.
-    hidden = first.answer["effects"][0]
+    # Its strength is worked out on the flight as it was, without noise.
+    ((_, nominal, (exact,), _, named),) = judged
+    assert nominal == first.nominal and list(named) == ["linear_drag"]
+    jumps = [np.diff(log.vel_w, 2, axis=0).std() for log in (exact, first.logs[0])]
+    assert jumps[0] < 0.1 * jumps[1]
+
+
+@pytest.mark.slow
+def test_a_continuous_case_is_as_strong_as_it_says():
+    """Thirty sigma on flights like those of the table; this one is short."""
+    hidden = build(SINGLE).answer["effects"][0]
     assert hidden["sigma"] > 2.0 and "linear_drag" not in hidden["allowed"]
 
 

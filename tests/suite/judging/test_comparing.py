@@ -17,7 +17,7 @@ from suite.judging.comparing import paired, read_runs, seeds_of
 
 @pytest.mark.parametrize("two", [False, True])
 def test_the_hierarchical_bootstrap_covers_as_it_says(two):
-    rng, hit, count = np.random.default_rng(3), 0, 1000
+    rng, hit, count = np.random.default_rng(3), 0, 500
     seeds, trials, spread = 8, 60, 0.5
 
     def mean(level):

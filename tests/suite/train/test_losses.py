@@ -45,7 +45,7 @@ def one_of_each() -> Scene:
         Spheres(np.array([[15.0, 0, 5]]), np.array([0.5])),
         np.zeros((0, 3, 3)),
     )
-    return jax.tree.map(lambda x: jnp.asarray(x)[None], scene)
+    return jax.tree.map(lambda x: np.asarray(x)[None], scene)
 
 
 def a_step(batch, **known):
@@ -86,13 +86,18 @@ def test_every_weight_of_the_table_scales_its_term_alone():
     names = ("pos_w", "vel_w", "acc_w", "jerk_w", "goal_w", "place_g")
     drawn = {name: jnp.asarray(rng.normal(0, 2, (4, 3))) for name in names}
     step = a_step(4, up=jnp.asarray([1.0, 0.3, 0.0, -0.5]), **drawn)
-    nothing = {weight: 0.0 for terms in losses.LOSSES.values() for _, weight in terms}
-    for name, terms in losses.LOSSES.items():
-        for term, weight in terms:
-            config = replace(LossConfig(), **{**nothing, weight: 3.0})
-            found = losses.weighted(config, step)
-            np.testing.assert_allclose(found[name], 3.0 * term(LossConfig(), step), rtol=1e-6)
-            assert not any(np.any(value) for key, value in found.items() if key != name)
+    terms = [(name, *term) for name, of_it in losses.LOSSES.items() for term in of_it]
+    nothing = {weight: 0.0 for _, _, weight in terms}
+
+    @jax.jit
+    def each_alone(step):
+        configs = [replace(LossConfig(), **{**nothing, weight: 3.0}) for _, _, weight in terms]
+        found = [losses.weighted(config, step) for config in configs]
+        return list(zip(found, (term(LossConfig(), step) for _, term, _ in terms), strict=True))
+
+    for (name, *_), (found, plain) in zip(terms, each_alone(step), strict=True):
+        np.testing.assert_allclose(found[name], 3.0 * plain, rtol=1e-6)
+        assert not any(np.any(value) for key, value in found.items() if key != name)
 
 
 def test_tilt_costs_from_an_angle_on_and_one_where_the_body_lies_level():
@@ -261,7 +266,7 @@ def unit_gate(count, yaw=0.4):
     gates = square_gates(
         np.tile([1.0, -2.0, 1.5], (count, 1)), yaw * ones, ones, 0.2 * ones, 0.1 * ones
     )
-    return Gates(*(jnp.asarray(x) for x in gates))
+    return Gates(*map(np.asarray, gates))
 
 
 @partial(jax.jit, static_argnums=0)

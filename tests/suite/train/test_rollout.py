@@ -1,6 +1,7 @@
-"""The whole rollout: gradients, what is cut out of them, and how the field enters."""
+"""The whole rollout and its gradient: what is cut out of it, images outside the loop, the field."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from suite.train import losses, rollout
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
 from suite.train.dynamics.interface import make_dynamics
+from suite.train.gradient import encoder_gradient, sampled_encoder_gradient
 from suite.train.losses import UNIT_FIELD
 from suite.train.rollout import make_rollout, view_in
 from suite.train.step import target_gate
@@ -63,15 +65,19 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
 
     def spy(scene, pos_w, rot_w, rays, *_):
-        cast.append(np.array(rays))
+        cast.append(rays)
         return jnp.ones((len(pos_w), len(rays)))
 
     monkeypatch.setattr(rollout, "depth_image", spy)
-    for rays in (1, 2):
+
+    @partial(jax.jit, static_argnums=0)
+    def rays_of(rays, state):
         camera = replace(SPEC.camera, rays=rays)
         sight = rollout.make_sight(replace(config, spec=replace(SPEC, camera=camera)))
         sight.see(worlds, state, jnp.asarray(worlds.target), state.pos_w, jax.random.split(KEY, 4))
-    one, two = cast
+        return cast[-1]
+
+    one, two = rays_of(1, state), rays_of(2, state)
     assert one.shape == (SPEC.camera.height * SPEC.camera.width, 3)
     np.testing.assert_array_equal(one, two)
 
@@ -129,6 +135,7 @@ def fly(params, worlds):
     return jnp.stack(positions), jnp.stack(velocities)
 
 
+@jax.jit
 def pull_at(worlds, pos_w, vel_w):
     """Return u_A of every world's first gate, 1 across the centre of a gate of 1 m."""
     gate, _ = target_gate(worlds.scene.gates, worlds.target)
@@ -258,7 +265,7 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     worlds = sample_worlds(config, 0)
     worlds = worlds._replace(vel_w=3.0 * worlds.heading_w)
     state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
-    found = rollout.observed_at_start(worlds, state, config)
+    found = jax.jit(lambda *start: rollout.observed_at_start(*start, config))(worlds, state)
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)
@@ -301,3 +308,41 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     after = np.cumsum(passed, 0) - passed > 0
     assert after.any()
     assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
+
+
+whole_gradient = jax.jit(encoder_gradient)
+
+
+def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
+    """The sums run in another order in float32: 1e-4 of each array's largest entry."""
+    config, worlds, params, gradient, loss, _ = two_pass
+    plain = jax.jit(jax.value_and_grad(loss_of(config, network.encode)))
+    expected_loss, expected = plain(params, worlds, None, config.loss.field_gain)
+    assert float(loss) == pytest.approx(float(expected_loss), rel=1e-5)
+    sizes = {k: float(np.abs(np.array(g)).max()) for k, g in expected.items()}
+    assert min(sizes.values()) > 1e-7, sizes
+    assert largest_difference(gradient, expected) < 1e-4
+
+
+def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypatch):
+    params = two_pass[2]
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
+    cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
+    inputs = params, images, cotangents
+    whole = whole_gradient(*inputs)
+    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
+    in_chunks = jax.jit(lambda *inputs: encoder_gradient(*inputs))
+    assert largest_difference(in_chunks(*inputs), whole) < 1e-5
+
+
+def test_the_encoders_gradient_from_every_other_image_is_right_on_average(two_pass):
+    params, rng = two_pass[2], np.random.default_rng(1)
+    images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
+    cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
+    whole = whole_gradient(params, images.reshape(12, 20, 20), cotangents.reshape(12, 8))
+    keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
+    sampled = jax.jit(sampled_encoder_gradient, static_argnums=3)
+    halves = [sampled(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
+    mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
+    assert largest_difference(mean, whole) < 1e-5

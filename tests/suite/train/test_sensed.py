@@ -26,43 +26,46 @@ def sensed(**changes):
 
 
 def seen(config, steps=2):
-    """Return what is seen of a drone that moves on, view after view, in a function of its start."""
+    """Return a function (worlds, start) of what is seen of a drone that moves on, and both."""
     sight = make_sight(config)
     worlds = boxes_worlds(config)
     start = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
     target = jnp.asarray(worlds.target)
 
-    def of(state):
-        memory, shown = sight.start(worlds, state), []
-        for step in range(steps):
+    def of(worlds, state):
+        def move(carry, step):
+            state, memory = carry
             keys = world_keys(jax.random.fold_in(KEY, step), worlds)
             state = state._replace(pos_w=state.pos_w + 0.05 * state.vel_w)
             one, memory = sight.see(worlds, state, target, state.pos_w, keys, memory)
-            shown.append(one)
-        return shown
+            return (state, memory), one
 
-    return jax.jit(of), start
+        begin = state, sight.start(worlds, state)
+        return jax.lax.scan(move, begin, jnp.arange(steps))[1]
+
+    return of, worlds, start
 
 
 def test_at_magnitude_nothing_the_truth_is_seen():
-    (perfect, state), (none, _) = seen(sensed(perfect_share=1.0)), seen(SMALL)
-    for one, two in zip(perfect(state), none(state), strict=True):
-        np.testing.assert_allclose(one.state, two.state, atol=2e-5)
-        np.testing.assert_allclose(one.image, two.image, atol=2e-5)
-    noisy, _ = seen(sensed(perfect_share=0.0, magnitude=(1.0, 1.0)))
-    last, true = noisy(state)[-1], none(state)[-1]
-    assert np.ptp(last.state - true.state) > 1e-2
-    assert np.ptp(last.image - true.image) > 1e-2
+    of, perfect, state = seen(sensed(perfect_share=1.0, magnitude=(1.0, 1.0)))
+    of = jax.jit(of)
+    noisy = seen(sensed(perfect_share=0.0, magnitude=(1.0, 1.0)))[1]
+    without, worlds, _ = seen(SMALL)
+    one, none, last = of(perfect, state), jax.jit(without)(worlds, state), of(noisy, state)
+    np.testing.assert_allclose(one.state, none.state, atol=2e-5)
+    np.testing.assert_allclose(one.image, none.image, atol=2e-5)
+    assert np.ptp(last.state[-1] - none.state[-1]) > 1e-2
+    assert np.ptp(last.image[-1] - none.image[-1]) > 1e-2
 
 
 def test_the_state_carries_a_finite_gradient_and_the_image_none():
-    of, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)), steps=3)
+    of, worlds, state = seen(sensed(perfect_share=0.0, magnitude=(2.0, 2.0)), steps=3)
 
     @jax.jit
     @jax.jacrev
     def slopes(pos_w):
-        shown = of(state._replace(pos_w=pos_w))
-        return sum(one.state.sum() for one in shown), sum(one.image.sum() for one in shown)
+        shown = of(worlds, state._replace(pos_w=pos_w))
+        return shown.state.sum(), shown.image.sum()
 
     of_state, of_image = map(np.array, slopes(state.pos_w))
     assert np.isfinite(of_state).all() and np.abs(of_state).max() > 0.1

@@ -1,5 +1,6 @@
-"""The worlds of an iteration follow the settings; images and distances leave out what is far."""
+"""The worlds of an iteration follow the settings; those of the next come in order, each once."""
 
+import threading
 from dataclasses import replace
 from functools import partial
 
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 
 from suite.delta.replay import nominal_model
+from suite.train import worlds as sampling
 from suite.train.dynamics.point_mass import PointMassParams
 from suite.train.rollout import SEEN
 from suite.train.step import NEAR
-from suite.train.worlds import sample_worlds
+from suite.train.worlds import WorldsAhead, sample_worlds
 from tests.support.training import small_config
 from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.geometry.camera import Camera, pixel_rays_b
@@ -134,3 +136,34 @@ def test_culled_distances_are_exact_where_they_matter(family):
     wrong = (np.abs(culled - whole) > 1e-4) | (np.abs(culled_away - away).max(-1) > 1e-3)
     assert wrong[near].mean() < 0.005
     assert np.abs(culled - whole).max() < 0.5
+
+
+def numbered(iteration):
+    """Return worlds that say which iteration's they are."""
+    return ("worlds", iteration)
+
+
+@pytest.mark.parametrize("accelerator", [False, True], ids=["a thread", "processes"])
+def test_every_iteration_comes_once_and_in_order(accelerator, monkeypatch):
+    monkeypatch.setattr(sampling.jax, "default_backend", lambda: "gpu" if accelerator else "cpu")
+    monkeypatch.setattr(sampling, "usable_cores", lambda: 3)
+    with WorldsAhead() as worlds:
+        found = list(worlds.worlds(numbered, 4, 9))
+        assert found == [(k, ("worlds", k)) for k in range(4, 9)]
+        # The next phase goes on with other worlds.
+        assert list(worlds.worlds(numbered, 9, 10)) == [(9, ("worlds", 9))]
+
+
+def test_the_next_worlds_are_sampled_while_the_devices_compute_and_none_beyond_the_end():
+    begun, next_one = [], threading.Event()
+
+    def sample(iteration):
+        begun.append(iteration)
+        if iteration == 1:
+            next_one.set()
+        return iteration
+
+    with WorldsAhead() as worlds:
+        for iteration, _ in worlds.worlds(sample, 0, 2):
+            assert iteration or next_one.wait(10.0)
+    assert begun == [0, 1]

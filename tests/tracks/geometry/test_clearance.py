@@ -29,7 +29,7 @@ def random_points(track, n, seed):
 
 
 def unbatched(scene):
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), scene)
+    return jax.tree.map(lambda a: np.asarray(a, np.float32), scene)
 
 
 @pytest.mark.parametrize("family", ["zigzag", "random"])
@@ -87,7 +87,7 @@ def box_distance(mesh, point):
 def test_the_nearest_point_is_on_a_surface_and_the_way_out_is_free(seed):
     track = make_track("zigzag", 9, seed)
     scene = unbatched(track.scene)
-    point = jnp.asarray(random_points(track, 400, seed), jnp.float32)
+    point = random_points(track, 400, seed).astype(np.float32)
     batched = jax.tree.map(lambda a: a[None], scene)
     distance, away = (np.asarray(a)[0] for a in nearest(batched, point[None]))
     every, _ = all_distances(scene, point)
@@ -119,7 +119,7 @@ def test_meshes_are_as_far_as_trimesh_says(root):
 def test_padding_and_culling_do_not_change_the_nearest():
     tracks = [make_track("circular", 9, 1), make_track("random", 9, 0)]
     scene = jax.tree.map(jnp.asarray, stack([t.scene for t in tracks], MAX_COUNTS))
-    gates = jnp.asarray(np.array([t.scene.gates.center_w for t in tracks]), jnp.float32)
+    gates = np.array([t.scene.gates.center_w for t in tracks], np.float32)
     distance, _ = nearest(scene, gates)
     limits = MAX_COUNTS._replace(boxes=24, cylinders=6, capsules=5, spheres=5)
     for i, track in enumerate(tracks):

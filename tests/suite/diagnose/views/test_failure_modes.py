@@ -64,7 +64,9 @@ def by_place(motion, t):
     return 1.5 * np.array([np.sin(1.5 * motion.pos_w[0]), np.cos(1.5 * motion.pos_w[1]), 0.0])
 
 
-@pytest.mark.parametrize(("extra", "seed"), [(up_and_down, 40), (by_place, 20)])
+@pytest.mark.parametrize(
+    ("extra", "seed"), [pytest.param(up_and_down, 40, marks=pytest.mark.slow), (by_place, 20)]
+)
 def test_a_force_that_nothing_explains_is_not_no_gap(extra, seed):
     """Three flights of 6 s are too few to fit a regression to it, and the search finds nothing."""
     label, names, found = found_in(pushed(extra, seed))
@@ -73,7 +75,8 @@ def test_a_force_that_nothing_explains_is_not_no_gap(extra, seed):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("thrust_tilt", (0.035, 0.0)), ("blade_flapping", 2e-6)]
+    ("name", "value"),
+    [pytest.param("thrust_tilt", (0.035, 0.0), marks=pytest.mark.slow), ("blade_flapping", 2e-6)],
 )
 def test_one_effect_is_named_without_a_second_small_one(name, value):
     label, names, _ = found_in(flights(4, seed=11, speed=4.0, hidden={name: (value,)}))

@@ -1,4 +1,4 @@
-"""Benchmarks: two implementations timed in turn, and the engines of a policy."""
+"""The benchmarks of the judge and of a policy's engines, timed in turn."""
 
 import json
 from itertools import count
@@ -9,7 +9,7 @@ import pytest
 from policies.formats.c.compiler import find_compiler
 from suite import cli
 from suite.common.errors import WorkFailed
-from suite.experiments.bench import diagnose, policy, sysid_baseline
+from suite.experiments.bench import diagnose, judge, policy, sysid_baseline
 from suite.experiments.bench.compare import Comparison, Figure, compared, in_turn
 from tests.support.small_policy import small_checkpoint
 
@@ -56,3 +56,14 @@ def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(sysid_baseline, "is_installed", lambda: False)
     with pytest.raises(WorkFailed, match=r"pip install 'mujoco\[sysid\]'"):
         diagnose.run()
+
+
+def test_both_sides_fly_the_same_trials_to_the_same_end(tmp_path, monkeypatch, capsys):
+    folder, run = str(small_checkpoint(tmp_path)), judge.run
+    monkeypatch.setattr(judge, "run", lambda: run(folder, trials=3, time_limit_s=0.2))
+    assert cli.main(["bench", "judge", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["ours"]["value"] > 0 and answer["baseline"]["value"] > 0
+    assert answer["ratio"] == answer["ours"]["value"] / answer["baseline"]["value"]
+    assert answer["details"]["trials_that_end_alike"] == 3
+    assert answer["details"]["images_a_trial"] > 1

@@ -20,6 +20,9 @@ def _float64():
         yield
 
 
+flown = jax.jit(point_mass.step)
+
+
 def constants(
     n, time_step=0.033, lag=12.0, drag=(0.3, 0.4, 0.45), wind=(0.5, -1.0, 0.1), delay=0.4
 ):
@@ -86,10 +89,12 @@ def test_gradient_decay_fades_position_and_velocity_alone():
 def test_attitude_carries_no_gradient():
     fixed, body = constants(2), some_body(2)
 
+    @jax.jit
     def of_rotation(rot_w):
         after = point_mass.step(body._replace(rot_w=rot_w), fixed, jnp.asarray(ACTION), TARGET, 0.0)
         return sum(x.sum() for x in (after.pos_w, after.vel_w, after.thrust_w, after.acc_w))
 
+    @jax.jit
     def to_attitude(action, pos, thrust):
         moved = body._replace(pos_w=pos, thrust_w=thrust)
         after = point_mass.step(moved, fixed, action, TARGET, 0.0)
@@ -139,7 +144,7 @@ def test_a_fine_rollout_is_the_solution_of_its_differential_equation(monkeypatch
         slope, (0, 1), np.concatenate([[1, 2, 3], vel, [0, 0, 0]]), rtol=1e-10, atol=1e-10
     )
     expected = exact.y[:, -1].reshape(3, 3)
-    errors = []
+    errors, step = [], jax.jit(lambda *now: point_mass.step(*now))  # with the attitude held
     for steps in (50, 100):
         fixed = constants(1, 1.0 / steps, lag, tuple(drag), tuple(wind), 0.0)
         body = point_mass.start(
@@ -148,7 +153,7 @@ def test_a_fine_rollout_is_the_solution_of_its_differential_equation(monkeypatch
         first = -ROLL @ (drag * (ROLL.T @ (vel - wind)))
         body = body._replace(acc_w=jnp.array([first]))
         for _ in range(steps):
-            body = point_mass.step(body, fixed, jnp.array([action]), TARGET[:1], 0.0)
+            body = step(body, fixed, action[None], TARGET[:1], 0.0)
         found = [np.array(x[0]) for x in (body.pos_w, body.vel_w, body.thrust_w)]
         np.testing.assert_allclose(found[2], expected[2], atol=1e-9)
         errors.append(max(np.abs(found[i] - expected[i]).max() for i in (0, 1)))
@@ -164,7 +169,7 @@ def test_a_delayed_command_is_the_one_of_steps_before():
     action, keep = jnp.ones((1, 3)) @ jnp.asarray(ROLL), np.exp(-12.0 * 0.033)
     for delay, command in commands.items():
         delayed = fixed._replace(delay=jnp.array([delay]))
-        now = point_mass.step(body, delayed, action, TARGET[:1], 0.0)
+        now = flown(body, delayed, action, TARGET[:1], 0.0)
         expected = command * (1 - keep) + body.thrust_w * keep
         np.testing.assert_allclose(now.thrust_w, expected, atol=1e-9)
 
@@ -173,7 +178,7 @@ def test_a_steady_acceleration_is_followed_exactly():
     fixed = constants(1, drag=(0.0, 0.0, 0.0), delay=0.0)
     body, held = some_body(1), jnp.array(ACTION[:1] @ ROLL.T)
     body = body._replace(thrust_w=held, acc_w=held)
-    after = point_mass.step(body, fixed, jnp.array(ACTION[:1]), TARGET[:1], 0.0)
+    after = flown(body, fixed, jnp.array(ACTION[:1]), TARGET[:1], 0.0)
     dt = 0.033
     expected = body.pos_w + body.vel_w * dt + 0.5 * held * dt**2
     np.testing.assert_allclose(after.pos_w, expected, atol=1e-12)

@@ -70,7 +70,7 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
 
 
 def test_the_motion_is_differentiable_in_the_action(worlds):
-    state = jax.tree.map(lambda leaf: leaf[0], reset(KEYS, worlds)[1])
+    state = jax.tree.map(lambda leaf: np.asarray(leaf)[0], reset(KEYS, worlds)[1])
 
     def forward(action):
         _, after, *_ = ENV.step(KEYS[0], state, action, worlds)

@@ -39,7 +39,9 @@ def test_advantages_are_those_of_a_plain_loop():
                 expected[first, world] += (discount * trace) ** (step - first) * error
                 if done[step, world]:
                     break
-    found = advantages(jnp.asarray(reward), jnp.asarray(value), jnp.asarray(done), discount, trace)
+    found = jax.jit(advantages)(
+        jnp.asarray(reward), jnp.asarray(value), jnp.asarray(done), discount, trace
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -59,11 +61,11 @@ def rollout_of(actor, seed=1, done=False):
     )
     mean = means(actor.params, embeddings, sequences)
     action = mean + jnp.exp(actor.log_deviation) * rng.normal(size=mean.shape)
-    log_prob = log_probability(mean, actor.log_deviation, action)
+    log_prob = density(mean, actor.log_deviation, action)
     return embeddings, sequences._replace(action_b=action, log_prob=log_prob)
 
 
-means = jax.jit(action_means)
+means, density, recur = map(jax.jit, (action_means, log_probability, network.recur))
 loss_and_slope = jax.jit(
     jax.value_and_grad(clipped_loss, argnums=1, has_aux=True), static_argnums=0
 )
@@ -87,7 +89,8 @@ def test_where_nothing_has_changed_its_gradient_is_the_policy_gradient():
     (_, numbers), gradient = loss_and_slope(CONFIG, actor, embeddings, sequences)
     assert float(numbers["clipped"]) == 0 and float(numbers["divergence"]) == pytest.approx(0)
     rng = np.random.default_rng(3)
-    way = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), actor)
+    actor, gradient = jax.tree.map(np.asarray, (actor, gradient))
+    way = jax.tree.map(lambda x: rng.normal(size=x.shape), actor)
     moved = [jax.tree.map(lambda x, d, h=h: x + h * d, actor, way) for h in (1e-6, -1e-6)]
     slope = float(surrogate(moved[0]) - surrogate(moved[1])) / 2e-6
     along = sum(jax.tree.leaves(jax.tree.map(lambda g, d: (g * d).sum(), gradient, way)))
@@ -104,7 +107,7 @@ def test_a_change_beyond_the_clip_is_not_rewarded(ratio, advantage, gain, learns
     embeddings, sequences = rollout_of(actor)
     sequences = sequences._replace(
         log_prob=sequences.log_prob - np.log(ratio),
-        advantage=jnp.full((STEPS, BATCH), advantage),
+        advantage=np.full((STEPS, BATCH), advantage),
     )
     (loss, numbers), gradient = loss_and_slope(
         replace(CONFIG, clip=0.2), actor, embeddings, sequences
@@ -120,9 +123,7 @@ def test_an_episode_that_ended_leaves_no_memory():
     mean = means(actor.params, embeddings, sequences)
     hidden, again = sequences.start[0], []
     for step in (3, 4):
-        action, hidden = network.recur(
-            actor.params, hidden, embeddings[step], sequences.state[step]
-        )
+        action, hidden = recur(actor.params, hidden, embeddings[step], sequences.state[step])
         again.append(action)
     np.testing.assert_allclose(mean[3:, 1], jnp.stack(again)[:, 1], rtol=1e-12)
     assert not np.allclose(mean[3:, 0], jnp.stack(again)[:, 0])

@@ -40,7 +40,7 @@ def worlds_with(sphere_w, radius=0.5):
     scene = worlds.scene._replace(gates=gates, boxes=boxes, spheres=spheres)
     assert isinstance(worlds.constants, point_mass.PointMassParams)
     constants = worlds.constants._replace(time_step=np.full(1, DT))
-    return jax.tree.map(jnp.asarray, worlds._replace(scene=scene, constants=constants))
+    return jax.tree.map(np.asarray, worlds._replace(scene=scene, constants=constants))
 
 
 def body_at(pos_w, vel_w=(0.0, 0, 0), acc_w=(0.0, 0, 0)):
@@ -132,6 +132,9 @@ def test_a_trainings_own_weights_change_nothing():
     assert careful == rewarded(before, body, near), "nor how fast a policy is asked to fly"
 
 
+features = jax.jit(critic.features)
+
+
 def test_the_features_of_a_state():
     worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)
     pos, vel, ahead = ([-1.0, 0.5, 50.0], [2.0, 0.0, 0.0], [1.0, 0.0, 0.0])
@@ -145,7 +148,6 @@ def test_the_features_of_a_state():
         distance, np.exp(-distance / 0.2),
         [0.5], [1.0, 0.0], [1.0], [1.0],  # the plane in half a second, at the opening's edge
     ])  # fmt: skip
-    features = jax.jit(critic.features)
     found = features(worlds, body, jnp.asarray([0]))
     assert found.shape == (1, critic.FEATURES)
     np.testing.assert_allclose(found[0], expected, atol=1e-5)
@@ -176,14 +178,14 @@ def test_the_last_number_is_how_fast_to_fly_where_the_policy_is_told():
     assert critic.features_of(PolicySpec()) == critic.FEATURES == critic.features_of(spec) - 1
     worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)._replace(wanted=jnp.asarray([0.3]))
     body = point_mass.start(*(jnp.asarray([x]) for x in ([-1.0, 0, 50], [2.0, 0, 0], [1.0, 0, 0])))
-    found = critic.features(worlds, body, jnp.asarray([0]))
+    found = features(worlds, body, jnp.asarray([0]))
     assert found.shape == (1, critic.features_of(spec)) and found[0, -1] == pytest.approx(0.3)
 
 
 def test_a_fresh_value_is_near_zero_and_is_that_of_a_plain_loop():
     params = jax.jit(critic.init, static_argnums=1)(jax.random.key(0), 6)
     seen = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3, critic.FEATURES)))
-    found = critic.value(params, seen)
+    found = jax.jit(critic.value)(params, seen)
     assert found.shape == (5, 3) and 0 < np.abs(found).max() < 0.05
     hidden = np.asarray(seen[2, 1])
     for layer in range(2):

@@ -28,7 +28,7 @@ def told(slope, groups, truth=0.0, beside=(), seed=0):
 
 
 def names_by_chance(slope, groups, **asked):
-    return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(250)])
+    return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(150)])
 
 
 @pytest.mark.parametrize("alike", [pytest.param(0.0, marks=pytest.mark.slow), 0.99])
