@@ -18,7 +18,7 @@ from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.run import is_identified
-from suite.diagnose.plans.plan import fly_plan, write_plan_of
+from suite.diagnose.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page

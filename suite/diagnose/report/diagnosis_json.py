@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from suite.diagnose.plans.plan import advice
+from suite.diagnose.plan import advice
 from suite.diagnose.report.parameters_json import parameters_json, short_name
 from suite.diagnose.report.summary import answer
 from suite.diagnose.search.evaluation import NamedEffect

@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eval.effects import EFFECTS, nameable_effects
+from eval.flights.simulate import SENSORS, log_of
+from eval.flights.simulate import fly as fly_ways
+from eval.flights.trajectory import ordinary_flights
 from eval.logs.flight_log import write_flight
 from eval.quadrotor.loops import KINDS
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.simulate import SENSORS, log_of
-from suite.diagnose.plans.simulate import fly as fly_ways
-from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds

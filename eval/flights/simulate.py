@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eval.effects.log_faults import apply_log_faults
+from eval.flights.follow import PilotGains, Recording, Step, follow, wanted_of
+from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.follow import PilotGains, Recording, Step, follow, wanted_of
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import to_world
 
 FULL_V = 16.5

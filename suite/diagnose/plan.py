@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.estimate.parameters import effects_in
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
 from tracks.input.reading import read_json
