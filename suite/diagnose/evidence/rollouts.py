@@ -103,8 +103,9 @@ class RolloutEvidence(Evidence):
         return super().share(now, at, then, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        """Return the energy (W, 12) of slow errors in `block`, and what noise gives of it."""
-        return slow_energy(self.whitening, block.residual), self.whitening.slow_freedom
+        """Return the energy (W, 12) of slow errors of the state, and what noise gives of it."""
+        energy = slow_energy(self.whitening, block.residual)
+        return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
     def _everything(self, at: Estimate) -> Linearisation:
         return self.model.linearise(at.theta, at.free, self.windows, None)
