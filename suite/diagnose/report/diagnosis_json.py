@@ -12,8 +12,8 @@ from suite.diagnose.report.parameters_json import parameters_json, short_name
 from suite.diagnose.report.summary import answer
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks
+from suite.diagnose.verdict.actuators import ActuatorMismatch
+from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap
 
@@ -169,18 +169,18 @@ def _figure(value: float) -> str:
     return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
-def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
-    """Return the entries that `checks` add to diagnosis.json; `seed` is of the intervals' draws."""
-    black_box = checks.black_box
+def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
+    """Return the entry `actuators`: measured rotor speeds against commanded ones."""
+    return [{**one._asdict(), "followed": one.followed} for one in mismatches]
+
+
+def black_box_json(found: BlackBoxComparisons, seed: int) -> dict[str, Any]:
+    """Return the entry `black_box`; `seed` is of the intervals' draws."""
     return {
-        "actuators": [{**one._asdict(), "followed": one.followed} for one in checks.actuators],
-        "black_box": black_box
-        and {
-            "held_out": _comparison(black_box.held_out, seed),
-            "outside": black_box.outside and _comparison(black_box.outside, seed),
-            "split_m_s": black_box.split_m_s,
-            "seconds": black_box.seconds,
-        },
+        "held_out": _comparison(found.held_out, seed),
+        "outside": found.outside and _comparison(found.outside, seed),
+        "split_m_s": found.split_m_s,
+        "seconds": found.seconds,
     }
 
 

@@ -23,7 +23,6 @@ from suite.diagnose.report.sections import (
     rivals_section,
 )
 from suite.diagnose.report.summary import next_steps
-from suite.diagnose.verdict.checks import Checks
 from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
 
@@ -50,19 +49,12 @@ CHANNELS = (
 )
 
 
-def page(
-    diagnosis: Diagnosis,
-    found: Mapping[str, Any],
-    checks: Checks | None,
-    toml: str,
-    files: set[str],
-) -> Report:
+def page(diagnosis: Diagnosis, found: Mapping[str, Any], toml: str, files: set[str]) -> Report:
     """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
 
-    `checks` is None without rollouts, `toml` is the text of the vehicle file that was written, and
-    `files` lists which of `FILES` exist.
+    `toml` is the text of the vehicle file that was written, `files` lists which of `FILES` exist.
     """
-    gap, flights = found["gap"], diagnosis.flights
+    gap, flown = found["gap"], diagnosis.main.source.rollouts
     facts = {
         "gap before": f"{gap['before']:.3g}",
         "gap after": f"{gap['after']:.3g}",
@@ -76,12 +68,12 @@ def page(
         facts["reference"] = f"{len(diagnosis.references)} flights"
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
-        *([logs_section(checks), noise_section(diagnosis)] if checks else []),
-        *(actuators_section(checks, flights.driven_by) if checks else []),
+        *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
+        *actuators_section(found),
         candidates_section(diagnosis),
         rivals_section(diagnosis, found),
         residual_section(found),
-        evidence_section(diagnosis, found, checks),
+        evidence_section(diagnosis, found),
         agreement_section(diagnosis),
     ]
     return Report(

@@ -21,10 +21,9 @@ from eval.quadrotor.loops import KINDS
 from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
+from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.checks import run_checks
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly, fly_all
 from tests.support.pendulum import Pendulum
@@ -246,11 +245,10 @@ def outcome(logs, drive="commands"):
     except ValueError as error:
         assert len(str(error)) > 20
         return str(error)
-    checks = run_checks(result.main.source.rollouts)
-    found = {**diagnosis_json(result), **checks_json(checks, 0)}
+    found = diagnosis_json(result)
     text = to_json(plain(found))
     assert "NaN" not in text and "Infinity" not in text
-    assert "<h2>" in html(page(result, json.loads(text), checks, "", set()))
+    assert "<h2>" in html(page(result, json.loads(text), "", set()))
     assert found["verdict"] in VERDICTS
     assert np.isfinite(found["gap"]["before"]) and np.isfinite(found["gap"]["after"])
     return found

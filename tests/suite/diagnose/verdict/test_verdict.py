@@ -9,7 +9,7 @@ from suite.diagnose.data.windows import KNOTS, STATE
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict import black_box, checks, diagnosis
+from suite.diagnose.verdict import black_box, diagnosis
 from suite.diagnose.verdict.diagnosis import Verdict, verdict_on
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
 from suite.diagnose.verdict.gap import Gap, share_left
@@ -185,9 +185,3 @@ def test_what_was_held_out_is_not_fitted_by_the_black_box(flown):
     assert len(known.flight) and not set(known.flight) & set(flown.held.flight)
     top, mean = black_box._speeds(flown.logs, known)
     assert (top >= mean).all() and (mean > 0.0).all()
-
-
-def test_checks_know_the_logs_and_their_motors(flown, drag_checks):
-    assert isinstance(drag_checks, checks.Checks) and drag_checks.black_box is None
-    assert [fact.name for fact in drag_checks.facts] == [log.name for log in flown.logs]
-    assert drag_checks.actuators[0].followed > 0.9
