@@ -139,16 +139,14 @@ def _next_name(
     if now is None:
         single = [c for c in near if not c.parts][: limits.short_list]
         near = [c for c in near if c.parts or c in single]
-    begin, judge = here, evidence.compared()
-    if judge is not evidence and near:
-        begin = evaluated_at(judge.again(here.at), here.at, among)
-    before, tried = chi2_of(begin, begin.block, begin.at, others), []
+    before, tried = chi2_of(here, here.block, here.at, others), []
+    total = float(here.equations.chi2.sum())
     for candidate in near:
-        at, block = fit_with(begin, others, candidate)
-        gains = before - chi2_of(begin, block, at, [*others, *candidate.indices])
-        share = judge.share(begin.block, at, block, candidate, gains)
+        at, block = fit_with(here, others, candidate)
+        gains = before - chi2_of(here, block, at, [*others, *candidate.indices])
+        share = evidence.share(here.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        fall = float(begin.equations.chi2.sum()) - chi2
+        fall = total - chi2
         outcome = f"lowers the squared error by {fall:,.0f} times the noise variance"
         if share is None:
             outcome = "rejected: flights disagree, or a value is implausible or explains too little"
@@ -163,14 +161,13 @@ def _next_name(
     if not tried:
         return None
     least = min(cost for cost, *_ in tried)
-    total = float(begin.equations.chi2.sum())
-    explained = total - chi2_fall(begin.equations, theta, space, others) - least
+    explained = total - chi2_fall(here.equations, theta, space, others) - least
     slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
     sure = [one for one in alike if one[2][0].p_value <= evidence.name_p_value]
     if not sure:
         return None
-    cost, best, (one, at) = min(sure, key=lambda t: (*judge.order(t[2][1], t[1]), t[0]))
+    cost, best, (one, at) = min(sure, key=lambda t: (*evidence.order(t[2][1], t[1]), t[0]))
     rivals = dict.fromkeys(c.name for _, c, _ in alike if c.name != best.name)
     worse_by = {c.label: other - cost for other, c, _ in tried if c != best}
     return replace(one, rivals=tuple(rivals), worse_by=worse_by), at

@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.sensors.lateness import DIFFER_P, STRETCH_S, acting
+from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, acting
 
 SHORT_S = 1.0
 """Colours are compared up to this lag [s]."""
