@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from eval.effects import EFFECTS
+from suite.diagnose.diagnose import Diagnosis
+from suite.diagnose.estimate.parameters import ParameterSpace
 from suite.diagnose.plan import advice
-from suite.diagnose.report.parameters_json import parameters_json, short_name
-from suite.diagnose.report.summary import answer
+from suite.diagnose.report.summary import answer, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
-from suite.diagnose.verdict.diagnosis import Diagnosis
 from suite.diagnose.verdict.gap import Gap
 
 SIZES = ("force", "torque", "drift")
@@ -147,6 +148,66 @@ def _undecided(finding: Finding, ones: Sequence[NamedEffect]) -> list[int]:
         and any(one.worse_by.get(f"{entry.effect} {(entry.component or 0) + 1}", np.inf) <= near
                 for one in ones)
     ]  # fmt: skip
+
+
+def parameters_json(
+    space: ParameterSpace,
+    name: str,
+    indices: Sequence[int],
+    theta: np.ndarray,
+    half_width: Mapping[int, float],
+    undecided: Sequence[int] = (),
+) -> dict[str, Any]:
+    """Return the parameters of the effect `name` as diagnosis.json has them.
+
+    Args:
+        space: of the vehicle.
+        name: of the effect.
+        indices: places of its numbers that were fitted, in order.
+        theta: (P,) all numbers.
+        half_width: of the 95 % intervals, by place.
+        undecided: places of its numbers that could stand in place of a fitted one.
+    """
+
+    def one(index: int) -> tuple[float, list[float]]:
+        entry = space.entries[index]
+        value, width = float(theta[index]), half_width[index]
+        return value, [max(value - width, entry.low), min(value + width, entry.high)]
+
+    found: dict[str, Any] = {}
+    for parameter in EFFECTS[name].parameters:
+        if parameter.one_at_a_time:
+            values = [one(i) for i in indices]
+            which = [_number(space, i) for i in indices]
+            lone = len(which) == 1
+            could = [*which, *(_number(space, i) for i in undecided)]
+            spans = [[min(could), max(could)]] if lone else [[k, k] for k in which]
+            found["index"] = {
+                "value": which[0] if lone else which,
+                "unit": "1",
+                "ci95": spans[0] if lone else spans,
+            }
+            found[parameter.name] = {
+                "value": values[0][0] if lone else [v for v, _ in values],
+                "unit": parameter.unit,
+                "ci95": values[0][1] if lone else [c for _, c in values],
+            }
+            continue
+        at = {space.entries[i].component: i for i in indices
+              if space.entries[i].parameter == parameter.name}  # fmt: skip
+        if not at:
+            continue
+        if parameter.size:
+            parts = [one(at[k]) if k in at else (None, None) for k in range(parameter.size)]
+            value, ci = [v for v, _ in parts], [c for _, c in parts]
+        else:
+            value, ci = one(at[None])
+        found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
+    return found
+
+
+def _number(space: ParameterSpace, index: int) -> int:
+    return (space.entries[index].component or 0) + 1
 
 
 def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:

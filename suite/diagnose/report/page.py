@@ -9,9 +9,9 @@ from typing import Any
 from eval.effects import EFFECTS
 from suite.common.report import Details, Links, Part, Picture, Report, Section, Steps
 from suite.diagnose.data.windows import UNITS
+from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.parameters_json import cells, components, grid, short_name
 from suite.diagnose.report.sections import (
     actuators_section,
     agreement_section,
@@ -22,8 +22,7 @@ from suite.diagnose.report.sections import (
     residual_section,
     rivals_section,
 )
-from suite.diagnose.report.summary import next_steps
-from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.report.summary import cells, components, grid, next_steps, short_name
 from tracks.common.grid import Cell, Grid
 
 FILES = (

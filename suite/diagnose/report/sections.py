@@ -10,6 +10,7 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from suite.common.report import Details, Part, Picture, Section
 from suite.diagnose.data.windows import SLICES, UNITS
+from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.report.charts import (
     AFTER,
     BEFORE,
@@ -19,9 +20,8 @@ from suite.diagnose.report.charts import (
     gap_chart,
     labelled_gaps,
 )
-from suite.diagnose.report.parameters_json import cells, grid, short_name
+from suite.diagnose.report.summary import cells, grid, short_name
 from suite.diagnose.sources.rollout_source import of_rollouts
-from suite.diagnose.verdict.diagnosis import Diagnosis
 from tracks.common.grid import Cell, Grid
 
 SHOWN = 12

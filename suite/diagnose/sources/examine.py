@@ -13,8 +13,7 @@ from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.sources.source import Finding, Source
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import EffectSize
+from suite.diagnose.verdict.gap import EffectSize, Gap
 
 APART = 1.5
 """Parameters contradict each other where their 95 % intervals are further apart than their

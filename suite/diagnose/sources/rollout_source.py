@@ -31,12 +31,13 @@ from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, swing_left
-from suite.diagnose.verdict.gap import Gap, share_left
-from suite.diagnose.verdict.relevance import (
+from suite.diagnose.verdict.gap import (
     FORCE_S,
     TORQUE_S,
     EffectSize,
+    Gap,
     rollout_size,
+    share_left,
     upper_size,
 )
 from suite.diagnose.verdict.residual_structure import (

@@ -19,8 +19,7 @@ from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source
 from suite.diagnose.verdict.disturbances import swing_left
-from suite.diagnose.verdict.gap import Channel, Gap
-from suite.diagnose.verdict.relevance import EffectSize, upper_size, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, upper_size, view_size
 
 STRETCH_S = 10.0
 """Length of the stretch in a picture [s]."""

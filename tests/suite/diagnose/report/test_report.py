@@ -12,23 +12,27 @@ from suite.diagnose.report.charts import (
     series_chart,
     write_rollouts,
 )
-from suite.diagnose.report.diagnosis_json import actuators_json, black_box_json, diagnosis_json
-from suite.diagnose.report.page import channels_grid, page
-from suite.diagnose.report.parameters_json import (
-    UNSEEN,
-    cells,
-    components,
-    grid,
-    in_digits,
+from suite.diagnose.report.diagnosis_json import (
+    actuators_json,
+    black_box_json,
+    diagnosis_json,
     parameters_json,
-    short_name,
 )
+from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.report.sections import (
     actuators_section,
     evidence_section,
     logs_section,
     noise_section,
     residual_section,
+)
+from suite.diagnose.report.summary import (
+    UNSEEN,
+    cells,
+    components,
+    grid,
+    in_digits,
+    short_name,
 )
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons

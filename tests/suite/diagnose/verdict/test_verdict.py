@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.windows import KNOTS, STATE
+from suite.diagnose.diagnose import Diagnosis, Verdict, verdict_on
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict import black_box, diagnosis
-from suite.diagnose.verdict.diagnosis import Verdict, verdict_on
+from suite.diagnose.verdict import black_box
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
 from suite.diagnose.verdict.gap import Gap, share_left
 from suite.diagnose.verdict.residual_structure import (
@@ -125,7 +125,7 @@ def test_the_noise_floor_is_what_start_and_row_make():
 
 
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
-    assert isinstance(drag, diagnosis.Diagnosis) and drag.label == "named"
+    assert isinstance(drag, Diagnosis) and drag.label == "named"
     assert drag.flights.driven_by == "commands"
     own = of_rollouts(found_drag.search.last).noise
     again = measure(flown.model, found_drag.theta, flown.held, own)
