@@ -35,7 +35,7 @@ MEASURES = {
     "voltage": "Log the battery's voltage as well.",
     "scale": "Better still: weigh the vehicle.",
 }
-"""What to measure besides, by its name in a `Separation`."""
+"""What to measure as well, by its name in a `Separation`."""
 FLIGHTS = "flights"
 """Folder of the simulated logs, within the plan's."""
 
@@ -75,7 +75,10 @@ def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     remove_plan(folder)
     ways, words = ways_for(found)
     if not ways:
-        return {"flights": [], "words": ["Nothing is left to separate: no flight is planned."]}
+        return {
+            "flights": [],
+            "words": ["No effects are left to separate: no flight is planned."],
+        }
     return write_plan(folder, ways, words)
 
 
@@ -230,13 +233,13 @@ class Separation:
     pair: tuple[str, str]
     """Names of the two effects."""
     words: str
-    """What to do, for people."""
+    """What to do, in words."""
     blurred: tuple[Trajectory, ...]
     """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]
     """Flights to add."""
     measure: tuple[str, ...] = ()
-    """What to log besides: `motor`, `voltage`, or `scale` for a weighing."""
+    """What to log as well: `motor`, `voltage`, or `scale` for a weighing."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (

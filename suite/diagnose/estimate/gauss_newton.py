@@ -177,7 +177,7 @@ def intervals95(
         leave_out: stretches are left out in turn, too (CR3): a stretch with much information fits
             itself. With few of them their spread is itself not well known (Bell & McCaffrey 2002).
         noise_share: share of the interval by curvature below which no interval is.
-        prior: (K,) information on each number besides the flights', as of one that was held.
+        prior: (K,) information on each number in addition to the flights', as of a fixed one.
     """
     count, size = equations.gradient.shape
     if not size:

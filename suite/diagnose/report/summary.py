@@ -24,7 +24,7 @@ CHANGES = {
     "explains it.",
 }
 USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loop (--vehicle)."
-CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock looks like physics."
+CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
 def answer(found: Mapping[str, Any]) -> str:
@@ -83,7 +83,7 @@ def _separate(found: Mapping[str, Any]) -> Iterator[str]:
             start = f"{effect['name']} from "
             flights = [line for line in found["separate_with"] if line.startswith(start)]
             yield (
-                f"These flights do not separate {names}. Decide by what you know of the vehicle, "
+                f"These flights do not separate {names}. Decide by what is known of the vehicle, "
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
                 "flights."
             )
@@ -114,7 +114,7 @@ def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
     if found["unexplained"]["where"]:
-        yield f"Look for a cause of the remaining error: {found['unexplained']['where']}."
+        yield f"Search for a cause of the remaining error: {found['unexplained']['where']}."
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
@@ -174,7 +174,7 @@ def components(effect: Mapping[str, Any]) -> Iterator[Component]:
         value, span, unit = entry["value"], entry["ci95"], entry["unit"]
         neutral = neutrals.get(name)
         if name == "index" and one_at_a_time:
-            # Of several motors each has a line of its own, which says which.
+            # Each of several motors has a line of its own with its number.
             if not isinstance(value, list):
                 sure = span is None or span[0] == span[1]
                 yield Component(name, *_one(value, None if sure else span), None)

@@ -179,7 +179,7 @@ def changed(
     base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
     weights = weights._replace(trim=trim, base=base)
     away = np.abs(means_of(left.residual, left.flight).mean(axis=0))
-    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * away))
+    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_error * away))
     # Few means hold little: all that explains what stands out is an alternative.
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(

@@ -230,7 +230,7 @@ def say_held_out(result: Mapping[str, Any], console: Console) -> None:
 
 
 def _values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:
-    """Return what the file says: a delay, scale or drift that may be none is left out."""
+    """Return the entries of the file; a delay, scale or drift that may be zero is left out."""
     models: dict[str, dict[str, float]] = {}
     for key, (one, _) in parameters.items():
         model, name = key.split(".")

@@ -62,7 +62,7 @@ def examine(
         explained = found, (before, after)
     remaining = source.remaining(*explained, seed)
     if remaining.wind and found.named and not source.worse(after, before):
-        # Wind that lasts from one stretch to the next looks like many a steady number.
+        # Wind that lasts from one stretch to the next has the effect of many constant numbers.
         found, after, sizes = found.refitted(()), before, {}
         remaining = source.remaining(found, (before, before), seed)
     labels = ", ".join(one.label for one in found.candidates) or "nothing"

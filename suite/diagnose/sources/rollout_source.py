@@ -292,8 +292,8 @@ def structure_where(
         for axis, p_value in residual.coloured.items()
         if p_value <= limits.colour_p_value and not rotor_input
     ]
-    loud = limits.structure_rotor_input if rotor_input else limits.structure
-    if not (shape or coloured or slow.sum() / expected.sum() > loud):
+    least = limits.structure_rotor_input if rotor_input else limits.structure
+    if not (shape or coloured or slow.sum() / expected.sum() > least):
         return None
     where = [shape.label] if shape else []
     if coloured:

@@ -156,7 +156,7 @@ class Source(ABC):
         return {}
 
     def stepped(self, found: SearchResult) -> bool:
-        """Return whether the named effects look like the time steps of a simulator."""
+        """Return whether the named effects may be caused by a simulator's time steps."""
         del found
         return False
 

@@ -245,8 +245,8 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
     if remembers(vehicle) and (drive == "commands" or not motors):
         raise ValueError(
-            f"{vehicle.name}: no log says what its {vehicle.controller.kind} rate loop remembers "
-            "where a stretch of a flight begins, so that commands cannot drive rollouts; give "
+            f"{vehicle.name}: no log holds the state of its {vehicle.controller.kind} rate loop "
+            "at the start of a stretch, so that commands cannot drive rollouts; give "
             "flights with measured rotor speeds (--drive motors), or a vehicle with a controller "
             "of kind p"
         )

@@ -67,7 +67,7 @@ class Gap(NamedTuple):
         """
         grown = self.energy - before.energy
         drawn = grown[_blocks(len(grown), seed, limits)].mean(axis=1)
-        return bool(np.quantile(drawn, 0.025) > 0.0 and grown.sum() * weight > limits.doubt_chi2)
+        return bool(np.quantile(drawn, 0.025) > 0.0 and grown.sum() * weight > limits.refuting_chi2)
 
 
 def share_left(before: Gap, after: Gap) -> float:

@@ -112,7 +112,7 @@ def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     assert after.above(before, 0.25, 0, THRESHOLDS)
     assert not before.above(after, 0.25, 0, THRESHOLDS)
     assert not before.above(before, 0.25, 0, THRESHOLDS)
-    assert not after.above(before, 0.25, 0, Thresholds(doubt_chi2=1e6))
+    assert not after.above(before, 0.25, 0, Thresholds(refuting_chi2=1e6))
 
 
 def test_the_noise_floor_is_what_start_and_row_make():
