@@ -139,13 +139,13 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
 
 def series_chart(series: Series) -> bytes:
     """Return a held-out stretch as measured and as simulated."""
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     axes = figure.subplots()
     axes.plot(series.time_s, series.measured, color=FLOOR, lw=1.6, label="measured")
     for (label, values), colour in zip(series.simulated.items(), (BEFORE, AFTER), strict=False):
         axes.plot(series.time_s, values, color=colour, lw=1.4, label=label)
     axes.set_xlabel("time [s]", fontsize=8)
-    axes.legend(fontsize=8, frameon=False, ncols=3)
+    figure.legend(fontsize=8, frameon=False, ncols=3, loc="outside lower center")
     titled(axes, series.label)
     return png(figure)
 

@@ -31,6 +31,7 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
     """Return what diagnosis.json has of the names and of the gap."""
     main, control = found.main, found.main.control
     limits = found.limits
+    swing = next((one.remaining.swing for one in found.findings if one.remaining.swing), None)
     entries: dict[str, Any] = {
         "verdict": found.label,
         "effects": effects_json(found),
@@ -59,6 +60,7 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
         "unexplained": {
             "share": found.verdict.share_left,
             "where": found.verdict.where,
+            "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
         "reference": list(found.references),
@@ -216,8 +218,8 @@ def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:
     if found.named:
         source = main.source
         words.append(
-            f"The {source.subject} on held-out flights is {_figure(main.after.rms)} instead of "
-            f"{_figure(main.before.rms)} {source.unit}."
+            f"On held-out flights the {source.subject} falls from {_figure(main.before.rms)} to "
+            f"{_figure(main.after.rms)} {source.unit}."
         )
     words += [one.words or f"Named: {one.name}." for one in found.tested]
     if found.verdict.where:

@@ -25,6 +25,13 @@ from suite.diagnose.report.sections import (
 from suite.diagnose.report.summary import cells, components, grid, next_steps, short_name
 from tracks.common.grid import Cell, Grid
 
+TITLES = {
+    "no_gap": "no gap",
+    "named": "cause named",
+    "partly": "partly explained",
+    "unknown": "cause unknown",
+}
+"""By verdict."""
 FILES = (
     ("vehicle.toml", "the vehicle with what was named; every command takes it"),
     ("diagnosis.json", "all numbers of this page"),
@@ -54,11 +61,11 @@ def page(diagnosis: Diagnosis, found: Mapping[str, Any], toml: str, files: set[s
     `toml` is the text of the vehicle file that was written, `files` lists which of `FILES` exist.
     """
     gap, flown = found["gap"], diagnosis.main.source.rollouts
+    after = f" → {gap['after']:.3g}" if found["effects"] else ""
     facts = {
-        "gap before": f"{gap['before']:.3g}",
-        "gap after": f"{gap['after']:.3g}",
+        "verdict": found["verdict"],
+        "gap on held-out flights": f"{gap['before']:.3g}{after} {diagnosis.main.source.unit}",
         "noise floor": f"{gap['noise_floor']:.3g}",
-        "unit": diagnosis.main.source.unit,
         "held out": _few(gap["held_out"]),
         "driven by": found["driven_by"],
         "took": f"{found['seconds']:.0f} s",
@@ -76,12 +83,12 @@ def page(diagnosis: Diagnosis, found: Mapping[str, Any], toml: str, files: set[s
         agreement_section(diagnosis),
     ]
     return Report(
-        title=f"Diagnosis: {found['verdict']}",
+        title=f"Diagnosis: {TITLES[found['verdict']]}",
         lead=found["headline"],
         facts=facts,
         sections=[
-            *_measured(diagnosis),
             Section("What to do next", [Steps(next_steps(found))]),
+            *_measured(diagnosis),
             *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
             *_findings(found.get("findings", ())),
             Section("The answer in numbers", _answer(found)),

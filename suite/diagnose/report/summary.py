@@ -115,6 +115,12 @@ def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
 def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
     if found["unexplained"]["where"]:
         yield f"Search for a cause of the remaining error: {found['unexplained']['where']}."
+    swing = found["unexplained"].get("swing")
+    if swing:
+        yield (
+            "If the vehicle carries a load on a line, weigh it and write mass and length = "
+            f"{swing['length_m']:.2g} into [effects.slung_load] of the vehicle file."
+        )
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}

@@ -153,13 +153,18 @@ class ViewSource(Source):
         return Shares(closed, np.maximum(explainable, closed), both - closed, variance, trim)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the stretch of a held-out flight that the names change most, see `Source`."""
+        """Return the stretch of a held-out flight that the names change most, see `Source`.
+
+        Where nothing is named, the one with the largest error.
+        """
         before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
         shares = self._shares(found)
-        axis = max(self.view.axes, key=lambda k: float(shares.closed[k] * shares.variance[k]))
+        weight = shares.variance * (shares.closed if found.named else 1.0)
+        axis = max(self.view.axes, key=lambda k: float(weight[k]))
         rows = before.flight == before.flight[0]
         middle = before.middle_s[rows]
-        moved = np.abs(before.residual[rows, axis] - after.residual[rows, axis])
+        apart = before.residual - (after.residual if found.named else 0.0)
+        moved = np.abs(apart[rows, axis])
         count = max(int((middle < middle[0] + STRETCH_S).sum()), 2)
         first = int(np.convolve(moved, np.ones(min(count, len(moved))), "valid").argmax())
         shown = slice(first, first + count)
@@ -174,7 +179,7 @@ class ViewSource(Source):
             measured,
             lines,
             f"{what} along body {'xyz'[axis]} [{self.unit}]",
-            "A stretch of a flight that took no part in finding or fitting anything.",
+            "A stretch of a held-out flight.",
         )
 
 

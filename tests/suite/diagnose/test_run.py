@@ -42,7 +42,7 @@ def test_files_come_out_whole_and_bad_flights_are_named(written):
 def test_every_step_is_in_the_report(written):
     text = (written / "report.html").read_text(encoding="utf-8")
     shown = re.findall(r"<h2>(.*?)</h2>", text)
-    assert shown[:2] == ["Measured and simulated", "What to do next"]
+    assert shown[:2] == ["What to do next", "Measured and simulated"]
     folded = re.findall(r'class="section"><summary>(.*?)</summary>', text)
     assert [head for head in folded if head in STEPS] == list(STEPS)
     assert "Actuators, apart from the air" in folded

@@ -85,7 +85,7 @@ def test_structure_goes_with_a_shape_a_colour_or_the_loudest_channel():
     assert structure_where(QUIET, left(), False) is None
     assert structure_where(QUIET, left(p_value=1e-4), False) == "force with the speed"
     coloured = structure_where(QUIET, left(coloured=1e-6), False)
-    assert coloured == "a changing " + ", ".join(AXES)
+    assert coloured == ("a changing force along body x, y, z; a changing torque along body x, y, z")
     assert structure_where(slow_errors(10.0), left(), False) == "errors of velocity x"
 
 
