@@ -25,10 +25,9 @@ class Thresholds:
     """Rotor speeds are compared with the loop's as means over this time, to average noise [s]."""
     still_speed: float = 10.0
     """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
-    loop_settled_s: float = 0.3
-    """Left out after the first row, until the initial rotor speeds have decayed [s]."""
     lag_settled_s: float = 0.2
-    """Left out after each hole in the log where lags are fitted, for the same reason [s]."""
+    """Left out after the first row and each hole in the log where rotor speeds are compared, until
+    the initial speeds have decayed [s]."""
     longest_lag_s: float = 0.15
     """Longest time constant of the rotors that is tried [s]."""
     lag_followed_share: float = 0.99
