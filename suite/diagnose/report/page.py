@@ -50,8 +50,8 @@ CHANNELS = (
     "RMS errors on flights that took no part in finding or fitting anything. Noise floor: what the "
     "measurement noise alone gives, in rollouts that of the start and of the row compared. "
     "Repeatability: how far the means of flights of the unchanged vehicle lie apart. Closed: the "
-    "share of the variance within a flight that the names close; black box: what a regression "
-    "without any physics closes of it, fitted to the same flights."
+    "share of the variance within a flight that the named effects explain; black box: the share "
+    "that a regression without physics explains, fitted to the same flights."
 )
 
 
@@ -127,7 +127,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
-    """Return the gap by channel; what no log measured has no row."""
+    """Return the gap by channel; a channel that no log measured has no row."""
     more = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
     every = [one for values in channels.values() for one in values.values()]
     shown = [key for key in more if any(key in one for one in every)]
@@ -150,7 +150,7 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
 
 
 def _answer(found: Mapping[str, Any]) -> list[Part]:
-    """Return the names, what they are and do, and their parameters."""
+    """Return the named effects, their equations and their parameters."""
     effects = found["effects"]
     if not effects:
         return ["Nothing was named: the vehicle file is as it was."]

@@ -68,9 +68,9 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         if np.isfinite(values := sigma[place]).any()
     ]
     words = (
-        "Standard deviation by axis, from the data: the residual of measured minus simulated when "
-        "all that changes slowly is taken off. Everything below is in units of it; where the gap "
-        "does not exceed what it gives, the verdict is no_gap."
+        "Standard deviation by axis, estimated from the residual of measured minus simulated "
+        "without its slow part. Everything below is in units of it; where the gap does not exceed "
+        "that of the noise, the verdict is no_gap."
     )
     return Section("The measurement noise", [words, grid("", ["measured", "noise"], rows)])
 
@@ -120,7 +120,7 @@ BLACK_BOX = (
 
 
 RIVALS = 6
-"""Other names in the table of what fits as well."""
+"""Largest number of alternatives to an effect in the table."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
@@ -184,15 +184,15 @@ def residual_section(found: Mapping[str, Any]) -> Section:
     if left.get("shapes"):
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in left["shapes"]]
         note = (
-            "A force or torque that no effect describes, with a plain shape over the state: its "
-            "gain on stretches left out, and how often chance gains as much."
+            "A force or torque outside the catalogue, as a simple function of the state: its gain "
+            "on left-out stretches, and its p-value."
         )
         parts.append(
             grid("Shapes without a name", ["remaining error as a", "gain", "p"], rows, note)
         )
         rows = [(axis, f"{p:.2g}") for axis, p in left["coloured"].items()]
-        note = "How often noise alone has as much energy in a smooth push along the axis."
-        parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
+        note = "P-value: how often noise alone has as much energy in a smooth disturbance."
+        parts.append(grid("Random disturbances", ["axis", "p"], rows, note))
     return Section("Remaining error", parts)
 
 
@@ -248,8 +248,8 @@ def _black_box(found: Mapping[str, Any] | None) -> list[Part]:
 
 
 AGREEMENT = (
-    "The fall of the squared error of each flight under what the others' fit gives, in units of "
-    "independent noise. A name needs all flights but one."
+    "The fall of the squared error of each flight with parameters that were fitted to the others, "
+    "in units of independent noise. An effect is named only if all flights but one agree."
 )
 
 

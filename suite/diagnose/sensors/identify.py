@@ -30,13 +30,13 @@ from suite.diagnose.sensors.errors import (
 
 SCHEMA = 1
 WITHIN = 0.2
-"""A colour fits where its autocorrelation is nowhere further than this from the measured one."""
+"""A model fits where its autocorrelation is within this of the measured one at every lag."""
 COUNTS = 0.2
 """Measured autocorrelations from here on are compared in relative terms as well."""
 
 
 class Fitted(NamedTuple):
-    """Errors of an estimate, as flights show them."""
+    """Errors of an estimate, fitted to flights."""
 
     lateness: Lateness
     axes: Mapping[str, Coloured]
@@ -83,7 +83,7 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
-    """Return by axis how a model fitted to one half of the flights is off on the other half.
+    """Return by axis how a model fitted to half of the flights differs from the other half.
 
     Both halves are held out in turn, and the worse counts; nothing is held out of one flight.
     """

@@ -91,8 +91,7 @@ class ViewSource(Source):
             if force and not structured:
                 structured, left = True, max(left, share_of_energy(*gaps, self._noise))
                 where = (
-                    f"a force of {force:.2g} m/s^2 beyond the noise, which no flown signal "
-                    "predicts"
+                    f"a force of {force:.2g} m/s^2 beyond the noise, which no flown signal predicts"
                 )
         closed, explainable = shares.whole(shares.closed), shares.whole(shares.explainable)
         return Remaining(
