@@ -113,7 +113,7 @@ def information(
     Arguments are those of `linearised`.
     """
     columns = columns_of(bool(sensors.voltage), names)
-    matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations().sums()
+    matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations.sums()
     return Information(columns, matrix)
 
 

@@ -112,7 +112,7 @@ def fit(
     low, high = space.array("low")[at], space.array("high")[at]
     best, block = start, known or evidence.linearise(start, indices)
     for done in range(limits.fit_rounds if rounds is None else rounds):
-        equations = block.equations().along_numbers(indices)
+        equations = block.equations.along_numbers(indices)
         change, promised = gauss_newton_step(equations, best.theta, space)
         # What is free moves as well, at least once.
         if promised < limits.converged and (done or not block.free.shape[1]):

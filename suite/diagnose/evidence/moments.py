@@ -356,7 +356,7 @@ def fast_share(
     """
     fast = changes_of(data)
     fast = fast._replace(slope=(fast.slope[..., list(columns)] @ away)[..., None])
-    block = block_of(fast, weights_of(fast, limits), stretch_of(fast, limits), [0]).equations()
+    block = block_of(fast, weights_of(fast, limits), stretch_of(fast, limits), [0]).equations
     hessian, gradient = block.sums()
     share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
     return share, float(intervals95(block).half_width[0])

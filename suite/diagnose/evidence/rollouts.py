@@ -189,7 +189,7 @@ def least_left(
     def left(chi2: float) -> float:
         return chi2 / max(int(np.asarray(evidence.trusted.seen).sum()), 1)
 
-    equations = block.equations()
+    equations = block.equations
     some = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
     start = model.space.array("start")
     _, fall = gauss_newton_step(equations.take(some), start, model.space)

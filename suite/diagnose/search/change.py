@@ -131,7 +131,7 @@ class ChangeEvidence(ViewEvidence):
         assert isinstance(block, ViewBlock) and self.spread and self.sure and self.weights
         weights = self.weights if named else self.sure
         each, along = np.arange(len(block.data.flight)), block.along
-        equations = block_of(block.data, weights, each, along).equations()
+        equations = block_of(block.data, weights, each, along).equations
         without = chi2_fall(equations, theta, self.space, named)
         groups = [candidate.indices for candidate in among]
         gains = [chi2_fall(equations, theta, self.space, [*named, *g]) - without for g in groups]
@@ -265,7 +265,7 @@ def search_motion_change(
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
     at = evidence.at(theta)
     block = evidence.linearise(at, sorted(name.candidate.indices))
-    last = Evaluation(evidence, at, block, block.equations())
+    last = Evaluation(evidence, at, block)
     named = (replace(name, rivals=rivals),)
     return SearchResult(named, evidence.at(begun), last, last, [], 0.0)
 

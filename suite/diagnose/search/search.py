@@ -97,15 +97,16 @@ def _scores(
 
 
 def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
-    block = evidence.linearise(at, indices_of([n.candidate for n in named]))
-    return Evaluation(evidence, at, block, block.equations())
+    return Evaluation(
+        evidence, at, evidence.linearise(at, indices_of([n.candidate for n in named]))
+    )
 
 
 def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     """Fit all names to the end, as some effects saturate; where there is none nothing is moved."""
     indices, limits = indices_of([n.candidate for n in named]), evidence.limits
-    at, block = fit(evidence, at, indices, limits.last_rounds if indices else 0, None, limits)
-    return Evaluation(evidence, at, block, block.equations())
+    rounds = limits.last_rounds if indices else 0
+    return Evaluation(evidence, *fit(evidence, at, indices, rounds, None, limits))
 
 
 def _next_name(

@@ -219,7 +219,7 @@ def _equations(flights: Sequence[Errors], channels: slice) -> NormalEquations:
     start_s = places[1] * STRETCH_S
     return without_nuisance(
         white[..., 0], white[..., 1:], (0, 1), number.ravel(), places[0], start_s
-    ).equations()
+    ).equations
 
 
 def _solved(equations: NormalEquations, fitted: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -221,7 +221,7 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
             continue
         every = sorted({*by.indices, *at})
         best, block = fit(evidence, by.estimate, every, limits=evidence.limits)
-        inside = intervals95(block.equations().along_numbers(every), evidence.draws).half_width
+        inside = intervals95(block.equations.along_numbers(every), evidence.draws).half_width
         for k in at:
             own, other = found.estimate.theta[k], best.theta[k]
             wide = float(inside[every.index(k)])

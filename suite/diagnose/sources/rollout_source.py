@@ -130,7 +130,7 @@ class RolloutSource(Source):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
             how = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
-            equations = weighed_by(model, self.coarser, linear, *how)[1].equations()
+            equations = weighed_by(model, self.coarser, linear, *how)[1].equations
             moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
             own = self.coarser_share * np.abs(moved)
 

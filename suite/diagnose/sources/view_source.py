@@ -195,7 +195,7 @@ class MotionSource(ViewSource):
         del say, seed
         found = search_motion_change(self.reference, self.fitted, self.among)
         evidence, block = self.known
-        none = Evaluation(evidence, self.start, block, block.equations())
+        none = Evaluation(evidence, self.start, block)
         return found or SearchResult((), self.start, none, none, [], 0.0)
 
 

@@ -91,7 +91,7 @@ def test_a_file_with_a_load_on_a_line_is_refused_in_one_line(tmp_path, capsys):
     line = [str(tmp_path), "--vehicle", str(tmp_path / "loaded.toml"), "--out", str(tmp_path / "o")]
     assert main(["diagnose", *line]) == 2
     said = capsys.readouterr().err.strip()
-    assert "effects.slung_load" in said and "take it out" in said and "\n" not in said
+    assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
 
 
 def test_what_is_read_is_not_written_over(tmp_path, capsys):

@@ -87,7 +87,9 @@ def test_two_effects_may_replace_one_that_resembles_both_together():
             turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
         )
         evidence = SimpleNamespace(limits=THRESHOLDS)
-        here = Evaluation(evidence, Estimate(theta, np.zeros((0, 0))), None, made)
+        here = Evaluation(
+            evidence, Estimate(theta, np.zeros((0, 0))), SimpleNamespace(equations=made)
+        )
         return [pair.parts for pair in better_pairs(here, [], drag, among)]
 
     assert pairs([rotor, inflow])[0] == (rotor, inflow)
