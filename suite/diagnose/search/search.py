@@ -242,20 +242,26 @@ def better_pairs(
 ) -> list[Candidate]:
     """Return the pairs of `among` that explain clearly more than `one` alone, best first.
 
-    Next to the numbers at `others`, to first order and regardless of bounds: each pair still has to
-    be fitted. A name is kept where a pair is better by chance or by what no fit is exact to.
+    Next to the numbers at `others` and to first order: each pair still has to be fitted. A pair has
+    to be better by more than chance, and by more than a fit is exact.
     """
-    equations, limits = here.equations, here.evidence.limits
+    equations, limits, space = here.equations, here.evidence.limits, here.evidence.space
+    known = [equations.numbers.index(number) for number in others]
     hessian, gradient = equations.sums()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     hessian, gradient = hessian * np.outer(scale, scale), gradient * scale
 
     def explained(*some: Candidate) -> float:
-        """Return the fall of chi-square, less one for each number."""
+        """Return the fall of chi-square without bounds, less one for each number."""
         columns = [column for each in some for column in equations.columns_of(each)]
-        at = sorted({*(equations.numbers.index(number) for number in others), *columns})
-        known = hessian[np.ix_(at, at)] + 1e-9 * np.eye(len(at))
-        return float(gradient[at] @ np.linalg.solve(known, gradient[at])) - len(columns)
+        at = sorted({*known, *columns})
+        matrix = hessian[np.ix_(at, at)] + 1e-9 * np.eye(len(at))
+        return float(gradient[at] @ np.linalg.solve(matrix, gradient[at])) - len(columns)
+
+    def possible(parts: Sequence[Candidate]) -> bool:
+        columns = [column for each in parts for column in equations.columns_of(each)]
+        fall = chi2_fall(equations, here.at.theta, space, [*known, *columns])
+        return fall - len(columns) > least
 
     nothing, own = explained(), explained(one)
     least = own + max(limits.rival_chi2, limits.least_name_share * (own - nothing))
@@ -264,6 +270,7 @@ def better_pairs(
     singles = [c for c in singles if explained(c) > nothing + limits.rival_chi2]
     gains = {parts: explained(*parts) for parts in combinations(singles, 2)}
     best = sorted((parts for parts, gain in gains.items() if gain > least), key=lambda p: -gains[p])
+    best = [parts for parts in best[: 4 * limits.short_list] if possible(parts)]
     return [
         Candidate(
             JOIN.join(part.name for part in parts),

@@ -86,7 +86,7 @@ def test_two_effects_may_replace_one_that_resembles_both_together():
         made = NormalEquations(
             turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
         )
-        evidence = SimpleNamespace(limits=THRESHOLDS)
+        evidence = SimpleNamespace(limits=THRESHOLDS, space=space)
         here = Evaluation(
             evidence, Estimate(theta, np.zeros((0, 0))), SimpleNamespace(equations=made)
         )
