@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
+from eval.flights.follow import FlightFailed, Recording
 from eval.judging.statistics import wilson
 from suite.diagnose.identify.identify import identify
-from suite.diagnose.plans.follow import FlightFailed, Recording
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests/support
 from tests.support.fleets import (

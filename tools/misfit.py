@@ -17,6 +17,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.flights.follow import FlightFailed
+from eval.flights.trajectory import ordinary_flights
 from eval.judging.statistics import wilson
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion, Wrench
@@ -30,8 +32,6 @@ from suite.diagnose.data.windows import cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.rollout_gap import gap_of
 from tracks.common.work import usable_cores, work_off

@@ -24,14 +24,14 @@ from scipy.stats import binomtest
 
 from eval.effects import EFFECTS
 from eval.effects.interface import at
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import ordinary_flights
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.startup import keep_compiled
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 
 NOMINAL = "reference"

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS, all_values
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import FALL_V_PER_S, SENSORS, Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory, long_flights, ordinary_flights
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.blind.cases import Case
@@ -28,10 +31,7 @@ from suite.blind.oracle.information import (
 from suite.blind.outside import KINDS, changed_values, draw_change, make_outside, true_parameters
 from suite.blind.simulators import Logged, Simulator, simulator_for
 from suite.common.errors import WorkFailed
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.plan import SEPARATIONS
-from suite.diagnose.plans.simulate import FALL_V_PER_S, SENSORS, Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory, long_flights, ordinary_flights
+from suite.diagnose.plan import SEPARATIONS
 
 TRIES = 6
 """Number of draws of flights and strengths before a case fails."""

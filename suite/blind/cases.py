@@ -12,7 +12,7 @@ from eval.effects import EFFECTS, nameable_effects
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from suite.blind.oracle.strength import vehicle_names
 from suite.blind.outside import KINDS
-from suite.diagnose.plans.plan import SEPARATIONS
+from suite.diagnose.plan import SEPARATIONS
 
 MULTIPLES = (2.0, 6.0)
 """Strengths of single effects, as multiples of the just detectable strength."""

@@ -10,6 +10,9 @@ from dataclasses import astuple, replace
 
 import numpy as np
 
+from eval.flights.follow import PilotGains, check_flights, steer
+from eval.flights.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
+from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
@@ -18,9 +21,6 @@ from suite.blind.continuous.engine import Flown, Rows, fly
 from suite.blind.continuous.log import Noise, log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
-from suite.diagnose.plans.follow import PilotGains, check_flights, steer
-from suite.diagnose.plans.simulate import FALL_V_PER_S, FULL_V, SAG_V, Extra, Sensors
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 
 ROLL_S = 0.25
 """Time before the first row and after the last one, for poses with a time offset [s]."""

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.flights.follow import Recording, Step, follow, wanted_of
+from eval.flights.simulate import FULL_V
+from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds.rotorpy import Multirotor, Push
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
-from suite.diagnose.plans.follow import Recording, Step, follow, wanted_of
-from suite.diagnose.plans.simulate import FULL_V
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import quat_to_rot
 
 

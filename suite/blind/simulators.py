@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from eval.flights.simulate import SENSORS, Extra, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import CONTINUOUS, ROTORPY, Case
@@ -15,8 +17,6 @@ from suite.blind.continuous.timing import draw_conditions
 from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop
 from suite.blind.oracle.strength import given_vehicle
 from suite.blind.rotorpy_flight import fly_rotorpy
-from suite.diagnose.plans.simulate import SENSORS, Extra, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 
 Ways = Sequence[Trajectory]
 Random = np.random.Generator

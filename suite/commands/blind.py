@@ -128,7 +128,7 @@ def _strengths(console: Console) -> dict[str, Any]:
 
 def _plan(config: Config, console: Console) -> dict[str, Any]:
     from eval.effects import find_effect
-    from suite.diagnose.plans.plan import plan_for, separations_of
+    from suite.diagnose.plan import plan_for, separations_of
     from tracks.common.files import plain
 
     names = [find_effect(name).name for name in config.effects]

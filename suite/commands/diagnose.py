@@ -60,8 +60,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for flights or a vehicle file that cannot be used.
     """
     from suite.delta.run import flight_files
-    from suite.diagnose.report.parameters_json import components
-    from suite.diagnose.report.summary import next_steps
+    from suite.diagnose.report.summary import components, next_steps
     from suite.diagnose.run import diagnose_files
 
     check_no_input(config.out / "vehicle.toml", [config.vehicle, config.fly], "--out")

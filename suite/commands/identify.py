@@ -51,7 +51,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     if config.sensors:
-        from suite.diagnose.sensors import run as of_sensors
+        from suite.diagnose.sensors import identify as of_sensors
 
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")

@@ -18,14 +18,14 @@ from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import refuse_own_motion
 from suite.diagnose.identify.run import is_identified
-from suite.diagnose.plans.plan import fly_plan, write_plan_of
+from suite.diagnose.plan import fly_plan, write_plan_of
 from suite.diagnose.report.charts import write_rollouts
-from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
+from suite.diagnose.report.diagnosis_json import actuators_json, black_box_json, diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.sources.rollout_source import of_rollouts
 from suite.diagnose.thresholds import THRESHOLDS
+from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxConfig, compare_black_box
-from suite.diagnose.verdict.checks import run_checks
 from tracks.common.files import plain, write_json
 from tracks.common.provenance import stamp
 
@@ -90,7 +90,7 @@ def diagnose_files(
         limits=limits,
     )  # fmt: skip
     found: dict[str, Any] = diagnosis_json(result)
-    flown, checks, files = result.main.source.rollouts, None, {"vehicle.toml", "diagnosis.json"}
+    flown, files = result.main.source.rollouts, {"vehicle.toml", "diagnosis.json"}
     if flown is None:
         wanted = {
             "--compare-delta": compare_delta,
@@ -103,13 +103,13 @@ def diagnose_files(
         warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
     found["warnings"] = [*warnings, *found["warnings"]]
     if flown is not None:
-        checks = run_checks(flown)
+        mismatches = actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
+        found["actuators"], found["black_box"] = actuators_json(mismatches), None
         if compare_delta:
             config = BlackBoxConfig(seed=seed)
             with console.progress("fitting the Delta Action Model", 1.0) as show:
                 compared = compare_black_box(flown, result.main, config, show)
-            checks = replace(checks, black_box=compared)
-        found |= checks_json(checks, seed)
+            found["black_box"] = black_box_json(compared, seed)
         if plan or truth is not None:
             folder = out / "plan"
             found["plan"] = write_plan_of(found, folder)
@@ -126,7 +126,7 @@ def diagnose_files(
     found["identified"] = is_identified(vehicle_name)
     found = {**plain(found), **stamp(SCHEMA, seed)}
     toml = _vehicle_file(result.vehicle, vehicle, found, out)
-    write_report(out / "report.html", page(result, found, checks, toml, files))
+    write_report(out / "report.html", page(result, found, toml, files))
     for warning in found["warnings"][shown:]:
         console.note(f"warning: {warning}")
     if found["verdict"] == "no_gap" and found["not_examined"]:

@@ -25,10 +25,9 @@ class Thresholds:
     """Rotor speeds are compared with the loop's as means over this time, to average noise [s]."""
     still_speed: float = 10.0
     """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
-    loop_settled_s: float = 0.3
-    """Left out after the first row, until the initial rotor speeds have decayed [s]."""
     lag_settled_s: float = 0.2
-    """Left out after each hole in the log where lags are fitted, for the same reason [s]."""
+    """Left out after the first row and each hole in the log where rotor speeds are compared, until
+    the initial speeds have decayed [s]."""
     longest_lag_s: float = 0.15
     """Longest time constant of the rotors that is tried [s]."""
     lag_followed_share: float = 0.99
@@ -60,7 +59,7 @@ class Thresholds:
     colour_gain: float = 3.0
     """Rise of the log-likelihood from which noise is modelled as coloured, not white [1]."""
     drift_gain: float = 3.0
-    """Rise of the log-likelihood from which an error of the model is assumed besides noise [1]."""
+    """Rise of the log-likelihood from which an error of the model is assumed as well [1]."""
     colour_aside: float = 3.0
     """Largest difference of row times between stretches that are compared, in rows."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
@@ -85,7 +84,7 @@ class Thresholds:
     """Draws of the null: p-values down to 1/2000."""
     folds: int = 5
     """Parts into which windows are dealt; each is left out once."""
-    loud_gain: float = 50.0
+    strong_gain: float = 50.0
     """Gain that noise never reaches: candidates nearly as good as the best are then real, too."""
     alike_share: float = 0.5
     """Share of the best gain from which a group of columns explains about as much [1]."""
@@ -176,7 +175,7 @@ class Thresholds:
     """Ridge weight, for each mean, of the regression of the reference flights' residual [1]."""
     carried_least: float = 0.1
     """Least standard deviation of that regression's inputs [m/s, m/s^2, rad/s^2]."""
-    gain_doubt: float = 0.5
+    gain_error: float = 0.5
     """Relative error of a change that an error of the vehicle file may cause along an axis:
     inertia, arms and rotor torque are no more accurate where they were not identified [1]."""
     spread_freedom: int = 4
@@ -203,7 +202,7 @@ class Thresholds:
     """Neighbouring windows that are drawn together: they overlap (1 s long, 0.25 s apart)."""
     gap_stride_s: float = 0.25
     """From one start to the next of the rollouts that measure the gap [s]."""
-    doubt_chi2: float = 25.0
+    refuting_chi2: float = 25.0
     """Rise of chi-square on held-out flights from which a name is withdrawn (five sigma)."""
     shown_chi2: float = 9.0
     """Expected fall of chi-square on held-out flights from which a name without any fall there is
@@ -223,7 +222,7 @@ class Thresholds:
     """Quantiles of the information over all directions that set the tested disturbance sizes."""
     informed_share: float = 1e-9
     """Directions with less than this share of the largest information do not count [1]."""
-    noise_doubt: float = 0.02
+    noise_error: float = 0.02
     """Relative uncertainty of the measured noise power [1]."""
     shape_p_value: float = 0.001
     """P-value up to which a shape over the state counts as structure in the residual."""

@@ -20,7 +20,7 @@ from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
-from suite.diagnose.report.parameters_json import components, grid
+from suite.diagnose.report.summary import components, grid
 from suite.loop.charts import SEVERAL, success_chart
 from suite.loop.compare import BEFORE, points, significance
 from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig

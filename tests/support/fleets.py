@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.flights.follow import Recording
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
-from suite.diagnose.plans.follow import Recording
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 SENSORS = Sensors(

@@ -7,11 +7,11 @@ from types import MappingProxyType
 import numpy as np
 
 from eval.effects import EFFECTS
+from eval.flights.simulate import Sensors
+from eval.flights.trajectory import Trajectory
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.identify import identify
-from suite.diagnose.plans.simulate import Sensors
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import Fleet, logs_of, recordings_of
 
 DRAG, DELAY = (0.3, 0.4, 0.2), 0.012

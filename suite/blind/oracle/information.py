@@ -20,6 +20,8 @@ from scipy.optimize import lsq_linear, root_scalar
 
 from eval.effects import EFFECTS, all_values, nameable_effects
 from eval.effects.interface import Parameter, Values, at, neutral
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.diagnose.data.colour import Noise
@@ -27,8 +29,6 @@ from suite.diagnose.data.windows import LENGTH_S, cut
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 from suite.diagnose.thresholds import THRESHOLDS
 
 SHORT_S, LONG_S = 0.5, LENGTH_S
@@ -113,7 +113,7 @@ def information(
     Arguments are those of `linearised`.
     """
     columns = columns_of(bool(sensors.voltage), names)
-    matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations().sums()
+    matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations.sums()
     return Information(columns, matrix)
 
 

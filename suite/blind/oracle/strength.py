@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS, nameable_effects
+from eval.flights.simulate import SENSORS, fly, log_of
+from eval.flights.trajectory import long_flights, ordinary_flights
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.oracle.information import (
@@ -28,8 +30,6 @@ from suite.blind.oracle.information import (
     information,
 )
 from suite.common.console import Console
-from suite.diagnose.plans.simulate import SENSORS, fly, log_of
-from suite.diagnose.plans.trajectory import long_flights, ordinary_flights
 from tracks.common.files import write_json
 from tracks.common.provenance import stamp
 

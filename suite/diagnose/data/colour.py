@@ -58,7 +58,7 @@ class _Stretches(NamedTuple):
 
 
 class _Process(NamedTuple):
-    """Noise of unit variance, and a model's error besides."""
+    """Noise of unit variance, and a model's error."""
 
     share: float
     """Of the noise, that is coloured."""
@@ -91,7 +91,7 @@ def measured_noise(
     coloured = {}
     for name in parts if np.max(gains) >= limits.colour_gain else ():
         process, _ = tried[name][int(gains.argmax())]
-        energy, freedom, _ = _beside_polynomial(parts[name], process)
+        energy, freedom, _ = _without_polynomial(parts[name], process)
         sigma[SLICES[name]] = np.sqrt(typical_variance(energy.reshape(-1, 3), freedom))
         coloured[name] = (process.share, process.lasts_s)
     return Noise(at_least(sigma, limits), coloured)
@@ -115,7 +115,7 @@ def left_as_noise(
         rows = len(stretches.time_s)
         bare = stretches._replace(powers=np.zeros((rows, 0)), drift=np.zeros((rows, rows)))
         process, _ = max(_by_time(bare, limits, LEFT_S), key=lambda one: one[1])
-        energy, freedom, _ = _beside_polynomial(bare, process)
+        energy, freedom, _ = _without_polynomial(bare, process)
         channels = SLICES[name]
         width = channels.stop - channels.start
         sigma[channels] = np.sqrt((energy.reshape(-1, width) / freedom).mean(axis=0))
@@ -210,7 +210,7 @@ def _drift(time_s: np.ndarray, integrated: int) -> np.ndarray:
     return early if integrated == 1 else np.zeros_like(early)
 
 
-def _beside_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
+def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
     """Return the energy (V * C,) off the polynomial, its freedom, and half a log-determinant.
 
     Rows are whitened by `process` first.
@@ -232,7 +232,7 @@ def _likelihood(stretches: _Stretches, process: _Process) -> float:
 
     Every stretch has its own noise variance, so that a few bad ones do not dominate.
     """
-    energy, freedom, spread = _beside_polynomial(stretches, process)
+    energy, freedom, spread = _without_polynomial(stretches, process)
     size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
     return -float((spread + size).sum())
 

@@ -85,7 +85,7 @@ def ready(
     for log, one in zip(logs, rotors, strict=True):
         if one is None:
             needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
-            raise ValueError(f"{log.name}: nothing says how its rotors turned; it needs {needs}")
+            raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
     acting = [one for one in rotors if one is not None]
     whole = [on_every_row(completed(log), limits) for log in posed(logs)]
     rows = [
@@ -150,7 +150,7 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
     flight = calibrated(flight, turned, noisy)
     step_s = float(np.median(np.diff(flight.rows.time_s)))
     between = 1.0 + torque_between_rows(vehicle, step_s)
-    return flight._replace(credible=flight.credible * between)
+    return flight._replace(reliability=flight.reliability * between)
 
 
 def parted(
@@ -174,7 +174,7 @@ def parted(
     until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
         whole = flights.smoothed[view.name][0]
-        rows, credible = whole.rows, whole.credible
+        rows, reliability = whole.rows, whole.reliability
         early = rows.time_s <= until_s
         for part, chosen in ((first, early), (last, ~early)):
             some = smoothed(view, _only(rows, chosen), limits)
@@ -182,7 +182,7 @@ def parted(
                 raise ValueError(
                     f"{flights.names[0]}: too short to hold a part of it out; fly longer"
                 )
-            part[view.name] = [some._replace(credible=credible)]
+            part[view.name] = [some._replace(reliability=reliability)]
     return first, last
 
 
@@ -194,13 +194,13 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
     """Return the noise (3,) of the measured accelerations, by that of neighbouring rows."""
     power = []
     for flight in flights:
-        felt_w = flight.rows.felt_w if view.in_world else None
+        imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
         path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
-        series = np.asarray(path if felt_w is None else felt_w)[np.asarray(flight.rows.good)]
+        series = np.asarray(path if imu_acc_w is None else imu_acc_w)[np.asarray(flight.rows.good)]
         bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
         # The median ignores the occasional steps of a filter or an estimator.
         sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
-        weights = flight.form.change if felt_w is None else flight.form.mean
+        weights = flight.form.change if imu_acc_w is None else flight.form.mean
         gain = weights.power(2).sum(axis=1).mean()
         power.append(sigma**2 * gain)
     floor = np.sqrt(np.mean(power, axis=0))
@@ -223,7 +223,7 @@ def completed(log: FlightLog) -> FlightLog:
     if isinstance(log, InertialLog):
         return log
     if "pos" in log.partial and "rate" in log.partial:
-        raise ValueError(f"{log.name}: no position and no gyro: nothing says how it moved")
+        raise ValueError(f"{log.name}: no position and no gyro: no signal shows its motion")
     if "pos" in log.partial:
         level, still = np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1)), 0.0 * log.rate_b
         return replace(log, pos_w=still, vel_w=still, quat_wxyz=level)

@@ -49,7 +49,7 @@ HIGH_M = 1000.0
 """Height of the start: nothing near."""
 UNSEEN = (
     "position, heading and height: wind, ground, and faults of pose or velocity",
-    "the accelerometer's own scale, which looks like thrust over mass",
+    "the accelerometer's own scale, which has the same effect as thrust over mass",
 )
 """What a flight without a pose does not show, in words."""
 
@@ -64,7 +64,7 @@ def is_inertial(log: FlightLog) -> bool:
 class InertialLog(FlightLog):
     """A flight whose pose is by inertia."""
 
-    sway_b: np.ndarray | None = None
+    pose_slope_b: np.ndarray | None = None
     """(N, 3, K) how the drag's acceleration changes with what is not known of the pose, each by its
     standard deviation before the flight [m/s^2]."""
 
@@ -94,18 +94,18 @@ def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
     drag, noise = DRAG, FORCE_NOISE
     for _ in range(ROUNDS):
         hessian, gradient = np.diag(DRAG_PRIOR**-2), (DRAG - drag) / DRAG_PRIOR**2
-        asked = []
+        eliminated = []
         for piece in (one for pieces in flights for one in pieces):
             design, left = piece.sides(drag, noise)
             own, shared = design[:, :12], np.column_stack([left, design[:, 12:]])
             to_own = np.linalg.lstsq(own, shared, rcond=None)[0]
-            # What its own numbers do not explain is said of the drag that all share.
+            # What its own numbers do not explain is information on the drag that all share.
             rest = shared - own @ to_own
             hessian = hessian + rest[:, 1:].T @ rest[:, 1:]
             gradient = gradient + rest[:, 1:].T @ rest[:, 0]
-            asked.append((piece, to_own))
+            eliminated.append((piece, to_own))
         change = np.maximum(np.linalg.solve(hessian, gradient), -drag)
-        for piece, to_own in asked:
+        for piece, to_own in eliminated:
             piece.numbers = piece.numbers + to_own[:, 0] - to_own[:, 1:] @ change
         drag = drag + change
         for pieces in flights:
@@ -141,7 +141,7 @@ def _pieces(log: FlightLog) -> list[_Piece]:
 def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> InertialLog:
     """Return `log` with the pose of its `pieces`, which share the row between two of them."""
     rot_w, vel_w = np.empty((len(log.time_s), 3, 3)), np.zeros((len(log.time_s), 3))
-    sway_b = np.zeros((len(log.time_s), 3, 12 * len(pieces)))
+    pose_slope_b = np.zeros((len(log.time_s), 3, 12 * len(pieces)))
     first = 0
     for k, piece in enumerate(pieces):
         part = slice(first, first + len(piece.time_s))
@@ -150,13 +150,13 @@ def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> Inerti
         slopes = np.swapaxes(rot_w[part], 1, 2) @ piece.slopes(rot_w[part])
         usual = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
         along = np.append(usual, usual.mean())[:, None]
-        sway_b[part, :, 12 * k : 12 * k + 12] = -along * slopes * piece.prior
+        pose_slope_b[part, :, 12 * k : 12 * k + 12] = -along * slopes * piece.prior
     pos_w = np.zeros_like(vel_w)
     pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(log.time_s)[:, None], axis=0)
     pos_w[:, 2] += HIGH_M
     quat = np.asarray(rot_to_quat(rot_w))
     about = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
-    return InertialLog(**{**about, "velocity_derived": False}, sway_b=sway_b)
+    return InertialLog(**{**about, "velocity_derived": False}, pose_slope_b=pose_slope_b)
 
 
 class _Piece:

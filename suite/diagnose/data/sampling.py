@@ -210,7 +210,7 @@ class StepGrid(NamedTuple):
 
     edge_s: np.ndarray
     """(T + 1,) ends of steps [s]."""
-    look_s: np.ndarray
+    sample_s: np.ndarray
     """(T,) until the rate loop's next sample; 0 where it takes none at the step's start [s]."""
     lead_s: np.ndarray
     """(T,) mean delay of the vehicle's samples after those of the steps [s]."""
@@ -227,7 +227,7 @@ def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) 
     row_s = np.asarray(row_s, dtype=float)
     spacing = np.diff(row_s)
     kept = _kept(row_s, 0.75 * longest_s)
-    # The rates that the loop knows are old by this, as the mean over a row.
+    # Mean age of the loop's rates over a row.
     whole = np.floor(spacing / period_s + 1e-6)
     rest = np.maximum(spacing - whole * period_s, 0.0)
     old = np.add.reduceat(0.5 * (whole * period_s**2 + rest**2), kept[:-1])
@@ -275,11 +275,11 @@ def integral_of_held(time: np.ndarray, command: np.ndarray) -> np.ndarray:
 
 def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
     """Return `grid` padded to `count` steps with steps of zero length, which have no influence."""
-    missing = count - len(grid.look_s)
+    missing = count - len(grid.sample_s)
     ends = (missing, 0) if at_front else (0, missing)
     return StepGrid(
         np.pad(grid.edge_s, ends, mode="edge"),
-        np.pad(grid.look_s, ends),
+        np.pad(grid.sample_s, ends),
         np.pad(grid.lead_s, ends),
     )
 
@@ -328,7 +328,7 @@ def rotors_at(
 def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
     """Return the share (3,) of the rotors' torque that rows `step_s` [s] apart do not show.
 
-    A rate loop that samples more often than the log has rows asks for less as the body turns: the
+    A rate loop that samples more often than the log has rows commands less as the body turns: the
     slope of an angular acceleration `a` falls by `gain * step * a / lag` from a row to the next,
     and the trapezoid misses `step / 12` of that fall (Euler and Maclaurin). Where rows are further
     apart than the lag, rotors settle between them: without any lag half of the fall is missed.

@@ -42,9 +42,9 @@ class FlightRows(NamedTuple):
     """(N,) battery voltage at the start less the present one [V]; zeros without a voltage."""
     good: Array
     """(N,) bool: all signals are there."""
-    felt_w: Array | None = None
+    imu_acc_w: Array | None = None
     """(N, 3) acceleration by the accelerometer, in flights without a pose [m/s^2]."""
-    sway_b: Array | None = None
+    pose_slope_b: Array | None = None
     """(N, 3, K) change of the drag by each uncertainty of such a flight's pose [m/s^2]."""
 
     @property
@@ -68,11 +68,11 @@ def rows_of(
     parts = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
     good = np.isfinite(np.concatenate(parts, axis=1)).all(axis=1)
     good &= np.isfinite(rot_w).all(axis=(1, 2))
-    felt_w = specific_force_w(log)
-    if felt_w is not None:
-        good &= np.isfinite(felt_w).all(axis=1)
-        felt_w = np.nan_to_num(felt_w)
-    sway_b = log.sway_b if isinstance(log, InertialLog) else None
+    imu_acc_w = specific_force_w(log)
+    if imu_acc_w is not None:
+        good &= np.isfinite(imu_acc_w).all(axis=1)
+        imu_acc_w = np.nan_to_num(imu_acc_w)
+    pose_slope_b = log.pose_slope_b if isinstance(log, InertialLog) else None
     push = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
     stands = (push < limits.ground_thrust * vehicle.mass * GRAVITY) & (
         np.linalg.norm(log.vel_w, axis=1) < limits.ground_speed
@@ -85,7 +85,9 @@ def rows_of(
     pos_w, vel_w, rate_b, speed = (np.nan_to_num(part) for part in parts)
     rot_w = np.where(np.isfinite(rot_w), rot_w, np.eye(3))
     since = log.time_s - log.time_s[0]
-    return FlightRows(since, pos_w, rot_w, vel_w, rate_b, speed, drop, good, felt_w, sway_b)
+    return FlightRows(
+        since, pos_w, rot_w, vel_w, rate_b, speed, drop, good, imu_acc_w, pose_slope_b
+    )
 
 
 def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:
@@ -135,7 +137,7 @@ class SmoothedFlight(NamedTuple):
     form: WeakForm
     measured: np.ndarray
     """(M, 3) mean accelerations, axes as the view's model has them."""
-    credible: np.ndarray = np.ones(3)
+    reliability: np.ndarray = np.ones(3)
     """(3,) factor on the model's changes within the flight: the share of the rotors' torque that is
     not noise, and a correction for what happens between rows."""
 
@@ -143,8 +145,8 @@ class SmoothedFlight(NamedTuple):
 def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
     """Return a flight's measured accelerations in `view`."""
     form = weak_form(rows.time_s, rows.good, view.width_s, limits.longest_hole_s)
-    if view.in_world and rows.felt_w is not None:
-        return SmoothedFlight(rows, form, form.mean @ rows.felt_w)
+    if view.in_world and rows.imu_acc_w is not None:
+        return SmoothedFlight(rows, form, form.mean @ rows.imu_acc_w)
     measured = form.change @ (rows.vel_w if view.in_world else rows.rate_b)
     return SmoothedFlight(rows, form, measured)
 
@@ -166,7 +168,7 @@ def calibrated(flight: SmoothedFlight, turned: np.ndarray, noise: np.ndarray) ->
         return flight
     whole = np.var(mean @ turned, axis=0)
     share = np.mean((mean @ noise) ** 2, axis=0) / np.maximum(whole, 1e-12)
-    return flight._replace(credible=np.maximum(1.0 - share, 0.0))
+    return flight._replace(reliability=np.maximum(1.0 - share, 0.0))
 
 
 class WeakForm(NamedTuple):

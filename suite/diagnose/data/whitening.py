@@ -49,9 +49,9 @@ class Whitening(NamedTuple):
     upper: np.ndarray
     """(W, F, F) from the start to `start`'s coordinates."""
     slow: np.ndarray
-    """(W, 12, N, L) unit slow errors of pose, velocity and rates, channel by channel."""
+    """(W, 19, N, L) unit slow errors, channel by channel."""
     slow_freedom: np.ndarray
-    """(W, 12) expected energy along them where there is noise only, by channel."""
+    """(W, 19) expected energy along them where there is noise only, by channel."""
     filters: Mapping[str, np.ndarray]
     """(W, N, N) by group of channels whose noise has a colour: from rows over their noise to
     independent ones."""
@@ -82,9 +82,9 @@ def make_whitening(
     time = 2.0 * np.asarray(windows.row_s)[..., None] - 1.0
     degrees = range(limits.slow_degree + 1)
     power = np.concatenate([eval_legendre(degree, time) for degree in degrees], axis=-1)
-    slow = np.moveaxis((weight[..., :STATE] > 0)[..., None] * power[:, :, None], 1, 2)
+    slow = np.moveaxis((weight > 0)[..., None] * power[:, :, None], 1, 2)
     slow = slow / np.maximum(np.linalg.norm(slow, axis=2, keepdims=True), 1e-9)
-    inside = start[:, : rows * channels].reshape(count, rows, channels, size)[:, :, :STATE]
+    inside = start[:, : rows * channels].reshape(count, rows, channels, size)
     taken = np.moveaxis(inside, 1, 3) @ slow
     slow_freedom = (slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))
     return Whitening(weight, prior, start, upper, slow, slow_freedom, filters)
@@ -153,11 +153,11 @@ def project_out_start(whitening: Whitening, white: np.ndarray) -> np.ndarray:
 
 
 def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
-    """Return the energy of slow errors (W, 12) in a block's `residual` (W, M), by channel.
+    """Return the energy of slow errors (W, 19) in a block's `residual` (W, M), by channel.
 
     What the start explains is out of the residual, so the slow errors need not be freed of it.
     """
-    rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)[..., :STATE]
+    rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)
     along = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
     return (along**2).sum(axis=2)
 

@@ -84,7 +84,7 @@ class FlightWindows(NamedTuple):
     """(W,) since the first row of the flight [s]."""
     edge_s: Array
     """(W, Q + S + 1) ends of steps; edge Q is the window's start [s]."""
-    look_s: Array
+    sample_s: Array
     """(W, Q + S) and `lead_s`, as `StepGrid` has them [s]."""
     lead_s: Array
     command_s: Array
@@ -296,8 +296,8 @@ def _of_one_shape(drives: Sequence[_Drive], like: FlightWindows | None) -> list[
         fitting = [size for size in sizes if size >= count]
         return fitting[0] if fitting else -(-count // sizes[0]) * sizes[0]
 
-    burn_in = most((len(d.burn_in.look_s) for d in drives), BURN_IN_STEPS)
-    steps = most((len(d.window.look_s) for d in drives), STEPS)
+    burn_in = most((len(d.burn_in.sample_s) for d in drives), BURN_IN_STEPS)
+    steps = most((len(d.window.sample_s) for d in drives), STEPS)
     commands = most((len(d.command_s) for d in drives), COMMANDS)
     if like is not None:
         burn_in, steps = like.burn_in_rate_b.shape[1], like.rotor_speed.shape[1]
@@ -373,7 +373,7 @@ def _window(
         np.asarray(number),
         np.asarray(begin - time[0]),
         np.concatenate([before.edge_s[:-1], window.edge_s]),
-        np.concatenate([before.look_s, window.look_s]),
+        np.concatenate([before.sample_s, window.sample_s]),
         np.concatenate([before.lead_s, window.lead_s]),
         drive.command_s,
         drive.command,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -47,8 +48,9 @@ class Block:
     free_slope: np.ndarray
     """(B, F, K) by how much that change falls for a unit change of each number."""
 
+    @cached_property
     def equations(self) -> NormalEquations:
-        """Return the sums that a fit needs."""
+        """The sums that a fit needs."""
         return NormalEquations(
             *products(self.slope, self.residual[..., None]),
             (self.residual**2).sum(axis=1),

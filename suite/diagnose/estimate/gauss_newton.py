@@ -112,7 +112,7 @@ def fit(
     low, high = space.array("low")[at], space.array("high")[at]
     best, block = start, known or evidence.linearise(start, indices)
     for done in range(limits.fit_rounds if rounds is None else rounds):
-        equations = block.equations().along_numbers(indices)
+        equations = block.equations.along_numbers(indices)
         change, promised = gauss_newton_step(equations, best.theta, space)
         # What is free moves as well, at least once.
         if promised < limits.converged and (done or not block.free.shape[1]):
@@ -177,7 +177,7 @@ def intervals95(
         leave_out: stretches are left out in turn, too (CR3): a stretch with much information fits
             itself. With few of them their spread is itself not well known (Bell & McCaffrey 2002).
         noise_share: share of the interval by curvature below which no interval is.
-        prior: (K,) information on each number besides the flights', as of one that was held.
+        prior: (K,) information on each number in addition to the flights', as of a fixed one.
     """
     count, size = equations.gradient.shape
     if not size:

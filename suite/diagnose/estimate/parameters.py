@@ -116,9 +116,8 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
     for name in vehicle.effects:
         if EFFECTS[name].start is not None:
             raise ValueError(
-                f"{vehicle.name}: effects.{name} has a motion of its own, and no log says how it "
-                "moves where a stretch of a flight begins; take it out of the vehicle file here "
-                "and put it back to fly"
+                f"{vehicle.name}: effects.{name} has a motion of its own, and no log holds it at "
+                "the start of a stretch; remove it from the vehicle file here, put it back to fly"
             )
 
 
@@ -159,11 +158,11 @@ def with_fitted(
     space: ParameterSpace,
     theta: np.ndarray,
     names: Collection[str],
-    besides: Mapping[str, Any] | None = None,
+    further: Mapping[str, Any] | None = None,
 ) -> Vehicle:
     """Return `vehicle` with the effects `names` at `theta` (P,) in place of what it has of them.
 
-    `besides` are values of further effects by name.
+    `further` are values of other effects by name.
     """
     fitted, effects = space.effects(theta), dict(vehicle.effects)
     for name in set(names):
@@ -171,7 +170,7 @@ def with_fitted(
         effects[name] = type(fitted[name])(
             *(tuple(v.tolist()) if v.ndim else float(v) for v in values)
         )
-    effects |= besides or {}
+    effects |= further or {}
     ordered = {name: effects[name] for name in EFFECTS if name in effects}
     return replace(vehicle, effects=MappingProxyType(ordered))
 
@@ -265,6 +264,6 @@ def _parameter(entry: FittedNumber) -> Parameter:
 
 
 def _neutral(entry: FittedNumber) -> float:
-    """Return the value with which nothing acts; that of the file where it hangs on the vehicle."""
+    """Return the value with which nothing acts; the file's where it depends on the vehicle."""
     neutral = _parameter(entry).neutral
     return entry.start if callable(neutral) else float(neutral)

@@ -55,8 +55,8 @@ def score_candidates(
     scale = space.array("step")[along]
     low, high = ((space.array(end) - theta)[along] / scale for end in ("low", "high"))
     hessian, gradient = equations.hessian * np.outer(scale, scale), equations.gradient * scale
-    told, columns = np.einsum("wjj->j", hessian), equations.columns_of
-    seen = [c for c in among if told[list(columns(c))].sum() > 1e-9]
+    informed, columns = np.einsum("wjj->j", hessian), equations.columns_of
+    seen = [c for c in among if informed[list(columns(c))].sum() > 1e-9]
     groups = [tuple(sorted({*named, *columns(c)})) for c in seen]
     gains, p_values, chance = permutation_test(
         hessian, gradient, groups, tuple(named), fold, seed, (low, high), limits
@@ -129,7 +129,7 @@ def permutation_test(
     rng = np.random.default_rng(seed)
     if len(fold) >= limits.few_windows:
         best = max(falls)
-        share = limits.alike_share if best > limits.loud_gain else 1.0
+        share = limits.alike_share if best > limits.strong_gain else 1.0
         alike = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
         at = sorted({column for group in alike for column in group})
         left = gradient - hessian[:, :, at] @ change(hessian.sum(0), gradient.sum(0), at)

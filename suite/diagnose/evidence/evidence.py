@@ -56,10 +56,6 @@ class Evidence(ABC):
         del at, block
         return None
 
-    def compared(self) -> Evidence:
-        """Return the evidence with which the search compares the fits of candidates."""
-        return self
-
     @property
     def draws(self) -> float:
         """`differ_p` of `intervals95`: 1 if each flight is one random draw, 0 if not."""

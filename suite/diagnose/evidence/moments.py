@@ -41,7 +41,7 @@ CHUNK = 1024
 """Rows a call: one shape, compiled once."""
 
 
-FELT = FlightRows._fields.index("felt_w")
+IMU_ACC = FlightRows._fields.index("imu_acc_w")
 """Fields of rows from here on are no input of a model."""
 
 
@@ -78,7 +78,7 @@ class ForceModel:
         with jax.enable_x64(True):
             for first in range(0, count, CHUNK):
                 at = np.minimum(np.arange(first, first + CHUNK), count - 1)
-                part = FlightRows(*(np.asarray(field)[at] for field in rows[:FELT]))
+                part = FlightRows(*(np.asarray(field)[at] for field in rows[:IMU_ACC]))
                 made = [self._compiled(self._given, theta, part, group) for group in directions]
                 values.append(np.asarray(made[0][0])[: count - first])
                 slope = np.concatenate([np.asarray(each) for _, each in made], axis=-1)
@@ -134,7 +134,7 @@ class ViewData(NamedTuple):
     """(M, 3) measured - model, body axes."""
     slope: np.ndarray
     """(M, 3, K) of the model along numbers."""
-    sway: np.ndarray
+    pose_slope: np.ndarray
     """(M, 3, L) what is not known of the pose makes of the model, by standard deviations; L may be
     0."""
 
@@ -168,34 +168,38 @@ def compare(
         value = mean @ forces.value[:, view.columns]
         slope = forces.slope[:, view.columns]
         slope = (mean @ slope.reshape(len(slope), -1)).reshape(count, *slope.shape[1:])
-        value, slope = (_believed(part, flight.credible) for part in (value, slope))
+        value, slope = (_attenuated(part, flight.reliability) for part in (value, slope))
         residual = flight.measured - value
         if view.in_world:
             to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
             residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
             slope = to_body @ slope
-        dumb = [axis for axis in range(3) if axis not in view.axes]
-        residual[:, dumb], slope[:, dumb] = 0.0, 0.0
-        sway_b = flight.rows.sway_b if view.in_world else None
-        sway = np.zeros((count, 3, 0))
-        if sway_b is not None:
-            sway = (mean @ sway_b.reshape(len(sway_b), -1)).reshape(count, 3, -1)
-        about = (flight.form.middle_s, value, residual, slope, sway)
+        unseen = [axis for axis in range(3) if axis not in view.axes]
+        residual[:, unseen], slope[:, unseen] = 0.0, 0.0
+        pose_slope_b = flight.rows.pose_slope_b if view.in_world else None
+        pose_slope = np.zeros((count, 3, 0))
+        if pose_slope_b is not None:
+            pose_slope = (mean @ pose_slope_b.reshape(len(pose_slope_b), -1)).reshape(count, 3, -1)
+        about = (flight.form.middle_s, value, residual, slope, pose_slope)
         parts.append(ViewData(np.full(count, number), *about))
-    widest = max(part.sway.shape[2] for part in parts)
+    widest = max(part.pose_slope.shape[2] for part in parts)
     parts = [
-        part._replace(sway=np.pad(part.sway, ((0, 0), (0, 0), (0, widest - part.sway.shape[2]))))
+        part._replace(
+            pose_slope=np.pad(
+                part.pose_slope, ((0, 0), (0, 0), (0, widest - part.pose_slope.shape[2]))
+            )
+        )
         for part in parts
     ]
     return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
-def _believed(series: np.ndarray, credible: np.ndarray) -> np.ndarray:
-    """Return `series` (M, 3, ...), its changes about the mean multiplied by `credible` (3,)."""
-    if not len(series) or (credible == 1.0).all():
+def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
+    """Return `series` (M, 3, ...), its changes about the mean multiplied by `reliability` (3,)."""
+    if not len(series) or (reliability == 1.0).all():
         return series
     mean = series.mean(axis=0)
-    return mean + credible.reshape(3, *[1] * (series.ndim - 2)) * (series - mean)
+    return mean + reliability.reshape(3, *[1] * (series.ndim - 2)) * (series - mean)
 
 
 def means_of(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
@@ -256,10 +260,10 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
         share = 1.0 - np.sqrt(own / (own + weights.trim**2))
         residual[rows] -= share * residual[rows].mean(axis=0)
         slope[rows] -= share[:, None] * slope[rows].mean(axis=0)
-        if data.sway.any():
+        if data.pose_slope.any():
             unit = weights.scatter * np.sqrt(weights.memory)
-            residual[rows], slope[rows] = _steadied(
-                residual[rows], slope[rows], data.sway[rows], unit
+            residual[rows], slope[rows] = _pose_whitened(
+                residual[rows], slope[rows], data.pose_slope[rows], unit
             )
     if weights.base is not None:
         # Where flights' means hold no information this is 0.
@@ -271,16 +275,18 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
     return residual / unit, slope / unit[:, None]
 
 
-def _steadied(
-    residual: np.ndarray, slope: np.ndarray, sway: np.ndarray, unit: np.ndarray
+def _pose_whitened(
+    residual: np.ndarray, slope: np.ndarray, pose_slope: np.ndarray, unit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return residual (M, 3) and slope (M, 3, P) of one flight as if its pose were known.
 
-    What is not known of it is a random effect: whatever `sway` (M, 3, L) is large along counts less
-    (whitening by the inverse root of `1 + sway sway'`, in units (3,) of the noise).
+    Its errors are random effects: directions along which `pose_slope` (M, 3, L) is large count less
+    (whitening by the inverse root of `1 + pose_slope pose_slope'`, in units (3,) of the noise).
     """
     count = residual.size
-    basis, size, _ = np.linalg.svd((sway / unit[:, None]).reshape(count, -1), full_matrices=False)
+    basis, size, _ = np.linalg.svd(
+        (pose_slope / unit[:, None]).reshape(count, -1), full_matrices=False
+    )
     less = 1.0 / np.sqrt(1.0 + size**2) - 1.0
 
     def steady(values: np.ndarray) -> np.ndarray:
@@ -333,10 +339,10 @@ def fast_share(
 ) -> tuple[float, float]:
     """Return which share of a named effect fast changes confirm, and the uncertainty of that share.
 
-    Motors answer what disturbs the body. A controller that holds it still against a slow torque
-    makes the motors' torque look like one that turns nothing, as if inertia were larger or thrust
-    less. Where the equations are right, what changes from one moment to the next shows the same
-    numbers as the whole does (a specification test; Hausman 1978, doi 10.2307/1913827).
+    Motors compensate what disturbs the body. Where a controller balances a slow torque, the
+    motors' torque causes no rotation, as with a larger inertia or less thrust. Where the equations
+    are right, changes from one moment to the next give the same numbers as all moments do (a
+    specification test; Hausman 1978, doi 10.2307/1913827).
 
     Args:
         data: with the name in the model.
@@ -350,7 +356,7 @@ def fast_share(
     """
     fast = changes_of(data)
     fast = fast._replace(slope=(fast.slope[..., list(columns)] @ away)[..., None])
-    block = block_of(fast, weights_of(fast, limits), stretch_of(fast, limits), [0]).equations()
+    block = block_of(fast, weights_of(fast, limits), stretch_of(fast, limits), [0]).equations
     hessian, gradient = block.sums()
     share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
     return share, float(intervals95(block).half_width[0])

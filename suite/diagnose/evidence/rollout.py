@@ -56,8 +56,8 @@ def fly_windows(
         feedback: what pushes in place of `push`.
     """
     burn_in = windows.burn_in_rate_b.shape[1]
-    edge_s, look_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.look_s)
-    spans = Steps(jnp.diff(edge_s), look_s > 0.0, jnp.asarray(windows.lead_s))
+    edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
+    spans = Steps(jnp.diff(edge_s), sample_s > 0.0, jnp.asarray(windows.lead_s))
     spans, command = jax.tree.map(
         lambda field: jnp.swapaxes(field, 0, 1), (spans, _acting(windows, plant.constants.delay))
     )
@@ -176,8 +176,8 @@ def _acting(windows: FlightWindows, delay: Any) -> Any:
     """
     since_s = jnp.asarray(windows.edge_s)[:, :-1] - delay
     # Where the loop takes no sample any command will do, but for the first: rotors begin with it.
-    look_s = jnp.asarray(windows.look_s)
-    held = jnp.where(look_s > 0.0, look_s, LONGEST_S)
+    sample_s = jnp.asarray(windows.sample_s)
+    held = jnp.where(sample_s > 0.0, sample_s, LONGEST_S)
 
     def integral(at_s: Any, time_s: Any, command: Any, total: Any) -> Any:
         # At a row's own time the command before it: a delay can only grow from none.

@@ -103,8 +103,9 @@ class RolloutEvidence(Evidence):
         return super().share(now, at, then, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        """Return the energy (W, 12) of slow errors in `block`, and what noise gives of it."""
-        return slow_energy(self.whitening, block.residual), self.whitening.slow_freedom
+        """Return the energy (W, 12) of slow errors of the state, and what noise gives of it."""
+        energy = slow_energy(self.whitening, block.residual)
+        return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
     def _everything(self, at: Estimate) -> Linearisation:
         return self.model.linearise(at.theta, at.free, self.windows, None)
@@ -188,7 +189,7 @@ def least_left(
     def left(chi2: float) -> float:
         return chi2 / max(int(np.asarray(evidence.trusted.seen).sum()), 1)
 
-    equations = block.equations()
+    equations = block.equations
     some = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
     start = model.space.array("start")
     _, fall = gauss_newton_step(equations.take(some), start, model.space)

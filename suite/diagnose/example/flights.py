@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from eval.effects.body import ComOffset
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import with_effects
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 
 FOLDER = Path(__file__).parent
 VEHICLE = FOLDER / "vehicle.toml"

@@ -18,7 +18,7 @@ from suite.diagnose.data.view import WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.fit import Z95, Fitted, Known, Rows, Unknown, fit
-from suite.diagnose.identify.grid import FELT, LEANING, ROTOR_NOISE, FlightGrid
+from suite.diagnose.identify.grid import IMU_ACC, LEANING, ROTOR_NOISE, FlightGrid
 
 WIDTH_S = 0.4
 BLOCK_S = 2.0
@@ -91,7 +91,7 @@ def together(
 
 def _force(flight: FlightGrid, driven: Driven) -> Residuals:
     pushes = PUSHES.get(driven.drive, "thrust_cmd")
-    moved = next(name for name in (FELT, "vel_w", "pos_w") if flight.has(name))
+    moved = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
     needs = (moved, pushes, LEANING if leaning else "rot_w")
     form, rows = flight.form(WIDTH_S, needs), flight.rows(turned=True)
@@ -99,7 +99,7 @@ def _force(flight: FlightGrid, driven: Driven) -> Residuals:
     if leaning:
         slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW
         form, path = form.take(slow), path.take(slow)
-    takes = path.mean if moved == FELT else path.change
+    takes = path.mean if moved == IMU_ACC else path.change
     measured = takes @ np.nan_to_num(flight.known[moved])
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
     axes = slice(2 if leaning else 0, 3)
@@ -165,8 +165,8 @@ def fit_torque(
 
     Noise in measured rotor speeds makes every slope smaller, by its share in the driving torque's
     variance (errors in variables; Fuller 1987, Sec. 1.1): the inertia would seem larger, the yaw
-    torque smaller. The model is believed without that share, which is known no better than to half
-    of itself. What stands at a limit is left as it was.
+    torque smaller. The model is multiplied by the remaining share (the reliability ratio); half of
+    the correction counts as its uncertainty. A number at a limit is left as it was.
 
     Args:
         flights: on their grids, with body rates.
@@ -187,13 +187,13 @@ def fit_torque(
         for flight in flights
     ]
     start = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
-    credible = _credible(flights, forms, driven, start)
-    unsure: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(credible), strict=True))
+    reliability = _reliability(flights, forms, driven, start)
+    unsure: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(reliability), strict=True))
     unknowns = [
         u._replace(floor=float(np.hypot(u.floor, Z95 * unsure.get(u.name, 0.0)))) for u in unknowns
     ]
     parts = zip(flights, forms, strict=True)
-    residuals = together([_torque(*part, driven, credible) for part in parts], unknowns, fixed)
+    residuals = together([_torque(*part, driven, reliability) for part in parts], unknowns, fixed)
     if any(unknown.name == "late" for unknown in unknowns):
         best = _likeliest(unknowns, residuals, forms, flights)
         unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
@@ -210,14 +210,16 @@ def fit_torque(
         held += beyond
 
 
-def _torque(flight: FlightGrid, form: WeakForm, driven: Driven, credible: np.ndarray) -> Residuals:
+def _torque(
+    flight: FlightGrid, form: WeakForm, driven: Driven, reliability: np.ndarray
+) -> Residuals:
     turned, rows = _turned(flight, form), flight.rows(turned=False)
 
     def residuals(numbers: Mapping[str, float]) -> Rows:
         _, turn_b = driven.acting(flight, rows, numbers)
-        if (credible < 1.0).any():
+        if (reliability < 1.0).any():
             _, alone_b = driven.acting(flight, rows, numbers, powered=False)
-            turn_b = alone_b + credible * (turn_b - alone_b)
+            turn_b = alone_b + reliability * (turn_b - alone_b)
         return Rows(turned - BAND * (form.mean @ turn_b), block_of(form), STILL)
 
     return residuals
@@ -227,7 +229,7 @@ def _turned(flight: FlightGrid, form: WeakForm) -> np.ndarray:
     return np.asarray(BAND * (form.change @ np.nan_to_num(flight.known["rate_b"])))
 
 
-def _credible(
+def _reliability(
     flights: Sequence[FlightGrid],
     forms: Sequence[WeakForm],
     driven: Driven,

@@ -58,8 +58,8 @@ def with_battery(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
 def with_motors(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
     """Return the vehicle with `[motors]`: full speed at full command where it had none.
 
-    Flights without a voltage give them an exponent of 0. With that the nominal voltage says
-    nothing, so that it may as well be the usual one of flights that have one.
+    Flights without a voltage give them an exponent of 0. The nominal voltage then has no effect;
+    it is set to the median voltage of the flights that have one.
     """
     motors = vehicle.motors
     if motors is None:
@@ -296,7 +296,7 @@ def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
 def unknown_to_the_fits(vehicle: Vehicle) -> Sequence[str]:
     """Return the effects of a start that no fit takes into account, and that stay in its file.
 
-    Force and torque know all that act by the state.
+    Force and torque model all effects that depend on the state.
     """
     known = (*OWN, *FITTED)
     unknown = {n for n, e in EFFECTS.items() if not e.by_state or e.late is not None}

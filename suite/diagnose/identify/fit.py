@@ -231,7 +231,7 @@ def _errors(
         return np.diag([unknown.room**2 for unknown in unknowns]), half
     taken = [names.index(name) for name in known.names]
     others = [k for k in range(total) if k not in taken]
-    equations = evidence.linearise(at).equations()
+    equations = evidence.linearise(at).equations
     prior = np.array([0.0 if k in free else 1.0 / unknowns[k].room ** 2 for k in others])
     found = intervals95(equations.take(others), DIFFER_P, True, BLIND, prior)
     most = np.array([np.inf if k in free else Z95 * unknowns[k].room for k in others])

@@ -73,7 +73,7 @@ def _step(task: ViewEvidence, found: SearchResult) -> float:
     last = found.last.evidence
     assert isinstance(last, ViewEvidence)
     then = replace(task, weights=last.weights)
-    hessian, gradient = then.linearise(then.at(theta), [at]).equations().sums()
+    hessian, gradient = then.linearise(then.at(theta), [at]).equations.sums()
     return float(gradient[0] / hessian[0, 0])
 
 

@@ -31,7 +31,7 @@ ROTOR_NOISE = "rotor_noise"
 as well."""
 LEANING = "leaning"
 """The attitude of the path, where none was measured."""
-FELT = "felt_w"
+IMU_ACC = "imu_acc_w"
 """The acceleration by the accelerometer, where no position was measured."""
 PATH_VELOCITY = "path_velocity"
 """The velocity of the path, where none was measured."""
@@ -88,14 +88,14 @@ class FlightGrid(NamedTuple):
 
 def grid_of(log: FlightLog) -> FlightGrid:
     """Return `log` on the grid."""
-    felt_w = specific_force_w(log)
+    imu_acc_w = specific_force_w(log)
     time_s = log.time_s - log.time_s[0]
     grid = np.arange(0.0, time_s[-1], STEP_S)
     known: dict[str, np.ndarray] = {}
     measured = {
         "pos_w": log.pos_w,
         "vel_w": None if log.velocity_derived else log.vel_w,
-        FELT: felt_w,
+        IMU_ACC: imu_acc_w,
         "rate_b": log.rate_b,
         "rotor_speed": log.rotor_speed,
     }

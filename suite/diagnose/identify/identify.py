@@ -60,7 +60,7 @@ from suite.diagnose.identify.numbers import (
 ROUNDS = 2
 """Force and torque in turn."""
 NO_LAG_S = 0.004
-"""A rotor's lag below this is not believed where the start has a longer one [s]."""
+"""A rotor's lag below this is rejected where the start has a longer one [s]."""
 
 
 @dataclass(frozen=True)
@@ -235,8 +235,8 @@ class _Start:
         source = self.fitted.get("rotors", self.fitted.get("torque"))
         known = source.as_known("late", "lag") if apart and source is not None else None
         wanted = [u for u in both if not apart or (known and u.name in known.names)]
-        besides = [*couplings(self.start), *air_torques(flown)]
-        unknowns = [*gains(), *besides, *wanted]
+        nuisance = [*couplings(self.start), *air_torques(flown)]
+        unknowns = [*gains(), *nuisance, *wanted]
         found = self.tried(
             "loop", lambda: fit_loop(flown, self.start, unknowns, self.lags(), known)
         )

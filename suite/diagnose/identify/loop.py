@@ -3,8 +3,8 @@
 The loop is flown by its commands alone and compared with the gyro (output error; Ljung 1999, Sec.
 4.3): measured rates in the loop's own equation would turn the gyro's noise into slower gains.
 Per axis, `lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`, where `e` is what is
-missed of `w x J w`, since the controller makes up for it by rotors that lag, and what moving air
-turns besides. It is that of the rates without it (one step of Picard's iteration); rotor speeds are
+missed of `w x J w`, since the controller compensates it by rotors that lag, and the torque of
+moving air. It is that of the rates without it (one step of Picard's iteration); rotor speeds are
 taken to change by little.
 """
 
@@ -34,7 +34,7 @@ def gains() -> list[Unknown]:
 def couplings(vehicle: Vehicle) -> list[Unknown]:
     """Return how much two axes' rates turn the third, `(J_z - J_y) / J_x` and so on.
 
-    They are of no use but for the others' sake: the inertia behind them may be wrong.
+    They are nuisance parameters: the inertia behind them may be wrong.
     """
     x, y, z = vehicle.inertia
     starts = ((z - y) / x, (x - z) / y, (y - x) / z)
@@ -45,7 +45,7 @@ def couplings(vehicle: Vehicle) -> list[Unknown]:
 def air_torques(flights: Sequence[FlightGrid]) -> list[Unknown]:
     """Return how much moving air turns the body, acceleration over speed (flapping) [1/(m s)].
 
-    They are of no use but for the others' sake, and none where the velocity is not known.
+    They are nuisance parameters; none where the velocity is not known.
     """
     if not all(flight.has("vel_w", "rot_w") for flight in flights):
         return []
@@ -114,7 +114,7 @@ def followed(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float])
         return out
 
     linear = answer(wanted, [[gain] for gain in gains])
-    # The controller makes up for `w x J w` by rotors that lag.
+    # The controller compensates `w x J w` by rotors that lag.
     products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
     coupled = products * [numbers[f"coupling_{axis}"] for axis in "xyz"]
     push = lagged(coupled, numbers["lag"]) - coupled

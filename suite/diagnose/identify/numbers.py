@@ -10,7 +10,7 @@ import numpy as np
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import UNSEEN
 from suite.diagnose.identify.fit import Z95, Fitted
-from suite.diagnose.identify.grid import FELT, FlightGrid
+from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
 
@@ -178,7 +178,7 @@ def not_attempted(
     def anywhere(*names: str) -> bool:
         return any(flight.has(*names) for flight in flights)
 
-    if anywhere(FELT):
+    if anywhere(IMU_ACC):
         lines += UNSEEN
     force = fitted.get("force")
     if force is None:

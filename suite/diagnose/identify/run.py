@@ -61,10 +61,10 @@ def identify_files(
     logs, slow = without_slow_rotors(logs)
     warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
-    if besides := unknown_to_the_fits(start):
+    if unknown := unknown_to_the_fits(start):
         warnings = [
             *warnings,
-            f"{start.name} has {', '.join(besides)} besides: the fits do not model them, so the "
+            f"{start.name} has {', '.join(unknown)}: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them",
         ]
     found = identify(logs, start, leave)

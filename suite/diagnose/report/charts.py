@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,6 @@ from suite.common.charts import png, titled
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.sources.source import Series
-from suite.diagnose.verdict.black_box import BlackBoxComparison
 from suite.diagnose.verdict.gap import Gap
 from suite.diagnose.verdict.rollout_gap import Rollouts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
@@ -66,7 +66,8 @@ def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, se
     """
     figure = Figure(figsize=(11.0, 3.4 if speed is not None else 2.0), layout="constrained")
     left, *others = figure.subplots(1, 1 if speed is None else 2, squeeze=False)[0]
-    _gap_bars(left, rows, seed)
+    bars = [(label, gap.rms, gap.ci95(seed), colour) for label, gap, colour in rows]
+    _gap_bars(left, bars, rows[0][1].floor)
     titled(left, "Gap on held-out flights; the dotted line is the noise floor")
     if speed is None:
         return png(figure)
@@ -82,40 +83,43 @@ def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, se
     return png(figure)
 
 
-def black_box_chart(sides: Sequence[BlackBoxComparison], seed: int) -> bytes:
-    """Return the gaps of the named effect and of the black box, for one or two comparisons."""
+def black_box_chart(sides: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return the gaps of the named effect and of the black box, for one or two comparisons.
+
+    `sides` are those of the JSON.
+    """
     figure = Figure(figsize=(11.0, 2.4), layout="constrained")
     for axes, side in zip(figure.subplots(1, 2), sides, strict=False):
-        colours = (BEFORE, AFTER, BOX)
-        rows = [(*row, colour) for row, colour in zip(labelled_gaps(side), colours, strict=True)]
-        _gap_bars(axes, [(label, gap, colour) for label, gap, colour in rows if gap], seed)
-        titled(axes, f"Gap on {side.judged_on}")
+        rows = [(label, one["gap"], one["ci95"], hue) for label, one, hue in labelled_gaps(side)]
+        _gap_bars(axes, rows, 1.0)
+        titled(axes, f"Gap on {side['judged_on']}")
     for axes in figure.axes[len(sides) :]:
         axes.set_axis_off()
     return png(figure)
 
 
-def labelled_gaps(side: BlackBoxComparison) -> list[tuple[str, Gap | None]]:
-    """Return what is compared, from top to bottom."""
-    return [
-        ("as given", side.before),
-        ("named effect", side.named),
-        ("Delta Action Model", side.black_box),
+def labelled_gaps(side: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], str]]:
+    """Return label, gap and colour of what is compared on a side, from top to bottom."""
+    rows = [
+        ("as given", side["before"], BEFORE),
+        ("named effect", side["named"], AFTER),
+        ("Delta Action Model", side["black_box"], BOX),
     ]
+    return [row for row in rows if row[1] is not None]
 
 
-def _gap_bars(axes: Axes, rows: Sequence[tuple[str, Gap, str]], seed: int) -> None:
-    """Draw gaps (label, gap, colour) with their 95 % intervals, from top to bottom."""
-    for place, (_, gap, colour) in enumerate(rows[::-1]):
-        low, high = gap.ci95(seed)
-        axes.plot([low, high], [place, place], color=colour, lw=2.5, solid_capstyle="butt")
-        axes.plot(gap.rms, place, "o", ms=7, color=colour)
-    axes.set_yticks(range(len(rows)), [label for label, _, _ in rows[::-1]])
+def _gap_bars(
+    axes: Axes, rows: Sequence[tuple[str, float, tuple[float, float], str]], floor: float
+) -> None:
+    """Draw gaps (label, gap, 95 % interval, colour) from top to bottom, and the noise floor."""
+    for place, (_, gap, between, colour) in enumerate(rows[::-1]):
+        axes.plot(between, [place, place], color=colour, lw=2.5, solid_capstyle="butt")
+        axes.plot(gap, place, "o", ms=7, color=colour)
+    axes.set_yticks(range(len(rows)), [label for label, *_ in rows[::-1]])
     axes.set_ylim(-0.6, len(rows) - 0.4)
-    floor = rows[0][1].floor
     axes.axvline(floor, color=FLOOR, lw=0.8, ls=":")
     axes.set_xscale("log")
-    most = max(gap.ci95(seed)[1] for _, gap, _ in rows)
+    most = max(between[1] for _, _, between, _ in rows)
     axes.set_xlim(0.8 * floor, 1.25 * max(1.5 * floor, most))
     _few_ticks(axes, "x")
 
@@ -135,13 +139,13 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
 
 def series_chart(series: Series) -> bytes:
     """Return a held-out stretch as measured and as simulated."""
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     axes = figure.subplots()
     axes.plot(series.time_s, series.measured, color=FLOOR, lw=1.6, label="measured")
     for (label, values), colour in zip(series.simulated.items(), (BEFORE, AFTER), strict=False):
         axes.plot(series.time_s, values, color=colour, lw=1.4, label=label)
     axes.set_xlabel("time [s]", fontsize=8)
-    axes.legend(fontsize=8, frameon=False, ncols=3)
+    figure.legend(fontsize=8, frameon=False, ncols=3, loc="outside lower center")
     titled(axes, series.label)
     return png(figure)
 

@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from suite.diagnose.plans.plan import advice
-from suite.diagnose.report.parameters_json import parameters_json, short_name
-from suite.diagnose.report.summary import answer
+from eval.effects import EFFECTS
+from suite.diagnose.diagnose import Diagnosis
+from suite.diagnose.estimate.parameters import ParameterSpace
+from suite.diagnose.plan import advice
+from suite.diagnose.report.summary import answer, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks
-from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.verdict.actuators import ActuatorMismatch
+from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from suite.diagnose.verdict.gap import Gap
 
 SIZES = ("force", "torque", "drift")
@@ -30,6 +31,7 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
     """Return what diagnosis.json has of the names and of the gap."""
     main, control = found.main, found.main.control
     limits = found.limits
+    swing = next((one.remaining.swing for one in found.findings if one.remaining.swing), None)
     entries: dict[str, Any] = {
         "verdict": found.label,
         "effects": effects_json(found),
@@ -58,6 +60,7 @@ def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
         "unexplained": {
             "share": found.verdict.share_left,
             "where": found.verdict.where,
+            "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
         "reference": list(found.references),
@@ -149,14 +152,74 @@ def _undecided(finding: Finding, ones: Sequence[NamedEffect]) -> list[int]:
     ]  # fmt: skip
 
 
+def parameters_json(
+    space: ParameterSpace,
+    name: str,
+    indices: Sequence[int],
+    theta: np.ndarray,
+    half_width: Mapping[int, float],
+    undecided: Sequence[int] = (),
+) -> dict[str, Any]:
+    """Return the parameters of the effect `name` as diagnosis.json has them.
+
+    Args:
+        space: of the vehicle.
+        name: of the effect.
+        indices: places of its numbers that were fitted, in order.
+        theta: (P,) all numbers.
+        half_width: of the 95 % intervals, by place.
+        undecided: places of its numbers that could stand in place of a fitted one.
+    """
+
+    def one(index: int) -> tuple[float, list[float]]:
+        entry = space.entries[index]
+        value, width = float(theta[index]), half_width[index]
+        return value, [max(value - width, entry.low), min(value + width, entry.high)]
+
+    found: dict[str, Any] = {}
+    for parameter in EFFECTS[name].parameters:
+        if parameter.one_at_a_time:
+            values = [one(i) for i in indices]
+            which = [_number(space, i) for i in indices]
+            lone = len(which) == 1
+            could = [*which, *(_number(space, i) for i in undecided)]
+            spans = [[min(could), max(could)]] if lone else [[k, k] for k in which]
+            found["index"] = {
+                "value": which[0] if lone else which,
+                "unit": "1",
+                "ci95": spans[0] if lone else spans,
+            }
+            found[parameter.name] = {
+                "value": values[0][0] if lone else [v for v, _ in values],
+                "unit": parameter.unit,
+                "ci95": values[0][1] if lone else [c for _, c in values],
+            }
+            continue
+        at = {space.entries[i].component: i for i in indices
+              if space.entries[i].parameter == parameter.name}  # fmt: skip
+        if not at:
+            continue
+        if parameter.size:
+            parts = [one(at[k]) if k in at else (None, None) for k in range(parameter.size)]
+            value, ci = [v for v, _ in parts], [c for _, c in parts]
+        else:
+            value, ci = one(at[None])
+        found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
+    return found
+
+
+def _number(space: ParameterSpace, index: int) -> int:
+    return (space.entries[index].component or 0) + 1
+
+
 def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:
     """Return the answer in a few sentences; `entries` is the rest of the JSON."""
     main, words = found.main, [answer(entries)]
     if found.named:
         source = main.source
         words.append(
-            f"The {source.subject} on held-out flights is {_figure(main.after.rms)} instead of "
-            f"{_figure(main.before.rms)} {source.unit}."
+            f"On held-out flights the {source.subject} falls from {_figure(main.before.rms)} to "
+            f"{_figure(main.after.rms)} {source.unit}."
         )
     words += [one.words or f"Named: {one.name}." for one in found.tested]
     if found.verdict.where:
@@ -169,18 +232,18 @@ def _figure(value: float) -> str:
     return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
-def checks_json(checks: Checks, seed: int) -> dict[str, Any]:
-    """Return the entries that `checks` add to diagnosis.json; `seed` is of the intervals' draws."""
-    black_box = checks.black_box
+def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
+    """Return the entry `actuators`: measured rotor speeds against commanded ones."""
+    return [{**one._asdict(), "followed": one.followed} for one in mismatches]
+
+
+def black_box_json(found: BlackBoxComparisons, seed: int) -> dict[str, Any]:
+    """Return the entry `black_box`; `seed` is of the intervals' draws."""
     return {
-        "actuators": [{**one._asdict(), "followed": one.followed} for one in checks.actuators],
-        "black_box": black_box
-        and {
-            "held_out": _comparison(black_box.held_out, seed),
-            "outside": black_box.outside and _comparison(black_box.outside, seed),
-            "split_m_s": black_box.split_m_s,
-            "seconds": black_box.seconds,
-        },
+        "held_out": _comparison(found.held_out, seed),
+        "outside": found.outside and _comparison(found.outside, seed),
+        "split_m_s": found.split_m_s,
+        "seconds": found.seconds,
     }
 
 

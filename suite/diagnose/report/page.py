@@ -9,9 +9,9 @@ from typing import Any
 from eval.effects import EFFECTS
 from suite.common.report import Details, Links, Part, Picture, Report, Section, Steps
 from suite.diagnose.data.windows import UNITS
+from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.estimate.composites import in_words
 from suite.diagnose.report.charts import series_chart
-from suite.diagnose.report.parameters_json import cells, components, grid, short_name
 from suite.diagnose.report.sections import (
     actuators_section,
     agreement_section,
@@ -22,11 +22,16 @@ from suite.diagnose.report.sections import (
     residual_section,
     rivals_section,
 )
-from suite.diagnose.report.summary import next_steps
-from suite.diagnose.verdict.checks import Checks
-from suite.diagnose.verdict.diagnosis import Diagnosis
+from suite.diagnose.report.summary import cells, components, grid, next_steps, short_name
 from tracks.common.grid import Cell, Grid
 
+TITLES = {
+    "no_gap": "no gap",
+    "named": "cause named",
+    "partly": "partly explained",
+    "unknown": "cause unknown",
+}
+"""By verdict."""
 FILES = (
     ("vehicle.toml", "the vehicle with what was named; every command takes it"),
     ("diagnosis.json", "all numbers of this page"),
@@ -45,29 +50,22 @@ CHANNELS = (
     "RMS errors on flights that took no part in finding or fitting anything. Noise floor: what the "
     "measurement noise alone gives, in rollouts that of the start and of the row compared. "
     "Repeatability: how far the means of flights of the unchanged vehicle lie apart. Closed: the "
-    "share of the variance within a flight that the names close; black box: what a regression "
-    "without any physics closes of it, fitted to the same flights."
+    "share of the variance within a flight that the named effects explain; black box: the share "
+    "that a regression without physics explains, fitted to the same flights."
 )
 
 
-def page(
-    diagnosis: Diagnosis,
-    found: Mapping[str, Any],
-    checks: Checks | None,
-    toml: str,
-    files: set[str],
-) -> Report:
+def page(diagnosis: Diagnosis, found: Mapping[str, Any], toml: str, files: set[str]) -> Report:
     """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
 
-    `checks` is None without rollouts, `toml` is the text of the vehicle file that was written, and
-    `files` lists which of `FILES` exist.
+    `toml` is the text of the vehicle file that was written, `files` lists which of `FILES` exist.
     """
-    gap, flights = found["gap"], diagnosis.flights
+    gap, flown = found["gap"], diagnosis.main.source.rollouts
+    after = f" → {gap['after']:.3g}" if found["effects"] else ""
     facts = {
-        "gap before": f"{gap['before']:.3g}",
-        "gap after": f"{gap['after']:.3g}",
+        "verdict": found["verdict"],
+        "gap on held-out flights": f"{gap['before']:.3g}{after} {diagnosis.main.source.unit}",
         "noise floor": f"{gap['noise_floor']:.3g}",
-        "unit": diagnosis.main.source.unit,
         "held out": _few(gap["held_out"]),
         "driven by": found["driven_by"],
         "took": f"{found['seconds']:.0f} s",
@@ -76,21 +74,21 @@ def page(
         facts["reference"] = f"{len(diagnosis.references)} flights"
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
-        *([logs_section(checks), noise_section(diagnosis)] if checks else []),
-        *(actuators_section(checks, flights.driven_by) if checks else []),
+        *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
+        *actuators_section(found),
         candidates_section(diagnosis),
         rivals_section(diagnosis, found),
         residual_section(found),
-        evidence_section(diagnosis, found, checks),
+        evidence_section(diagnosis, found),
         agreement_section(diagnosis),
     ]
     return Report(
-        title=f"Diagnosis: {found['verdict']}",
+        title=f"Diagnosis: {TITLES[found['verdict']]}",
         lead=found["headline"],
         facts=facts,
         sections=[
-            *_measured(diagnosis),
             Section("What to do next", [Steps(next_steps(found))]),
+            *_measured(diagnosis),
             *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
             *_findings(found.get("findings", ())),
             Section("The answer in numbers", _answer(found)),
@@ -129,7 +127,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
-    """Return the gap by channel; what no log measured has no row."""
+    """Return the gap by channel; a channel that no log measured has no row."""
     more = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
     every = [one for values in channels.values() for one in values.values()]
     shown = [key for key in more if any(key in one for one in every)]
@@ -152,7 +150,7 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
 
 
 def _answer(found: Mapping[str, Any]) -> list[Part]:
-    """Return the names, what they are and do, and their parameters."""
+    """Return the named effects, their equations and their parameters."""
     effects = found["effects"]
     if not effects:
         return ["Nothing was named: the vehicle file is as it was."]

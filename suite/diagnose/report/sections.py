@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from eval.logs.flight_log import FlightLog
 from suite.common.report import Details, Part, Picture, Section
 from suite.diagnose.data.windows import SLICES, UNITS
+from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.report.charts import (
     AFTER,
     BEFORE,
@@ -18,38 +20,43 @@ from suite.diagnose.report.charts import (
     gap_chart,
     labelled_gaps,
 )
-from suite.diagnose.report.parameters_json import cells, grid, short_name
+from suite.diagnose.report.summary import cells, grid, short_name
 from suite.diagnose.sources.rollout_source import of_rollouts
-from suite.diagnose.verdict.actuators import ActuatorMismatch
-from suite.diagnose.verdict.black_box import BlackBoxComparison
-from suite.diagnose.verdict.checks import Checks
-from suite.diagnose.verdict.diagnosis import Diagnosis
-from suite.diagnose.verdict.gap import Gap
 from tracks.common.grid import Cell, Grid
 
 SHOWN = 12
 """Logs in the table."""
 
 
-def logs_section(checks: Checks) -> Section:
+def logs_section(logs: Sequence[FlightLog]) -> Section:
     """Return what the logs hold."""
-    rows = [
-        (
-            short_name(fact.name),
-            f"{fact.duration_s:.1f} s",
-            f"{fact.rows}",
-            f"{fact.rate_hz:.0f} Hz",
-            f"{1e3 * fact.longest_hole_s:.0f} ms",
-            f"{100 * fact.missing:.1f} %",
-            f"{fact.top_speed:.1f} m/s",
-            fact.channels,
-        )
-        for fact in checks.facts[:SHOWN]
-    ]
     headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
-    more = len(checks.facts) - SHOWN
-    parts: list[Part] = [grid("", headers, rows, f"And {more} more." if more > 0 else "")]
-    return Section("The logs", parts)
+    more = len(logs) - SHOWN
+    rows = [_facts(log) for log in logs[:SHOWN]]
+    return Section("The logs", [grid("", headers, rows, f"And {more} more." if more > 0 else "")])
+
+
+def _facts(log: FlightLog) -> tuple[str, ...]:
+    """Return the row of a log; rows are incomplete where a part of state or command is missing."""
+    there = {
+        "commands": log.thrust_cmd is not None,
+        "velocity": not log.velocity_derived,
+        "rotor speeds": log.rotor_speed is not None,
+        "rotor commands": log.rotor_speed_cmd is not None,
+        "accelerometer": log.acc_b is not None,
+        "voltage": log.voltage is not None,
+    }
+    steps, speed = np.diff(log.time_s), log.speed[np.isfinite(log.speed)]
+    return (
+        short_name(log.name),
+        f"{log.duration_s:.1f} s",
+        f"{len(log.time_s)}",
+        f"{1.0 / float(np.median(steps)):.0f} Hz",
+        f"{1e3 * float(steps.max()):.0f} ms",
+        f"{100 * float(1.0 - log.whole.mean()):.1f} %",
+        f"{speed.max():.1f} m/s" if len(speed) else "",
+        ", ".join(name for name, is_there in there.items() if is_there) or "none",
+    )
 
 
 def noise_section(diagnosis: Diagnosis) -> Section:
@@ -61,41 +68,46 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         if np.isfinite(values := sigma[place]).any()
     ]
     words = (
-        "Standard deviation by axis, from the data: the residual of measured minus simulated when "
-        "all that changes slowly is taken off. Everything below is in units of it; where the gap "
-        "does not exceed what it gives, the verdict is no_gap."
+        "Standard deviation by axis, estimated from the residual of measured minus simulated "
+        "without its slow part. Everything below is in units of it; where the gap does not exceed "
+        "that of the noise, the verdict is no_gap."
     )
     return Section("The measurement noise", [words, grid("", ["measured", "noise"], rows)])
 
 
-def actuators_section(checks: Checks, input_source: str) -> list[Section]:
-    """Return measured rotor speeds compared with commanded ones; nothing without measured ones."""
-    if not checks.actuators:
+def actuators_section(found: Mapping[str, Any]) -> list[Section]:
+    """Return measured rotor speeds compared with commanded ones; nothing without measured ones.
+
+    `found` is the JSON.
+    """
+    if not found.get("actuators"):
         return []
     words = (
-        f"The model is driven by {input_source}. The difference between rotor speeds that are "
-        "commanded and measured is the flight controller's and the motors', no physics of the air: "
-        "integrators and filters that the nominal rate loop has not show here."
+        f"The model is driven by {found['driven_by']}. The difference between commanded and "
+        "measured rotor speeds is caused by the flight controller and the motors, not by the air: "
+        "integrators and filters which the nominal rate loop lacks are visible here."
     )
-    return [Section("Actuators, apart from the air", [words, *map(_mismatch, checks.actuators)])]
+    grids = [_mismatch(one) for one in found["actuators"]]
+    return [Section("Actuators, apart from the air", [words, *grids])]
 
 
-def _mismatch(found: ActuatorMismatch) -> Grid:
-    scale = ", ".join(f"{s:.4f}" for s in found.scale)
-    turn = ", ".join(f"{mean:.2f} ± {spread:.2f}" for mean, spread in found.turn)
-    given = f"{100 * max(found.followed, 0.0):.0f} % of the change is given"
+def _mismatch(one: Mapping[str, Any]) -> Grid:
+    def spread(pair: Sequence[float]) -> str:
+        return f"{pair[0]:.2f} ± {pair[1]:.2f}"
+
+    given = f"{100 * max(one['followed'], 0.0):.0f} % of the change is given"
     rows = [
-        ("speeds change by", f"{found.spread:.1f} rad/s"),
-        ("off the commanded ones, with the vehicle file's lag", f"{found.rms:.1f} rad/s ({given})"),
-        ("lag that fits best", f"{1e3 * found.time_constant:.1f} ms"),
-        ("delay before it", f"{1e3 * found.delay:.1f} ms"),
-        ("measured over commanded, by rotor", scale),
-        ("what these leave", f"{found.rms_fitted:.1f} rad/s"),
-        ("thrust more than commanded", f"{found.thrust[0]:.2f} ± {found.thrust[1]:.2f} m/s²"),
-        ("turning more than commanded, x y z", f"{turn} rad/s²"),
+        ("speeds change by", f"{one['spread']:.1f} rad/s"),
+        ("difference, with the vehicle file's lag", f"{one['rms']:.1f} rad/s ({given})"),
+        ("lag that fits best", f"{1e3 * one['time_constant']:.1f} ms"),
+        ("delay before it", f"{1e3 * one['delay']:.1f} ms"),
+        ("measured over commanded, by rotor", ", ".join(f"{s:.4f}" for s in one["scale"])),
+        ("difference with these", f"{one['rms_fitted']:.1f} rad/s"),
+        ("excess thrust", f"{spread(one['thrust'])} m/s²"),
+        ("excess angular acceleration, x y z", f"{', '.join(map(spread, one['turn']))} rad/s²"),
     ]
     note = "± is the spread over the flights."
-    return grid(f"Against the {found.commanded_by}", ["", ""], rows, note)
+    return grid(f"Against the {one['commanded_by']}", ["", ""], rows, note)
 
 
 HORIZON = "0.5 s"
@@ -108,7 +120,7 @@ BLACK_BOX = (
 
 
 RIVALS = 6
-"""Other names in the table of what fits as well."""
+"""Largest number of alternatives to an effect in the table."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
@@ -172,21 +184,19 @@ def residual_section(found: Mapping[str, Any]) -> Section:
     if left.get("shapes"):
         rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in left["shapes"]]
         note = (
-            "A force or torque that no effect describes, with a plain shape over the state: its "
-            "gain on stretches left out, and how often chance gains as much."
+            "A force or torque outside the catalogue, as a simple function of the state: its gain "
+            "on left-out stretches, and its p-value."
         )
         parts.append(
             grid("Shapes without a name", ["remaining error as a", "gain", "p"], rows, note)
         )
         rows = [(axis, f"{p:.2g}") for axis, p in left["coloured"].items()]
-        note = "How often noise alone has as much energy in a smooth push along the axis."
-        parts.append(grid("A push that no shape follows", ["axis", "p"], rows, note))
+        note = "P-value: how often noise alone has as much energy in a smooth disturbance."
+        parts.append(grid("Random disturbances", ["axis", "p"], rows, note))
     return Section("Remaining error", parts)
 
 
-def evidence_section(
-    diagnosis: Diagnosis, found: Mapping[str, Any], checks: Checks | None
-) -> Section:
+def evidence_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
     """Return the gap on held-out flights, with controls; `found` is the JSON."""
     seed, main = diagnosis.seed, diagnosis.main
     gaps = [("as given", main.before, BEFORE)]
@@ -196,7 +206,10 @@ def evidence_section(
         gaps += [(f"without {label}", gap, BEFORE) for label, gap in main.without.items()]
     if main.names:
         gaps.append(("with what was named", main.after, AFTER))
-    rows = [(label, *_gap_cells(gap, main.before, seed, 3)) for label, gap, _ in gaps]
+    before, floor = main.before.rms, main.before.floor
+    rows = [
+        (label, *_gap_cells(gap.rms, gap.ci95(seed), before, floor, 3)) for label, gap, _ in gaps
+    ]
     held = ", ".join(found["gap"]["held_out"])
     words = (
         f"{main.source.measure}. Held out: {held}; they took no part in finding or fitting "
@@ -214,26 +227,29 @@ def evidence_section(
         Picture(gap_chart(gaps, speed, seed), "Bars are 95 %; dots are rollouts."),
         grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
     ]
-    if checks is None:
-        return Section("The evidence", parts)
-    if checks.black_box is None:
-        parts.append(
-            "A black box on the same split, and outside the speeds of its fit: "
-            "suite diagnose --compare-delta."
-        )
-    else:
-        sides = [side for side in (checks.black_box.held_out, checks.black_box.outside) if side]
-        caption = "Bars are 95 %; 1 is the noise floor."
-        parts += [BLACK_BOX, Picture(black_box_chart(sides, seed), caption)]
-        parts += [_comparison(side, seed) for side in sides]
-        if checks.black_box.outside is None:
-            parts.append("There are too few stretches to fit slow ones and judge fast ones.")
+    if flown is not None:
+        parts += _black_box(found.get("black_box"))
     return Section("The evidence", parts)
 
 
+def _black_box(found: Mapping[str, Any] | None) -> list[Part]:
+    """Return the comparison with a Delta Action Model; `found` is its JSON, None without one."""
+    if found is None:
+        return [
+            "A black box on the same split, and outside the speeds of its fit: "
+            "suite diagnose --compare-delta."
+        ]
+    sides = [side for side in (found["held_out"], found["outside"]) if side]
+    chart = Picture(black_box_chart(sides), "Bars are 95 %; 1 is the noise floor.")
+    parts: list[Part] = [BLACK_BOX, chart, *map(_comparison, sides)]
+    if found["outside"] is None:
+        parts.append("There are too few stretches to fit slow ones and judge fast ones.")
+    return parts
+
+
 AGREEMENT = (
-    "The fall of the squared error of each flight under what the others' fit gives, in units of "
-    "independent noise. A name needs all flights but one."
+    "The fall of the squared error of each flight with parameters that were fitted to the others, "
+    "in units of independent noise. An effect is named only if all flights but one agree."
 )
 
 
@@ -252,30 +268,31 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
 
 
-def _comparison(side: BlackBoxComparison, seed: int) -> Grid:
+def _comparison(side: Mapping[str, Any]) -> Grid:
+    before = side["before"]["gap"]
     rows = [
         (
             label,
-            *_gap_cells(gap, side.before, seed, 2),
-            *(f"{values.error:.3g}" for values in gap.channels[HORIZON].values()),
+            *_gap_cells(one["gap"], one["ci95"], before, 1.0, 2),
+            *(f"{error:.3g}" for error in one["rollouts"][HORIZON].values()),
         )
-        for label, gap in labelled_gaps(side)
-        if gap is not None
+        for label, one, _ in labelled_gaps(side)
     ]
-    names = [f"{group} [{UNITS[group]}]" for group in side.before.channels[HORIZON]]
+    names = [f"{group} [{UNITS[group]}]" for group in side["before"]["rollouts"][HORIZON]]
     headers = ["", "gap", "95 %", "removed", *names]
+    count = side["stretches"]
     note = (
-        f"{side.fitted} stretches fitted, {side.judged} judged. The last columns: RMS errors of "
-        f"rollouts of {HORIZON}."
+        f"{count['fitted']} stretches fitted, {count['judged']} judged. The last columns: RMS "
+        f"errors of rollouts of {HORIZON}."
     )
-    return grid(f"On {side.judged_on}", headers, rows, note)
+    return grid(f"On {side['judged_on']}", headers, rows, note)
 
 
-def _gap_cells(gap: Gap, before: Gap, seed: int, digits: int) -> tuple[str, str, str]:
-    """Return a gap, its interval, and the share of `before` that it removes."""
-    low, high = gap.ci95(seed)
-    whole = before.rms - before.floor
+def _gap_cells(
+    gap: float, ci95: Sequence[float], before: float, floor: float, digits: int
+) -> tuple[str, str, str]:
+    """Return a gap, its interval, and the share of `before` above the floor that it removes."""
     removed = ""
-    if gap is not before and whole > 0.0:
-        removed = f"{100 * (before.rms - gap.rms) / whole:.0f} %"
-    return f"{gap.rms:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}", removed
+    if gap != before and before > floor:
+        removed = f"{100 * (before - gap) / (before - floor):.0f} %"
+    return f"{gap:.{digits}f}", f"{ci95[0]:.{digits}f} to {ci95[1]:.{digits}f}", removed

@@ -1,12 +1,14 @@
-"""The first screen of a report: the answer, its size on these flights, and what to do next."""
+"""A diagnosis in words: the answer, its size on these flights, and what to do next."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from eval.effects import EFFECTS
-from suite.diagnose.report.parameters_json import components
+from tracks.common.grid import Cell, Grid
 
 VERDICTS = {
     "no_gap": "Simulation and flights agree within the measurement noise.",
@@ -22,7 +24,7 @@ CHANGES = {
     "explains it.",
 }
 USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loop (--vehicle)."
-CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock looks like physics."
+CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
 def answer(found: Mapping[str, Any]) -> str:
@@ -81,7 +83,7 @@ def _separate(found: Mapping[str, Any]) -> Iterator[str]:
             start = f"{effect['name']} from "
             flights = [line for line in found["separate_with"] if line.startswith(start)]
             yield (
-                f"These flights do not separate {names}. Decide by what you know of the vehicle, "
+                f"These flights do not separate {names}. Decide by what is known of the vehicle, "
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
                 "flights."
             )
@@ -112,7 +114,105 @@ def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
     if found["unexplained"]["where"]:
-        yield f"Look for a cause of the remaining error: {found['unexplained']['where']}."
+        yield f"Search for a cause of the remaining error: {found['unexplained']['where']}."
+    swing = found["unexplained"].get("swing")
+    if swing:
+        yield (
+            "If the vehicle carries a load on a line, weigh it and write mass and length = "
+            f"{swing['length_m']:.2g} into [effects.slung_load] of the vehicle file."
+        )
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
+
+
+UNSEEN = "not identifiable"
+"""Shown in place of a value that no flight identifies."""
+
+
+class Component(NamedTuple):
+    """One number of a named effect, for people."""
+
+    label: str
+    """Parameter, axis and unit."""
+    value: float | None
+    ci95: tuple[float, float] | None
+    neutral: float | None
+    """The value with which nothing acts, where it is the same for every vehicle."""
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a value that is not the neutral one, as far as its interval shows."""
+        if self.value is None or self.ci95 is None or self.neutral is None:
+            return self.value is not None
+        return not self.ci95[0] <= self.neutral <= self.ci95[1]
+
+    def shown(self) -> tuple[str, str]:
+        """Return the value and its interval, in as many digits as the interval supports."""
+        if self.value is None:
+            return UNSEEN, ""
+        if self.ci95 is None:
+            return f"{self.value:.4g}", ""
+        numbers = (self.value, *self.ci95)
+        value, low, high = (in_digits(number, numbers) for number in numbers)
+        if not self.found:
+            value = f"not different from {self.neutral:g}"
+        return value, f"{low} to {high}"
+
+
+def in_digits(number: float, interval: Sequence[float]) -> str:
+    """Return `number` with two significant digits of half the width of (value, low, high)."""
+    half, size = 0.5 * (interval[2] - interval[1]), max(abs(n) for n in interval)
+    if half <= 0.0 or not np.isfinite(half):
+        return f"{number:.4g}"
+    last = int(np.floor(np.log10(half) + 1e-6)) - 1
+    if size < 1e-3 or last > 0:
+        return f"{number:.{max(int(np.floor(np.log10(size))) - last, 0)}e}" if size else "0"
+    return f"{number:.{-last}f}"
+
+
+def components(effect: Mapping[str, Any]) -> Iterator[Component]:
+    """Yield every number of a named `effect`, an entry of diagnosis.json."""
+    known = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
+    neutrals = {p.name: p.neutral for p in known if not callable(p.neutral)}
+    one_at_a_time = {p.name for p in known if p.one_at_a_time}
+    for name, entry in effect["parameters"].items():
+        value, span, unit = entry["value"], entry["ci95"], entry["unit"]
+        neutral = neutrals.get(name)
+        if name == "index" and one_at_a_time:
+            # Each of several motors has a line of its own with its number.
+            if not isinstance(value, list):
+                sure = span is None or span[0] == span[1]
+                yield Component(name, *_one(value, None if sure else span), None)
+            continue
+        if not isinstance(value, list):
+            yield Component(f"{name} [{unit}]", *_one(value, span), neutral)
+            continue
+        which = effect["parameters"].get("index", {}).get("value")
+        axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
+        if name in one_at_a_time and isinstance(which, list):
+            axes = which
+        for k, one in enumerate(value):
+            between = span[k] if span else None
+            yield Component(f"{name} {axes[k]} [{unit}]", *_one(one, between), neutral)
+
+
+def _one(
+    value: float | None, span: Sequence[float] | None
+) -> tuple[float | None, tuple[float, float] | None]:
+    return value, None if span is None else (float(span[0]), float(span[1]))
+
+
+def cells(*texts: str) -> list[Cell]:
+    """Return a row of cells without a tone."""
+    return [Cell(text) for text in texts]
+
+
+def grid(title: str, headers: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Grid:
+    """Return a table of plain texts."""
+    return Grid(title, headers, [cells(*row) for row in rows], note=note)
+
+
+def short_name(name: str) -> str:
+    """Return a log's name without its folders."""
+    return name.replace("\\", "/").rsplit("/", 1)[-1]

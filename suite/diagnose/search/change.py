@@ -131,7 +131,7 @@ class ChangeEvidence(ViewEvidence):
         assert isinstance(block, ViewBlock) and self.spread and self.sure and self.weights
         weights = self.weights if named else self.sure
         each, along = np.arange(len(block.data.flight)), block.along
-        equations = block_of(block.data, weights, each, along).equations()
+        equations = block_of(block.data, weights, each, along).equations
         without = chi2_fall(equations, theta, self.space, named)
         groups = [candidate.indices for candidate in among]
         gains = [chi2_fall(equations, theta, self.space, [*named, *g]) - without for g in groups]
@@ -179,7 +179,7 @@ def changed(
     base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
     weights = weights._replace(trim=trim, base=base)
     away = np.abs(means_of(left.residual, left.flight).mean(axis=0))
-    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_doubt * away))
+    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_error * away))
     # Few means hold little: all that explains what stands out is an alternative.
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
@@ -265,7 +265,7 @@ def search_motion_change(
     rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in others))
     at = evidence.at(theta)
     block = evidence.linearise(at, sorted(name.candidate.indices))
-    last = Evaluation(evidence, at, block, block.equations())
+    last = Evaluation(evidence, at, block)
     named = (replace(name, rivals=rivals),)
     return SearchResult(named, evidence.at(begun), last, last, [], 0.0)
 

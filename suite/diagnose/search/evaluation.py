@@ -40,7 +40,11 @@ class Evaluation(NamedTuple):
     evidence: Evidence
     at: Estimate
     block: Block
-    equations: NormalEquations
+
+    @property
+    def equations(self) -> NormalEquations:
+        """The block's sums."""
+        return self.block.equations
 
 
 def evaluated_at(
@@ -59,7 +63,7 @@ def evaluated_at(
             free_slope=np.concatenate([block.free_slope, there.free_slope[..., columns]], axis=-1),
             along=(*block.along, *numbers),
         )
-    return Evaluation(evidence, at, block, block.equations())
+    return Evaluation(evidence, at, block)
 
 
 def fit_with(
@@ -95,7 +99,7 @@ def wanted_change(
 
 def chi2_of(here: Evaluation, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
     """Return the squared error (G,) of each part of the flights under the others' fit."""
-    equations = block.equations().along_numbers(sorted(indices))
+    equations = block.equations.along_numbers(sorted(indices))
     return chi2_by_part(equations, at.theta, here.evidence.space, here.evidence.parts(block))
 
 
@@ -149,10 +153,10 @@ class SearchResult:
         begin = Estimate(theta, self.estimate.free) if named else self.start
         at, judged = self.judged, self.judged.evidence
         best, block = fit(judged, begin, indices, limits=judged.limits)
-        last = at = Evaluation(judged, best, block, block.equations())
+        last = at = Evaluation(judged, best, block)
         if self.judged is not self.last:
             block = self.last.evidence.linearise(best, indices)
-            last = Evaluation(self.last.evidence, best, block, block.equations())
+            last = Evaluation(self.last.evidence, best, block)
         nothing = self.explained + float(self.last.equations.chi2.sum())
         explained = nothing - float(last.equations.chi2.sum()) if named else 0.0
         return replace(self, named=tuple(named), last=last, judged=at, explained=explained)

@@ -1,5 +1,9 @@
 """The search for effects: forward selection, then each named effect against its alternatives.
 
+Forward selection alone names one effect that resembles two others together, as a drag along three
+axes does. So an alternative may be a pair of effects (floating search; Pudil et al. 1994, doi
+10.1016/0167-8655(94)90127-9).
+
 A named effect must lower the error on left-out stretches by more than the best of all candidates
 does by chance, and pass further tests of its source of evidence. A rival is another candidate that
 explains the same flights; it is listed as an alternative. All sources use this search.
@@ -9,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
-from suite.diagnose.estimate.parameters import Candidate, indices_of
+from suite.diagnose.estimate.parameters import JOIN, Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
 from suite.diagnose.search.evaluation import (
@@ -92,15 +97,16 @@ def _scores(
 
 
 def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
-    block = evidence.linearise(at, indices_of([n.candidate for n in named]))
-    return Evaluation(evidence, at, block, block.equations())
+    return Evaluation(
+        evidence, at, evidence.linearise(at, indices_of([n.candidate for n in named]))
+    )
 
 
 def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
     """Fit all names to the end, as some effects saturate; where there is none nothing is moved."""
     indices, limits = indices_of([n.candidate for n in named]), evidence.limits
-    at, block = fit(evidence, at, indices, limits.last_rounds if indices else 0, None, limits)
-    return Evaluation(evidence, at, block, block.equations())
+    rounds = limits.last_rounds if indices else 0
+    return Evaluation(evidence, *fit(evidence, at, indices, rounds, None, limits))
 
 
 def _next_name(
@@ -134,16 +140,14 @@ def _next_name(
     if now is None:
         single = [c for c in near if not c.parts][: limits.short_list]
         near = [c for c in near if c.parts or c in single]
-    begin, judge = here, evidence.compared()
-    if judge is not evidence and near:
-        begin = evaluated_at(judge.again(here.at), here.at, among)
-    before, tried = chi2_of(begin, begin.block, begin.at, others), []
+    before, tried = chi2_of(here, here.block, here.at, others), []
+    total = float(here.equations.chi2.sum())
     for candidate in near:
-        at, block = fit_with(begin, others, candidate)
-        gains = before - chi2_of(begin, block, at, [*others, *candidate.indices])
-        share = judge.share(begin.block, at, block, candidate, gains)
+        at, block = fit_with(here, others, candidate)
+        gains = before - chi2_of(here, block, at, [*others, *candidate.indices])
+        share = evidence.share(here.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        fall = float(begin.equations.chi2.sum()) - chi2
+        fall = total - chi2
         outcome = f"lowers the squared error by {fall:,.0f} times the noise variance"
         if share is None:
             outcome = "rejected: flights disagree, or a value is implausible or explains too little"
@@ -154,18 +158,17 @@ def _next_name(
                 gains=tuple(gains.tolist()), share=share,
             )  # fmt: skip
             tried.append((chi2 + len(candidate.indices), candidate, (one, at)))
-    tried = without_idle(tried, limits)
+    tried = _without_vain_pairs(task, without_idle(tried, limits))
     if not tried:
         return None
     least = min(cost for cost, *_ in tried)
-    total = float(begin.equations.chi2.sum())
-    explained = total - chi2_fall(begin.equations, theta, space, others) - least
+    explained = total - chi2_fall(here.equations, theta, space, others) - least
     slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     alike = [one for one in tried if one[0] - least <= slack]
     sure = [one for one in alike if one[2][0].p_value <= evidence.name_p_value]
     if not sure:
         return None
-    cost, best, (one, at) = min(sure, key=lambda t: (*judge.order(t[2][1], t[1]), t[0]))
+    cost, best, (one, at) = min(sure, key=lambda t: (*evidence.order(t[2][1], t[1]), t[0]))
     rivals = dict.fromkeys(c.name for _, c, _ in alike if c.name != best.name)
     worse_by = {c.label: other - cost for other, c, _ in tried if c != best}
     return replace(one, rivals=tuple(rivals), worse_by=worse_by), at
@@ -181,7 +184,7 @@ def _judged(
 ) -> tuple[list[NamedEffect], Estimate]:
     """Weigh the name at `place` when added last: a better rival takes its place, or it goes.
 
-    It is weighed against `among`, all candidates if not given.
+    It is weighed against `among`, if not given against all candidates and pairs of them.
     """
     one, theta = named[place].candidate, at.theta.copy()
     theta[list(one.indices)] = evidence.space.array("start")[list(one.indices)]
@@ -189,6 +192,8 @@ def _judged(
     others = [*named[:place], *named[place + 1 :]]
     left = [c for c in (task.among if among is None else among) if one not in c.parts]
     here = evaluated_at(evidence.again(without), without, left)
+    if among is None and len(named) < task.limits.most_names:
+        left += better_pairs(here, indices_of([n.candidate for n in others]), one, left)
     found = _next_name(task, here, others, left, None, one)
     if found is None:
         return others, without
@@ -230,6 +235,62 @@ def _settled(
         if [n.candidate for n in named] == before:
             break
     return named, at
+
+
+def better_pairs(
+    here: Evaluation, others: Sequence[int], one: Candidate, among: Sequence[Candidate]
+) -> list[Candidate]:
+    """Return the pairs of `among` that explain clearly more than `one` alone, best first.
+
+    Next to the numbers at `others` and to first order: each pair still has to be fitted. A pair has
+    to be better by more than chance, and by more than a fit is exact.
+    """
+    equations, limits, space = here.equations, here.evidence.limits, here.evidence.space
+    known = [equations.numbers.index(number) for number in others]
+    hessian, gradient = equations.sums()
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    hessian, gradient = hessian * np.outer(scale, scale), gradient * scale
+
+    def explained(*some: Candidate) -> float:
+        """Return the fall of chi-square without bounds, less one for each number."""
+        columns = [column for each in some for column in equations.columns_of(each)]
+        at = sorted({*known, *columns})
+        matrix = hessian[np.ix_(at, at)] + 1e-9 * np.eye(len(at))
+        return float(gradient[at] @ np.linalg.solve(matrix, gradient[at])) - len(columns)
+
+    def possible(parts: Sequence[Candidate]) -> bool:
+        columns = [column for each in parts for column in equations.columns_of(each)]
+        fall = chi2_fall(equations, here.at.theta, space, [*known, *columns])
+        return fall - len(columns) > least
+
+    nothing, own = explained(), explained(one)
+    least = own + max(limits.rival_chi2, limits.least_name_share * (own - nothing))
+    taken = {*others, *one.indices}
+    singles = [c for c in among if not c.parts and not taken & set(c.indices)]
+    singles = [c for c in singles if explained(c) > nothing + limits.rival_chi2]
+    gains = {parts: explained(*parts) for parts in combinations(singles, 2)}
+    best = sorted((parts for parts, gain in gains.items() if gain > least), key=lambda p: -gains[p])
+    best = [parts for parts in best[: 4 * limits.short_list] if possible(parts)]
+    return [
+        Candidate(
+            JOIN.join(part.name for part in parts),
+            tuple(indices_of(parts)),
+            JOIN.join(part.label for part in parts),
+            parts,
+        )
+        for parts in best[: limits.short_list]
+    ]
+
+
+def _without_vain_pairs(
+    task: SearchTask, tried: list[tuple[float, Candidate, T]]
+) -> list[tuple[float, Candidate, T]]:
+    """Return what was `tried`, without pairs that are not clearly better than every candidate.
+
+    Of two effects at a time some always fit as well.
+    """
+    least = min((cost for cost, c, _ in tried if c in task.among), default=np.inf)
+    return [one for one in tried if one[1] in task.among or one[0] + task.limits.rival_chi2 < least]
 
 
 def could_be_best(

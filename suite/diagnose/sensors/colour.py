@@ -8,9 +8,9 @@ distance (c^2 a metre, at the speed s)
 
 whatever constant bias a flight has (Cressie 1993, "Statistics for spatial data", section 2.4). The
 drift is fitted at lags of seconds; then the others at lags up to one second and at the variance
-about each flight's mean, v (1 - m) + c^2 s D / 6, with m the share that the mean of a flight of
-length D takes with it. Each stretch of a flight has a variogram of its own; intervals are by how
-these disagree.
+about each flight's mean, v (1 - m) + c^2 s D / 6, where m is the share of the variance that the
+mean of a flight of length D contains. Each stretch of a flight has a variogram of its own; their
+disagreement gives the intervals.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.sensors.lateness import DIFFER_P, STRETCH_S, acting
+from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, acting
 
 SHORT_S = 1.0
 """Colours are compared up to this lag [s]."""
@@ -75,7 +75,7 @@ class Coloured(NamedTuple):
     def correlation(self, lag_s: np.ndarray, duration_s: float) -> np.ndarray:
         """Return the autocorrelation (L,) that a flight of `duration_s` shows on average.
 
-        Its own mean is taken off, which takes a share of a slow error with it.
+        The flight's mean is subtracted, which removes a share of a slow error.
         """
         colour = Colour(self.fast.value, self.fast_s.value, self.lasts_s.value)
         plain, lost = colour.correlation(lag_s), colour.of_mean(duration_s)
@@ -83,7 +83,7 @@ class Coloured(NamedTuple):
 
 
 class Colour(NamedTuple):
-    """How noise lasts."""
+    """Correlation of noise in time."""
 
     fast: float
     """Share [1]."""
@@ -166,7 +166,7 @@ class _Noise(NamedTuple):
 
     @property
     def colour(self) -> Colour:
-        """How it lasts."""
+        """Its correlation in time."""
         return _colour(self.theta)
 
 
@@ -280,7 +280,7 @@ def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) ->
 
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
-    """Return the size of what stays for a flight: the means, less what noise makes of them."""
+    """Return the size of the constant part of a flight: its mean, less the mean of the noise."""
     seen = [flight for flight in flights if np.isfinite(flight.value).any()]
     means, count = np.array([np.nanmean(flight.value) for flight in seen]), len(seen)
     noise = variance * np.mean([colour.of_mean(f.duration_s) for f in seen])

@@ -1,15 +1,26 @@
-"""Errors of an on-board state estimate in a flight log, compared with the log's reference pose."""
+"""Errors of an on-board state estimate against the log's reference pose, and their delay.
+
+To first order a delay d causes the error -d times the derivative of the truth, and a scale error k
+of the velocity causes k v. Both are fitted by least squares to the errors of all flights, less each
+flight's mean; axes are weighted by their variance. Errors are correlated in time, so intervals come
+from the disagreement of stretches. Rows are not whitened: that would weight fast motion, in which
+an estimator's own dynamics dominate.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from eval.judging.statistics import Interval
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog
+from suite.diagnose.estimate.block import NormalEquations, without_nuisance
+from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.identify.grid import attitude_on, joined
 from tracks.geometry.rotation import to_local
 
@@ -110,3 +121,114 @@ def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
         return np.full_like(values, np.nan)
     how = {"deriv": 1, "delta": step_s, "axis": 0, "mode": "nearest"}
     return np.asarray(savgol_filter(values, SLOPE_ROWS, 2, **how))
+
+
+STRETCH_S = 5.0
+"""Errors further apart than this count as independent [s]."""
+DIFFER_P = 0.05
+"""Flights differ where chance makes them do so more rarely than this."""
+
+
+ROUNDS = 3
+"""Of the fit, each at the delay of the one before."""
+
+
+class Lateness(NamedTuple):
+    """The systematic part of the errors."""
+
+    delay_s: Interval
+    velocity_scale: Interval
+    by_part: dict[str, Interval]
+    """Delay by each part of the state alone [s]."""
+
+
+def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
+    """Return the delay and the scale of the velocity, and the errors at that delay.
+
+    A delay whose interval contains 0 is set to 0.
+    """
+    delay_s, found = 0.0, None
+    for _ in range(ROUNDS):
+        flights = [errors_of(log, delay_s) for log in logs]
+        found = _fitted(flights, delay_s)
+        delay_s = found.delay_s.value
+    assert found is not None
+    return found, [errors_of(log, acting(found.delay_s)) for log in logs]
+
+
+def _fitted(flights: Sequence[Errors], at_s: float) -> Lateness:
+    fitted, scale = (0, 1), Interval(0.0, 0.0, 0.0)
+    every = _equations(flights, slice(0, 9))
+    value, half = _solved(every, fitted)
+    if value[1]:
+        scale = _interval(value[1], half[1])
+        if not acting(scale):  # it would only widen the delay's interval
+            fitted = (0,)
+            value, half = _solved(every, fitted)
+    by_part = {}
+    for k, part in enumerate(PARTS):
+        own = _equations(flights, slice(3 * k, 3 * k + 3))
+        if own.hessian[:, 0, 0].any():
+            alone, width = _solved(own, fitted)
+            by_part[part] = _interval(at_s + alone[0], width[0])
+    return Lateness(_interval(at_s + value[0], half[0]), scale, by_part)
+
+
+def acting(found: Interval) -> float:
+    """Return the value, or 0 where the interval contains 0."""
+    return 0.0 if found.low <= 0.0 <= found.high else found.value
+
+
+def _interval(value: float, half: float) -> Interval:
+    return Interval(float(value), float(value - half), float(value + half))
+
+
+def without(flight: Errors, scale: float) -> np.ndarray:
+    """Return the errors (T, 9) less what a scale of the velocity explains."""
+    return flight.value - scale * _scaled(flight)
+
+
+def stretches(flight: Errors) -> np.ndarray:
+    """Return the number (T,) of each row's stretch."""
+    return (np.arange(len(flight.value)) * flight.step_s / STRETCH_S).astype(int)
+
+
+def _scaled(flight: Errors) -> np.ndarray:
+    nothing = np.zeros_like(flight.vel_b)
+    return np.concatenate([nothing, flight.vel_b, nothing], axis=1)
+
+
+def _equations(flights: Sequence[Errors], channels: slice) -> NormalEquations:
+    """Return the normal equations of delay and scale on the errors of `channels`, by stretch."""
+    rows, stretch, flight_of = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    for number, flight in enumerate(flights):
+        values = np.stack([flight.value, -flight.slope, _scaled(flight)], axis=-1)[:, channels]
+        whole = np.isfinite(values).all(axis=-1, keepdims=True)
+        values = np.where(whole, values, 0.0)
+        mean = values.sum(axis=0) / np.maximum(whole.sum(axis=0), 1)
+        rows.append(np.where(whole, values - mean, 0.0))
+        stretch.append(stretches(flight))
+        flight_of.append(np.full(len(values), number))
+    both = np.stack([np.concatenate(flight_of), np.concatenate(stretch)])
+    places, number = np.unique(both, axis=1, return_inverse=True)
+    every = np.concatenate(rows)
+    # Noise in units of what is left, of which the fit itself takes little.
+    count = np.maximum(np.count_nonzero(every[..., 0], axis=0), 1)
+    noise = np.sqrt(np.maximum((every[..., 0] ** 2).sum(axis=0) / count, 1e-300))
+    white = every / noise[:, None]
+    start_s = places[1] * STRETCH_S
+    return without_nuisance(
+        white[..., 0], white[..., 1:], (0, 1), number.ravel(), places[0], start_s
+    ).equations
+
+
+def _solved(equations: NormalEquations, fitted: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return delay and scale (2,) and their intervals' half-widths (2,); 0 where not fitted."""
+    hessian, gradient = equations.sums()
+    at = [k for k in fitted if hessian[k, k] > 1e-9]
+    value, half = np.zeros(2), np.zeros(2)
+    if at:
+        value[at] = np.linalg.solve(hessian[np.ix_(at, at)], gradient[at])
+        left = equations._replace(gradient=equations.gradient - equations.hessian @ value)
+        half[at] = intervals95(left.take(at), DIFFER_P, leave_out=True).half_width
+    return value, half

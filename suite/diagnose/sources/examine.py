@@ -13,8 +13,7 @@ from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.estimate.parameters import Candidate, effects_in, indices_of
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.sources.source import Finding, Source
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import EffectSize
+from suite.diagnose.verdict.gap import EffectSize, Gap
 
 APART = 1.5
 """Parameters contradict each other where their 95 % intervals are further apart than their
@@ -63,7 +62,7 @@ def examine(
         explained = found, (before, after)
     remaining = source.remaining(*explained, seed)
     if remaining.wind and found.named and not source.worse(after, before):
-        # Wind that lasts from one stretch to the next looks like many a steady number.
+        # Wind that lasts from one stretch to the next has the effect of many constant numbers.
         found, after, sizes = found.refitted(()), before, {}
         remaining = source.remaining(found, (before, before), seed)
     labels = ", ".join(one.label for one in found.candidates) or "nothing"
@@ -222,7 +221,7 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
             continue
         every = sorted({*by.indices, *at})
         best, block = fit(evidence, by.estimate, every, limits=evidence.limits)
-        inside = intervals95(block.equations().along_numbers(every), evidence.draws).half_width
+        inside = intervals95(block.equations.along_numbers(every), evidence.draws).half_width
         for k in at:
             own, other = found.estimate.theta[k], best.theta[k]
             wide = float(inside[every.index(k)])

@@ -31,12 +31,13 @@ from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, swing_left
-from suite.diagnose.verdict.gap import Gap, share_left
-from suite.diagnose.verdict.relevance import (
+from suite.diagnose.verdict.gap import (
     FORCE_S,
     TORQUE_S,
     EffectSize,
+    Gap,
     rollout_size,
+    share_left,
     upper_size,
 )
 from suite.diagnose.verdict.residual_structure import (
@@ -129,7 +130,7 @@ class RolloutSource(Source):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
             how = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
-            equations = weighed_by(model, self.coarser, linear, *how)[1].equations()
+            equations = weighed_by(model, self.coarser, linear, *how)[1].equations
             moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
             own = self.coarser_share * np.abs(moved)
 
@@ -228,7 +229,7 @@ class RolloutSource(Source):
         return float(min(share.max(), 1.0))
 
     def series(self, found: SearchResult) -> Series:
-        """Return a held-out flight along the axis where the model misses most, see `Source`."""
+        """Return a held-out flight along the axis where the error is best seen, see `Source`."""
         windows, simulated = self.flown.simulated(found.estimate.theta if found.named else None)
         sigma = of_rollouts(found.last).noise.sigma
         measured = {
@@ -241,10 +242,13 @@ class RolloutSource(Source):
         first = next(iter(simulated.values()))[of]
 
         def missed(group: str, axis: int) -> float:
+            """Return the mean squared error beyond the noise, over the variance of the motion."""
             at = SLICES[group].start + axis
             there = seen[..., at] & np.isfinite(first[..., at])
-            error = first[..., at][there]
-            return float(np.sqrt((error**2).mean()) / sigma[at]) if there.any() else 0.0
+            if not there.any():
+                return -np.inf
+            error, motion = first[..., at][there], np.asarray(measured[group])[of][..., axis][there]
+            return float(((error**2).mean() - sigma[at] ** 2) / max(motion.var(), sigma[at] ** 2))
 
         every = ((group, axis) for group in measured for axis in range(3))
         group, axis = max(every, key=lambda one: missed(*one))
@@ -263,8 +267,8 @@ class RolloutSource(Source):
             line(value),
             lines,
             f"{group.capitalize()} along {frame} {'xyz'[axis]} [{UNITS[group]}]",
-            "A flight that took no part in finding or fitting anything, in rollouts of a second "
-            "from measured states, along the axis where the model misses most.",
+            "A held-out flight in rollouts of a second from measured states, along the axis where "
+            "the error is largest next to the motion.",
         )
 
 
@@ -291,12 +295,14 @@ def structure_where(
         for axis, p_value in residual.coloured.items()
         if p_value <= limits.colour_p_value and not rotor_input
     ]
-    loud = limits.structure_rotor_input if rotor_input else limits.structure
-    if not (shape or coloured or slow.sum() / expected.sum() > loud):
+    least = limits.structure_rotor_input if rotor_input else limits.structure
+    if not (shape or coloured or slow.sum() / expected.sum() > least):
         return None
     where = [shape.label] if shape else []
-    if coloured:
-        where.append("a changing " + ", ".join(coloured))
+    for kind in ("force", "torque"):
+        axes = [axis[-1] for axis in coloured if axis.startswith(kind)]
+        if axes:
+            where.append(f"a changing {kind} along body {', '.join(axes)}")
     return "; ".join(where) or _loudest(slow.sum(axis=0), expected.sum(axis=0))
 
 

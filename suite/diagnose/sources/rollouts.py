@@ -158,7 +158,7 @@ def _enough(count: int, limits: Thresholds) -> None:
     """Refuse fewer stretches than can be fitted.
 
     Raises:
-        ValueError: saying how many there are and have to be.
+        ValueError: with the number of stretches and the least one.
     """
     if count < limits.least_windows:
         raise ValueError(

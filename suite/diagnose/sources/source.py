@@ -23,8 +23,7 @@ from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.disturbances import Swing
-from suite.diagnose.verdict.gap import Gap
-from suite.diagnose.verdict.relevance import EffectSize
+from suite.diagnose.verdict.gap import EffectSize, Gap
 from suite.diagnose.verdict.rollout_gap import Rollouts
 
 
@@ -157,7 +156,7 @@ class Source(ABC):
         return {}
 
     def stepped(self, found: SearchResult) -> bool:
-        """Return whether the named effects look like the time steps of a simulator."""
+        """Return whether the named effects may be caused by a simulator's time steps."""
         del found
         return False
 

@@ -19,8 +19,7 @@ from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source
 from suite.diagnose.verdict.disturbances import swing_left
-from suite.diagnose.verdict.gap import Channel, Gap
-from suite.diagnose.verdict.relevance import EffectSize, upper_size, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, upper_size, view_size
 
 STRETCH_S = 10.0
 """Length of the stretch in a picture [s]."""
@@ -92,8 +91,7 @@ class ViewSource(Source):
             if force and not structured:
                 structured, left = True, max(left, share_of_energy(*gaps, self._noise))
                 where = (
-                    f"a force of {force:.2g} m/s^2 beyond the noise, which goes with nothing that "
-                    "was flown"
+                    f"a force of {force:.2g} m/s^2 beyond the noise, which no flown signal predicts"
                 )
         closed, explainable = shares.whole(shares.closed), shares.whole(shares.explainable)
         return Remaining(
@@ -154,13 +152,18 @@ class ViewSource(Source):
         return Shares(closed, np.maximum(explainable, closed), both - closed, variance, trim)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the stretch of a held-out flight that the names change most, see `Source`."""
+        """Return the stretch of a held-out flight that the names change most, see `Source`.
+
+        Where nothing is named, the one with the largest error.
+        """
         before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
         shares = self._shares(found)
-        axis = max(self.view.axes, key=lambda k: float(shares.closed[k] * shares.variance[k]))
+        weight = shares.variance * (shares.closed if found.named else 1.0)
+        axis = max(self.view.axes, key=lambda k: float(weight[k]))
         rows = before.flight == before.flight[0]
         middle = before.middle_s[rows]
-        moved = np.abs(before.residual[rows, axis] - after.residual[rows, axis])
+        apart = before.residual - (after.residual if found.named else 0.0)
+        moved = np.abs(apart[rows, axis])
         count = max(int((middle < middle[0] + STRETCH_S).sum()), 2)
         first = int(np.convolve(moved, np.ones(min(count, len(moved))), "valid").argmax())
         shown = slice(first, first + count)
@@ -175,7 +178,7 @@ class ViewSource(Source):
             measured,
             lines,
             f"{what} along body {'xyz'[axis]} [{self.unit}]",
-            "A stretch of a flight that took no part in finding or fitting anything.",
+            "A stretch of a held-out flight.",
         )
 
 
@@ -192,7 +195,7 @@ class MotionSource(ViewSource):
         del say, seed
         found = search_motion_change(self.reference, self.fitted, self.among)
         evidence, block = self.known
-        none = Evaluation(evidence, self.start, block, block.equations())
+        none = Evaluation(evidence, self.start, block)
         return found or SearchResult((), self.start, none, none, [], 0.0)
 
 

@@ -83,7 +83,7 @@ def actuator_mismatches(
     plant = make_plant(vehicle, step_s(vehicle), {})
     found = []
     for commanded_by, demand_of in (
-        ("nominal rate loop", lambda log, at_s: rate_loop_demand(log, plant, at_s)),
+        ("nominal rate loop", partial(rate_loop_demand, plant=plant)),
         ("logged motor commands", _logged_demand),
     ):
         stretches: list[_Stretch] = []
@@ -96,7 +96,7 @@ def actuator_mismatches(
     return found
 
 
-def rate_loop_demand(log: FlightLog, plant: Plant, at_s: np.ndarray) -> Demand | None:
+def rate_loop_demand(log: FlightLog, at_s: np.ndarray, plant: Plant) -> Demand | None:
     """Return the speeds by the rate loop of `plant` at the measured rates and at times `at_s` (S,).
 
     None where the log has no commands.
@@ -245,8 +245,8 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
     if remembers(vehicle) and (drive == "commands" or not motors):
         raise ValueError(
-            f"{vehicle.name}: no log says what its {vehicle.controller.kind} rate loop remembers "
-            "where a stretch of a flight begins, so that commands cannot drive rollouts; give "
+            f"{vehicle.name}: no log holds the state of its {vehicle.controller.kind} rate loop "
+            "at the start of a stretch, so that commands cannot drive rollouts; give "
             "flights with measured rotor speeds (--drive motors), or a vehicle with a controller "
             "of kind p"
         )
@@ -276,40 +276,23 @@ def another_controller(
     The loop is given the measured rates, so that nothing but the controller and the rotors is
     compared: what the air or a moved centre of mass does shows in the rates.
     """
+    dt, plant = step_s(vehicle), make_plant(vehicle, step_s(vehicle))
+    delay, lag = float(plant.constants.delay), float(plant.constants.time_constant)
     missed, change, count = 0.0, 0.0, 0
     for log in logs:
-        error, own = _mean_speeds(log, vehicle, limits)
-        missed, change, count = missed + (error**2).sum(), change + (own**2).sum(), count + own.size
+        demand_of = partial(rate_loop_demand, plant=plant)
+        for part in _stretches(log, vehicle, demand_of, limits):
+            wanted = _follow(part.demand(delay), part.row, dt, lag)
+            place = (part.row * dt / limits.speed_mean_s).astype(int)
+            bins, number = np.unique(place, return_inverse=True)
+            sums = np.zeros((len(bins), 8))
+            np.add.at(sums, number, np.concatenate([part.measured, wanted], axis=1))
+            own, loop = np.split(sums / np.bincount(number)[:, None], 2, axis=1)
+            missed += float(((own - loop) ** 2).sum())
+            change += float(((own - own.mean(axis=0)) ** 2).sum())
+            count += own.size
     still = count * limits.still_speed**2
     return bool(missed > still and missed > limits.fitted_loop_share**2 * max(change, still))
-
-
-def _mean_speeds(
-    log: FlightLog, vehicle: Vehicle, limits: Thresholds
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far means of the speeds (B, 4) are from the loop's, and from their own mean."""
-    nothing = np.zeros((0, 4)), np.zeros((0, 4))
-    dt, passed = step_s(vehicle), log.time_s - log.time_s[0]
-    time = np.arange(log.time_s[0], log.time_s[-1], dt)
-    plant = make_plant(vehicle, dt)
-    demand = rate_loop_demand(log, plant, time)
-    if log.rotor_speed is None or demand is None:
-        return nothing
-    good = np.isfinite(log.rotor_speed).all(axis=1) & (passed > limits.loop_settled_s)
-    if not good.any():
-        return nothing
-    wanted = demand(float(plant.constants.delay))
-    if not np.isfinite(wanted).all():
-        return nothing
-    loop = follow_lag(wanted, dt, float(plant.constants.time_constant))
-    wanted = np.stack([np.interp(log.time_s, time, column) for column in loop.T], axis=-1)
-    place = (passed / limits.speed_mean_s).astype(int)
-    bins, inverse = np.unique(place[good], return_inverse=True)
-    means = np.zeros((2, len(bins), 4))
-    for mean, values in zip(means, (log.rotor_speed[good], wanted[good]), strict=True):
-        np.add.at(mean, inverse, values)
-    measured, wanted = means / np.bincount(inverse, minlength=len(bins))[:, None]
-    return measured - wanted, measured - measured.mean(axis=0)
 
 
 LAG = "motor_lag"

@@ -3,7 +3,7 @@
 The black box is a Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
 et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net acceleration that the
 command asks for. Its output is added to the body's acceleration, as in the point mass; three more
-outputs turn the body, since these commands hold body rates besides. It is fitted by gradients
+outputs turn the body, since these commands contain body rates as well. It is fitted by gradients
 through the rollouts of the windows, to the same errors by which names are judged.
 """
 

@@ -66,12 +66,11 @@ class Swing(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the sentence on it, and what a vehicle file needs to fly with it."""
+        """Return what oscillates, and what may cause it."""
         low, high = self.ci95
         return (
-            f"swings with {self.period_s:.2f} s period (95 % {low:.2f} to {high:.2f}), "
-            f"as a load on a line of {self.length_m:.2g} m would (to fly it, weigh the load and "
-            f"write mass and length = {self.length_m:.2g} into [effects.slung_load])"
+            f"a force that oscillates with a period of {self.period_s:.2f} s (95 % {low:.2f} to "
+            f"{high:.2f}), as a load on a line of {self.length_m:.2g} m causes"
         )
 
 

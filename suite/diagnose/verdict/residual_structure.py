@@ -125,7 +125,7 @@ def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Threshol
             size = 1.0 / np.quantile(values[seen], share)
             weight = size * values[seen] / (1.0 + size * values[seen])
             mean = float(weight.sum())
-            spread = 2.0 * float((weight**2).sum()) + (limits.noise_doubt * mean) ** 2
+            spread = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
             value = float((weight * power).sum())
             found.append(float(gamma.sf(value, mean**2 / spread, scale=spread / mean)))
     return min(1.0, len(found) * min(found)) if found else 1.0

@@ -117,11 +117,15 @@ def gap_of(
     noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
-    """Return the gap of residuals; the slopes in `linear` are those along what is free."""
+    """Return the gap of residuals; the slopes in `linear` are those along what is free.
+
+    The score is of pose, velocity and rates. Models are compared by every channel that is fitted:
+    a bias of the accelerometer moves no other.
+    """
     whitening = make_whitening(linear, noise, windows, limits)
     residual = block_of(whitening, linear, (), windows).residual
     slow = slow_energy(whitening, residual)
-    score = slow.sum(axis=1) / whitening.slow_freedom.sum(axis=1)
+    score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
     free = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
     channels = {}
     for horizon in HORIZONS_S:

@@ -81,7 +81,7 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
         evidence, known = weighed_by(model, task.windows, linear, along=indices)
         state, block = fit(evidence, state, indices, known=known)
         if evidence.trusted.seen.sum() <= seen:
-            return state.theta[indices], block.equations()
+            return state.theta[indices], block.equations
         seen = evidence.trusted.seen.sum()
 
 

@@ -55,10 +55,10 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
         seed: of the truth, the flights and the noise.
         duration_s: of each flight.
     """
+    from eval.flights.follow import FlightFailed
+    from eval.flights.simulate import SENSORS, fly, log_of
+    from eval.flights.trajectory import ordinary_flights
     from suite.blind.oracle.strength import given_vehicle
-    from suite.diagnose.plans.follow import FlightFailed
-    from suite.diagnose.plans.simulate import SENSORS, fly, log_of
-    from suite.diagnose.plans.trajectory import ordinary_flights
 
     def attempt(number: int) -> Task:
         rng = np.random.default_rng([seed, number])

@@ -4,11 +4,11 @@ import shutil
 
 import pytest
 
+from eval.flights.trajectory import Trajectory
 from suite.blind import build as build_module
 from suite.blind import make as make_module
 from suite.blind.make import make_set
 from suite.common.console import Console
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.blind import NULL, SINGLE
 
 

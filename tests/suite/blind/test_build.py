@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS, nameable_effects
+from eval.flights.simulate import fly
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
 from suite.blind import build as module
 from suite.blind.build import build
@@ -12,8 +14,6 @@ from suite.blind.make import open_answers
 from suite.blind.oracle.strength import columns_in_table, detectable_along, given_vehicle
 from suite.blind.outside import KINDS as OUTSIDE
 from suite.blind.outside import changed_values, draw_change, make_outside
-from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.blind import SINGLE
 from tracks.common.files import plain
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import SENSORS
+from eval.flights.trajectory import Trajectory
 from suite.blind.continuous.body import POS, QUAT
 from suite.blind.continuous.timing import Conditions
 from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop
 from suite.blind.outside import make_outside
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import SENSORS
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.02)

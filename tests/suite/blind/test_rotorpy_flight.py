@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import fly
+from eval.flights.trajectory import Trajectory
 from eval.quadrotor.plant import Motion
 from suite.blind.rotorpy_flight import check_effects, damping_of_hubs, fly_rotorpy
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import fly
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.rotation import to_world
 

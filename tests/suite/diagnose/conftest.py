@@ -35,7 +35,7 @@ LAGGED = with_lag(PLAIN, 0.03)
 def diagnosed(tmp_path_factory):
     """Diagnose by the command line three flights with a drag that the vehicle file lacks.
 
-    Return its folder with the files that it wrote, the diagnosis itself and its checks.
+    Return its folder with the files that it wrote, and the diagnosis itself.
     """
     folder = tmp_path_factory.mktemp("diagnosis")
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
@@ -48,11 +48,10 @@ def diagnosed(tmp_path_factory):
     line = [*paths, str(bad), "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
     said, made = io.StringIO(), {}
     with contextlib.redirect_stdout(said), pytest.MonkeyPatch.context() as patch:
-        for name in ("diagnose", "run_checks"):
-            patch.setattr(run, name, kept(name, getattr(run, name), made))
+        patch.setattr(run, "diagnose", kept("diagnose", run.diagnose, made))
         assert main(["diagnose", *line, "--drive", "commands", "--seed", "3", "--json"]) == 0
     (folder / "said.json").write_text(said.getvalue(), encoding="utf-8")
-    return out, made["diagnose"], made["run_checks"]
+    return out, made["diagnose"]
 
 
 def kept(name, function, made):
@@ -81,9 +80,3 @@ def found_drag(drag):
 def flown(drag):
     """Return its rollouts."""
     return drag.main.source.rollouts
-
-
-@pytest.fixture(scope="session")
-def drag_checks(diagnosed):
-    """Return what its report shows besides the names."""
-    return diagnosed[2]

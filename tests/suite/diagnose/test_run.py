@@ -42,7 +42,7 @@ def test_files_come_out_whole_and_bad_flights_are_named(written):
 def test_every_step_is_in_the_report(written):
     text = (written / "report.html").read_text(encoding="utf-8")
     shown = re.findall(r"<h2>(.*?)</h2>", text)
-    assert shown[:2] == ["Measured and simulated", "What to do next"]
+    assert shown[:2] == ["What to do next", "Measured and simulated"]
     folded = re.findall(r'class="section"><summary>(.*?)</summary>', text)
     assert [head for head in folded if head in STEPS] == list(STEPS)
     assert "Actuators, apart from the air" in folded
@@ -91,7 +91,7 @@ def test_a_file_with_a_load_on_a_line_is_refused_in_one_line(tmp_path, capsys):
     line = [str(tmp_path), "--vehicle", str(tmp_path / "loaded.toml"), "--out", str(tmp_path / "o")]
     assert main(["diagnose", *line]) == 2
     said = capsys.readouterr().err.strip()
-    assert "effects.slung_load" in said and "take it out" in said and "\n" not in said
+    assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
 
 
 def test_what_is_read_is_not_written_over(tmp_path, capsys):

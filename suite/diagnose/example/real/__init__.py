@@ -1,6 +1,6 @@
 """Two short flights of a real quadrotor as its laboratory published them, cut to the flight.
 
-Their source, licence and what was cut: README.md beside this file, which goes with every copy.
+Their source, licence and what was cut: README.md next to this file, which is part of every copy.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import suite.blind.continuous
+from eval.flights.simulate import SENSORS
+from eval.flights.trajectory import Trajectory
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL
 from suite.blind.continuous.timing import (
     CLOCK_S,
@@ -19,8 +21,6 @@ from suite.blind.continuous.timing import (
     schedule,
 )
 from suite.blind.continuous_flight import fly_continuous, with_loop
-from suite.diagnose.plans.simulate import SENSORS
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.suite.test_imports import imported
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from eval.effects import nameable_effects
+from eval.flights.simulate import SENSORS, log_of
 from suite.blind.oracle import information as oracle
 from suite.blind.oracle import strength
 from suite.blind.oracle.information import (
@@ -18,7 +19,6 @@ from suite.blind.oracle.information import (
     left_over,
 )
 from suite.blind.oracle.strength import columns_in_table, detectable_along, strengths
-from suite.diagnose.plans.simulate import SENSORS, log_of
 from tests.support.ways import BARE, bare_flights
 
 NAMES = ("rotor_drag", "linear_drag", "com_offset", "gyro_bias", "weak_motor")

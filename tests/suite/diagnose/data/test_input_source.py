@@ -42,5 +42,5 @@ def test_commands_drive_no_loop_that_remembers():
     log = fly(LAGGED, 0, duration_s=2.0, motors=True)
     assert rotors_are_input([log], "auto", REMEMBERING)
     for given, drive in ((log, "commands"), (replace(log, rotor_speed=None), "auto")):
-        with pytest.raises(ValueError, match="crazyflie rate loop remembers"):
+        with pytest.raises(ValueError, match="state of its crazyflie rate loop"):
             rotors_are_input([given], drive, REMEMBERING)

@@ -9,7 +9,7 @@ from suite.diagnose.data.sampling import padded_grid, step_grid, with_lost_rows
 def test_steps_on_a_grid_are_the_loops_periods():
     grid = step_grid(np.arange(11) * 0.01, 0.002)
     np.testing.assert_allclose(grid.edge_s, np.arange(51) * 0.002, atol=1e-12)
-    np.testing.assert_allclose(grid.look_s, 0.002)
+    np.testing.assert_allclose(grid.sample_s, 0.002)
     np.testing.assert_allclose(grid.lead_s, 0.0, atol=1e-12)
 
 
@@ -23,7 +23,7 @@ def test_a_row_off_the_grid_ends_a_step():
 
 def test_a_slow_loop_looks_at_its_own_times_and_steps_between():
     grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.005)
-    looks = grid.edge_s[:-1][grid.look_s > 0]
+    looks = grid.edge_s[:-1][grid.sample_s > 0]
     np.testing.assert_allclose(looks, [0.0, 0.005, 0.01, 0.015])
     assert np.diff(grid.edge_s).max() < 0.003
     np.testing.assert_allclose(grid.lead_s, 0.0, atol=1e-12)
@@ -33,13 +33,13 @@ def test_a_slow_loop_looks_at_its_own_times_and_steps_between():
 def test_looks_of_a_fast_loop_are_taken_together(period, lead):
     """Rates held for a period are old by half of one on average, ours by half a step of 2 ms."""
     grid = step_grid(np.arange(5) * 0.01, period)
-    assert len(grid.look_s) == 20
+    assert len(grid.sample_s) == 20
     np.testing.assert_allclose(grid.lead_s, lead, atol=1e-12)
 
 
 def test_rows_nearer_than_a_step_share_one_and_start_the_loop_anew():
     grid = step_grid(np.arange(101) * 0.001, 0.005)
-    assert len(grid.look_s) == 50
+    assert len(grid.sample_s) == 50
     # The loop looks at every row, so that what it knows is old by half a row.
     np.testing.assert_allclose(grid.lead_s, 0.0005, atol=1e-9)
 
@@ -62,7 +62,7 @@ def test_padding_moves_nothing():
     grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.002)
     for at_front in (False, True):
         longer = padded_grid(grid, 16, at_front)
-        assert len(longer.look_s) == 16 and len(longer.edge_s) == 17
+        assert len(longer.sample_s) == 16 and len(longer.edge_s) == 17
         assert (np.diff(longer.edge_s) == 0.0).sum() == 6
         assert longer.edge_s[0] == 0.0 and longer.edge_s[-1] == 0.02
-        assert (longer.look_s > 0.0).sum() == 10
+        assert (longer.sample_s > 0.0).sum() == 10

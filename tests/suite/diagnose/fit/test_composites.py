@@ -88,8 +88,9 @@ def test_lent_columns_come_last_and_are_a_composites_alone():
     assert sorted(made.numbers[c] for c in columns) == list(WIND.indices)
     evidence: Any = SimpleNamespace(space=SPACE)
     at: Any = SimpleNamespace(theta=SPACE.array("start"))
-    block: Any = None
-    change, told = wanted_change(Evaluation(evidence, at, block, made), [], WIND)
+    change, told = wanted_change(
+        Evaluation(evidence, at, SimpleNamespace(equations=made)), [], WIND
+    )
     np.testing.assert_allclose(change[list(lent)], [1.0, -2.0, 0.5], atol=1e-3)
     assert (told[list(lent)] > 0.0).all() and told[places("frame_tilt")].max() == 0.0
 

@@ -152,7 +152,7 @@ def test_a_toy_source_goes_through_the_whole_diagnosis(monkeypatch, size, label)
     found = plain(diagnosis_json(result))
     assert found["verdict"] == label and found["gap"]["held_out"] == ["flight 4"]
     assert found["gap"]["channels"]["air"]["air"]["noise_floor"] == 1.0
-    text = html(page(result, found, None, "", set()))
+    text = html(page(result, found, "", set()))
     assert "temperature" in text and "The evidence" in text
     if size:
         (effect,) = found["effects"]

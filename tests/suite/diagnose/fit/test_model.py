@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 
+from eval.flights.simulate import SENSORS, fly, log_of
+from eval.flights.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.rollouts import RolloutModel
-from suite.diagnose.plans.simulate import SENSORS, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory, ordinary_flights
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.rollout_gap import true_starts
 from tests.support.faults import ImuFault, with_imu_fault

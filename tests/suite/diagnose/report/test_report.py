@@ -1,7 +1,5 @@
 """A diagnosis as JSON, report and recording: what is said is what was found."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -14,17 +12,13 @@ from suite.diagnose.report.charts import (
     series_chart,
     write_rollouts,
 )
-from suite.diagnose.report.diagnosis_json import checks_json, diagnosis_json
-from suite.diagnose.report.page import channels_grid, page
-from suite.diagnose.report.parameters_json import (
-    UNSEEN,
-    cells,
-    components,
-    grid,
-    in_digits,
+from suite.diagnose.report.diagnosis_json import (
+    actuators_json,
+    black_box_json,
+    diagnosis_json,
     parameters_json,
-    short_name,
 )
+from suite.diagnose.report.page import channels_grid, page
 from suite.diagnose.report.sections import (
     actuators_section,
     evidence_section,
@@ -32,7 +26,17 @@ from suite.diagnose.report.sections import (
     noise_section,
     residual_section,
 )
+from suite.diagnose.report.summary import (
+    UNSEEN,
+    cells,
+    components,
+    grid,
+    in_digits,
+    short_name,
+)
+from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
+from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid
@@ -41,8 +45,11 @@ PNG = b"\x89PNG"
 
 
 @pytest.fixture(scope="module")
-def found(drag, drag_checks):
-    return plain({**diagnosis_json(drag), **checks_json(drag_checks, 0)})
+def found(drag, flown):
+    mismatches = actuator_mismatches(flown.logs, flown.vehicle)
+    return plain(
+        {**diagnosis_json(drag), "actuators": actuators_json(mismatches), "black_box": None}
+    )
 
 
 def texts(table):
@@ -52,7 +59,7 @@ def texts(table):
 def compared(drag):
     gaps = (drag.main.before, drag.main.after, drag.main.before)
     side = BlackBoxComparison("flights left out", 9, 5, *gaps)
-    return BlackBoxComparisons(side, None, 4.0, 1.0)
+    return black_box_json(BlackBoxComparisons(side, None, 4.0, 1.0), 0)
 
 
 def test_rows_are_cells_without_a_tone():
@@ -68,11 +75,11 @@ def test_the_json_says_what_was_found(drag, found):
     value = np.array(effect["parameters"]["coefficient"]["value"])
     np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
-    assert found["black_box"] is None
+    assert found["actuators"][0]["followed"] > 0.9
 
 
-def test_a_comparison_with_a_black_box_is_in_the_json(drag, drag_checks):
-    box = checks_json(replace(drag_checks, black_box=compared(drag)), 0)["black_box"]
+def test_a_comparison_with_a_black_box_is_in_the_json(drag):
+    box = compared(drag)
     assert box["outside"] is None and box["held_out"]["stretches"] == {"fitted": 9, "judged": 5}
     assert box["held_out"]["named"]["gap"] == drag.main.after.rms
 
@@ -105,20 +112,27 @@ def test_a_weak_motor_says_which_and_how_surely():
     assert labels == ["scale 2 [1]", "scale 4 [1]"]
 
 
-def test_sections_show_the_numbers(drag, drag_checks, found):
-    logs = logs_section(drag_checks)
+def test_sections_show_the_numbers(drag, flown, found):
+    logs = logs_section(flown.logs)
     assert isinstance(logs.parts[0], Grid) and len(logs.parts[0].rows) == 3
     noise = noise_section(drag).parts[1]
     assert isinstance(noise, Grid) and [row[0] for row in texts(noise)][0] == "position [m]"
-    assert len(actuators_section(drag_checks, "commands")) == 1
-    assert actuators_section(replace(drag_checks, actuators=[]), "commands") == []
+    assert len(actuators_section(found)) == 1
+    assert actuators_section({**found, "actuators": []}) == []
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
     assert residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
-    with_box = replace(drag_checks, black_box=compared(drag))
-    held = evidence_section(drag, found, with_box).parts
+    held = evidence_section(drag, {**found, "black_box": compared(drag)}).parts
     assert "too few stretches" in str(held[-1])
     tables = [part for part in held if isinstance(part, Grid)]
     assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
+
+
+def test_the_facts_of_a_log():
+    log = fly(PLAIN, 0, duration_s=3.0, motors=True)
+    log.pos_w[30:60] = np.nan
+    (row,) = texts(logs_section([log]).parts[0])
+    assert row[1:6] == ["3.0 s", "301", "100 Hz", "10 ms", "10.0 %"]
+    assert row[7] == "commands, velocity, rotor speeds"
 
 
 def test_what_no_log_measured_is_not_in_the_table(found):
@@ -132,7 +146,7 @@ def test_charts_are_pictures(drag, monkeypatch):
     main = drag.main
     scores = main.search.first
     assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
-    assert black_box_chart([compared(drag).held_out], 0).startswith(PNG)
+    assert black_box_chart([compared(drag)["held_out"]]).startswith(PNG)
     series = main.source.series(main.search)
     assert series_chart(series).startswith(PNG)
     drawn = lambda figure: figure.axes[0]  # noqa: E731
@@ -142,8 +156,8 @@ def test_charts_are_pictures(drag, monkeypatch):
     assert labels == ["measured", *series.simulated] and len(series.simulated) == 2
 
 
-def test_the_page_stands_alone(drag, drag_checks, found):
-    text = html(page(drag, found, drag_checks, "name = 'x'", {"vehicle.toml"}))
+def test_the_page_stands_alone(drag, found):
+    text = html(page(drag, found, "name = 'x'", {"vehicle.toml"}))
     assert (
         text.count("<h2>") == 4
         and text.count('class="section"') >= 6

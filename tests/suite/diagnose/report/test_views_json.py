@@ -24,6 +24,6 @@ def test_the_json_has_every_axis_and_the_page_its_headline_first(by_views):
     whole = sum(axis["before"] ** 2 for axis in main.values()) ** 0.5
     assert abs(found["gap"]["before"] - whole) < 1e-9 * whole
     assert found["headline"].startswith(answer(found)) and "linear_drag" in answer(found)
-    text = html(page(by_views, found, None, "mass = 1", {"vehicle.toml"}))
+    text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
     assert text.index(found["headline"][:40]) < text.index("data:image/png") < text.index("<table")
     assert "What was written" in text and "mass = 1" in text and "black box" in text

@@ -15,8 +15,7 @@ from eval.logs.flight_log import FlightLog, write_flight
 from eval.sensors.interface import Draws, View
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from suite.common.console import Console
-from suite.diagnose.sensors.identify import fit_sensors, held_out, parameters_of
-from suite.diagnose.sensors.run import identify_sensors
+from suite.diagnose.sensors.identify import fit_sensors, held_out, identify_sensors, parameters_of
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 

@@ -10,8 +10,7 @@ import pytest
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.sources.examine import relevant_part
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.gap import Channel
-from suite.diagnose.verdict.relevance import EffectSize, rollout_size, upper_size, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, rollout_size, upper_size, view_size
 
 LIMITS = Thresholds()
 

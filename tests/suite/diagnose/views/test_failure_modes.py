@@ -65,13 +65,17 @@ def by_place(motion, t):
 
 
 @pytest.mark.parametrize(
-    ("extra", "seed"), [pytest.param(up_and_down, 40, marks=pytest.mark.slow), (by_place, 20)]
+    ("extra", "seed", "axes"),
+    [pytest.param(up_and_down, 40, "z", marks=pytest.mark.slow), (by_place, 20, "xy")],
 )
-def test_a_force_that_nothing_explains_is_not_no_gap(extra, seed):
+def test_a_force_that_nothing_explains_is_not_no_gap(extra, seed, axes):
     """Three flights of 6 s are too few to fit a regression to it, and the search finds nothing."""
     label, names, found = found_in(pushed(extra, seed))
     assert (label, names) == ("unknown", {})
     assert found.verdict.share_left > 0.9 and "m/s^2 beyond the noise" in found.verdict.where
+    main = found.main
+    shown = main.source.series(main.search)
+    assert shown.label.partition("body ")[2][0] in axes, "the picture shows where the error is"
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from suite.diagnose.data.view import SmoothedFlight, weak_form
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
+from suite.diagnose.report.summary import next_steps
 from suite.diagnose.verdict.disturbances import Swing, find_swing
 from tests.support.real_flights import VEHICLE, flights
 
@@ -67,5 +68,6 @@ def test_a_load_on_a_line_is_said_to_swing_with_its_period():
     # A pendulum on a free body of 0.75 kg swings faster than on a wall, by sqrt(1 + 0.08 / 0.75).
     assert swing.period_s == pytest.approx(1.42 / np.sqrt(1.0 + 0.08 / 0.75), rel=0.08)
     entries = diagnosis_json(found)
-    assert f"length = {swing.length_m:.2g} into [effects.slung_load]" in entries["headline"]
-    assert entries["unexplained"]["where"].startswith("swings with 1.")
+    steps = " ".join(next_steps(entries))
+    assert f"length = {swing.length_m:.2g} into [effects.slung_load]" in steps
+    assert "oscillates with a period of 1." in entries["unexplained"]["where"]

@@ -39,7 +39,7 @@ def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
     theta[list(one.indices)] = scale
     evidence, at = force.judged.evidence, force.estimate._replace(theta=theta)
     block = evidence.linearise(at, one.indices)
-    here = Evaluation(evidence, at, block, block.equations())
+    here = Evaluation(evidence, at, block)
     named = (NamedEffect(one, 0.001, 1.0),)
     torque = replace(force, named=named, last=here, judged=here)
     assert [name for name, _ in contradicted(force, torque)] == [one] * count

@@ -214,8 +214,8 @@ def test_a_model_is_believed_as_far_as_its_rotors_are_measured():
         (flight,) = ready([replace(log, rotor_speed=speed)], VEHICLE).smoothed["torque"]
         truth, seen = (flight.form.mean @ _about_x(part) for part in (true, speed))
         slope = np.sum(truth * seen) / np.sum(seen**2)
-        assert least <= flight.credible[0] <= most
-        assert flight.credible[0] == pytest.approx(slope, abs=0.05)
+        assert least <= flight.reliability[0] <= most
+        assert flight.reliability[0] == pytest.approx(slope, abs=0.05)
 
 
 def _about_x(speed):

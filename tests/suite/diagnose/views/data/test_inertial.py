@@ -65,7 +65,7 @@ def test_gyro_and_accelerometer_tell_the_velocity(end_s):
     assert np.sqrt((off**2).mean()) < 0.3
     lean = (rot.as_matrix()[:, :, 2] * found.rot_w[:, :, 2]).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(lean, -1.0, 1.0))).mean() < 2.0
-    assert found.sway_b is not None and found.sway_b.shape[:2] == (len(off), 3)
+    assert found.pose_slope_b is not None and found.pose_slope_b.shape[:2] == (len(off), 3)
 
 
 def test_a_flight_may_begin_on_its_side():

@@ -142,7 +142,7 @@ def test_a_flight_is_judged_by_what_the_others_say(dragged):
     task = task_of(dragged)
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
     evidence, block = task.weighed(task.start)
-    equations, theta, part = block.equations(), task.start.theta, evidence.parts(block)
+    equations, theta, part = block.equations, task.start.theta, evidence.parts(block)
     without, with_it = (
         chi2_by_part(equations.along_numbers(at), theta, SPACE, part) for at in ([], drag)
     )

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from eval.flights.follow import PilotGains, steer
+from eval.flights.simulate import SENSORS, fly, log_of
+from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.plant import Motion
 from suite.diagnose.diagnose import diagnose
-from suite.diagnose.plans.follow import PilotGains, steer
-from suite.diagnose.plans.plan import (
+from suite.diagnose.plan import (
     COLUMNS,
     OTHERWISE,
     SEPARATIONS,
@@ -24,8 +26,6 @@ from suite.diagnose.plans.plan import (
     write_plan,
     write_plan_of,
 )
-from suite.diagnose.plans.simulate import SENSORS, fly, log_of
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.plans.trajectory import KINDS, Trajectory
+from eval.flights.trajectory import KINDS, Trajectory
 from tests.support.ways import CIRCLE
 
 

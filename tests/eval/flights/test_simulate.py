@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import FULL_V, SENSORS, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.quadrotor.plant import Wrench, accelerations, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import FULL_V, SENSORS, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tests.support.ways import BARE, CIRCLE, EIGHT, bare_flights, having
 

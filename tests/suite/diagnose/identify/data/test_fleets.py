@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from eval.flights.trajectory import Trajectory
 from suite.diagnose.identify.drive import Driven
 from suite.diagnose.identify.grid import grid_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.fleets import (
     DELAY,
     SENSORS,

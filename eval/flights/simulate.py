@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eval.effects.log_faults import apply_log_faults
+from eval.flights.follow import PilotGains, Recording, Step, follow, wanted_of
+from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.follow import PilotGains, Recording, Step, follow, wanted_of
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.rotation import to_world
 
 FULL_V = 16.5
@@ -30,7 +30,7 @@ INTEGRATOR = "euler"
 
 
 class Extra(Protocol):
-    """Physics besides the vehicle's, acting on N flights at once."""
+    """Physics in addition to the vehicle's, acting on N flights at once."""
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return the command that acts in place of `command`, once a step."""
@@ -54,11 +54,11 @@ def fly(
     """Fly `trajectories` side by side and return what happened.
 
     Args:
-        nominal: what the pilot believes.
-        truth: what is flown: the same quadrotor with the effects that are true.
+        nominal: the vehicle that the position controller assumes.
+        truth: the vehicle that flies: the same quadrotor with the true effects.
         trajectories: N of them.
         rate_hz: of commands and of log rows; the rate loop's frequency must be a multiple of it.
-        extra: physics besides the effects.
+        extra: further physics that no effect describes.
         rng: for random wind; none blows without it.
         has_voltage: whether effects see the battery's voltage, as they do where it is logged.
         gains: of the pilot.

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from eval.flights.follow import FlightFailed, Step, follow, wanted_of
+from eval.flights.trajectory import Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench
-from suite.diagnose.plans.follow import FlightFailed, Step, follow, wanted_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tests.support.vehicles import PLAIN
 from tests.support.ways import CIRCLE, EIGHT, bare_flights
 

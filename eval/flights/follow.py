@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.attitude import attitude_command
 from eval.quadrotor.plant import Command, Motion, Wrench
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.plans.trajectory import Reference, Trajectory
 from tracks.geometry.scene import Array
 
 FURTHEST_M = 4.0

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from eval.flights.follow import FlightFailed
+from eval.flights.simulate import Sensors, fly, log_of
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import write_flight
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.windows import SLICES
 from suite.diagnose.estimate.parameters import effects_in
-from suite.diagnose.plans.follow import FlightFailed
-from suite.diagnose.plans.simulate import Sensors, fly, log_of
-from suite.diagnose.plans.trajectory import Trajectory
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
 from tracks.input.reading import read_json
@@ -35,7 +35,7 @@ MEASURES = {
     "voltage": "Log the battery's voltage as well.",
     "scale": "Better still: weigh the vehicle.",
 }
-"""What to measure besides, by its name in a `Separation`."""
+"""What to measure as well, by its name in a `Separation`."""
 FLIGHTS = "flights"
 """Folder of the simulated logs, within the plan's."""
 
@@ -70,12 +70,16 @@ def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
 def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Write the plan that follows from `found`; return it, with no flights where none is needed.
 
-    An earlier plan in `folder` goes, with its simulated logs, so that nobody takes them for these.
+    An earlier plan in `folder` is removed with its simulated logs, so that they are not mistaken
+    for the new ones.
     """
     remove_plan(folder)
     ways, words = ways_for(found)
     if not ways:
-        return {"flights": [], "words": ["Nothing is left to separate: no flight is planned."]}
+        return {
+            "flights": [],
+            "words": ["No effects are left to separate: no flight is planned."],
+        }
     return write_plan(folder, ways, words)
 
 
@@ -92,8 +96,8 @@ def fly_plan(
     Args:
         plan: from `write_plan_of`.
         sigma: (19,) noise of each channel in its unit that the logs get; NaN: not logged.
-        nominal: what the pilot believes.
-        truth: what is flown.
+        nominal: the vehicle that the position controller assumes.
+        truth: the vehicle that flies.
         folder: of the plan.
         seed: of the noise and of random wind.
 
@@ -220,23 +224,23 @@ _SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
 _HOVER = Trajectory("hover")
 _UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
 OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
-"""What to do about a pair that is not known."""
+"""What to do where no entry of `SEPARATIONS` applies."""
 
 
 @dataclass(frozen=True)
 class Separation:
-    """A pair of effects, flights that leave it a pair, and flights that separate it."""
+    """Two effects, flights that do not separate them, and flights that do."""
 
     pair: tuple[str, str]
     """Names of the two effects."""
     words: str
-    """What to do, for people."""
+    """What to do, in words."""
     blurred: tuple[Trajectory, ...]
     """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]
     """Flights to add."""
     measure: tuple[str, ...] = ()
-    """What to log besides: `motor`, `voltage`, or `scale` for a weighing."""
+    """What to log as well: `motor`, `voltage`, or `scale` for a weighing."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (
@@ -317,22 +321,22 @@ SEPARATIONS: tuple[Separation, ...] = (
         ("voltage",),
     ),
 )
-"""Pairs that effects of a quadrotor form on gentle flights, with the way out."""
+"""Pairs of effects that gentle flights do not separate, and what does."""
 
 
 def separations_of(names: Iterable[str]) -> list[Separation]:
-    """Return the known ways to split the set `names`: those whose two effects are both in it.
+    """Return the entries of `SEPARATIONS` whose two effects are both in `names`.
 
-    Of effects that are one hypothesis each counts.
+    A composite counts as its effects.
     """
     wanted = {effect for name in names for effect in effects_in(name)}
     return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
 
 
 def plan_for(names: Iterable[str]) -> list[Trajectory]:
-    """Return the flights that split the set `names` as far as flights can, each only once.
+    """Return the flights that separate `names`, each once.
 
-    A set that holds no known pair gets the flights that excite most: speeds, turns and chirps.
+    Without a known pair these are the flights with most excitation: speeds, turns and chirps.
     """
     found = [way for entry in separations_of(names) for way in entry.separating]
     return list(dict.fromkeys(found or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))

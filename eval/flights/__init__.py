@@ -1,0 +1,1 @@
+"""Commanded trajectories, flown in simulation and logged with noise."""

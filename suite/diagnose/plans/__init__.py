@@ -1,1 +1,0 @@
-"""Commanded trajectories, flown in simulation, and which of them separate which effects."""
