@@ -35,9 +35,9 @@ RANGES = (
     ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
 """Range of a throttle, its span, its usual median in flight, and the step to 0 to 1."""
-THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.07
+THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.15
 """A ratio within the first factor of a unit's is that unit. One within the second factor of 1 may
-be a physical effect or a wrong mass, one within the third is certainly of that unit."""
+be a physical effect or a wrong mass, one within the third is m/s^2 whatever the mass."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
@@ -81,8 +81,10 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
-    near, exact = within(units, THRUST_FITS, ratio), within(units, THRUST_SAME, ratio)
-    if exact == ["in newtons"] and "in m/s^2" in near and sign > 0.0:
+    near = within(units, THRUST_FITS, ratio)
+    nearest = min(near, key=lambda n: abs(np.log(ratio / units[n])), default="")
+    far = abs(np.log(ratio)) > np.log(THRUST_SAME)
+    if far and nearest == "in newtons" and "in m/s^2" in near and sign > 0.0:
         text = f"{figures}: it may be in newtons, as the mass is {units['in newtons']:.3g} kg, or "
         text += "thrust is off by so much"
         fix = option(("cmd_thrust", f"{1.0 / units['in newtons']:.6g}"))

@@ -91,7 +91,8 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
     time_s, rate = rows["time"], rows["rate"]
-    thrust = _thrust(rows[name], name, vehicle, rows.get("voltage"))
+    motors = vehicle.motors if vehicle is not None and name == "pwm" else None
+    thrust = rows[name] ** 2 if motors is None else np.asarray(motor_thrust(motors, rows[name]))
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
     if len(time_s) < 20 * count:
         return unseen("motors", "the flight is too short", "motor_order", "motor_spin")
@@ -149,10 +150,8 @@ Scores = dict[tuple[int, ...], np.ndarray]
 
 
 def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
-    good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
-    mean, turning = mean[good] - mean[good].mean(axis=0), turning[good] - turning[good].mean(axis=0)
     return {
-        order: np.array([_alike((mean[:, order] @ mixer.T)[:, k], turning[:, k]) for k in range(3)])
+        order: _correlations(mean[:, order] @ mixer.T, turning).diagonal()
         for order in permutations(range(4))
     }
 
@@ -161,25 +160,12 @@ def _best(scores: Scores) -> tuple[int, ...]:
     return max(scores, key=lambda order: float(scores[order][:2].sum()))
 
 
-def _thrust(
-    value: np.ndarray, name: str, vehicle: Vehicle | None, voltage: np.ndarray | None
-) -> np.ndarray:
-    """Return a quantity proportional to each motor's thrust (T, 4)."""
-    if name == "pwm" and vehicle is not None and vehicle.motors is not None:
-        return np.asarray(motor_thrust(vehicle.motors, value))
-    return value**2
-
-
 def _correlations(mean: np.ndarray, turning: np.ndarray) -> np.ndarray:
+    """Return the correlation of each column of `mean` with each of `turning`."""
     good = np.isfinite(mean).all(axis=1) & np.isfinite(turning).all(axis=1)
     a, b = mean[good] - mean[good].mean(axis=0), turning[good] - turning[good].mean(axis=0)
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
     return (a.T @ b) / np.maximum(size, 1e-12)
-
-
-def _alike(first: np.ndarray, second: np.ndarray) -> float:
-    size = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return float(first @ second) / size if size > 0.0 else 0.0
 
 
 def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
@@ -193,14 +179,13 @@ def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     lift = over_force(rows, thrust) / vehicle.mass
     if not lift > 0.0:
         return []
-    factor = float(np.sqrt(lift))
     figures = f"by {vehicle.name!r} they lift {lift:.3g} times the weight"
     if 1.0 / FITS < lift < FITS:
         if abs(np.log(lift)) < np.log(SAME):
             return [Finding("ok", "rotor speeds", figures)]
         text = f"{figures}: an effect, which suite diagnose names, or a mass that is off"
         return [Finding("note", "rotor speeds", text, "thrust_scale", lift, 0.9)]
-    return [_of_factor(rows, vehicle, factor, figures)]
+    return [_of_factor(rows, vehicle, float(np.sqrt(lift)), figures)]
 
 
 def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
@@ -227,9 +212,8 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
         fix = f"mass = {vehicle.mass / whole[0]:.3g} in the vehicle file"
         return Finding("doubt", "mass", text, "vehicle_mass", factor**-2, 0.9, fix)
     if poles:
-        declared, _, true = poles[0].split(" ")[0], None, poles[0].split(" ")[-1]
         text = f"{figures}: {poles[0]}, or the mass or the thrust coefficient is wrong"
-        fix = f"--motor-poles {true}" if declared else ""
+        fix = f"--motor-poles {poles[0].split(' ')[-1]}"
         return Finding("doubt", "rotor speeds", text, "motor_poles", factor, 0.9, fix)
     text = f"{figures}: the speeds' unit, the mass or the thrust coefficient is wrong"
     fix = "mass or rotors.thrust_coefficient of the vehicle file"

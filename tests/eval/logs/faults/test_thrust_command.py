@@ -15,7 +15,7 @@ def found(factor, vehicle=PLAIN):
     return check_thrust_command(rows, vehicle)
 
 
-@pytest.mark.parametrize("factor", [1.0, 0.85, 1.3])
+@pytest.mark.parametrize("factor", [1.0, 0.88, 1.3])
 def test_a_command_near_the_force_is_fine(factor):
     (finding,) = found(factor)
     assert finding.status == "ok"
@@ -41,8 +41,9 @@ def test_newtons_need_the_mass_and_a_share_of_full_thrust_has_no_unit():
     (finding,) = found(4.0, heavy)
     assert "newtons" in finding.evidence and finding.fix == "--read cmd_thrust=0.25"
     light = PLAIN.__class__(**{**vars(PLAIN), "mass": 0.78})
-    (finding,) = found(0.78, light)
-    assert finding.fault == "thrust_command_unit" and not finding.is_open, "or thrust is lower"
+    for factor in (0.78, 0.84):
+        (finding,) = found(factor, light)
+        assert finding.fault == "thrust_command_unit" and not finding.is_open, "or thrust is lower"
     (finding,) = found(4.0, None)
     assert finding.is_open and finding.fault == "thrust_command_unit"
     (finding,) = found(0.67)
