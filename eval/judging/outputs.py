@@ -30,6 +30,10 @@ LIFT = 3.0
 CLEAR = 0.5
 """Smallest difference of an output between gates on opposite sides that counts [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
+SCALE_FIX = (
+    "export it with the contract of its environment, or set action.scale; "
+    "after a very short training this is no fault"
+)
 TIMES, ALIKE = 1.5, 1e-3
 """Factor on a test image, and the largest relative change of output that counts as no change."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
@@ -99,8 +103,7 @@ def _warnings(
         found.append(Note("action_not_finite", seen, "check its weights and its normalisation"))
     if plain and 0.0 < max(largest) <= UNIT:
         seen = "all its outputs are within -1 to 1 m/s^2 and are probably unscaled"
-        fix = "export it with the contract of its environment, or set action.scale"
-        found.append(Note("action_scale", seen, fix))
+        found.append(Note("action_scale", seen, SCALE_FIX))
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
         seen = f"its outputs contain gravity: {up:.1f} m/s^2 upwards while it climbs"
@@ -154,8 +157,7 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
         found.append(Note("action_gravity", seen + "its action contained gravity", fix))
     if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
         seen = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
-        fix = "export it with the contract of its environment, or set action.scale"
-        found.append(Note("action_scale", seen, fix))
+        found.append(Note("action_scale", seen, SCALE_FIX))
     if _divides_images(policy):
         seen = f"{name}: has the same output for an image and for {TIMES:g} times that image"
         fix = "an image without scale contains no distances: do not divide it by its maximum"
