@@ -59,7 +59,7 @@ class BlockPolicy:
         hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
         if len(state) == self.rows == self.block:
-            return _refuse_lost_memory(*self.model(*inputs))
+            return _nan_if_overflowed(*self.model(*inputs))
         actions = np.empty((len(state), self.spec.action.size), np.float32)
         remembered = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
@@ -67,7 +67,7 @@ class BlockPolicy:
             action, after = self.model(*(self._padded(x[used]) for x in inputs))
             actions[used] = action[: used.stop - low]
             remembered[used] = after[: used.stop - low]
-        return _refuse_lost_memory(actions, remembered)
+        return _nan_if_overflowed(actions, remembered)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
         if len(rows) == self.block:
@@ -116,12 +116,12 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
                        for x in (state, image, hidden))  # fmt: skip
         alone = tuple(x[row : row + 1] for x in policy.model(*among_zeros))
         for found in (policy.model(*everywhere), alone):
-            _refuse_leaning(tuple(x[: len(found[0])] for x in wanted), found, where)
+            _refuse_batch_dependence(tuple(x[: len(found[0])] for x in wanted), found, where)
             one_by_one |= not _same(tuple(x[: len(found[0])] for x in wanted), found)
     return dataclasses.replace(policy, rows=1) if one_by_one else policy
 
 
-def _refuse_leaning(
+def _refuse_batch_dependence(
     wanted: tuple[np.ndarray, ...], found: tuple[np.ndarray, ...], where: str
 ) -> None:
     """Refuse outputs that depend on the other rows by more than rounding, as with BatchNorm."""
@@ -167,7 +167,7 @@ def _drawn(
     return state, image, hidden
 
 
-def _refuse_lost_memory(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nan_if_overflowed(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the outputs, with NaN actions in rows whose recurrent state is not finite."""
     lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
     if lost.any():
