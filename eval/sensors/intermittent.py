@@ -78,15 +78,31 @@ STATE_LOSS = Sensor(
 )
 
 
-class WrongGate(NamedTuple):
-    """Values of `wrong_gate`."""
+class Fault(NamedTuple):
+    """Values of the faults below."""
 
     share: Array
     length: Array
 
 
+def _fault(usual_share: tuple[float, float], **others: Any) -> Sensor:
+    """Return a sensor model with the parameters `share` and `length` alone."""
+    return Sensor(
+        source="our estimate",
+        values=Fault,
+        parameters=(
+            Parameter("share", "1", 0.0, 0.0, 0.95, usual_share),
+            Parameter("length", "s", 0.0, 0.0, 10.0, (0.05, 0.3)),
+        ),
+        grows=("share",),
+        trial=Needs(uniform=1),
+        observation=Needs(uniform=1),
+        **others,
+    )
+
+
 def wrong_gate_sense(
-    values: WrongGate, memory: Array, seen: View, moment: Moment
+    values: Fault, memory: Array, seen: View, moment: Moment
 ) -> tuple[View, Array]:
     """Return the view with the second gate in place of the first during the fault."""
     xp, chance = seen.pos_w.__array_namespace__(), moment.draws.uniform[..., 0]
@@ -96,35 +112,18 @@ def wrong_gate_sense(
     return seen._replace(gate_w=gate_w, axis_w=axis_w), wrong
 
 
-WRONG_GATE = Sensor(
+WRONG_GATE = _fault(
+    usual_share=(0.002, 0.02),
     name="wrong_gate",
     stage="gates",
     summary="The gate after the next one is taken for the next, for a while",
     equation="Markov chain: wrong for `share` of the observations, `length` at a time",
-    source="our estimate",
-    values=WrongGate,
-    parameters=(
-        Parameter("share", "1", 0.0, 0.0, 0.95, (0.002, 0.02)),
-        Parameter("length", "s", 0.0, 0.0, 10.0, (0.05, 0.3)),
-    ),
-    grows=("share",),
-    trial=Needs(uniform=1),
-    observation=Needs(uniform=1),
     start=absent,
     sense=wrong_gate_sense,
 )
 
 
-class Exposure(NamedTuple):
-    """Values of `exposure`."""
-
-    share: Array
-    length: Array
-
-
-def exposure_sense(
-    values: Exposure, memory: Array, seen: View, moment: Moment
-) -> tuple[View, Array]:
+def exposure_sense(values: Fault, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
     """Return the view with an image at full range where the camera is blind."""
     xp, chance = seen.depth_m.__array_namespace__(), moment.draws.uniform[..., 0]
     blind = sticky(memory, chance, values.share, values.length, moment.dt_s)
@@ -132,39 +131,24 @@ def exposure_sense(
     return seen._replace(depth_m=depth_m), blind
 
 
-EXPOSURE = Sensor(
+EXPOSURE = _fault(
+    usual_share=(0.005, 0.05),
     name="exposure",
     stage="depth",
     summary="The camera is blind for a while; its image reads as the range everywhere",
     equation="Markov chain: blind for `share` of the images, `length` at a time; z = range",
-    source="our estimate",
-    values=Exposure,
-    parameters=(
-        Parameter("share", "1", 0.0, 0.0, 0.95, (0.005, 0.05)),
-        Parameter("length", "s", 0.0, 0.0, 10.0, (0.05, 0.3)),
-    ),
-    grows=("share",),
-    trial=Needs(uniform=1),
-    observation=Needs(uniform=1),
     start=absent,
     sense=exposure_sense,
 )
 
 
-class FrameLoss(NamedTuple):
-    """Values of `frame_loss`."""
-
-    share: Array
-    length: Array
-
-
-def frame_loss_start(values: FrameLoss, moment: Moment) -> dict[str, Any]:
+def frame_loss_start(values: Fault, moment: Moment) -> dict[str, Any]:
     """Return the state at the start: no image is lost."""
     return {"lost": absent(values, moment), "shown_m": moment.truth.depth_m}
 
 
 def frame_loss_sense(
-    values: FrameLoss, memory: dict[str, Any], seen: View, moment: Moment
+    values: Fault, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
     """Return the view with the last image that was not lost."""
     xp = seen.depth_m.__array_namespace__()
@@ -174,20 +158,12 @@ def frame_loss_sense(
     return seen._replace(depth_m=shown_m), {"lost": lost, "shown_m": shown_m}
 
 
-FRAME_LOSS = Sensor(
+FRAME_LOSS = _fault(
+    usual_share=(0.01, 0.1),
     name="frame_loss",
     stage="depth",
     summary="Images are lost, alone or in bursts, and the one before is seen again",
     equation="Markov chain: lost for `share` of the images, `length` at a time; z = z of the last",
-    source="our estimate",
-    values=FrameLoss,
-    parameters=(
-        Parameter("share", "1", 0.0, 0.0, 0.95, (0.01, 0.1)),
-        Parameter("length", "s", 0.0, 0.0, 10.0, (0.05, 0.3)),
-    ),
-    grows=("share",),
-    trial=Needs(uniform=1),
-    observation=Needs(uniform=1),
     start=frame_loss_start,
     sense=frame_loss_sense,
 )
