@@ -22,8 +22,9 @@ class Config(Command):
     """Make cases with hidden effects, run the diagnosis on them, score it against the answers."""
 
     what: tyro.conf.Positional[Literal["make", "run", "score", "strengths", "plan"]]
-    """make a set, run `suite diagnose` on it, score the answers; strengths: make the table of
-    detectable strengths again; plan: print which flights separate --effects."""
+    """make: write a set of cases; run: `suite diagnose` on each; score: compare the answers with
+    the truth; strengths: the table of detectable strengths again; plan: which flights separate
+    --effects."""
     out: Path = Path("runs/blind")
     """Folder of the set; the same command again continues where it stopped."""
     set: Literal["tuning", "published"] = "tuning"

@@ -41,7 +41,7 @@ class Config(Command):
     """
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
-    """For which shell."""
+    """bash or zsh."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Container, Sequence
 
 GROUPS: dict[str, dict[str, str]] = {
@@ -111,6 +112,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 }
 """Command -> examples that its help begins with."""
 
+WIDTH = 80
+"""Characters of a line of a command's help."""
 JOINED = ("--track", "--difficulty")
 """Options that read a list from one text."""
 
@@ -146,7 +149,7 @@ def first_paragraph(text: str | None) -> str:
 
 def description(name: str, about: str) -> str:
     """Return the head of a command's help: its purpose, its examples, then what more there is."""
-    first, *more = [" ".join(part.split()) for part in about.split("\n\n")]
+    first, *more = [textwrap.fill(" ".join(part.split()), WIDTH) for part in about.split("\n\n")]
     examples = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
     return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
 
