@@ -112,8 +112,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 }
 """Command -> examples that its help begins with."""
 
-WIDTH = 80
-"""Characters of a line of a command's help."""
 JOINED = ("--track", "--difficulty")
 """Options that read a list from one text."""
 
@@ -149,9 +147,12 @@ def first_paragraph(text: str | None) -> str:
 
 def description(name: str, about: str) -> str:
     """Return the head of a command's help: its purpose, its examples, then what more there is."""
-    first, *more = [textwrap.fill(" ".join(part.split()), WIDTH) for part in about.split("\n\n")]
-    examples = "\n".join(f"  {line}" for line in EXAMPLES.get(name, ()))
-    return "\n\n".join([first, *([f"Examples:\n{examples}"] if examples else []), *more])
+    first, *more = [" ".join(part.split()) for part in about.split("\n\n")]
+    # A line that begins with a space keeps its break; others are joined, and not wrapped.
+    notes = [line for part in more for line in textwrap.wrap(part, 76, break_on_hyphens=False)]
+    parts = {"Examples": EXAMPLES.get(name, ()), "Notes": notes}
+    texts = ["\n  ".join([f"{title}:", *lines]) for title, lines in parts.items() if lines]
+    return "\n\n".join([first, *texts])
 
 
 def with_lists(

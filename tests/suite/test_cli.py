@@ -73,6 +73,8 @@ def test_every_command_has_help_for_every_option(name, capsys):
     assert text.index("Examples:\n  suite ") < text.index("--help ") and "None" not in text
     for option in options(module.Config):
         assert option.about and (option.positional or option.flag in text), option
+    notes = text.partition("\nNotes:\n")[2].partition("╭")[0]
+    assert max(map(len, notes.splitlines()), default=0) <= 80
     rare = [option.flag for option in options(module.Config) if option.advanced]
     assert all(flag in text.partition("advanced options")[2] for flag in rare)
 
