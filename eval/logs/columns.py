@@ -199,13 +199,12 @@ def _need_a_command(present: list[str], columns: Mapping[str, np.ndarray], name:
 
 def _did_you_mean(column: str, columns: Mapping[str, np.ndarray]) -> str:
     free = {other.lower(): other for other in columns if other not in KNOWN}
-    for candidate in (column, *_OTHER_NAMES.get(column, ())):
-        if candidate in free:
-            return f"; did you mean {free[candidate]!r}? Rename it (and check its unit)"
-    close = difflib.get_close_matches(column, free, n=1, cutoff=0.7)
-    if close:
-        return f"; did you mean {free[close[0]]!r}? Rename it (and check its unit)"
-    return ""
+    exact = [name for name in (column, *_OTHER_NAMES.get(column, ())) if name in free]
+    close = exact or difflib.get_close_matches(column, free, n=1, cutoff=0.7)
+    if not close:
+        return ""
+    what = "Rename it and check its unit, or describe the columns to suite import --map"
+    return f"; did you mean {free[close[0]]!r}? {what}"
 
 
 def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:

@@ -13,6 +13,7 @@ from eval.logs.faults.catalogue import FAULTS, manoeuvre
 from eval.logs.faults.clock import check_clock, check_time
 from eval.logs.faults.commands import (
     check_controller_rate,
+    check_gyro_signs,
     check_rate_command,
     check_throttle,
     check_thrust_command,
@@ -53,6 +54,7 @@ POSE: tuple[Check, ...] = (
 """Position, attitude, rates, velocity and acceleration; each check relies on those before it."""
 DRIVE: tuple[Check, ...] = (
     lambda rows, _: check_voltage(rows),
+    lambda rows, against: check_gyro_signs(rows, against.vehicle),
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle),
     lambda rows, _: check_throttle(rows),

@@ -6,11 +6,11 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.motors import over_force, within
+from eval.logs.faults.motors import over_force, torque_correlations, within
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
-from eval.logs.faults.vectors import DEG, RATES
+from eval.logs.faults.vectors import DEG, RATES, UPWARDS, upwards
 from eval.vehicles.vehicle import Vehicle
 
 REACH_S, STEP_S = 0.3, 0.01
@@ -162,6 +162,38 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         fix = "the link's or the logger's clock; a delay in the simulation: effects.command_delay"
         findings.append(Finding("doubt", subject, text, "command_delay", delay, 0.93, fix))
     return findings or [Finding("ok", subject, figures)]
+
+
+def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return inverted axes of a log without an attitude, by two witnesses.
+
+    A gyro is inverted where commands and motors' torques contradict it; each of them alone could be
+    wrong itself. All are forward-right-down where the accelerometer and the torques contradict it.
+    """
+    if "quat" in rows or not {"cmd_rate", "rate"} <= rows.keys():
+        return []
+    torque = torque_correlations(rows, vehicle)
+    rate = smooth(rows["time"], rows["rate"], WIDTH_S)
+    if torque is None or rms(rate) < CALM_RATE:
+        return []
+    _, command = _delayed(rows["time"], rows["cmd_rate"], rate)
+    followed = match(command, rate).as_given
+    if not (np.minimum(np.abs(followed), np.abs(torque)) > -OPPOSITE).all():
+        return []
+    alike = ", ".join(f"{c:+.2f} and {t:+.2f}" for c, t in zip(followed, torque, strict=True))
+    text = f"its correlations with commands and with the motors' torques are {alike} about x, y, z"
+    wrong, signals = (followed < 0.0) & (torque < 0.0), ["rate"]
+    axes = ",".join(("-" if w else "") + "xyz"[k] for k, w in enumerate(wrong))
+    upside_down = "acc" in rows and upwards(rows["acc"])[1] < -UPWARDS
+    if upside_down and (np.sign(torque) == [1.0, -1.0, -1.0]).all():
+        axes, signals = "x,-y,-z", ["rate", "acc"]
+        signals += ["cmd_rate"] if (followed > 0.0).all() else []
+        text += ", and the accelerometer reads thrust downwards"
+    elif not wrong.any():
+        return []
+    frame = "body_frame" if axes == "x,-y,-z" else "gyro_axes"
+    fix = option(*((signal, axes) for signal in signals))
+    return [Finding("corrected", "gyro", text, frame, None, 0.95, fix)]
 
 
 def _response(vehicle: Vehicle) -> float:

@@ -70,7 +70,7 @@ def check_count(turning: int, whose: str) -> list[Finding]:
 
 def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     """Return stopped motors, and whether order and spin agree with the angular accelerations."""
-    name = next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
+    name = _drive(rows)
     if name is None:
         return []
     speed = rows[name]
@@ -85,8 +85,24 @@ def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     return _order(rows, name, vehicle)
 
 
-def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
-    """Return whether the motors' torques agree with the angular accelerations, in any order."""
+def torque_correlations(rows: Rows, vehicle: Vehicle | None) -> np.ndarray | None:
+    """Return the correlations of torque and angular acceleration about x, y, z in the given order.
+
+    None where the flight does not show them.
+    """
+    name = _drive(rows)
+    found = "" if name is None or "rate" not in rows else _torques(rows, name, vehicle)
+    return None if isinstance(found, str) else _scores(*found)[AS_GIVEN]
+
+
+def _drive(rows: Rows) -> str | None:
+    return next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
+
+
+def _torques(
+    rows: Rows, name: str, vehicle: Vehicle | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | str:
+    """Return thrusts (N, 4), angular momentum's changes (N, 3) and mixer (3, 4), or why not."""
     hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
@@ -95,7 +111,7 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     thrust = rows[name] ** 2 if motors is None else np.asarray(motor_thrust(motors, rows[name]))
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
     if len(time_s) < 20 * count:
-        return unseen("motors", "the flight is too short", "motor_order", "motor_spin")
+        return "the flight is too short"
     inertia = np.array([1.0, 1.0, 1.0] if vehicle is None else vehicle.inertia)
     momentum = rate * inertia
     change = (momentum[count:] - momentum[:-count]) / (time_s[count:] - time_s[:-count])[:, None]
@@ -103,13 +119,21 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
     turning = change + gyroscopic
     size = rms(turning / inertia)
     if size < CALM_TURN:
-        text = f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
-        return unseen("motors", text, "motor_order", "motor_spin")
+        return f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
     full = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
     mean = (full[count:-1] - full[: -1 - count]) / count
     step = float(np.median(np.diff(time_s)))
     late = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
     mean = max(late, key=lambda one: float(np.sum(_correlations(one, turning) ** 2)))
+    return mean, turning, mixer
+
+
+def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
+    """Return whether the motors' torques agree with the angular accelerations, in any order."""
+    found = _torques(rows, name, vehicle)
+    if isinstance(found, str):
+        return unseen("motors", found, "motor_order", "motor_spin")
+    mean, turning, mixer = found
     scores = _scores(mean, turning, mixer)
     half = len(mean) // 2
     halves = [

@@ -49,6 +49,8 @@ CALM_SPEED = 0.3
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
 OK = 0.3
 """Largest relative error of a correct signal."""
+UPWARDS = 0.5
+"""Least share of an accelerometer's median that is along body z, as thrust is."""
 APART = 0.5
 """Least relative difference of two frames at which they are distinguishable."""
 
@@ -103,6 +105,13 @@ def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
     if top < GYRO_TOP:
         return unseen("gyro", why, "gyro_scale")
     text = f"it reads up to {top:.4g} rad/s, and no gyro of a drone measures that; {why}"
+    command = rms(rows["cmd_rate"]) if "cmd_rate" in rows else 0.0
+    ratio = rms(rows["rate"]) / command if command > CALM_RATE else 0.0
+    for words, factor in RATES.items():
+        if ratio > 0.0 and abs(np.log(ratio / factor)) < np.log(1.5):
+            text = f"{text}. It is {ratio:.3g} times the commanded rates: {words}"
+            about = ("gyro_scale", factor, 0.95, option(("rate", f"{1.0 / factor:.10g}")))
+            return [Finding("corrected", "gyro", text, *about)]
     fix = f"{option(('rate', f'{DEG:.6g}'))} for deg/s, or {DEG / COUNTS:.6g} for raw counts"
     return [Finding("doubt", "gyro", text, "gyro_scale", None, 0.95, fix)]
 
@@ -277,17 +286,32 @@ def _unit_of(ratio: float, within: float) -> tuple[str, float]:
 
 
 def _unit_alone(rows: Rows) -> list[Finding]:
-    ratio = _middle(smooth(rows["time"], rows["acc"], WIDTH_S)) / GRAVITY
+    """Return unit and direction of an accelerometer without a path: thrust is one g, upwards."""
+    acc = smooth(rows["time"], rows["acc"], WIDTH_S)
+    ratio = _middle(acc) / GRAVITY
     figures = f"half of the flight it reads below {GRAVITY * ratio:.3g} m/s^2"
+    mean, up = upwards(rows["acc"])
+    if up < UPWARDS and ratio > 0.5:
+        text = f"it reads ({', '.join(f'{v:.3g}' for v in mean)}) m/s^2, and thrust is along body z"
+        fix = f"{option(('acc', 'x,-y,-z'))} for forward-right-down, or -x,-y,-z for its sign"
+        fix = fix if up < -UPWARDS else "the accelerometer's columns"
+        return [Finding("doubt", "accelerometer", text, "accelerometer_axes", None, 0.95, fix)]
     if 0.5 < ratio < 2.0:
         return [Finding("ok", "accelerometer", figures)]
     unit, factor = _unit_of(ratio, 1.5)
     if factor == 1.0:
-        text = f"{figures}: no unit of it is one g"
+        text = f"{figures}: no unit of it is one g, or gravity was taken out"
         return [Finding("doubt", "accelerometer", text, "accelerometer_unit", ratio, 0.9)]
     text = f"{figures}: it is in {unit}"
     fix = option(("acc", f"{1.0 / factor:.10g}"))
     return [Finding("corrected", "accelerometer", text, "accelerometer_unit", factor, 0.95, fix)]
+
+
+def upwards(acc: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return an accelerometer's median (3,), and its share along body z: 1 if it is upwards."""
+    known = acc[np.isfinite(acc).all(axis=1)]
+    mean = np.median(known, axis=0) if len(known) else np.array([0.0, 0.0, 1.0])
+    return mean, float(mean[2]) / max(float(np.linalg.norm(mean)), 1e-9)
 
 
 def _sideways(acc: np.ndarray, force: np.ndarray) -> str:

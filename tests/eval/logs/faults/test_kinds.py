@@ -10,7 +10,7 @@ from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, check_files, run_checks
 from eval.logs.faults.clock import check_clock
 from eval.logs.faults.commands import check_controller_rate
-from eval.logs.faults.reading import read_rows
+from eval.logs.faults.reading import parse_readings, read_rows
 from suite.experiments.injected.kinds import KINDS, inject
 from tests.support import known_flight
 from tests.support.vehicles import PLAIN
@@ -80,6 +80,30 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
 def test_a_good_flight_has_no_fault(seed):
     findings, readings = checked(good(seed))
     assert not named(findings) and not readings
+
+
+@pytest.mark.parametrize(
+    ("wrong", "names"),
+    [
+        ((), set()),
+        (("rate=x,-y,z",), {"gyro_axes"}),
+        (("rate=x,-y,-z",), {"body_frame"}),
+        (("rate=x,-y,-z", "acc=x,-y,-z", "cmd_rate=x,-y,-z"), {"body_frame", "accelerometer_axes"}),
+        (("acc=-x,-y,-z",), {"accelerometer_axes"}),
+        (("acc=z,y,-x",), {"accelerometer_axes"}),
+        (("rate=938.7",), {"gyro_scale"}),
+        (("rate=57.3",), {"gyro_scale"}),
+        (("motor=1,2,4,3",), {"motor_order"}),
+        (("cmd_rate=x,-y,z",), {"rate_command_sign"}),
+    ],
+)
+def test_without_a_pose_a_second_witness_decides_which_signal_is_wrong(wrong, names):
+    right = {name: part for name, part in good().items() if name not in ("pos", "quat", "vel")}
+    findings, readings = checked(read_rows(right, parse_readings(wrong)))
+    assert named(findings) == names
+    if any(text.startswith("rate=") for text in wrong):
+        fixed = read_rows(read_rows(right, parse_readings(wrong)), readings)["rate"]
+        np.testing.assert_allclose(fixed, right["rate"], rtol=1e-3, atol=1e-9)
 
 
 def test_a_calm_flight_says_what_it_does_not_show():
