@@ -115,7 +115,7 @@ FAULTS = (
           "mean_norm(pos - windows.pos_w[:, :-1])", "delta/test_fit"),
     Fault("suite/delta", "optax.adam(optax.cosine_decay_schedule(config.rate, iterations))",
           "optax.adam(config.rate)", "delta/test_fit"),
-    Fault("suite/delta", "ahead * np.where(up[..., 2:] < 0, -1.0, 1.0)", "ahead * 1.0",
+    Fault("suite/delta", "np.where(up[..., 2:] < 0, -ahead, ahead)", "ahead",
           "delta/test_windows"),
     # suite: diagnosis
     Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))",

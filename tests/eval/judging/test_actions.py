@@ -52,7 +52,11 @@ def test_hovering_by_any_kind_of_action_stays_where_it_is(kind, world):
 
 @pytest.mark.parametrize(
     ("kind", "single"),
-    [("ctbr", ("mjx",)), ("motors", ()), pytest.param("motors", ("mjx",), marks=pytest.mark.slow)],
+    [
+        ("ctbr", ()),
+        ("motors", ()),
+        *(pytest.param(k, ("mjx",), marks=pytest.mark.slow) for k in ("ctbr", "motors")),
+    ],
 )
 def test_worlds_agree_and_rotorpy_flies_commands_too(kind, single):
     action = ActionSpec(kind)

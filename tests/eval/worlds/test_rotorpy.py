@@ -133,6 +133,7 @@ def test_one_trial_is_finished_and_another_ends_at_a_wall(installed):
     assert np.ptp(flight.rotor_speed[1:], axis=0).min() > 10.0
 
 
+@pytest.mark.slow
 def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
     rules = Rules(time_limit_s=0.4)
     still, _ = one(Steady(), rules=rules)

@@ -11,7 +11,9 @@ from eval.logs.flight_log import write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
 from suite.cli import main
 from suite.diagnose import run
+from suite.diagnose.diagnose import diagnose
 from tests.support.diagnosis_flights import fly_all
+from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 UNOPTIMISED = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
@@ -80,3 +82,10 @@ def found_drag(drag):
 def flown(drag):
     """Return its rollouts."""
     return drag.main.source.rollouts
+
+
+@pytest.fixture(scope="session")
+def by_views():
+    """Return a diagnosis of two effects by views."""
+    hidden = {"linear_drag": ((0.4, 0.3, 0.2),), "angular_damping": ((6.0, 6.0, 4.0),)}
+    return diagnose(flights(4, hidden=hidden), VEHICLE, by="views")

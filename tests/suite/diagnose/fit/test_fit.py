@@ -139,6 +139,7 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
     assert last == pytest.approx([0.25, 1.0], abs=0.011)
 
 
+@pytest.mark.slow
 def test_a_search_names_the_drag_and_leaves_its_result_alone(linearised):
     model, windows, linear = linearised
     among = [

@@ -4,39 +4,6 @@ import numpy as np
 
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95, solve
-from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.estimate.permutation import folds_of, score_candidates
-from tests.support.vehicles import PLAIN
-
-
-def made_equations(rng, space, true_size, windows=24, rows=40):
-    """Windows whose residual is white noise plus `true_size` of the first candidate's slope."""
-    slope = rng.standard_normal((windows, rows, len(space.entries)))
-    slope /= space.array("step")
-    residual = rng.standard_normal((windows, rows))
-    residual += true_size * slope[..., 0] * space.array("step")[0]
-    turned = np.swapaxes(slope, 1, 2)
-    return NormalEquations(
-        turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
-    )
-
-
-def test_the_null_gives_small_p_values_as_rarely_as_they_say():
-    space = make_space(PLAIN)
-    fold = folds_of(np.repeat(np.arange(4), 6), np.tile(np.arange(6.0), 4))
-    theta = 0.5 * (space.array("low") + space.array("high"))
-    among = candidates(space, False, {"command"})
-    rng = np.random.default_rng(3)
-    best = []
-    for _ in range(25):
-        made = made_equations(rng, space, 0.0)
-        best.append(score_candidates(made, theta, space, [], among, fold)[0].p_value)
-    # Of 25 nulls 2.5 are expected below 0.1; 8 or more come with a chance of 0.3 %.
-    assert np.sum(np.array(best) <= 0.1) < 8
-    assert np.median(best) > 0.2
-    strong = score_candidates(made_equations(rng, space, 0.5), theta, space, [], among, fold)[0]
-    assert strong.candidate.name == space.entries[0].effect
-    assert strong.p_value <= 0.01
 
 
 def test_bounds_hold_and_the_free_solution_is_exact():

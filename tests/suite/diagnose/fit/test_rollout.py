@@ -37,11 +37,11 @@ def beyond_noise(frequency, rate_hz, jitter=0.3, lag=0.0, delay=0.0, seed=1):
 @pytest.mark.parametrize(
     ("frequency", "rate_hz", "lag", "delay"),
     [
-        (500.0, 100.0, 0.0, 0.0),
+        pytest.param(500.0, 100.0, 0.0, 0.0, marks=pytest.mark.slow),
         pytest.param(500.0, 100.0, 0.03, 0.0, marks=pytest.mark.slow),
         pytest.param(1000.0, 100.0, 0.015, 0.0, marks=pytest.mark.slow),
         pytest.param(2000.0, 100.0, 0.0, 0.01, marks=pytest.mark.slow),
-        (200.0, 100.0, 0.03, 0.0273),
+        pytest.param(200.0, 100.0, 0.03, 0.0273, marks=pytest.mark.slow),
         (500.0, 50.0, 0.03, 0.0273),
         pytest.param(500.0, 500.0, 0.03, 0.005, marks=pytest.mark.slow),
         pytest.param(1000.0, 1000.0, 0.03, 0.005, marks=pytest.mark.slow),

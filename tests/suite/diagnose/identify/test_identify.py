@@ -81,15 +81,10 @@ def fleet(coverage):
     return coverage.flown(0, 1)
 
 
-EVERY_TIME = ("rotors",)
-"""Cases of tools/coverage.py that are not left to the slow tests."""
-
-
-@pytest.mark.parametrize("often", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet, often):
-    assert set(EVERY_TIME) < set(coverage.CASES)
+@pytest.mark.slow
+def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet):
     off = []
-    for case in (case for case in coverage.CASES if (case in EVERY_TIME) == often):
+    for case in coverage.CASES:
         found = coverage.pulls(*fleet, case, np.random.default_rng(0))
         assert len(found) >= 3, case
         off += [pull for pull, _ in found.values()]

@@ -40,6 +40,7 @@ def few():
     return RolloutModel(LAGGED, make_space(LAGGED), False, False), take(windows, np.arange(BATCH))
 
 
+@pytest.mark.slow
 def test_a_network_that_was_not_fitted_changes_nothing(few):
     model, windows = few
     params = {name: np.asarray(value) for name, value in _start(0).items()}

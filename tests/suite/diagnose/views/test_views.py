@@ -17,23 +17,18 @@ from tests.support.vehicles import with_effects
 DRAG = (0.4, 0.3, 0.2)
 
 
-@pytest.fixture(scope="module")
-def found():
-    return diagnose(flights(4, linear_drag=(DRAG,)), VEHICLE, by="views")
-
-
-def test_a_drag_is_named_and_closes_what_any_model_could(found):
-    assert found.label == "named" and found.warnings == []
-    assert found.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
-    force, left = found.main, found.main.remaining
+def test_a_drag_is_named_and_closes_what_any_model_could(by_views):
+    assert by_views.label == "named" and by_views.warnings == []
+    assert by_views.vehicle.effects["linear_drag"].coefficient[0] == pytest.approx(0.4, abs=0.05)
+    force, left = by_views.findings[0], by_views.findings[0].remaining
     assert left.gap_details["closed"] > 0.8 > 0.3 * left.explainable
     assert force.after.rms < 0.6 * force.before.rms and force.removed(force.names) > 0.9
-    assert len(found.flights.held_out) == 1
+    assert len(by_views.flights.held_out) == 1
 
 
 @pytest.mark.parametrize(("scale", "count"), [(0.9, 1), (1.0, 0)])
-def test_a_thrust_that_the_force_refuses_is_contradicted(found, scale, count):
-    force, space = found.findings[0].search, found.space
+def test_a_thrust_that_the_force_refuses_is_contradicted(by_views, scale, count):
+    force, space = by_views.findings[0].search, by_views.space
     (one,) = [c for c in candidates(space, False, ()) if c.name == "thrust_scale"]
     theta = space.array("start")
     theta[list(one.indices)] = scale
@@ -108,10 +103,11 @@ def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
     assert [name.candidate.name for _, name in found.named] == ["com_offset"]
 
 
-def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(found):
-    fitted = found.main.search.last.evidence.flights
+def test_a_black_box_closes_what_goes_with_what_was_flown_and_no_noise(by_views):
+    force = by_views.findings[0].search
+    fitted = force.last.evidence.flights
     inputs = np.concatenate([inputs_of(flight) for flight in fitted])
-    flight = found.main.search.last.block.data.flight
+    flight = force.last.block.data.flight
     noise = np.random.default_rng(0).standard_normal((len(flight), 3))
     said = fit_black_box(inputs, noise, flight).predict(inputs)
     assert closed_share(noise, noise - said, flight).max() < 0.2

@@ -102,7 +102,11 @@ def fly_judge(vehicle, actions, rate_hz):
     return [np.stack(column) for column in zip(*rows, strict=True)]
 
 
-@pytest.mark.parametrize("vehicle", [REFERENCE, HIDDEN], ids=["reference", "hidden"])
+@pytest.mark.parametrize(
+    "vehicle",
+    [pytest.param(REFERENCE, marks=pytest.mark.slow), HIDDEN],
+    ids=["reference", "hidden"],
+)
 def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(float64, vehicle):
     """At 20 Hz a period is 5 steps of the judge's attitude loop, 25 of its physics."""
     config = QuadrotorConfig(vehicle, physics_hz=500.0, **ALIKE)
@@ -117,7 +121,10 @@ def test_on_the_judges_steps_the_trainers_quadrotor_flies_the_judges_flight(floa
 
 @pytest.mark.parametrize(
     ("rates", "steps", "off_m"),
-    [((100.0, 250.0), (7, 2), 0.02), ((60.0, 120.0), (4, 2), 0.03)],
+    [
+        pytest.param((100.0, 250.0), (7, 2), 0.02, marks=pytest.mark.slow),
+        ((60.0, 120.0), (4, 2), 0.03),
+    ],
     ids=["default", "race"],
 )
 def test_training_steps_stay_near_the_judges(float64, rates, steps, off_m):
@@ -148,7 +155,14 @@ def test_long_steps_change_a_flight_by_far_less_than_what_is_drawn(float64):
     assert 0 < off(long) < 0.02 * off(drawn)
 
 
-@pytest.mark.parametrize("name", shipped_vehicles())
+OFTEN = "crazyflie21"
+"""The lightest of the shipped vehicles, with a loop that remembers; others are slow tests."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n == OFTEN else pytest.mark.slow) for n in shipped_vehicles()],
+)
 def test_the_default_recipe_draws_vehicles_that_fly(name):
     """Around any shipped vehicle: a second of mild actions tips none over."""
     config = with_quadrotor(named_recipe("race"), load_vehicle(name)).quadrotor

@@ -69,6 +69,7 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
     assert ended[2]["truncated"][2]
 
 
+@pytest.mark.slow
 def test_the_motion_is_differentiable_in_the_action(worlds):
     state = jax.tree.map(lambda leaf: np.asarray(leaf)[0], reset(KEYS, worlds)[1])
 
