@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,6 +14,14 @@ from tests.support.diagnosis_flights import NOISE
 from tests.support.vehicles import PLAIN, with_effects
 
 DRAG = (0.3, 0.35, 0.1)
+
+
+@pytest.fixture(autouse=True)
+def _compiled_quickly():
+    """Each program here runs once or twice, so that optimising it costs more than it saves."""
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
 CHANNELS = {"position": "pos", "attitude": "att", "velocity": "vel", "rates": "rate",
             "accelerometer": "acc"}  # fmt: skip
 

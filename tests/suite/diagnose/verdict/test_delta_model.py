@@ -16,7 +16,7 @@ from suite.diagnose.verdict.black_box import (
     compare_black_box,
     fit_black_box,
 )
-from suite.diagnose.verdict.rollout_gap import measure, true_starts
+from suite.diagnose.verdict.rollout_gap import true_starts
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -41,16 +41,6 @@ def few():
 
 
 @pytest.mark.slow
-def test_a_network_that_was_not_fitted_changes_nothing(few):
-    model, windows = few
-    params = {name: np.asarray(value) for name, value in _start(0).items()}
-    plain = measure(model, model.space.array("start"), windows, WHITE)
-    boxed = black_box_gap(model, params, windows, WHITE)
-    np.testing.assert_allclose(boxed.score, plain.score, rtol=1e-6)
-    assert plain.rms > 2.0
-
-
-@pytest.mark.slow
 def test_where_measured_rotors_drive_it_sees_their_thrust():
     """A log of motors has no commands: what stands in their place must not count."""
     windows, _ = cut([fly(TRUTH, 0, duration_s=7.0, motors=True)], LAGGED, True, 0.5)
@@ -67,6 +57,8 @@ def test_where_measured_rotors_drive_it_sees_their_thrust():
 
 
 def test_its_output_pushes_the_body(few):
+    # Each program runs once: optimising it would take longer.
+    jax.config.update("jax_disable_most_optimizations", True)
     model, windows = few
     theta = model.space.array("start")
     push = np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])

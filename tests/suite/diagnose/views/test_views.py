@@ -40,14 +40,6 @@ def test_a_thrust_that_the_force_refuses_is_contradicted(by_views, scale, count)
     assert [name for name, _ in contradicted(force, torque)] == [one] * count
 
 
-@pytest.mark.slow
-def test_a_drag_that_only_the_file_has_is_named_and_goes():
-    found = diagnose(flights(4), with_effects(VEHICLE, linear_drag=(DRAG,)), by="views")
-    assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
-    assert found.label == "named"
-    assert found.vehicle.effects["linear_drag"].coefficient == pytest.approx((0, 0, 0), abs=0.05)
-
-
 def test_a_drag_of_the_file_makes_way_for_what_rotors_do_and_none_stands_for_another():
     hidden = {"rotor_drag": 7.8e-5, "translational_lift": 0.027, "inflow": 1.5e-4}
     logs = flights(4, speed=4.0, hidden={name: (value,) for name, value in hidden.items()})
@@ -77,24 +69,11 @@ def test_a_slow_effect_is_no_noise_with_a_memory_however_long_the_flights():
     assert found.vehicle.effects["battery_sag"].rate == pytest.approx(0.004, rel=0.05)
 
 
-@pytest.mark.slow
-def test_a_mass_is_an_alternative_of_a_thrust_though_it_is_not_linear():
-    logs = flights(4, seed=8, speed=4.0)
-    rivals, _ = names(logs, with_effects(VEHICLE, mass_offset=(0.15,)))
-    assert rivals.keys() | set().union(*rivals.values()) >= {"thrust_scale", "mass_offset"}
-
-
 def without_gyro(logs):
     return [
         replace(log, rate_b=np.full_like(log.rate_b, np.nan), about={"partial": ["rate"]})
         for log in logs
     ]
-
-
-@pytest.mark.slow
-def test_rates_that_a_log_lacks_are_those_of_its_attitude():
-    found = diagnose(without_gyro(flights(4, seed=5)), VEHICLE, by="views")
-    assert (found.label, found.named) == ("no_gap", [])
 
 
 def test_an_attitude_alone_tells_the_torque_as_finely_as_a_gyro():
