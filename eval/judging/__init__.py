@@ -1,1 +1,1 @@
-"""Trials of a policy flown, judged and counted."""
+"""Flies trials of a policy, judges them and computes the statistics."""

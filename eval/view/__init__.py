@@ -1,1 +1,1 @@
-"""Seeing trials: a rerun recording, pictures and a video."""
+"""Recordings, pictures and videos of trials."""

@@ -1,1 +1,1 @@
-"""The networks, and the pieces they are made of."""
+"""The neural networks, and the layers they are made of."""

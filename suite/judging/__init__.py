@@ -1,1 +1,1 @@
-"""What `suite eval`, `collect` and `view` do."""
+"""The work of the commands that fly, check or export a policy."""

@@ -1,1 +1,1 @@
-"""The differentiable point-mass trainer: runs with jax, numpy and pure-Python packages only."""
+"""The differentiable trainer; it needs jax, numpy and pure-Python packages only."""

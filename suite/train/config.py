@@ -146,11 +146,11 @@ class LossConfig:
     gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
     """alpha, the decay rate of the gradients of position and velocity, back in time [1/s]."""
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
-    """A world deeper than this in a solid leaves the loss for the rest of the rollout, because its
+    """A world deeper than this in a solid no longer counts in the loss of this rollout, because its
     gradients have no more meaning for flying [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_tilt, which grows from 0 at a tilt of 65 degrees to 1 at 90 degrees, where the
-    judge ends a trial. Above 0 a world beyond 90 degrees leaves the loss. It has a gradient through
+    judge ends a trial. Above 0 a world beyond 90 degrees no longer counts. It has a gradient for
     quadrotors only; a point mass has no attitude [1]."""
 
 
@@ -177,8 +177,9 @@ class EpisodeConfig:
     """Share of worlds that start at rest at the track's start; the others start between two gates,
     with a recurrent state from a random step of the last rollout."""
     stop_from: Share = 0.33
-    """Worlds that start at rest leave the loss at a random step after this share of `steps`, so
-    that the policy cannot count the remaining steps and take risks at the end; 1: none leaves."""
+    """Worlds that start at rest no longer count in the loss from a random step after this share of
+    `steps`, so that the policy cannot count the remaining steps and take risks at the end; 1: all
+    count."""
     start_speed: Annotated[float, Range(0.0, 100.0)] = 6.0
     """Largest speed towards the gate of a world that starts between two gates; a sideways speed is
     added [m/s]."""
@@ -192,8 +193,8 @@ class EpisodeConfig:
     bare_share: Share = 0.2
     """Share of tracks without obstacles."""
     finish: bool = False
-    """Whether a world leaves the loss as it passes its last gate. If not, its goal becomes a point
-    10 m beyond, which makes speed worth more at the last gate than at the others."""
+    """Whether a world no longer counts in the loss after its last gate. If not, its goal becomes a
+    point 10 m beyond, which makes speed worth more at the last gate than at the others."""
     height_spread: Annotated[float, Range(0.0, 100.0)] = 1.0
     """Factor on the usual spread of the gates' heights, before they are limited to 0.8 to 2.2 m; 2
     gives about the spread of circles and ellipses [1]."""

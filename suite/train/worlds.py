@@ -59,7 +59,7 @@ class Worlds(NamedTuple):
     """(B,) 1 if a world starts between two gates, with a recurrent state from an earlier
     rollout."""
     stop: Array
-    """(B,) step at which a world leaves the loss."""
+    """(B,) step from which a world no longer counts in the loss."""
     number: Array
     """(B,) number in the batch, which determines a world's noise on any device."""
     fov_scale: Array

@@ -1,1 +1,1 @@
-"""Shared by all rooms: files, names, provenance, TOML."""
+"""Shared by the whole project: files, names, provenance, TOML."""

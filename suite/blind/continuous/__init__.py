@@ -1,1 +1,1 @@
-"""An engine of its own for blind cases: continuous time, and no code of the model that fits."""
+"""A separate simulator for blind cases, in continuous time, without code of the fitted model."""

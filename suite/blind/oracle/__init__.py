@@ -1,1 +1,1 @@
-"""What flights can say about each parameter, without a diagnosis."""
+"""How well flights can determine each parameter, computed without a diagnosis."""

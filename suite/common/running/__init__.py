@@ -1,1 +1,1 @@
-"""How a command runs: one writer a folder, and signals that end it."""
+"""How a command runs: folder locks, signals, several processes and hosts."""

@@ -1,1 +1,1 @@
-"""Faults of an interface put into good flights, and flights as other programs write them."""
+"""Faults that are put into correct flights, and flights in the formats of other programs."""

@@ -1,1 +1,1 @@
-"""A study: settings x training seeds, trained, flown in unseen worlds or judged, and compared."""
+"""Studies: policies of several settings and training seeds are trained, judged and compared."""

@@ -1,1 +1,1 @@
-"""A policy leaves the house: exported, measured, and said what it is."""
+"""Exports a policy, checks the exported files, and measures their speed."""

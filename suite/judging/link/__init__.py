@@ -1,1 +1,1 @@
-"""A policy in real time at one end of a MAVLink link, a vehicle or a simulated one at the other."""
+"""Flies a policy in real time over MAVLink, on a vehicle or on a simulated one."""

@@ -1,1 +1,1 @@
-"""What flies in training: the point mass or the quadrotor."""
+"""The dynamics of a training: the point mass or the quadrotor."""

@@ -1,1 +1,1 @@
-"""The comparison's baseline: recurrent PPO in the trainer's worlds and dynamics."""
+"""Recurrent PPO in the worlds and dynamics of the trainer, as a baseline."""
