@@ -175,7 +175,7 @@ def _iterate_phase(
     update = method.make_update()
     started = time.monotonic()
     for iteration, worlds in ahead.worlds(method.worlds, first, method.end):
-        with _others_there(iteration, recorder.run.folder):
+        with _explained_if_another_ended(iteration, recorder.run.folder):
             state, numbers = update(state, worlds)
             row = {key: float(value) for key, value in numbers.items()}
         _check_finite(iteration, row, recorder.run.folder)
@@ -236,7 +236,7 @@ class _Recorder:
 
 
 @contextmanager
-def _others_there(iteration: int, folder: Path) -> Iterator[None]:
+def _explained_if_another_ended(iteration: int, folder: Path) -> Iterator[None]:
     """Raise `WorkFailed` with advice if another process of the training has ended."""
     try:
         yield
