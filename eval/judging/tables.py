@@ -17,7 +17,7 @@ from eval.judging.statistics import (
     wilson,
 )
 from eval.worlds.trial import ENDINGS, TrialResult
-from tracks.common.grid import Grid, markdown, table
+from tracks.common.grid import Grid, markdown, table_of
 
 PRINTED_TRIALS = 10
 """Trials of a cell in the papers' tables."""
@@ -27,19 +27,6 @@ NOTE = (
     "largest speed before any contact."
 )
 """Note below every table."""
-HEADERS = (
-    "policy",
-    "track",
-    "level",
-    "trials",
-    "success",
-    "gates",
-    "v_max [m/s]",
-    "v_mean [m/s]",
-    "lap [s]",
-    "ended otherwise by",
-)
-PAIR_HEADERS = ("difference", "track", "level", "pairs", "success", "p (McNemar)", "v_mean [m/s]")
 PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired interval."
 
 
@@ -181,41 +168,41 @@ def markdown_table(summary: dict[str, Any]) -> str:
 
 
 def _cell_grid(cells: Sequence[Tally]) -> Grid:
-    lines = []
-    for cell in cells:
-        ended = [f"{how} {n}" for how, n in cell.ended_by.items() if how != "finished"]
-        ended += [f"of these {cell.late} by a late answer"] if cell.late else []
-        line = (
-            cell.policy,
-            cell.track,
-            str(cell.difficulty),
-            str(cell.trials),
-            percent(cell.success),
-            f"{cell.gates_passed:.1f}",
-            with_interval(cell.v_max),
-            with_interval(cell.v_mean),
-            with_interval(cell.lap_s),
-            ", ".join(ended) or "-",
-        )
-        lines.append(line)
-    return table(HEADERS, lines, note=NOTE)
+    return table_of(
+        cells,
+        ("policy", lambda cell: cell.policy),
+        ("track", lambda cell: cell.track),
+        ("level", lambda cell: str(cell.difficulty)),
+        ("trials", lambda cell: str(cell.trials)),
+        ("success", lambda cell: percent(cell.success)),
+        ("gates", lambda cell: f"{cell.gates_passed:.1f}"),
+        ("v_max [m/s]", lambda cell: with_interval(cell.v_max)),
+        ("v_mean [m/s]", lambda cell: with_interval(cell.v_mean)),
+        ("lap [s]", lambda cell: with_interval(cell.lap_s)),
+        ("ended otherwise by", _other_endings),
+        note=NOTE,
+    )
+
+
+def _other_endings(cell: Tally) -> str:
+    ended = [f"{how} {n}" for how, n in cell.ended_by.items() if how != "finished"]
+    ended += [f"of these {cell.late} by a late answer"] if cell.late else []
+    return ", ".join(ended) or "-"
 
 
 def _pair_grid(paired: Sequence[Pairing]) -> Grid:
-    def points(interval: Interval) -> str:
-        value, low, high = (100 * x for x in interval)
+    def points(pair: Pairing) -> str:
+        value, low, high = (100 * x for x in pair.success)
         return f"{value:+.0f} [{low:+.0f}, {high:+.0f}] points"
 
-    lines = []
-    for pair in paired:
-        line = (
-            f"{pair.policy} - {pair.against}",
-            pair.track,
-            str(pair.difficulty),
-            str(pair.trials),
-            points(pair.success),
-            f"{pair.p_value:.3g}",
-            f"{pair.v_mean.value:+.2f} [{pair.v_mean.low:+.2f}, {pair.v_mean.high:+.2f}]",
-        )
-        lines.append(line)
-    return table(PAIR_HEADERS, lines, note=PAIR_NOTE)
+    return table_of(
+        paired,
+        ("difference", lambda pair: f"{pair.policy} - {pair.against}"),
+        ("track", lambda pair: pair.track),
+        ("level", lambda pair: str(pair.difficulty)),
+        ("pairs", lambda pair: str(pair.trials)),
+        ("success", points),
+        ("p (McNemar)", lambda pair: f"{pair.p_value:.3g}"),
+        ("v_mean [m/s]", lambda pair: "{:+.2f} [{:+.2f}, {:+.2f}]".format(*pair.v_mean)),
+        note=PAIR_NOTE,
+    )

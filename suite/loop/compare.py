@@ -23,7 +23,7 @@ from eval.judging.statistics import (
     wilson,
 )
 from eval.worlds.trial import TrialResult, TrialSpec
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import Cell, Grid, table
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)
@@ -160,16 +160,10 @@ def _grid(title: str, lines: Sequence[Line], field: str, scale: float, digits: i
         measure: Measure = getattr(line, field)
         level = "all" if line.difficulty is None else str(line.difficulty)
         to_control, to_before = (difference_cell(d, scale, digits) for d in measure[3:])
-        rows.append(
-            [
-                *(Cell(text) for text in (line.track, level, str(line.trials))),
-                *(Cell(value_text(interval, scale, digits)) for interval in measure[:3]),
-                to_control,
-                *([Cell(f"{line.p_value:.2g}")] if test else []),
-                to_before,
-            ]
-        )
-    return Grid(title, headers, rows, strong_last=True)
+        alone = [value_text(interval, scale, digits) for interval in measure[:3]]
+        p_value = [f"{line.p_value:.2g}"] if test else []
+        rows.append([line.track, level, str(line.trials), *alone, to_control, *p_value, to_before])
+    return table(headers, rows, title, strong_last=True)
 
 
 def value_text(interval: Interval, scale: float, digits: int) -> str:

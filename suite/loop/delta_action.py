@@ -19,7 +19,7 @@ from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, ve
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.report import errors_row
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
-from tracks.common.grid import Grid
+from tracks.common.grid import table
 
 JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seeds"
 
@@ -59,7 +59,7 @@ def _delta(fitted: Mapping) -> Section:
             f"Recorded actions are flown again in the {corrected} for {horizon:g} s. "
             f"{held} flights ({windows['held_out']} windows) took no part in any fit; "
             f"{windows['fit']} windows of the others did.",
-            Grid("", ["", "position error [m]", "velocity error [m/s]", "of the first"], rows),
+            table(["", "position error [m]", "velocity error [m/s]", "of the first"], rows),
             Picture(delta_chart(fitted), f"Mean distance from the record after {horizon:g} s."),
         ],
     )

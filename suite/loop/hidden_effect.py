@@ -29,7 +29,7 @@ from suite.loop.standings import Standing, cell_grid, overall_grid, standings
 from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
-from tracks.common.grid import Grid
+from tracks.common.grid import table
 
 NOMINAL, CONTROL, DELTA, NAMED, BOTH = "nominal", "control", "delta", "named", "both"
 LABELS = {
@@ -183,7 +183,7 @@ def _delta(out: Path) -> Section:
         "as measured, so the noise of the start is in every row. The diagnosis, which corrected "
         "the vehicle, has seen some of these flights; no Delta Action Model has."
     )
-    return Section("Delta Action Models on held-out flights", [words, Grid("", headers, rows)])
+    return Section("Delta Action Models on held-out flights", [words, table(headers, rows)])
 
 
 def _training(out: Path, config: LoopConfig) -> Section:

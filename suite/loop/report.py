@@ -10,7 +10,7 @@ from suite.common.report import Details, Links, Picture, Report, Section, write_
 from suite.loop.config import LoopConfig
 from suite.loop.variants import Findings, Loop
 from tracks.common.files import to_json
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import table
 from tracks.common.provenance import VERSION, git_commit
 
 
@@ -57,19 +57,19 @@ def _flights(out: Path, loop: Loop) -> list[Section]:
 
 def _run(out: Path, loop: Loop, config: LoopConfig, seconds: Mapping[str, float]) -> Section:
     links = [(path, words) for path, words in loop.files if (out / path).is_file()]
-    took = [[Cell(name), Cell(duration(value))] for name, value in seconds.items()]
-    took.append([Cell("all"), Cell(duration(sum(seconds.values())))])
+    took = {**seconds, "all": sum(seconds.values())}
+    times = [(name, duration(value)) for name, value in took.items()]
     return Section(
         "Files and configuration",
         [
             Links(links),
-            Grid("Time", ["stage", "took"], took, strong_last=True),
+            table(["stage", "took"], times, "Time", strong_last=True),
             Details("Configuration", to_json(config, indent=2)),
         ],
     )
 
 
-def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = None) -> list[Cell]:
+def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = None) -> list[str]:
     """Return a row of a Delta Action Model's errors on held-out flights.
 
     Args:
@@ -80,4 +80,4 @@ def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = No
     texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
     if base_m is not None:
         texts.append(f"{100 * errors['position_m'] / base_m:.0f} %")
-    return [Cell(text) for text in texts]
+    return texts

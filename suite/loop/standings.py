@@ -11,7 +11,7 @@ import numpy as np
 from eval.judging.statistics import Interval, bootstrap_mean, bootstrap_median, paired_success
 from eval.worlds.trial import TrialResult
 from suite.loop.compare import difference_cell, rate, same_trials, value_text
-from tracks.common.grid import Cell, Grid
+from tracks.common.grid import Cell, Grid, table
 
 
 class Difference(NamedTuple):
@@ -89,24 +89,21 @@ def overall_grid(
         headers += [f"minus {labels[other]}", "p"]
     rows = []
     for one in found:
-        row = [Cell(labels[one.name]), Cell(value_text(one.success, 100, 0))]
+        row: list[str | Cell] = [labels[one.name], value_text(one.success, 100, 0)]
         apart = {difference.against: difference for difference in one.differences}
         for other in references:
-            row += [Cell(""), Cell("")]
-            if other in apart:
-                row[-2] = difference_cell(apart[other].success)
-                row[-1] = Cell(f"{apart[other].p_value:.2g}")
-        row += [Cell(value_text(value, 1, 2)) for value in (one.gates, one.v_mean)]
-        rows.append(row)
+            less = apart.get(other)
+            row += [difference_cell(less.success), f"{less.p_value:.2g}"] if less else ["", ""]
+        rows.append([*row, *(value_text(value, 1, 2) for value in (one.gates, one.v_mean))])
     headers += ["gates passed, mean", "mean speed, median [m/s]"]
-    return Grid(f"Over {trials} trials of each policy", headers, rows)
+    return table(headers, rows, f"Over {trials} trials of each policy")
 
 
 def cell_grid(found: Sequence[Standing], labels: Mapping[str, str]) -> Grid:
     """Return a row a track and level, a column a policy: success."""
     headers = ["track and level", *(labels[one.name] for one in found)]
     rows = [
-        [Cell(cell), *(Cell(value_text(one.by_cell[cell], 100, 0)) for one in found)]
+        [cell, *(value_text(one.by_cell[cell], 100, 0) for one in found)]
         for cell in found[0].by_cell
     ]
-    return Grid("Success by track and level [%]", headers, rows)
+    return table(headers, rows, "Success by track and level [%]")

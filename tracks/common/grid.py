@@ -43,19 +43,23 @@ class Grid:
 
 
 def table(
-    headers: Sequence[str], lines: Iterable[Sequence[str | Cell]], title: str = "", note: str = ""
+    headers: Sequence[str],
+    lines: Iterable[Sequence[str | Cell]],
+    title: str = "",
+    note: str = "",
+    strong_last: bool = False,
 ) -> Grid:
     """Return a table of texts and of cells with a tone."""
     rows = [[Cell(entry) if isinstance(entry, str) else entry for entry in row] for row in lines]
-    return Grid(title, headers, rows, note=note)
+    return Grid(title, headers, rows, strong_last, note)
 
 
 def table_of(
-    rows: Iterable[Row], *columns: tuple[str, Callable[[Row], str | Cell]], title: str = ""
+    rows: Iterable[Row], *columns: tuple[str, Callable[[Row], str | Cell]], note: str = ""
 ) -> Grid:
     """Return a table with a line for each of `rows`; a column is its header and its cells' text."""
     lines = [[text(row) for _, text in columns] for row in rows]
-    return table([header for header, _ in columns], lines, title)
+    return table([header for header, _ in columns], lines, note=note)
 
 
 def markdown(grid: Grid) -> str:

@@ -33,7 +33,7 @@ EXAMPLE = "examples/hidden.toml"
     ("args", "words"),
     [
         (["--recipe", "quik"], "Did you mean 'quick'?"),
-        (["--policy", "nobody.onnx"], "needs a checkpoint's folder"),
+        (["--policy", "nobody.onnx"], "give a checkpoint's folder"),
         (["--track", "my.toml"], "cannot be held apart"),
         (["--track", "zigzg"], "Did you mean 'zigzag'?"),
         (["--difficulty", "10"], "level 10 is not 0 to 9"),
@@ -69,7 +69,7 @@ EXAMPLE = "examples/hidden.toml"
             ["--hidden-vehicle", EXAMPLE, "--no-delta", "--fit-iterations", "5"],
             "--fit-iterations is 5, but",
         ),
-        (["--hidden-vehicle", EXAMPLE, "--policy", "nobody.onnx"], "needs a checkpoint's folder"),
+        (["--hidden-vehicle", EXAMPLE, "--policy", "nobody.onnx"], "give a checkpoint's folder"),
         (["--hidden-vehicle", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
         (["--hidden-vehicle", EXAMPLE, "--flights", "0"], "--flights is 0"),
         (["--hidden-vehicle", EXAMPLE, "--set", "quadrotor.mas_std=0"], "Did you mean 'mass_std'"),
