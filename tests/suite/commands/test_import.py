@@ -126,7 +126,7 @@ def test_the_diagnosis_names_it(tmp_path, capsys):
 def flights(tmp_path):
     folder = tmp_path / "flights"
     folder.mkdir()
-    for index, log in enumerate(known.logs("rates", 0)[:2]):
+    for index, log in enumerate(known.logs("rates", 0)[:3]):
         write_flight(folder / f"{index}.parquet", log)
     save_vehicle(known.start(), tmp_path / "start.toml")
     return folder
@@ -143,7 +143,7 @@ def test_a_vehicle_file_comes_out_with_what_was_told(flights, tmp_path, capsys):
     assert list(written.controller.rate_gain) == gain["value"]
     assert gain["ci95"][0][0] < gain["value"][0] < gain["ci95"][0][1]
     assert "controller.rate_gain[0]" in out.read_text()
-    assert len(told["flights"]) == 2
+    assert len(told["flights"]) == 3
 
 
 def test_the_file_that_is_started_from_is_not_written_over(flights, tmp_path, monkeypatch, capsys):
