@@ -50,6 +50,7 @@ HIGH_M = 1000.0
 UNSEEN = (
     "position, heading and height: wind, ground, and faults of pose or velocity",
     "the accelerometer's own scale, which has the same effect as thrust over mass",
+    "the gyro's own scale if they have no attitude, which has the same effect as inertia",
 )
 """What a flight without a pose does not show, in words."""
 

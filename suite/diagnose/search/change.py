@@ -127,7 +127,10 @@ class ChangeEvidence(ViewEvidence):
         among: Sequence[Candidate],
         seed: int,
     ) -> list[CandidateScore]:
-        """Return the scores, best first, see `Evidence`."""
+        """Return the scores of all that come near the best, best first, see `Evidence`.
+
+        Few means hold little: in their squared error nearly every candidate is close to the best.
+        """
         assert isinstance(block, ViewBlock) and self.spread and self.sure and self.weights
         weights = self.weights if named else self.sure
         each, along = np.arange(len(block.data.flight)), block.along
@@ -145,7 +148,8 @@ class ChangeEvidence(ViewEvidence):
             CandidateScore(candidate, gain - 2.0 * len(candidate.indices), p_value, 0.0)
             for candidate, gain, p_value in zip(among, gains, p_values, strict=True)
         ]
-        return sorted(found, key=lambda score: -score.gain)
+        least = self.limits.near_share * max((score.gain for score in found), default=0.0)
+        return sorted((one for one in found if one.gain >= least), key=lambda one: -one.gain)
 
     def share(
         self, now: Block, at: Estimate, then: Block, candidate: Candidate, gains: np.ndarray

@@ -49,6 +49,18 @@ def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong():
     }
 
 
+def test_only_what_comes_near_the_best_stands_in_its_place():
+    """Otherwise a more usual effect replaces the right one, and held-out flights refute it."""
+    weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),))
+    before, after = (task_of(logs, TORQUE) for logs in (flights(3, seed=5, speed=1.0), weak))
+    evidence, start = changed(before, after.flights, rotor_spread([before, after]))
+    block = evidence.linearise(start)
+    among = view_candidates(candidates(SPACE, False, ()), block)
+    found = evidence.scores(block, block.equations, start.theta, [], among, 0)
+    assert 0 < len(found) < len(among)
+    assert found[-1].gain >= THRESHOLDS.near_share * found[0].gain
+
+
 def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_others():
     logs = flights(3, seed=5, trim=0.0)
     force, torque = task_of(logs), task_of(logs, TORQUE)
