@@ -90,7 +90,7 @@ def evaluate_policy(
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds.trial import TrialSpec
     from policies.policy import load_policy
-    from suite.common.choices import parse_levels, parse_tracks
+    from suite.judging.requests import parse_levels, parse_tracks
 
     flown = load_policy(policy) if isinstance(policy, str | Path) else policy
     if lacking := [name for name in ("name", "spec", "start", "act") if not hasattr(flown, name)]:

@@ -12,7 +12,6 @@ from typing import Any
 
 from eval.effects.interface import as_arrays
 from eval.sensors import (
-    delay,
     depth_cameras,
     gate_detection,
     gate_filter,
@@ -43,7 +42,7 @@ def _wrong(name: str, sensor: Any) -> str | None:
 
 
 _OWN = (
-    delay.SENSOR,
+    state_errors.DELAY,
     gate_map.SENSOR,
     state_errors.STATE_DRIFT,
     state_errors.STATE_NOISE,

@@ -1,10 +1,11 @@
-"""Errors of an estimated state: drift of dead reckoning; coloured noise with a constant bias."""
+"""Errors of an estimated state: drift of dead reckoning, coloured noise with a bias, delay."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 from eval.sensors.interface import (
+    Ages,
     Array,
     Moment,
     Needs,
@@ -159,4 +160,34 @@ STATE_NOISE = Sensor(
     observation=Needs(normal=9),
     start=state_noise_start,
     sense=state_noise_sense,
+)
+
+
+class Delay(NamedTuple):
+    """Values of `delay`."""
+
+    state: float
+    image: float
+    jitter: float
+
+
+def delay_ages(values: Delay) -> Ages:
+    """Return the ages: `eval/judging/ages.py` takes each view at the physics step before them."""
+    return Ages(*map(float, values))
+
+
+DELAY = Sensor(
+    name="delay",
+    stage="state",
+    summary="State and image are delayed when the policy decides",
+    equation="seen(t) = true(t - a), a = age (1 + jitter u), u even from -1 to 1 each decision",
+    source="Falanga et al. 2019 (latency of vision in flight): 10 to 100 ms",
+    values=Delay,
+    parameters=(
+        Parameter("state", "s", 0.0, 0.0, 1.0, (0.005, 0.05)),
+        Parameter("image", "s", 0.0, 0.0, 1.0, (0.01, 0.1)),
+        Parameter("jitter", "1", 0.0, 0.0, 1.0, (0.1, 1.0)),
+    ),
+    grows=("state", "image"),
+    ages=delay_ages,
 )

@@ -9,10 +9,10 @@ from typing import Any
 
 import tyro
 
-from suite.common.choices import is_track_file, parse_levels
 from suite.common.console import Console
 from suite.common.options import Command
 from suite.common.usage import first_paragraph
+from suite.judging.requests import is_track_file, parse_levels
 from tracks.input.ranges import Seed
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from eval.judging.tables import Tally, grids, percent, summarise
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import load_sensors
-from suite.common.choices import LEVELS
 from suite.common.console import Console
 from suite.common.report import Picture
 from suite.experiments.pages.document import Made
@@ -17,6 +16,7 @@ from suite.experiments.pages.paper import goal_grid, goals, sim_to_sim
 from suite.experiments.study import judging, options
 from suite.experiments.study.cache import Place
 from suite.judging.flying import default_policy
+from suite.judging.requests import LEVELS
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials

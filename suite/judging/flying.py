@@ -7,11 +7,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.common.stages import Estimate
 from suite.judging.content import PolicyContent, policy_digest
-from suite.judging.requests import PLAIN, Collection, Evaluation, Manner
+from suite.judging.requests import (
+    PLAIN,
+    Collection,
+    Evaluation,
+    Manner,
+    is_track_file,
+    parse_levels,
+    parse_tracks,
+)
 from tracks.common.files import plain
 from tracks.common.work import Workers, crew, usable_cores
 from tracks.input.ranges import check_ranges

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from suite.common.choices import parse_levels, parse_tracks
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
 from suite.judging.flying import custom_tracks, default_policy, load_in_manner, trial_list
-from suite.judging.requests import Evaluation, manners
+from suite.judging.requests import Evaluation, manners, parse_levels, parse_tracks
 from tracks.input.ranges import check_ranges, shown
 from tracks.input.reading import read_json
 

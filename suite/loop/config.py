@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 from policies import shipped
-from suite.common.choices import is_track_file, parse_levels, parse_tracks
 from suite.delta.fit import FitConfig
+from suite.judging.requests import is_track_file, parse_levels, parse_tracks
 from suite.train.config import TrainConfig, check
 from suite.train.overrides import changed, check_owned, check_phases, override, phase_configs
 from suite.train.recipes import (
@@ -63,9 +63,9 @@ class LoopConfig:
     policy: str | None
     """The policy to start from: a shipped name or a checkpoint's folder; None trains one."""
     track: str
-    """As in `suite.common.choices.parse_tracks`, families only."""
+    """As in `suite.judging.requests.parse_tracks`, families only."""
     difficulty: str
-    """As in `suite.common.choices.parse_levels`."""
+    """As in `suite.judging.requests.parse_levels`."""
     trials: Trials
     """Judged trials of each policy on every track at every level."""
     flights: Trials

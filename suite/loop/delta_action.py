@@ -11,9 +11,9 @@ from pathlib import Path
 
 from eval.worlds.trial import TrialResult
 from suite.common import curve
-from suite.common.choices import parse_tracks
 from suite.common.report import Picture, Section
 from suite.delta.run import errors_by_name
+from suite.judging.requests import parse_tracks
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
 from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, verdict
 from suite.loop.config import DeltaLoopConfig, LoopConfig

@@ -16,7 +16,6 @@ import numpy as np
 from eval.judging.results import read_trials
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
-from suite.common.choices import parse_levels
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
 from suite.common.running.apart import Job
@@ -27,7 +26,7 @@ from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
 from suite.judging.flying import checkpoint_folder, flying_needs, workers_for
 from suite.judging.replay import first_trials, fly_again
-from suite.judging.requests import Collection, Evaluation
+from suite.judging.requests import Collection, Evaluation, parse_levels
 from suite.loop.compare import BEFORE
 from suite.loop.config import OWN, DeltaLoopConfig, LoopConfig
 from suite.loop.measured import enough, measure

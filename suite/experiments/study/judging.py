@@ -21,7 +21,6 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds.trial import TrialResult, TrialSpec
 from policies.policy import Policy, load_policy
 from policies.spec import NeedsTrust, PolicyError
-from suite.common.choices import parse_levels
 from suite.common.console import Console
 from suite.common.stages import announce
 from suite.experiments.study.cache import FLIES, Place, code_digest, digest, engines
@@ -34,6 +33,7 @@ from suite.judging.flying import (
     labels,
     trial_list,
 )
+from suite.judging.requests import parse_levels
 from tracks.common.work import Workers, crew, usable_cores, work_off
 from tracks.families import JUDGED
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from suite.common.choices import parse_levels
+from suite.judging.requests import parse_levels
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_owned
 from tracks.common.names import unknown_name
