@@ -73,9 +73,14 @@ class ViewFlights:
 
 
 def ready(
-    logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
+    logs: Sequence[FlightLog],
+    vehicle: Vehicle,
+    limits: Thresholds = THRESHOLDS,
+    others: Sequence[FlightLog] = (),
 ) -> ViewFlights:
     """Return those of `logs` that have a stretch, for the views that all of them allow.
+
+    `others` are flights that these are compared with: axes and means are what they allow too.
 
     Raises:
         ValueError: where a log has nothing that turns or pushes, or none has a stretch.
@@ -95,10 +100,10 @@ def ready(
     views = [SPECIFIC if all(inertial) else FORCE]
     if any("pos" in log.partial and not own for log, own in zip(logs, inertial, strict=True)):
         views = []
-    elif any("quat" in log.partial and not own for log, own in zip(logs, inertial, strict=True)):
-        views = [replace(FORCE, axes=(2,))]
+    elif any("quat" in log.partial and not is_inertial(log) for log in (*logs, *others)):
+        views = [replace(views[0], axes=(2,))]
     if all(one.each for one in acting):
-        slow = any({"quat", "rate"} <= set(log.partial) for log in logs)
+        slow = any({"quat", "rate"} <= set(log.partial) for log in (*logs, *others))
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
     if not views:
         raise ValueError(

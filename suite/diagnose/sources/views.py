@@ -43,7 +43,7 @@ def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
     if before and not given.chosen:
         return None
     vehicle, limits, references = given.vehicle, given.limits, given.references
-    flights = ready(given.logs, vehicle, limits)
+    flights = ready(given.logs, vehicle, limits, given.references)
     logs = [given.logs[k] for k in flights.kept]
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in [*logs, *references])
@@ -171,7 +171,7 @@ def _references(
     """Return the reference flights by view, how they differ, and which were left out."""
     if not given.references:
         return {}, None, ()
-    before = ready(given.references, given.vehicle, limits)
+    before = ready(given.references, given.vehicle, limits, given.logs)
     if len(before.names) < 2:
         raise ValueError(
             "; ".join(

@@ -120,6 +120,7 @@ def test_a_path_says_how_a_quadrotor_leaned():
     assert np.degrees(np.arccos(np.clip((up * leaned).sum(1), -1, 1))).mean() < 3.0
     views = ready([lacks], VEHICLE).views
     assert views[0].axes == (2,) and views[1].width_s > TORQUE.width_s
+    assert ready([log], VEHICLE, others=[lacks]).views == views, "both sets are judged alike"
 
 
 def test_a_lone_flights_end_is_held_out():
