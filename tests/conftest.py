@@ -52,6 +52,15 @@ def root() -> Path:
     return ROOT
 
 
+@pytest.fixture
+def float64():
+    """Let JAX compute in double precision."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield
+
+
 def folder_of(path: Path) -> str:
     """Return the folder that a test is run with: one of `TOGETHER`, or the one it is in."""
     folder = path.relative_to(ROOT / "tests").parent.as_posix()

@@ -1,6 +1,5 @@
 """PPO in one file: at a small size its networks learn, and its file answers as they do."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +8,13 @@ import torch
 from eval.envs.gymnasium_env import RaceEnv
 from policies.contract import contract_of
 from policies.policy import load_policy
+from tests.support.tools import program
 
 PATH = Path(__file__).resolve().parents[2] / "examples" / "cleanrl_ppo.py"
 
 
 def test_it_trains_and_what_it_exports_answers_as_its_agent(tmp_path, monkeypatch, capsys):
-    found = importlib.util.spec_from_file_location("cleanrl_ppo", PATH)
-    assert found and found.loader
-    example = importlib.util.module_from_spec(found)
-    found.loader.exec_module(example)
+    example = program(PATH)
     agents, kind = [], example.Agent
     monkeypatch.setattr(example, "Agent", lambda: agents.append(kind()) or agents[0])
     policy = load_policy(example.main(tmp_path, 0.0, envs=2, steps=12))

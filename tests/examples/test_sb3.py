@@ -1,6 +1,5 @@
 """The example of Stable-Baselines3, where that is installed: from training to a judged file."""
 
-import importlib.util
 import warnings
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 from eval.envs.gymnasium_env import RaceEnv
 from policies.contract import contract_of
 from policies.policy import load_policy
+from tests.support.tools import program
 
 pytest.importorskip("stable_baselines3", reason="pip install 'diffracing-suite[sb3]'")
 
@@ -17,12 +17,9 @@ pytest.importorskip("stable_baselines3", reason="pip install 'diffracing-suite[s
 def test_what_it_exports_answers_as_its_model(tmp_path, monkeypatch):
     path = Path(__file__).resolve().parents[2] / "examples" / "sb3_race.py"
     assert len([line for line in path.read_text().splitlines() if line]) <= 60
-    found = importlib.util.spec_from_file_location("sb3_race", path)
-    assert found and found.loader
-    example = importlib.util.module_from_spec(found)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found.loader.exec_module(example)
+        example = program(path)
         made, export = [], example.export_module
         monkeypatch.setattr(
             example, "export_module", lambda *given: made.append(given[0]) or export(*given)

@@ -19,7 +19,7 @@ from suite.common.console import Console
 from suite.common.running.apart import Job
 from suite.common.work import all_done
 from tests.support.cluster import cluster
-from tests.support.tools import tool
+from tests.support.tools import program
 
 TRIALS = ["--track", "zigzag", "--difficulty", "0,9", "--trials", "12"]
 FILES = ("table.md", "trials.parquet")
@@ -148,7 +148,7 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
     ids=lambda command: command.split()[0],
 )
 def test_a_command_comes_to_the_same_on_a_cluster(command, tmp_path, root):
-    digest = tool(root, "kills").digest
+    digest = program(root / "tools" / "kills.py").digest
     here, there = tmp_path / "here", tmp_path / "there"
     again = ["blind run"] if command.startswith("blind") else []
     with cluster(tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) as nodes:

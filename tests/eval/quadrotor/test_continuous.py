@@ -19,10 +19,7 @@ MOVING = Motion(0.0 * ONES, np.eye(3)[None], ONES, 0.0 * ONES)
 by_jax = jax.jit(fly, static_argnums=6)
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def flown(length_s, integrator="continuous", duration_s=0.6):

@@ -24,11 +24,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
 from tracks.geometry.rotation import quat_to_rot
 
-
-@pytest.fixture(autouse=True)
-def double_precision():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def aggressive_commands(steps, seed=0):

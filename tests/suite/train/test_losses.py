@@ -19,11 +19,7 @@ from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import square_gates
 from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 
-
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @pytest.fixture(autouse=True)

@@ -83,12 +83,6 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
 
 
 @pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.fixture
 def held_attitude(float64, monkeypatch):
     """Hold the attitude: its gradient is cut on purpose, so differences must not move it."""
     held = jnp.asarray(TILTED)

@@ -1,6 +1,5 @@
 """Numbers of a known vehicle come back from its flights, each within its interval."""
 
-import importlib.util
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import as_json
 from tests.support import identified as known
 from tests.support.fleets import Fleet, logs_of
+from tests.support.tools import program
 from tests.support.vehicles import with_effects
 
 TRUE = {
@@ -68,11 +68,7 @@ def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn(noise):
 @pytest.fixture(scope="module")
 def coverage(root):
     """`tools/coverage.py`."""
-    spec = importlib.util.spec_from_file_location("coverage", root / "tools" / "coverage.py")
-    assert spec and spec.loader
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    return tool
+    return program(root / "tools" / "coverage.py")
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,7 @@ from suite.train.dynamics.point_mass import PointMassParams, PointMassState
 ROLL = np.array(Rotation.from_euler("ZYX", [0.7, -0.3, 0.4]).as_matrix())
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 flown = jax.jit(point_mass.step)

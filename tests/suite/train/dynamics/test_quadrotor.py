@@ -47,12 +47,6 @@ FAR_W = np.array([40.0, 5.0, 3.0])
 """A gate that is never reached."""
 
 
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield
-
-
 def lively_actions(decisions, batch=2, seed=0):
     """Return actions (decisions, batch, 3) of some m/s^2 that turn around before the floor."""
     rng = np.random.default_rng(seed)

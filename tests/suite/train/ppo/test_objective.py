@@ -17,10 +17,7 @@ STEPS, BATCH = 5, 3
 CONFIG = PpoConfig(spec=SPEC, entropy=0.0)
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def test_advantages_are_those_of_a_plain_loop():
