@@ -117,6 +117,17 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         from pymavlink.DFReader import DFReader_binary
     except ImportError:
         raise FlightLogError(str(path), None, None, MISSING) from None
+
+    class Forward(DFReader_binary):
+        """Refuses a message without a length, which the reader would read again for ever."""
+
+        def _parse_next(self) -> Any:
+            before = self.offset
+            message = super()._parse_next()
+            if message is not None and self.offset <= before:
+                raise ValueError(f"a message of 0 bytes at {before}")
+            return message
+
     table: dict[str, list[dict[str, Any]]] = {name: [] for name in MESSAGES}
     try:
         with (
@@ -125,10 +136,10 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
             _native_lines_dropped(),
             contextlib.ExitStack() as opened,
         ):
-            reader = DFReader_binary.__new__(DFReader_binary)
+            reader = Forward.__new__(Forward)
             # Where a damaged file ends its constructor, it leaves the file open.
             opened.push(partial(_close, reader))
-            DFReader_binary.__init__(reader, str(path))
+            reader.__init__(str(path))
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
         parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
