@@ -103,7 +103,7 @@ def _about(view: View) -> dict[str, Any]:
     measure = MEASURE.format(**about, width=view.width_s)
     return {
         **about, "name": view.name, "view": view, "horizon_s": view.width_s, "measure": measure,
-        "subject": view.name,
+        "subject": f"error of the {view.name}",
     }  # fmt: skip
 
 
