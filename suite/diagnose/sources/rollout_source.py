@@ -242,15 +242,14 @@ class RolloutSource(Source):
         first = next(iter(simulated.values()))[of]
 
         def missed(group: str, axis: int) -> float:
-            """Return the squared error beyond noise of start and row, over the motion's variance."""
+            """Return the squared error beyond noise, over the variance of the motion."""
             at = SLICES[group].start + axis
             there = seen[..., at] & np.isfinite(first[..., at])
             if not there.any():
                 return -np.inf
             error, motion = first[..., at][there], np.asarray(measured[group])[of][..., axis][there]
-            return float(
-                ((error**2).mean() - 4.0 * sigma[at] ** 2) / max(motion.var(), sigma[at] ** 2)
-            )
+            noise = float(sigma[at]) ** 2
+            return float(((error**2).mean() - 4.0 * noise) / max(float(motion.var()), noise))
 
         every = ((group, axis) for group in measured for axis in range(3))
         group, axis = max(every, key=lambda one: missed(*one))
