@@ -114,7 +114,10 @@ def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
     if found["unexplained"]["where"]:
-        yield f"Search for a cause of the remaining error: {found['unexplained']['where']}."
+        yield (
+            "Search for the cause of what is unexplained; the report's section Remaining error "
+            "shows on what it depends."
+        )
     swing = found["unexplained"].get("swing")
     if swing:
         yield (
