@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from eval.effects.interface import GRAVITY
+from eval.importers.rows import continuous
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.plant import Command, make_plant
@@ -160,9 +161,8 @@ def _column(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -
 def on_one_side(quat: np.ndarray) -> np.ndarray:
     """Return quaternions (T, 4) of which neighbours do not differ by sign alone."""
     own = np.flatnonzero(np.isfinite(quat).all(axis=1))
-    flips = np.cumsum((quat[own][1:] * quat[own][:-1]).sum(axis=1) < 0.0)
     out = quat.copy()
-    out[own[1:]] *= np.where(flips % 2, -1.0, 1.0)[:, None]
+    out[own] = continuous(quat[own])
     return out
 
 
