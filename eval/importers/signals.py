@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.logs.columns import FlightLogError
+from eval.logs.columns import LARGEST, FlightLogError
 from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import TIMES, Readings, option, read_as
 
@@ -22,8 +22,6 @@ NEEDED = ("pos", "quat", "rate")
 """What a flight cannot do without."""
 BACKWARDS_MAX = 0.05
 """Largest share of rows with non-increasing time in an accepted signal."""
-LARGEST = 1e20
-"""Larger numbers are damage in any unit (Unix time in ns is 1.8e18); their squares overflow."""
 LEAST_STEP = 1e-15
 """Least step of increasing times, so that a division by it does not overflow."""
 

@@ -69,6 +69,8 @@ LIMITS = {
     "pwm": (-0.05, 1.05, "not from 0 to 1; a motor command is a share of the full one"),
 }
 """Group -> least and largest value, and the reason for which others are refused."""
+LARGEST = 1e20
+"""Larger numbers are damage in any unit (Unix time in ns is 1.8e18); their squares overflow."""
 QUATERNION_TOLERANCE = 0.05
 """Quaternions further than this from unit norm are refused."""
 DURATION_MIN = 1.0
@@ -130,6 +132,7 @@ def check_columns(
     values = {c: as_numbers(columns[c], c, name) for group in present for c in GROUPS[group]}
     for column, data in values.items():
         _refuse_where(np.isinf(data), name, column, data, "infinite")
+        _refuse_where(np.abs(data) > LARGEST, name, column, data, "too large for any unit")
     present = [group for group in present if _has_values(group, values, name, needed)]
     if not partial:
         _need_a_command(present, columns, name)

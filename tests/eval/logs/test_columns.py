@@ -41,6 +41,7 @@ BAD = [
     (spoil("cmd_rate_z", 149, np.inf), "cmd_rate_z", 150, "infinite"),
     (spoil("pos_z", 9, -100_001.0), "pos_z", 10, "100 km"),
     (spoil("rate_x", 2, 201.0), "rate_x", 3, "200 rad/s"),
+    (spoil("vel_x", 3, 1e300), "vel_x", 4, "too large for any unit"),
     (spoil("quat_w", 5, 3.0), "quat_w", 6, "norm"),
     (drop("pos_x"), "pos_x", None, "missing"),
     (drop("pos_x", "x"), "pos_x", None, "did you mean 'x'"),
