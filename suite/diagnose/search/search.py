@@ -1,9 +1,5 @@
 """The search for effects: forward selection, then each named effect against its alternatives.
 
-Forward selection alone names one effect that resembles two others together, as a drag along three
-axes does. So an alternative may be a pair of effects (floating search; Pudil et al. 1994, doi
-10.1016/0167-8655(94)90127-9).
-
 A named effect must lower the error on left-out stretches by more than the best of all candidates
 does by chance, and pass further tests of its source of evidence. A rival is another candidate that
 explains the same flights; it is listed as an alternative. All sources use this search.
@@ -13,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
-from suite.diagnose.estimate.parameters import JOIN, Candidate, indices_of
+from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
 from suite.diagnose.search.evaluation import (
@@ -158,7 +153,7 @@ def _next_name(
                 gains=tuple(gains.tolist()), share=share,
             )  # fmt: skip
             tried.append((chi2 + len(candidate.indices), candidate, (one, at)))
-    tried = _without_vain_pairs(task, without_idle(tried, limits))
+    tried = without_idle(tried, limits)
     if not tried:
         return None
     least = min(cost for cost, *_ in tried)
@@ -184,7 +179,7 @@ def _judged(
 ) -> tuple[list[NamedEffect], Estimate]:
     """Weigh the name at `place` when added last: a better rival takes its place, or it goes.
 
-    It is weighed against `among`, if not given against all candidates and pairs of them.
+    It is weighed against `among`, all candidates if not given.
     """
     one, theta = named[place].candidate, at.theta.copy()
     theta[list(one.indices)] = evidence.space.array("start")[list(one.indices)]
@@ -192,8 +187,6 @@ def _judged(
     others = [*named[:place], *named[place + 1 :]]
     left = [c for c in (task.among if among is None else among) if one not in c.parts]
     here = evaluated_at(evidence.again(without), without, left)
-    if among is None and len(named) < task.limits.most_names:
-        left += better_pairs(here, indices_of([n.candidate for n in others]), one, left)
     found = _next_name(task, here, others, left, None, one)
     if found is None:
         return others, without
@@ -235,62 +228,6 @@ def _settled(
         if [n.candidate for n in named] == before:
             break
     return named, at
-
-
-def better_pairs(
-    here: Evaluation, others: Sequence[int], one: Candidate, among: Sequence[Candidate]
-) -> list[Candidate]:
-    """Return the pairs of `among` that explain clearly more than `one` alone, best first.
-
-    Next to the numbers at `others` and to first order: each pair still has to be fitted. A pair has
-    to be better by more than chance, and by more than a fit is exact.
-    """
-    equations, limits, space = here.equations, here.evidence.limits, here.evidence.space
-    known = [equations.numbers.index(number) for number in others]
-    hessian, gradient = equations.sums()
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    hessian, gradient = hessian * np.outer(scale, scale), gradient * scale
-
-    def explained(*some: Candidate) -> float:
-        """Return the fall of chi-square without bounds, less one for each number."""
-        columns = [column for each in some for column in equations.columns_of(each)]
-        at = sorted({*known, *columns})
-        matrix = hessian[np.ix_(at, at)] + 1e-9 * np.eye(len(at))
-        return float(gradient[at] @ np.linalg.solve(matrix, gradient[at])) - len(columns)
-
-    def possible(parts: Sequence[Candidate]) -> bool:
-        columns = [column for each in parts for column in equations.columns_of(each)]
-        fall = chi2_fall(equations, here.at.theta, space, [*known, *columns])
-        return fall - len(columns) > least
-
-    nothing, own = explained(), explained(one)
-    least = own + max(limits.rival_chi2, limits.least_name_share * (own - nothing))
-    taken = {*others, *one.indices}
-    singles = [c for c in among if not c.parts and not taken & set(c.indices)]
-    singles = [c for c in singles if explained(c) > nothing + limits.rival_chi2]
-    gains = {parts: explained(*parts) for parts in combinations(singles, 2)}
-    best = sorted((parts for parts, gain in gains.items() if gain > least), key=lambda p: -gains[p])
-    best = [parts for parts in best[: 4 * limits.short_list] if possible(parts)]
-    return [
-        Candidate(
-            JOIN.join(part.name for part in parts),
-            tuple(indices_of(parts)),
-            JOIN.join(part.label for part in parts),
-            parts,
-        )
-        for parts in best[: limits.short_list]
-    ]
-
-
-def _without_vain_pairs(
-    task: SearchTask, tried: list[tuple[float, Candidate, T]]
-) -> list[tuple[float, Candidate, T]]:
-    """Return what was `tried`, without pairs that are not clearly better than every candidate.
-
-    Of two effects at a time some always fit as well.
-    """
-    least = min((cost for cost, c, _ in tried if c in task.among), default=np.inf)
-    return [one for one in tried if one[1] in task.among or one[0] + task.limits.rival_chi2 < least]
 
 
 def could_be_best(

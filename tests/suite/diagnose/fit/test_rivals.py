@@ -1,16 +1,13 @@
 """A name that one flight alone carries is no name where the model is off."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from suite.diagnose.estimate.block import Estimate, NormalEquations
+from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.gauss_newton import chi2_by_part, chi2_fall
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.evidence import flights_agree
-from suite.diagnose.search.evaluation import Evaluation
-from suite.diagnose.search.search import better_pairs, could_be_best, without_idle
+from suite.diagnose.search.search import could_be_best, without_idle
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 
@@ -63,34 +60,3 @@ def test_several_effects_have_to_explain_more_than_each_of_them_alone():
     fallen = {payload: 100.0, mass: 95.0, com: 10.0}
     assert not could_be_best(fallen, payload, THRESHOLDS)
     assert could_be_best({**fallen, mass: 50.0}, payload, THRESHOLDS)
-
-
-def test_two_effects_may_replace_one_that_resembles_both_together():
-    space = make_space(PLAIN)
-    among = candidates(space, False, ())
-    drag, rotor, inflow = (
-        next(one for one in among if one.name == name)
-        for name in ("linear_drag", "rotor_drag", "inflow")
-    )
-    rng, step, theta = np.random.default_rng(1), space.array("step"), space.array("start")
-    slope = rng.standard_normal((24, 40, len(step)))
-    x, y, z = (slope[..., k] for k in drag.indices)
-    slope[..., rotor.indices[0]] = x + y + 0.1 * rng.standard_normal(x.shape)
-    slope[..., inflow.indices[0]] = z + 0.1 * rng.standard_normal(x.shape)
-    slope /= step
-
-    def pairs(true):
-        moved = step * np.isin(np.arange(len(step)), [i for one in true for i in one.indices])
-        residual = slope @ moved + rng.standard_normal(x.shape)
-        turned = np.swapaxes(slope, 1, 2)
-        made = NormalEquations(
-            turned @ slope, (turned @ residual[..., None])[..., 0], (residual**2).sum(1)
-        )
-        evidence = SimpleNamespace(limits=THRESHOLDS, space=space)
-        here = Evaluation(
-            evidence, Estimate(theta, np.zeros((0, 0))), SimpleNamespace(equations=made)
-        )
-        return [pair.parts for pair in better_pairs(here, [], drag, among)]
-
-    assert pairs([rotor, inflow])[0] == (rotor, inflow)
-    assert pairs([drag]) == []
