@@ -1,7 +1,7 @@
 """Gradients where a formula is written twice, for what is usual and for a limit, and around it.
 
 A constant in the place of a limit has the right value and no slope: a training learns nothing from
-it. Every function is held against finite differences at its special states and beside them.
+it. Every function is compared with finite differences at its special states and beside them.
 """
 
 from functools import cache

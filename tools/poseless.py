@@ -6,8 +6,8 @@ Every case hides one effect of usual size, or none, in a vehicle that flies six 
 MuJoCo, 8 s each. Its logs hold gyro, accelerometer, set points, rotor speeds and voltage alone,
 with noise and constant biases as a small board's sensors have them. Prints a line a case, with the
 errors of the named numbers over half their intervals; then how many effects are named alone, how
-many clean vehicles are accused, and how many 95 % intervals hold the truth, each with its 95 %
-interval (Clopper and Pearson). 60 cases take about 6 minutes on two cores.
+many clean vehicles get a name (false alarms), and how many 95 % intervals hold the truth, each with
+its 95 % interval (Clopper and Pearson). 60 cases take about 6 minutes on two cores.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def outcome_of(name: str, effects: list[dict[str, Any]]) -> str:
     """Return how what is named compares with what was hidden, `name`, in words."""
     alike = [{e["name"], *e["alternatives"]} for e in effects]
     if not name:
-        return "accused" if effects else "clean"
+        return "false alarm" if effects else "clean"
     if len(effects) == 1 and name in alike[0]:
         return "named alone"
     if any(name in group for group in alike):
@@ -149,9 +149,9 @@ def main() -> None:
         off += scaled
         print(f"{number:3d} {name or 'nothing':16} {outcome:18} {'; '.join(words)}  "
               f"{' '.join(f'{e:+.2f}' for e in scaled)}", flush=True)  # fmt: skip
-    clean = outcomes["clean"] + outcomes["accused"]
+    clean = outcomes["clean"] + outcomes["false alarm"]
     print(share("named, and nothing else", outcomes["named alone"], cases - clean))
-    print(share("clean vehicles accused", outcomes["accused"], clean))
+    print(share("clean vehicles with a false alarm", outcomes["false alarm"], clean))
     print(share("intervals that hold the truth", sum(abs(e) <= 1.0 for e in off), len(off)))
 
 

@@ -31,7 +31,7 @@ MASSES = {
     ),
     "standard": (("log150", "log155"), ("log160", "log170", "log180")),
 }
-"""Flights of crazyswarm2 by motors: reference, and those held against them."""
+"""Flights of crazyswarm2 by motors: reference, and those compared with them."""
 
 
 def suite(*words: Any) -> dict[str, Any]:
@@ -88,7 +88,8 @@ def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
         f"Vehicle file from {', '.join(FITTED)}; diagnosed: "
         f"{', '.join(sorted(path.stem for path in others))}.",
         "",
-        "| vehicle file | named | verdict | force x, y: share closed (black box) | seconds |",
+        "| vehicle file | named | verdict | "
+        "force x, y: share of variance explained (black box) | seconds |",
         "|---|---|---|---|---|",
     ]
     for label, file in (("identified, its drag left out", bare), ("identified", vehicle)):
@@ -114,7 +115,7 @@ def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
 
 
 def changed(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> str:
-    """Return what is named of `flights`, held against `references`, in a line."""
+    """Return what is named of `flights`, compared with `references`, in a line."""
     before = [one for one in references if one not in flights]
     if len(before) < 2:
         return "too few references"

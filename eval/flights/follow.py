@@ -1,4 +1,7 @@
-"""A position controller (the pilot) that flies trajectories in any simulator by CTBR commands."""
+"""A position controller (the pilot) that flies trajectories in any simulator.
+
+Its commands are collective thrust and body rates (CTBR).
+"""
 
 from __future__ import annotations
 
@@ -37,21 +40,22 @@ class Recording(NamedTuple):
     rotor_speed: np.ndarray
     """(K, 4) at the start of each step [rad/s]."""
     command: Command
-    """(K, ...) as the pilot gave it."""
+    """(K, ...) of the pilot."""
     acc_b: np.ndarray
     """(K, 3) specific force in the step that has just ended [m/s^2]."""
     voltage: np.ndarray
     """(K,) [V]."""
     acting: Command
-    """(K, ...) what acted, before the vehicle's own delay; differs from `command` by an `Extra`."""
+    """(K, ...) what acted, before the vehicle's own delay: `command`, as an
+    `eval.flights.simulate.Extra` changed it."""
     extra: Wrench
-    """(K, 3) what an `Extra` added."""
+    """(K, 3) force and torque that an `Extra` (physics beyond the vehicle's) added."""
     integrator: str | None = None
     """How the simulator stepped where its step shows in the flight: `euler`, by `dt`."""
 
 
 class FlightFailed(RuntimeError):
-    """A simulated flight went where no log should: tipped over, into the ground, or away."""
+    """A simulated flight tipped over, hit the ground or left its trajectory."""
 
 
 class Step(NamedTuple):
@@ -64,7 +68,7 @@ class Step(NamedTuple):
     acting: Command
     """(N, ...) what acted, before the vehicle's own delay."""
     extra: Wrench
-    """(N, 3) what an `Extra` added."""
+    """(N, 3) as in `Recording`."""
     acc_b: np.ndarray
     """(N, 3) specific force [m/s^2]."""
 
@@ -113,7 +117,7 @@ def follow(
         gains: of the pilot.
 
     Raises:
-        FlightFailed: where a flight tips over, leaves the air or its trajectory.
+        FlightFailed: where a flight tips over, hits the ground or leaves its trajectory.
     """
     count = len(trajectories)
     steps = [round(way.duration_s / dt) for way in trajectories]
@@ -150,10 +154,10 @@ def _of(rows: Sequence[Any], index: int) -> Any:
 
 
 def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
-    """Check that N flights are where a log may be, at `time_s` (N,) [s].
+    """Check at `time_s` (N,) [s] that N flights are upright, above ground and on their way.
 
     Raises:
-        FlightFailed: where one has tipped over, left the air or its trajectory.
+        FlightFailed: where one has tipped over, hit the ground or left its trajectory.
     """
     off = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
     # Written so that a state that is no number fails too.
@@ -169,7 +173,7 @@ def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None
 
 @dataclass(frozen=True)
 class PilotGains:
-    """Of the loops around position; below them are the vehicle's own."""
+    """Gains of the pilot's position loop; attitude and rate loops have the vehicle file's gains."""
 
     position: float = 5.0
     """Acceleration per position error [1/s^2]."""
@@ -182,19 +186,25 @@ class PilotGains:
 
 
 def corrected(
-    gains: PilotGains, acc_w: Array, off_w: Array, slow_w: Array, summed_w: Array | float = 0.0
+    gains: PilotGains,
+    acc_w: Array,
+    pos_error_w: Array,
+    vel_error_w: Array,
+    summed_w: Array | float = 0.0,
 ) -> Array:
     """Return the acceleration (..., 3) [m/s^2] that also brings a vehicle back to its path.
 
     Args:
         gains: of the position loop.
-        acc_w: (..., 3) of the path [m/s^2].
-        off_w: (..., 3) by how much the path is ahead in position [m].
-        slow_w: (..., 3) and in velocity [m/s].
-        summed_w: (..., 3) `off_w` summed over time [m s].
+        acc_w: (..., 3) acceleration of the path [m/s^2].
+        pos_error_w: (..., 3) path minus vehicle, position [m].
+        vel_error_w: (..., 3) path minus vehicle, velocity [m/s].
+        summed_w: (..., 3) integral of `pos_error_w` over time [m s].
     """
     xp = acc_w.__array_namespace__()
-    correction = gains.position * off_w + gains.velocity * slow_w + gains.integral * summed_w
+    correction = (
+        gains.position * pos_error_w + gains.velocity * vel_error_w + gains.integral * summed_w
+    )
     return acc_w + xp.clip(correction, -gains.correction, gains.correction)
 
 
@@ -208,12 +218,12 @@ def steer(
         gains: of the position loop.
         wanted: of N flights at this moment.
         motion: (N, ...) true states.
-        summed_w: (N, 3) position error summed over time [m s].
+        summed_w: (N, 3) integral of the position error over time [m s].
     """
-    off_w, slow_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
-    acc_w = corrected(gains, wanted.acc_w, off_w, slow_w, summed_w)
+    pos_error_w, vel_error_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
+    acc_w = corrected(gains, wanted.acc_w, pos_error_w, vel_error_w, summed_w)
     force_w = acc_w + np.array([0.0, 0.0, GRAVITY])
-    # Never further over than 70 degrees: a commanded free fall would turn the vehicle over.
+    # Tilt of at most 70 degrees: a commanded free fall would turn the vehicle over.
     flat = np.sqrt((force_w[:, :2] ** 2).sum(-1))
     force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(0.36 * flat, 1.0))
     heading_w = np.stack(

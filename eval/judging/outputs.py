@@ -31,11 +31,16 @@ CLEAR = 0.5
 """Smallest difference of an output between gates on opposite sides that counts [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
 SCALE_FIX = (
-    "export it with the contract of its environment, or set action.scale; "
+    "export it with the contract (units, scales, frames) of its environment, or set action.scale; "
     "after a very short training this is no fault"
 )
-TIMES, ALIKE = 1.5, 1e-3
+IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
 """Factor on a test image, and the largest relative change of output that counts as no change."""
+VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
+"""Parts of a state observation (`policies.observation`), in body axes: velocity, the world's z
+axis, the next gate's centre."""
+ACTION_B = slice(9, 12)
+"""Last action, an acceleration in body axes."""
 ASIDE_M, AHEAD_M, SPEED, STEPS = 2.0, 6.0, 3.0, 10
 """Distances of the test gate to the side and ahead [m], forward speed [m/s], number of steps."""
 
@@ -57,8 +62,8 @@ class Outputs:
         self._count += ~guarded.late
         self._largest = np.fmax(self._largest, guarded.largest)
         if self._is_acceleration:
-            climbs = (state[:, 3:6] * state[:, 0:3]).sum(-1) > 0.0
-            self._up += climbs * (state[:, 3:6] * guarded.action_b).sum(-1)
+            climbs = (state[:, UP_B] * state[:, VEL_B]).sum(-1) > 0.0
+            self._up += climbs * (state[:, UP_B] * guarded.action_b).sum(-1)
 
     def columns(self, slot: int) -> dict[str, Any]:
         """Return the fields of `TrialResult` for the outputs in `slot`."""
@@ -87,7 +92,7 @@ def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, 
 
 
 def _twice(action: ActionSpec) -> str:
-    return "" if action.is_plain else ", and that module and contract do not both scale it"
+    return "" if action.is_plain else "; scale it once, by the network or by action.scale"
 
 
 def _warnings(
@@ -159,7 +164,7 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
         seen = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
         found.append(Note("action_scale", seen, SCALE_FIX))
     if _divides_images(policy):
-        seen = f"{name}: has the same output for an image and for {TIMES:g} times that image"
+        seen = f"{name}: has the same output for an image and for {IMAGE_FACTOR:g} times that image"
         fix = "an image without scale contains no distances: do not divide it by its maximum"
         found.append(Note("image_scale", seen, fix))
     return tuple(found)
@@ -170,10 +175,10 @@ def _divides_images(policy: Policy) -> bool:
     spec = policy.spec
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
-    image = np.stack([falling, TIMES * falling, np.flip(falling, -2)]).astype(np.float32)
+    image = np.stack([falling, IMAGE_FACTOR * falling, np.flip(falling, -2)]).astype(np.float32)
     answers = _answers(policy, _level(spec, np.zeros((len(image), 2))), image)[1][0]
-    multiple, turned = np.abs(answers[1:] - answers[0]).max(-1)
-    return bool(multiple < ALIKE * turned)
+    scaled, flipped = np.abs(answers[1:] - answers[0]).max(-1)
+    return bool(scaled < NO_CHANGE * flipped)
 
 
 def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
@@ -191,14 +196,14 @@ def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
 def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
     """Return states of level flight with a gate ahead, offset by `aside` (N, 2): left, up [m]."""
     state = np.zeros((len(aside), spec.state_size), np.float32)
-    state[:, 0], state[:, 5] = SPEED, 1.0
-    state[:, 6], state[:, 7:9] = AHEAD_M, aside
+    state[:, VEL_B], state[:, UP_B] = (SPEED, 0, 0), (0, 0, 1)
+    state[:, GATE_B] = np.insert(aside, 0, AHEAD_M, axis=1)
     first = spec.base_size
     for key, numbers in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
         if getattr(spec, key):
             state[:, first : first + numbers] = (1, 0, 0)
             if key == "second_gate":
-                state[:, first : first + 3] = state[:, 6:9] + (AHEAD_M, 0, 0)
+                state[:, first : first + 3] = state[:, GATE_B] + (AHEAD_M, 0, 0)
             first += numbers
     if spec.speed_input:
         state[:, -1] = spec.speed
@@ -208,12 +213,12 @@ def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
 def _answers(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the last actions (N, 3) [m/s^2] and all outputs (STEPS, N, 3), see `probed`."""
     spec = policy.spec
-    hidden, outputs, action = policy.start(len(state)), [], state[:, 9:12]
+    hidden, outputs, action = policy.start(len(state)), [], state[:, ACTION_B]
     for step in range(STEPS):
         fresh = np.full(len(state), step == 0)
         output, hidden = policy.act(hidden, state, image, fresh)
         outputs.append(output)
         action = np.asarray(spec.action.to_si(output), np.float32)
         size = np.linalg.norm(action, axis=-1, keepdims=True)
-        state[:, 9:12] = action * np.minimum(1.0, 50.0 / np.maximum(size, 1e-6))
+        state[:, ACTION_B] = action * np.minimum(1.0, ActionLimits().size / np.maximum(size, 1e-6))
     return np.asarray(action, float), np.array(outputs, float)

@@ -10,16 +10,19 @@ from eval.logs.flight import Flight
 from eval.worlds import Rows
 
 _EMPTY = (
-    0.0,
-    *(np.zeros(size) for size in (3, 4, 3, 3)),
-    0.0,
-    np.zeros(3),
-    np.zeros(4),
-    0,
-    np.zeros(3),
-    False,
+    0.0,  # time_s
+    np.zeros(3),  # pos_w
+    np.zeros(4),  # quat_wxyz
+    np.zeros(3),  # vel_w
+    np.zeros(3),  # rate_b
+    0.0,  # thrust_cmd
+    np.zeros(3),  # rate_cmd_b
+    np.zeros(4),  # rotor_speed
+    0,  # gate
+    np.zeros(3),  # action
+    False,  # whether the action is new
 )
-"""An empty row, for a trial that ended at its start."""
+"""A row that gives a flight without rows the right shapes, for a trial that ended at its start."""
 
 
 class Recorder:
@@ -31,7 +34,8 @@ class Recorder:
         Args:
             slots: how many trials fly at once.
             depth: whether depth images are kept (3 kB each at 24 x 32).
-            first: (size,) the action before the first one; zeros of an acceleration without it.
+            first: (size,) action recorded before the first decision; by default a zero
+                acceleration (3,).
         """
         self._depth = depth
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
@@ -56,7 +60,7 @@ class Recorder:
                 self._last_image[slot] = depth_m[slot].astype(np.float32)
 
     def add(self, rows: Rows) -> None:
-        """Add one row to the flight of each slot that is due."""
+        """Add one row to the flight of each slot that is recorded at this step (`rows.due`)."""
         for slot in np.flatnonzero(rows.due):
             new = bool(self._is_new[slot])
             self._is_new[slot] = False

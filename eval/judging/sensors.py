@@ -1,6 +1,7 @@
 """Sensor models in the judge's slots, with each trial's own draws.
 
-They change only the policy's observation: the autopilot, its heading and the judge use the truth.
+They change only the policy's observation: the autopilot, the heading that it commands and the
+judge use the true state.
 All random numbers come from the trial's own seed, model by model and in a fixed order, so that a
 trial's outcome depends on the trial alone.
 """
@@ -51,7 +52,7 @@ class Sensors:
         """Return the view with sensor errors; call it once for each observation.
 
         Args:
-            truth: the true view in each slot, with the gates' numbers.
+            truth: the true view in each slot, including gate indices.
             fresh: (N,) bool, slots whose trial begins.
             flying: (N,) bool, slots in flight; other rows are returned unchanged.
         """
@@ -61,11 +62,12 @@ class Sensors:
                 draw(self._draws[name], slot, generators[slot])
         if not len(rows):
             return truth
-        # Empty slots get a valid view, since their contents are undefined.
-        whole = take(truth, np.where(flying, np.arange(len(flying)), rows[0]))
-        models, about, memory = self._models, (self._dt_s, self._camera), self._memory
+        # Empty slots hold undefined values: they get a copy of a flying slot's view.
+        filled = take(truth, np.where(flying, np.arange(len(flying)), rows[0]))
+        models, timing_and_camera = self._models, (self._dt_s, self._camera)
+        memory = self._memory
         if memory is None or fresh.any():
-            begun = sensors.start(models, whole, self._trial, *about)
+            begun = sensors.start(models, filled, self._trial, *timing_and_camera)
             memory = begun if memory is None else select(fresh, begun, memory)
-        seen, self._memory = sensors.sense(models, memory, whole, self._draws, *about)
+        seen, self._memory = sensors.sense(models, memory, filled, self._draws, *timing_and_camera)
         return select(flying, seen, truth)

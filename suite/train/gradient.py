@@ -1,4 +1,9 @@
-"""The gradient of a rollout: the loop first, then the encoder on all images at once."""
+"""The gradient of a rollout in two passes, because the encoder is the most expensive part.
+
+First the rollout is differentiated with a frozen image encoder. A zero shift added to each
+embedding gives the gradient of the loss with respect to the embeddings. Then these gradients are
+back-propagated through the encoder, for all images at once.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +42,8 @@ def encoder_gradient(
         total: network.Params, part: tuple[jax.Array, jax.Array]
     ) -> tuple[network.Params, None]:
         image, cotangent = part
-        _, pull = jax.vjp(lambda p: network.encode(p, image), params)
-        return jax.tree.map(jnp.add, total, pull(cotangent)[0]), None
+        _, encoder_vjp = jax.vjp(lambda p: network.encode(p, image), params)
+        return jax.tree.map(jnp.add, total, encoder_vjp(cotangent)[0]), None
 
     zero = jax.tree.map(jnp.zeros_like, params)
     split = (
@@ -56,6 +61,9 @@ def sampled_encoder_gradient(
     key: jax.Array,
 ) -> network.Params:
     """Return the encoder's gradient from the images of every `stride`-th step, times `stride`.
+
+    Neighbouring images are similar: a sample of them saves most of the cost. The random first step
+    and the factor make the expected gradient that of all images.
 
     Args:
         params: the policy's parameters.
@@ -77,7 +85,11 @@ def sampled_encoder_gradient(
 def make_gradient(
     config: TrainConfig,
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
-    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records) of one device."""
+    """Return gradient(params, worlds, key, delta) -> (gradient, loss, records).
+
+    It computes on one device. `delta` holds the parameters of the Delta Action Model, a network
+    that corrects the actions so that simulated flights match measured ones; None without one.
+    """
     stride, steps = config.episode.image_stride, config.episode.steps
     rollout, width = make_rollout(config), config.spec.hidden_size
 
@@ -87,14 +99,14 @@ def make_gradient(
     def gradient(
         params: network.Params, worlds: Worlds, key: jax.Array, delta: delta_network.Params | None
     ) -> tuple[network.Params, jax.Array, StepRecord]:
-        def flown(
+        def rollout_loss(
             params: network.Params, embedding_shift: jax.Array
         ) -> tuple[jax.Array, StepRecord]:
             return rollout(params, embedding_shift, worlds, key, frozen_encode, delta)
 
         embedding_shift = jnp.zeros((steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(
-            flown, argnums=(0, 1), has_aux=True
+            rollout_loss, argnums=(0, 1), has_aux=True
         )(params, embedding_shift)
         through_images = sampled_encoder_gradient(
             params, records.image, cotangents, stride, jax.random.fold_in(key, stride)

@@ -1,8 +1,9 @@
 """A scene as MuJoCo geoms in the world body.
 
-Every solid collides, so that MuJoCo's rays see it too; geoms of the world body never collide with
-one another. Geoms come kind by kind in the order of `Track.names`, each kind followed by its
-padding, and the ground last.
+Solids have MuJoCo's default contact bits, so a drone collides with them; geoms of the world body
+never collide with one another. Rays ignore contact bits and hit every solid, unless they select a
+geom group. Geoms come kind by kind in the order of `Track.names`, the ground last. Each kind is
+followed by its padding: solids far below the ground that only fill up their number.
 """
 
 from __future__ import annotations
@@ -36,9 +37,8 @@ def add_scene(
     """Add the scene's solids and the ground plane to the world body of `spec`.
 
     A geom is named after its solid; the bars of a frame, which share a name, and padding get a
-    running number ("gate 3 frame/2"): see `solid_name`. Padding solids are parked far below the
-    ground, so that scenes padded alike compile to models of the same sizes (as
-    `mujoco.batch.Batch.set_models` asks for).
+    running number ("gate 3 frame/2"): see `solid_name`. Scenes padded to the same numbers compile
+    to models of the same sizes, as `mujoco.batch.Batch.set_models` requires.
 
     Args:
         spec: is changed in place.
@@ -51,19 +51,22 @@ def add_scene(
         ValueError: where the scene holds more solids of a kind than `pad_to`, or names and solids
             do not match in number.
     """
-    real = [len(kind[0]) for kind in (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)]
+    solid_counts = [
+        len(kind[0]) for kind in (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
+    ]
     if sum(mesh_sizes) != len(scene.triangles):
         raise ValueError(
             f"mesh_sizes add up to {sum(mesh_sizes)}, the scene has {len(scene.triangles)} "
             "triangles; give the number of triangles of each mesh"
         )
-    if names and len(names) != sum(real) + len(mesh_sizes):
+    if names and len(names) != sum(solid_counts) + len(mesh_sizes):
         raise ValueError(
-            f"{len(names)} names for {sum(real) + len(mesh_sizes)} solids; give one a solid"
+            f"{len(names)} names for {sum(solid_counts) + len(mesh_sizes)} solids; "
+            "give one name for each solid"
         )
     if pad_to is not None:
         scene = pad(scene, pad_to._replace(triangles=len(scene.triangles)))
-    give_name = _Names(names, real)
+    give_name = _Names(names, solid_counts)
     world = spec.worldbody
     geom = mujoco.mjtGeom
 
@@ -93,15 +96,15 @@ def add_scene(
 class _Names:
     """Returns unique geom names, solid by solid."""
 
-    def __init__(self, names: tuple[str, ...], real: list[int]) -> None:
+    def __init__(self, names: tuple[str, ...], solid_counts: list[int]) -> None:
         self._names = names
-        self._real = real
-        self._first = np.concatenate([[0], np.cumsum(real)])
+        self._counts = solid_counts
+        self._first = np.concatenate([[0], np.cumsum(solid_counts)])
         self._used: dict[str, int] = {}
 
     def __call__(self, kind: int, number: int) -> str:
         name = PARKED
-        if kind == len(self._real) or number < self._real[kind]:
+        if kind == len(self._counts) or number < self._counts[kind]:
             fallback = f"{Scene._fields[kind + 1]} {number}"
             name = self._names[self._first[kind] + number] if self._names else fallback
         seen = self._used.get(name, 0)

@@ -1,8 +1,9 @@
-"""`suite bench judge`: trials judged in MuJoCo, against the same with MuJoCo's own rays.
+"""`suite bench judge`: the judge's speed, compared with the same trials using `mj_multiRay`.
 
-The shipped policy flies level 9 of every family in one process. The baseline casts the rays of an
-image with `mj_multiRay`, one camera after the other, and flies 64 trials at once. Both are timed by
-the process's own processor time, which other work on the machine hardly changes.
+The shipped policy flies the same trials twice, level 9 of every family, in one process. The suite
+casts the rays of all images together (`tracks/geometry/tiles.py`). The baseline casts those of one
+camera after the other with `mj_multiRay`, and flies 64 trials at once. Both are timed by the
+process's own processor time, which other work on the machine hardly changes.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ class OwnRays(MujocoWorld):
             if self._seen.get(slot, (None, None))[0] is not model:
                 self._seen[slot] = model, mujoco.MjData(model)
                 mujoco.mj_kinematics(*self._seen[slot])
+            # `_eye` is the policy's camera model; it casts the rays by `mj_multiRay`.
             images.append(self._eye.image(*self._seen[slot], pos_w[row], rot_w[row]))
         return np.array(images)
 
@@ -51,12 +53,13 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
 
     Args:
         policy: name or folder; the shipped one by default.
-        trials: of one call.
+        trials: number of trials per call.
         time_limit_s: of a trial [s].
     """
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
     flown, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
+    # JUDGED: the three track families of the results tables.
     specs = [TrialSpec(JUDGED[k % 3], 9, k // 3) for k in range(trials)]
     ended: dict[str, list[TrialResult]] = {}
 

@@ -1,8 +1,10 @@
-"""The same refit by `mujoco.sysid`: finite differences of rollouts in MuJoCo's C engine.
+"""The refit of `rigid_body.Task` by `mujoco.sysid`, which the diagnosis is compared with.
+
+`mujoco.sysid` takes finite differences of rollouts in MuJoCo's C engine.
 
 The model is MuJoCo's, with the rotors' thrusts as controls. Bounds and typical sizes are those of
 the catalogue. Residuals are divided by the measurement noise, so both sides minimise the same
-error. A window starts in its measured state: `mujoco.sysid` cannot fit the start.
+error. A window starts in its measured state: `mujoco.sysid` does not estimate initial states.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from suite.diagnose.data.windows import SLICES, step_s
 from suite.diagnose.estimate.block import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
-POSE = 13
-"""Numbers of qpos and qvel of a free body."""
+STATE_SIZE = 13
+"""Numbers in the state of a free body: position 3, quaternion 4, velocity 3, rates 3."""
 FILL_S = 1e-3
 """Time between empty rows [s]."""
 
@@ -60,7 +62,7 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
     spec.option.timestep = dt
     add_quadrotor(spec, task.nominal)
     # Never computed: `mujoco.sysid` only needs the size of a measurement.
-    spec.add_sensor(name="measured", type=mujoco.mjtSensor.mjSENS_USER, dim=POSE)
+    spec.add_sensor(name="measured", type=mujoco.mjtSensor.mjSENS_USER, dim=STATE_SIZE)
     base = spec.compile()
     windows = task.windows
     names = [str(w) for w in range(len(windows.flight))]
@@ -85,8 +87,8 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
     ) -> tuple[np.ndarray, Any, Any]:
         # The state after step k stands in row k - 1, behind the time. The first row is the start.
         rows = np.clip(np.rint(measured.times[1:] / dt).astype(int), 1, len(state)) - 1
-        apart = _difference(state[rows, 1 : 1 + POSE], measured.data[1:])
-        return np.where(np.isfinite(apart), apart, 0.0) * scale, measured, measured
+        errors = _difference(state[rows, 1 : 1 + STATE_SIZE], measured.data[1:])
+        return np.where(np.isfinite(errors), errors, 0.0) * scale, measured, measured
 
     residual = sysid.build_residual_fn(
         models_sequences=[sequences],
@@ -105,7 +107,7 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
     """Return the fitted numbers (K,) and their normal equations, one for each window."""
     import mujoco.sysid as sysid
 
-    # Its optimiser has an option to print nothing, `sysid.optimize` has none.
+    # `verbose=False` silences `sysid.optimize`, not the optimiser that it calls.
     with contextlib.redirect_stdout(io.StringIO()):
         params, result = sysid.optimize(
             problem.params.copy(),
@@ -115,13 +117,12 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
         )
     values = np.asarray(params.as_vector())
     parts = problem.residual(values, params)[0]
-    residual = np.concatenate(parts)
     count = len(problem.task.windows.flight)
-    slope = np.asarray(result.jac).reshape(count, -1, len(values))
-    apart = residual.reshape(count, -1)
-    turned = np.swapaxes(slope, 1, 2)
-    pull = -(turned @ apart[..., None])[..., 0]
-    return values, NormalEquations(turned @ slope, pull, (apart**2).sum(1))
+    jacobian = np.asarray(result.jac).reshape(count, -1, len(values))
+    residual = np.concatenate(parts).reshape(count, -1)
+    jacobian_t = np.swapaxes(jacobian, 1, 2)
+    gradient = -(jacobian_t @ residual[..., None])[..., 0]
+    return values, NormalEquations(jacobian_t @ jacobian, gradient, (residual**2).sum(1))
 
 
 def _built(base: Any, task: Task, values: np.ndarray) -> Any:
@@ -181,15 +182,15 @@ def _measured(task: Task, w: int) -> Any:
 
 def _difference(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return simulated - measured (N, 12), the attitude as a small rotation in body axes."""
-    turn = np.full((len(measured), 3), np.nan)
+    rotation_b = np.full((len(measured), 3), np.nan)
     seen = np.isfinite(measured[:, 3:7]).all(axis=1)
-    was, now = (
+    reference, found = (
         Rotation.from_quat(rows[seen, 3:7], scalar_first=True) for rows in (measured, simulated)
     )
-    turn[seen] = 2.0 * (was.inv() * now).as_quat(canonical=True)[:, :3]
-    apart = np.zeros((len(measured), 12))
-    apart[:, SLICES["position"]] = simulated[:, :3] - measured[:, :3]
-    apart[:, SLICES["attitude"]] = turn
-    apart[:, SLICES["velocity"]] = simulated[:, 7:10] - measured[:, 7:10]
-    apart[:, SLICES["rates"]] = simulated[:, 10:13] - measured[:, 10:13]
-    return apart
+    rotation_b[seen] = 2.0 * (reference.inv() * found).as_quat(canonical=True)[:, :3]
+    errors = np.zeros((len(measured), 12))
+    errors[:, SLICES["position"]] = simulated[:, :3] - measured[:, :3]
+    errors[:, SLICES["attitude"]] = rotation_b
+    errors[:, SLICES["velocity"]] = simulated[:, 7:10] - measured[:, 7:10]
+    errors[:, SLICES["rates"]] = simulated[:, 10:13] - measured[:, 10:13]
+    return errors

@@ -28,7 +28,10 @@ def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
         ("decisions/s", lambda row: f"{row['worlds'] * steps / row['seconds']:,.0f}"),
         ("a gradient step [ms]", lambda row: f"{1e3 * row['seconds']:,.0f}"),
         ("TFLOP/s", lambda row: f"{row['operations'] / row['seconds'] / 1e12:.2f}"),
-        ("share of the product's", lambda row: f"{row['operations'] / row['seconds'] / best:.1%}"),
+        (
+            "share of the largest matrix-product speed",
+            lambda row: f"{row['operations'] / row['seconds'] / best:.1%}",
+        ),
     )
 
 
@@ -38,7 +41,7 @@ def judge_grid(rows: Sequence[Numbers]) -> Grid:
         rows,
         ("trials at once", lambda row: f"{row['worlds']}"),
         ("decisions/s", lambda row: f"{row['decisions_per_s']:,.0f}"),
-        ("seconds flown a second", lambda row: f"{row['flown_s_per_s']:,.0f}"),
+        ("simulated seconds per second", lambda row: f"{row['flown_s_per_s']:,.0f}"),
         ("all of them [s]", lambda row: f"{row['seconds']:.1f}"),
     )
 
@@ -55,7 +58,7 @@ def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
         ("trials", lambda row: f"{row['trials']}"),
         ("the same success", lambda row: f"{row['same_success']}"),
         ("the same ending", lambda row: f"{row['same_ending']}"),
-        ("success here minus there [points, 95 %]", difference),
+        ("success, GPU minus CPU [points, 95 %]", difference),
     )
 
 

@@ -1,4 +1,7 @@
-"""`suite fly`: simulated flights compared with the judge's, or one flight over a real link."""
+"""`suite fly`: simulated flights compared with the judge's trials, or one flight over a real link.
+
+The judge is the simulator that scores policies (`eval.judging.judge`).
+"""
 
 from __future__ import annotations
 
@@ -69,13 +72,15 @@ def fly_commanded(
     course = read_course(evaluation, real_time=True)
     refuse_one_name({trial.track for trial in course.trials})
     name = policy or default_policy()
+    # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
     loaded = load_in_manner(name, evaluation.trust, plain)
+    # One vehicle needs no block of 64 rows; the judge keeps blocks, for equal rounding.
     flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if evaluation.monitor:
         loaded, flying = Monitored(loaded), Monitored(flying)
-    flown = LinkFlights(evaluation, about_policy(name, loaded), limits, link or "simulated")
-    refuse_other_run(out, flown)
+    settings = LinkFlights(evaluation, about_policy(name, loaded), limits, link or "simulated")
+    refuse_other_run(out, settings)
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # Before the flights, since the judge may refuse the policy.
     judged = [] if link else _judged(loaded, course, rules)
@@ -93,12 +98,12 @@ def fly_commanded(
         found = {**totals(flights, limits), "judge_successes": sum(judged[: len(flights)])}
         found["flights"] = [flight.row for flight in flights]
         _show(found, flights, console)
-    about = {"policy": flown.policy, "limits": limits, "link": flown.link}
+    about = {"policy": settings.policy, "limits": limits, "link": settings.link}
     if isinstance(flying, Monitored):
         found["interventions"] = flying.interventions
     answer = {**stamp(1, evaluation.seed), **about, **found}
     write_json(out / FLY, answer)
-    write_run_record(out, flown, evaluation.seed)
+    write_run_record(out, settings, evaluation.seed)
     if interrupt is not None:
         raise interrupt
     return {**answer, "out": str(out)}
@@ -138,7 +143,9 @@ def _real(
     link = UdpLink(address, wire.speaks)
     track = track_of(course.tracks, trial)
     companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
-    console.say(f"waiting for states and images on {address}; Ctrl-C hands over")
+    console.say(
+        f"waiting for states and images on {address}; Ctrl-C returns control to the autopilot"
+    )
     try:
         fly_link(companion, link)
     except KeyboardInterrupt:
@@ -154,8 +161,8 @@ def _real(
         why = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
         if companion.over is not None:
             why = f"handed over before the first set point: {companion.over}"
-        elif companion.misfit:
-            why += f" ({companion.misfit})"
+        elif companion.wrong_image_size:
+            why += f" ({companion.wrong_image_size})"
         raise WorkFailed(f"{address}: {why}; see docs/fly.md, 'When it hands over'")
     console.say(f"handed over: {companion.over}; log: {file}")
     if link.strangers:
@@ -206,5 +213,6 @@ def _warn_of_missed(count: int, console: Console) -> None:
     if count:
         console.note(
             f"warning: {count} decisions were missed: no state came in their time (send ODOMETRY "
-            "several times as often as the policy decides), or an answer of the policy took so long"
+            "several times as often as the policy decides), or the policy took longer than one "
+            "decision period"
         )

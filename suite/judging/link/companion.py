@@ -98,11 +98,11 @@ class Companion:
         return bool(self.rows) and self.over is None
 
     @property
-    def misfit(self) -> str:
+    def wrong_image_size(self) -> str:
         """A message about depth images of another size than the policy's; empty without any."""
-        if self._picture.misfit is None:
+        if self._picture.other_size is None:
             return ""
-        camera, (width, height) = self._policy.spec.camera, self._picture.misfit
+        camera, (width, height) = self._policy.spec.camera, self._picture.other_size
         return (
             f"depth images of {width} x {height} pixels left out: the policy's are "
             f"{camera.width} x {camera.height}"
@@ -150,9 +150,9 @@ class Companion:
         return [self._wire.encoded(Note(f"policy hands over: {reason}"))]
 
     def _see(self, packet: Packet) -> None:
-        known, found = self._picture.misfit, self._picture.add(packet)
-        if self._picture.misfit != known:
-            self._event(self.misfit)
+        known, found = self._picture.other_size, self._picture.add(packet)
+        if self._picture.other_size != known:
+            self._event(self.wrong_image_size)
         if found is not None:
             self._depth, self._depth_at = found, self._clock()
 

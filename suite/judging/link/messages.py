@@ -297,7 +297,7 @@ class Picture:
             )
         self._parts: dict[int, bytes] = {}
         self._wanted = 0
-        self.misfit: tuple[int, int] | None = None
+        self.other_size: tuple[int, int] | None = None
         """Width and height of the last announced image of another size."""
 
     def add(self, packet: Packet) -> np.ndarray | None:
@@ -307,7 +307,7 @@ class Picture:
             fits = size == self._size and packet.parts == -(-self._size // PACKET)
             self._parts, self._wanted = {}, packet.parts if fits else 0
             if (height, width) != self._shape:
-                self.misfit = (width, height)
+                self.other_size = (width, height)
             return None
         if packet.place in self._parts:  # from the next image, whose announcement was lost
             self._parts, self._wanted = {}, 0

@@ -260,7 +260,7 @@ def test_depth_images_of_another_size_are_said_once(bench):
     assert one.tell() == []
     said = [event for event in one.companion.events if "depth images" in event]
     assert len(said) == 1 and "64 x 48 pixels left out: the policy's are 32 x 24" in said[0]
-    assert one.companion.misfit in said[0]
+    assert one.companion.wrong_image_size in said[0]
 
 
 @pytest.mark.parametrize(("off_m", "jumped"), [(0.45, False), (0.55, True)])
