@@ -26,7 +26,7 @@ OURS = "ours"
 COLUMNS = [
     header
     for track in JUDGED
-    for header in (f"{track} SR", "v_max [m/s]", "of ten [m/s]", "v_mean [m/s]", "lap [s]")
+    for header in (f"{track} SR", "v_max [m/s]", "largest of 10 [m/s]", "v_mean [m/s]", "lap [s]")
 ]
 """Columns of every track."""
 
