@@ -51,7 +51,8 @@ class Recording(NamedTuple):
     extra: Wrench
     """(K, 3) force and torque that an `Extra` (physics beyond the vehicle's) added."""
     integrator: str | None = None
-    """How the simulator stepped where its step shows in the flight: `euler`, by `dt`."""
+    """`euler` if the simulator integrates by Euler steps of `dt`, as the flight shows; None if the
+    flight counts as continuous in time."""
 
 
 class FlightFailed(RuntimeError):

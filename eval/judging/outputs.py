@@ -22,8 +22,9 @@ LIMITED_MOST = 0.05
 UNIT = 1.0 + 1e-6
 """Largest output of a policy whose action space is -1 to 1."""
 UP_MOST = 6.0
-"""A mean vertical acceleration above this contains gravity [m/s^2]. It counts as 0 where a vehicle
-does not climb: a correct policy commands upwards if a weak vehicle sinks."""
+"""A mean vertical acceleration above this shows that outputs contain gravity [m/s^2]. Decisions in
+which the vehicle does not climb enter the mean as 0: a correct policy commands upwards while a
+vehicle with too little thrust sinks."""
 
 LIFT = 3.0
 """A vertical acceleration above this, even towards a gate below, contains gravity [m/s^2]."""
