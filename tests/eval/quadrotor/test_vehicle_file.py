@@ -149,6 +149,9 @@ def test_unreadable_files_are_refused(tmp_path):
     with pytest.raises(VehicleFileError, match="mass|has no 'name'"):
         load_vehicle(path)
     path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(VehicleFileError, match="UTF-16"):
+        load_vehicle(path)
+    path.write_bytes(b"name = \xe9")
     with pytest.raises(VehicleFileError, match="is not TOML"):
         load_vehicle(path)
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
