@@ -75,7 +75,8 @@ def open_streams() -> None:
 
 def _text(raw: io.FileIO, old: TextIO | None) -> TextIO:
     encoding = old.encoding if old else "utf-8"
-    lines = raw.isatty() or isinstance(raw, _Unfailing)
+    unbuffered = getattr(old, "write_through", False)  # python -u, PYTHONUNBUFFERED
+    lines = raw.isatty() or unbuffered or isinstance(raw, _Unfailing)
     return io.TextIOWrapper(
         io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=lines
     )

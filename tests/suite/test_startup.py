@@ -256,3 +256,14 @@ def test_warnings_of_numbers_are_not_for_people(root, tmp_path):
     (tmp_path / "it.toml").write_text(text.replace("mass = 0.75", "mass = 1e300"))
     done = suite(root, ["eval", "--vehicle", "it.toml", "--trials", "1"], cwd=tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_output_is_unbuffered_where_that_is_asked(asked):
+    code = (
+        "import os; from suite.common.startup import open_streams as o; o(); print(1); os._exit(0)"
+    )
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1" if asked else ""}
+    args = [sys.executable, "-c", code]
+    found = subprocess.run(args, env=environment, capture_output=True, text=True, check=True)
+    assert found.stdout == ("1\n" if asked else "")
