@@ -26,8 +26,10 @@ from suite.loop.compare import difference_cell
 from tracks.common.grid import Cell, Grid, table
 from tracks.input.ranges import Trials
 
-MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
-"""Factors of the magnitudes in the shipped files."""
+PRESET_MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
+"""Factors of the magnitudes in the shipped files, for a whole preset."""
+MODEL_MAGNITUDES = (0.0, 1.0, 2.0)
+"""The same for one sensor model alone."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class Config(options.Judged):
     """Judge policies through sensor models: all presets on every cell, and growing magnitudes.
 
     All policies fly the same trials under every condition. Give a policy that was trained with
-    sensor models as the second one to see the effect of that training.
+    sensor models as the second one to see the effect of that training. Models alone, one at a
+    time, are flown by the first policy only.
     """
 
     difficulty: str = "0,3,6,9"
@@ -43,7 +46,7 @@ class Config(options.Judged):
     trials: Trials = 50
     """Trials of every policy on every track at every level through every preset."""
     growing_trials: Trials = 32
-    """Trials of every policy on every track at level 3 at every magnitude."""
+    """Trials of a policy on every track at level 3 at every magnitude."""
     only: tuple[str, ...] = ()
     """Only these presets and models, by name; all by default."""
 
@@ -52,19 +55,24 @@ def document(config: Config, place: Place, console: Console) -> Made:
     """Return tables and numbers; what is missing is flown first."""
     from suite.experiments.pages.charts import sweeps_chart
 
-    vehicle, sets = load_vehicle(config.vehicle), chosen_sets(config.only)
+    vehicle, presets, models = load_vehicle(config.vehicle), *chosen_sets(config.only)
     policies = judging.named_policies(config.policy)
     cells, growing = judging.trials_of(config), replace(config, trials=config.growing_trials)
     base = Condition("perfect", 0.0, "", vehicle)
-    presets = [
-        Condition(name, 1.0, "", vehicle, sensors)
-        for name, sensors in sets.items()
-        if name in shipped_sensors()
-    ]
-    tested, _ = disturbed.flown_under([base, *presets], {}, policies, cells, place, console)
-    sweeps = {sweep: sweep_conditions(vehicle, sweep) for sweep in growing_sweeps(sets)}
+    usual = [Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()]
+    tested, _ = disturbed.flown_under([base, *usual], {}, policies, cells, place, console)
     again = judging.trials_of(growing, [3])
-    _, grown_points = disturbed.flown_under([], sweeps, policies, again, place, console)
+
+    def grown_under(
+        sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
+    ) -> disturbed.Grown:
+        sweeps = growing_sweeps(sets, magnitudes)
+        conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
+        return disturbed.flown_under([], conditions, policies, again, place, console)[1]
+
+    first_policy = dict([next(iter(policies.items()))])
+    grown_presets = grown_under(presets, PRESET_MAGNITUDES, policies)
+    grown_models = grown_under(models, MODEL_MAGNITUDES, first_policy)
     facts = {
         **judging.policy_facts(policies),
         "presets": f"three tracks, levels {config.difficulty}, seeds "
@@ -75,43 +83,50 @@ def document(config: Config, place: Place, console: Console) -> Made:
     }
     parts: dict[str, list[Grid | Picture]] = {
         "Presets on every cell": [preset_grid(tested), *gain_grids(tested)],
-        "Growing magnitudes": [
-            Picture(sweeps_chart(grown_points), "Success against the magnitude of each"),
-            magnitude_grid(grown_points),
-        ],
     }
+    for title, points in (
+        ("Presets of growing magnitude", grown_presets),
+        ("Single models of growing magnitude", grown_models),
+    ):
+        if points:
+            chart = Picture(sweeps_chart(points), "Success against the magnitude of each")
+            parts[title] = [chart, magnitude_grid(points)]
     numbers = [
         disturbed.tested_numbers(entry, entries[0])
-        for entries in (tested, *grown_points.values())
+        for entries in (tested, *grown_presets.values(), *grown_models.values())
         for entry in entries
     ]
     return Made(facts, parts, {"conditions": numbers})
 
 
-def chosen_sets(only: Sequence[str]) -> dict[str, SensorSet]:
-    """Return the presets, then each model alone at its usual size, that are in `only`, or all.
+def chosen_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, SensorSet]]:
+    """Return the presets, and each model alone at its usual size: those in `only`, or all.
 
     Raises:
         ValueError: for an unknown name.
     """
     presets = {name: load_sensors(name) for name in shipped_sensors() if name != "perfect"}
     usual = {**presets["tof-depth"].models, **presets["all"].models}
-    alone = {
+    models = {
         name: SensorSet(name, MappingProxyType({name: usual[name]}))
         for name, sensor in SENSORS.items()
         if name in usual and not sensor.measure
     }
-    return options.chosen({**presets, **alone}, only, "preset or sensor model")
+    names = options.chosen({**presets, **models}, only, "preset or sensor model")
+    return (
+        {name: presets[name] for name in names if name in presets},
+        {name: models[name] for name in names if name in models},
+    )
 
 
-def growing_sweeps(sets: Mapping[str, SensorSet]) -> list[Sweep]:
-    """Return a sweep of the magnitude of each of `sets`."""
+def growing_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -> list[Sweep]:
+    """Return a sweep over `magnitudes` (times the usual) of each of `sets`."""
 
     def at(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
         return vehicle, grown(sensors, size)
 
     return [
-        Sweep(name, "magnitude, times the usual", MAGNITUDES, partial(at, sensors))
+        Sweep(name, "magnitude, times the usual", magnitudes, partial(at, sensors))
         for name, sensors in sets.items()
     ]
 
@@ -163,5 +178,6 @@ def magnitude_grid(grown_points: Mapping[Sweep, Sequence[Tested]]) -> Grid:
         for name in points[0].results:
             cells = (f"{percent(p.success(name))}, {_speed(p, name):.2f} m/s" for p in points)
             lines.append([sweep.name, name, *cells])
-    headers = ["sensors", "policy", *(f"x {size:g}" for size in MAGNITUDES)]
+    magnitudes = next(iter(grown_points)).sizes
+    headers = ["sensors", "policy", *(f"x {size:g}" for size in magnitudes)]
     return table(headers, lines, "Success with its 95 % interval, and the median of v_mean")

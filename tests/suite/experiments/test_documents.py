@@ -37,17 +37,19 @@ def test_perception(sky, tmp_path):
     another_racer(trained, 3)
     args += ["1", "--policy", "race-paper", "--policy", str(trained)]
     assert reproduce(tmp_path, "perception", *args) == 0
-    # Perfect and one preset on two levels; two sets at four magnitudes on one of the two.
-    assert len(sky.flown) == 2 * 3 * (2 * 2 + 2 * 4 - 1), "magnitude 1 of a preset is that preset"
+    # Two policies: perfect and a preset on two levels, and the preset at three more magnitudes on
+    # one of them. The first policy: one model at two magnitudes.
+    assert len(sky.flown) == 2 * 3 * (2 * 2 + 3) + 3 * 2, "magnitude 1 of a preset is that preset"
     noises = {flight[2].models["stereo"].noise for flight in sky.flown
               if list(flight[2].models) == ["stereo"]}  # fmt: skip
-    assert sorted(noises) == pytest.approx([0.05, 0.1, 0.15, 0.2])
+    assert sorted(noises) == pytest.approx([0.1, 0.2])
     text, numbers = page(tmp_path, "perception")
-    assert len(numbers["conditions"]) == 2 + 2 * 5
+    assert len(numbers["conditions"]) == 2 + 5 + 3
     assert text.count("| 0 % [0, 56] | 0 % [0, 56] | 0 % [0, 39] |") == 4
     assert "| sensors | trained |\n" in text and text.count("| +0 [-39, +39], +0.0% |") == 2
     assert text.count("| stereo | race-paper | 0 % [0, 56], ") == 1
-    assert (tmp_path / "docs" / "perception.png").is_file()
+    assert "| stereo | trained |" not in text and "| vio | trained |" in text
+    assert (tmp_path / "docs" / "perception-2.png").is_file()
 
 
 def test_table2_and_all_levels(sky, tmp_path, capfd):
