@@ -38,11 +38,11 @@ class DepthEncoding:
     """Inverse depth as the network sees it: scale / clip(depth, near, far) - offset."""
 
     scale: Annotated[float, Range(1e-6, 1e6)] = 3.0
-    """Numerator [m]."""
+    """Numerator of the encoding, scale / depth - offset [m]."""
     near: Annotated[float, Range(1e-3, 100.0)] = 0.3
     """Smaller depths are set to this [m]."""
     offset: Annotated[float, Range(-1e6, 1e6)] = 0.6
-    """Subtracted, so that distant pixels are near zero [1]."""
+    """Subtracted in the encoding, so that distant pixels are near zero [1]."""
     channel_axis: bool = False
     """Whether images are (1, height, width) and not (height, width)."""
     uint8: bool = False

@@ -74,13 +74,13 @@ def evaluate_policy(
     Args:
         policy: a policy (`load_policy`, or any object with its methods), a shipped name or a file.
         track: a track of your own, "all" (the judged families), a family, or several with commas.
-        difficulty: a level 0 to 9, "0,3", "0-9" or "all"; without meaning for a track of your own.
-        trials: on every track at every level.
-        seed: of the first trial; the others follow by one.
+        difficulty: a level 0 to 9, "0,3", "0-9" or "all"; ignored for a track of your own.
+        trials: number of trials on every track at every level.
+        seed: seed of the first trial; each further trial adds one.
         vehicle: a vehicle, a shipped name or a vehicle file.
         simulator: a name of `suite list simulators`.
         sensors: what the policy sees and knows: a shipped name or a sensors file.
-        workers: processes; None takes as many cores as are worth it.
+        workers: number of processes; None takes as many cores as give a gain.
 
     Raises:
         ValueError: for anything that cannot be used, before the first flight.
@@ -125,8 +125,8 @@ def train_policy(
         out: folder of the run.
         recipe: a name of `suite list recipes`.
         settings: changes as `suite train --set` takes them, such as "loss.progress=2".
-        iterations: gradient steps, instead of the recipe's.
-        seed: of parameters, tracks and randomisation.
+        iterations: number of gradient steps; None takes the recipe's.
+        seed: seed of the parameters, tracks and randomisation.
         progress: print progress.
 
     Raises:
@@ -207,7 +207,7 @@ def register_effect(effect: Effect) -> None:
 
 
 def register_track(name: str, make: Any) -> None:
-    """Add a track family, make(difficulty, rng) -> (scene, start, names), for this process.
+    """Add a track family for this process: a function make(difficulty, rng) -> Layout.
 
     Raises:
         ValueError: for a name that is taken, or something that makes no tracks.

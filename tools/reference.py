@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import sys
 from collections.abc import Iterable
 from dataclasses import MISSING, is_dataclass
@@ -19,12 +20,36 @@ from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
-from suite.common.options import SILENT, Option, options, settings
+from eval.sensors.measured_state import Axis, MeasuredState
+from suite.common.options import SILENT, Option, field_texts, options, settings
 from suite.common.usage import EXAMPLES, GROUPS
 from suite.train.recipes import named_recipe
 
+HEADS = Path(__file__).with_name("heads")
+"""The text above the made part of each page."""
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
 HEAD = "<!-- Made by tools/reference.py; change the code, not this page. -->\n"
+
+WHOLE = {
+    "velocity_scale": "k: relative error of the velocity.",
+    "position_drift": "c: drift of the position over the root of the distance.",
+}
+"""Parameters of `measured_state` that have no axis, and their meanings."""
+SETTING_GROUPS = {
+    "spec": "The policy: rate, camera, inputs, network (`spec`)",
+    "physics": "The point mass, and the images of all trainings (`physics`)",
+    "quadrotor": "The quadrotor and how it varies between worlds (`quadrotor`)",
+    "loss": "The loss and the field (`loss`)",
+    "episode": "The worlds of a gradient step (`episode`)",
+    "optimizer": "The optimiser (`optimizer`)",
+    "": "The whole run",
+}
+"""First part of a setting's name -> heading of its table."""
+
+
+def head(page: str) -> str:
+    """Return a page's title and introduction."""
+    return (HEADS / f"{page}.md").read_text(encoding="utf-8")
 
 
 def cell(text: Any) -> str:
@@ -34,7 +59,7 @@ def cell(text: Any) -> str:
 
 def commands() -> str:
     """Return the page of commands."""
-    parts = ["# Commands, option by option\n"]
+    parts = [head("commands")]
     for group, table in GROUPS.items():
         parts.append(f"## {group}\n")
         for name, summary in table.items():
@@ -61,12 +86,33 @@ def _default(option: Option) -> str:
     return "" if text in SILENT else cell(text)
 
 
+class _Plain(str):
+    """An annotation that a signature prints without quotes."""
+
+    __repr__ = str.__str__
+
+
+def _signature(function: Any) -> str:
+    """Return a function's parameters, a line each, and what it returns."""
+    known = inspect.signature(function)
+    parameters = [
+        one.replace(annotation=_Plain(one.annotation)) for one in known.parameters.values()
+    ]
+    # A bare `*` stands before the first parameter that is given by name only.
+    lines = [str(one) for one in parameters]
+    named = [one.kind is inspect.Parameter.KEYWORD_ONLY for one in parameters]
+    if True in named:
+        lines.insert(named.index(True), "*")
+    body = "\n".join(f"    {line}," for line in lines)
+    return f"suite.{function.__name__}(\n{body}\n) -> {known.return_annotation}"
+
+
 def python() -> str:
     """Return the page of the Python interface."""
-    parts = [f"# Python\n\n{inspect.getdoc(suite)}\n"]
+    parts = [head("python")]
     for name in suite.__all__:
         function = getattr(suite, name)
-        parts.append(f"## {name}\n\n```text\nsuite.{name}{inspect.signature(function)}\n```\n")
+        parts.append(f"## {name}\n\n```text\n{_signature(function)}\n```\n")
         parts.append(f"```text\n{inspect.getdoc(function)}\n```\n")
     return "\n".join(parts)
 
@@ -78,43 +124,59 @@ def _value(value: Any) -> str:
 
 
 def training() -> str:
-    """Return the page of the settings of a training."""
-    rows = [
-        f"| `{one.path}` | {_value(one.default)} | {one.allowed} | {cell(one.about)} |"
-        for one in settings(named_recipe("race"))
-        if not one.path.startswith("quadrotor.vehicle.")
-    ]
-    head = "| setting | in `race`, first phase | allowed | meaning |\n|---|---|---|---|\n"
-    return (
-        "# Settings of a training\n\nWhat `suite train --set` takes.\n\n" + head + "\n".join(rows)
-    )
+    """Return the page of the settings of a training: a table for each group of settings."""
+    groups = dict[str, list[str]]()
+    for one in settings(named_recipe("race")):
+        if not one.path.startswith("quadrotor.vehicle."):
+            group = one.path.split(".")[0] if "." in one.path else ""
+            row = f"| `{one.path}` | {_value(one.default)} | {one.allowed} | {cell(one.about)} |"
+            groups.setdefault(group, []).append(row)
+    titles = "| setting | in `race`, first phase | allowed | meaning |\n|---|---|---|---|\n"
+    parts = [head("settings")]
+    for group, title in SETTING_GROUPS.items():
+        parts.append(f"## {title}\n\n{titles}" + "\n".join(groups.pop(group)) + "\n")
+    assert not groups, f"settings without a title: {sorted(groups)}"
+    return "\n".join(parts)
 
 
-def catalogue(title: str, entries: Iterable[Any]) -> str:
+def _meaning(entry: Any, parameter: str) -> str:
+    """Return the text below a parameter's field, without its shape and unit."""
+    if entry.values is MeasuredState:
+        suffix = re.sub(r"^[a-z]+_[xyz]_?", "", parameter)
+        text = WHOLE.get(parameter) or field_texts(Axis)[suffix or "noise"]
+    else:
+        text = field_texts(entry.values)[parameter]
+    text = re.sub(r"^\([^)]*\),? ?| \[[^]]*\](?=[.;]|$)", "", text)
+    return text if re.match(r"\w+:", text) else text[:1].upper() + text[1:]
+
+
+def catalogue(page: str, entries: Iterable[Any]) -> str:
     """Return the page of a catalogue: effects of a vehicle file, or sensor models."""
-    vehicle, rows = load_vehicle("reference"), list[str]()
+    vehicle, parts = load_vehicle("reference"), [head(page)]
     for entry in entries:
-        about = f"`{entry.name}` | {cell(entry.summary)} | {cell(entry.equation)}"
+        equation = entry.equation.replace("; ", "\n    ")
+        stage = f" Table `[[{entry.stage}]]`." if hasattr(entry, "stage") else ""
+        parts.append(f"## {entry.name}\n\n{entry.summary}.{stage}\n\n    {equation}\n")
+        rows = dict[str, str]()
         for parameter in entry.parameters:
             low, high = (at(end, vehicle) for end in (parameter.low, parameter.high))
             usual = " to ".join(f"{end:g}" for end in parameter.typical)
-            rows.append(
-                f"| {about} | `{parameter.name}` [{parameter.unit}] | {usual} | "
-                f"{low:g} to {high:g} |"
-            )
-            about = " | | "
-    head = (
-        "| name | what | equation | parameter | usual size | allowed |\n|---|---|---|---|---|---|\n"
-    )
-    return f"# {title}\n\n{head}" + "\n".join(rows)
+            about = cell(_meaning(entry, parameter.name))
+            # The nine axes of `measured_state` differ in their names only.
+            name = re.sub(r"_[xyz](?=_|$)", "_AXIS", parameter.name)
+            shown = f"`{name}` [{parameter.unit}]"
+            rows[name] = f"| {shown} | {about} | {usual} | {low:g} to {high:g} |"
+        parts.append("| parameter | meaning | usual size | allowed |\n|---|---|---|---|")
+        parts.append("\n".join(rows.values()) + f"\n\nSource: {entry.source}.\n")
+    return "\n".join(parts)
 
 
 MADE = {
     "commands": commands,
     "python": python,
     "settings": training,
-    "effects": lambda: catalogue("Effects of a vehicle file", EFFECTS.values()),
-    "sensors": lambda: catalogue("Models of a sensors file", SENSORS.values()),
+    "effects": lambda: catalogue("effects", EFFECTS.values()),
+    "sensors": lambda: catalogue("sensors", SENSORS.values()),
 }
 """Page -> what returns its text."""
 

@@ -85,7 +85,7 @@ class TorqueTrim(NamedTuple):
     """Values of `torque_trim`."""
 
     torque: Array
-    """(..., 3) about body x, y, z [N m]."""
+    """(..., 3) torque about body x, y, z [N m]."""
 
 
 def torque_trim_torque(values: TorqueTrim, flow: Flow) -> Array:

@@ -11,7 +11,7 @@ class LinearDrag(NamedTuple):
     """Values of `linear_drag`."""
 
     coefficient: Array
-    """(..., 3) D along body x, y, z [1/s]."""
+    """(..., 3) D: drag along body x, y, z per mass and airspeed [1/s]."""
 
 
 def linear_drag_force(values: LinearDrag, flow: Flow) -> Array:
@@ -36,7 +36,7 @@ class QuadraticDrag(NamedTuple):
     """Values of `quadratic_drag`."""
 
     coefficient: Array
-    """(..., 3) C along body x, y, z [1/m]."""
+    """(..., 3) C: drag along body x, y, z per mass and squared airspeed [1/m]."""
 
 
 def quadratic_drag_force(values: QuadraticDrag, flow: Flow) -> Array:
@@ -68,7 +68,7 @@ class RotorDrag(NamedTuple):
     """Values of `rotor_drag`."""
 
     coefficient: Array
-    """(...,) k [kg/rad]."""
+    """(...,) k: drag per airspeed and sum of the rotor speeds [kg/rad]."""
 
 
 def rotor_drag_force(values: RotorDrag, flow: Flow) -> Array:
@@ -94,7 +94,7 @@ class AngularDamping(NamedTuple):
     """Values of `angular_damping`."""
 
     coefficient: Array
-    """(..., 3) d about body x, y, z [1/s]."""
+    """(..., 3) d: damping about body x, y, z per inertia [1/s]."""
 
 
 def angular_damping_torque(values: AngularDamping, flow: Flow) -> Array:

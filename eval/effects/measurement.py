@@ -64,7 +64,7 @@ class FrameTilt(NamedTuple):
     """Values of `frame_tilt`."""
 
     angle: Array
-    """(..., 2) of gravity about world x, then y [rad]."""
+    """(..., 2) tilt of gravity about world x, then y [rad]."""
 
 
 def frame_tilt_constants(values: FrameTilt, constants: Constants) -> Constants:
@@ -99,7 +99,7 @@ class ClockOffset(NamedTuple):
     """Values of `clock_offset`."""
 
     offset: Array
-    """() how much later a pose is logged than it was [s]."""
+    """() how much later than measured a pose is logged [s]."""
 
 
 CLOCK_OFFSET = Effect(

@@ -11,7 +11,7 @@ class MotorLag(NamedTuple):
     """Values of `motor_lag`."""
 
     time_constant: Array
-    """(...,) tau_m [s]."""
+    """(...,) tau_m: time constant of the rotor speeds [s]."""
 
 
 def motor_lag_constants(values: MotorLag, constants: Constants) -> Constants:

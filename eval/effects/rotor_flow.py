@@ -11,7 +11,7 @@ class Inflow(NamedTuple):
     """Values of `inflow`."""
 
     coefficient: Array
-    """(...,) k [N s^2/(m rad)]."""
+    """(...,) k: lost thrust per climb speed and rotor speed [N s^2/(m rad)]."""
 
 
 def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
@@ -39,7 +39,7 @@ class TranslationalLift(NamedTuple):
     """Values of `translational_lift`."""
 
     coefficient: Array
-    """(...,) k [1/m]."""
+    """(...,) k: lift per mass and squared horizontal airspeed [1/m]."""
 
 
 def translational_lift_force(values: TranslationalLift, flow: Flow) -> Array:
@@ -65,7 +65,7 @@ class BladeFlapping(NamedTuple):
     """Values of `blade_flapping`."""
 
     coefficient: Array
-    """(...,) k [N s^2/rad]."""
+    """(...,) k: torque per airspeed and sum of the rotor speeds [N s^2/rad]."""
 
 
 def blade_flapping_torque(values: BladeFlapping, flow: Flow) -> Array:
@@ -98,9 +98,9 @@ class GroundEffect(NamedTuple):
     """Values of `ground_effect`."""
 
     strength: Array
-    """(...,) g; 1 is Cheeseman and Bennett's rotor [1]."""
+    """(...,) g: 1 is the rotor of Cheeseman and Bennett 1955 [1]."""
     rotor_radius: Array
-    """(...,) r [m]."""
+    """(...,) r: radius of a rotor [m]."""
 
 
 def ground_effect_thrust(values: GroundEffect, flow: Flow, thrust: Array) -> Array:

@@ -11,7 +11,7 @@ class RotorGyroscopic(NamedTuple):
     """Values of `rotor_gyroscopic`."""
 
     rotor_inertia: Array
-    """(...,) J_r of one rotor about its axis [kg m^2]."""
+    """(...,) J_r: inertia of one rotor about its axis [kg m^2]."""
 
 
 def rotor_gyroscopic_torque(values: RotorGyroscopic, flow: Flow) -> Array:
@@ -37,7 +37,7 @@ class RotorSpinUp(NamedTuple):
     """Values of `rotor_spin_up`."""
 
     rotor_inertia: Array
-    """(...,) J_r of one rotor with its motor's bell about its axis [kg m^2]."""
+    """(...,) J_r: inertia of one rotor with its motor's bell, about its axis [kg m^2]."""
 
 
 def rotor_spin_up_torque(values: RotorSpinUp, flow: Flow) -> Array:

@@ -24,9 +24,9 @@ class SlungLoad(NamedTuple):
     """Values of `slung_load`."""
 
     mass: Array
-    """(...,) m_L [kg]."""
+    """(...,) m_L: mass of the load [kg]."""
     length: Array
-    """(...,) of the line at rest, L [m]."""
+    """(...,) length of the line at rest, L [m]."""
 
 
 class LoadState(NamedTuple):

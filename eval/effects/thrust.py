@@ -104,7 +104,7 @@ class ThrustTilt(NamedTuple):
     """Values of `thrust_tilt`."""
 
     angle: Array
-    """(..., 2) of the thrust about body x, then y [rad]."""
+    """(..., 2) tilt of the thrust about body x, then y [rad]."""
 
 
 def thrust_tilt_constants(values: ThrustTilt, constants: Constants) -> Constants:

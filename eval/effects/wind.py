@@ -11,7 +11,7 @@ class ConstantWind(NamedTuple):
     """Values of `constant_wind`."""
 
     velocity: Array
-    """(..., 3) of the air in the world [m/s]."""
+    """(..., 3) velocity of the air in the world [m/s]."""
 
 
 def constant_wind_wind(values: ConstantWind, gust: Gust) -> Array:
@@ -51,7 +51,7 @@ class Gusts(NamedTuple):
     intensity: Array
     """(...,) standard deviation of the horizontal wind components [m/s]."""
     length: Array
-    """(...,) over which the wind changes [m]."""
+    """(...,) distance over which the wind changes [m]."""
 
 
 def gusts_start(values: Gusts, noise: Array) -> Array:

@@ -22,15 +22,25 @@ class Stereo(NamedTuple):
     """Values of `stereo`."""
 
     noise: Array
+    """n: standard deviation of the disparity (shift between the two images)."""
     offset: Array
+    """o: standard deviation of a trial's constant disparity error."""
     step: Array
+    """Disparity is rounded to multiples of this; 0: not rounded."""
     least: Array
+    """Smaller disparities read as the camera's range."""
     near: Array
+    """Nearer points read as the camera's range."""
     edge_holes: Array
+    """Share of pixels at the far side of an edge that are holes."""
     thin_holes: Array
+    """Share of pixels on thin objects that show what is behind."""
     smear: Array
+    """Share of pixels at the far side of an edge that show the near side."""
     focal: Array
+    """f: focal length of the stereo camera."""
     baseline: Array
+    """b: distance between its two lenses."""
 
 
 def stereo_start(values: Stereo, moment: Moment) -> Array:
@@ -116,10 +126,16 @@ class TimeOfFlight(NamedTuple):
     """Values of `tof`."""
 
     noise: Array
+    """s: standard deviation, as a share of the depth."""
     bias: Array
+    """b: standard deviation of a trial's error by multipath, as a share of the depth; never below
+    0."""
     mixing: Array
+    """Share of pixels at an edge that mix near and far depths."""
     wrapped: Array
+    """Share of pixels whose depth is known only up to multiples of c / (2 f)."""
     modulation: Array
+    """f: frequency of the emitted light's modulation."""
 
 
 def tof_start(values: TimeOfFlight, moment: Moment) -> Array:

@@ -27,11 +27,17 @@ class GateDetection(NamedTuple):
     """Values of `gate_detection`."""
 
     pixels: Array
+    """s: standard deviation of a corner in an image of 640 pixels across."""
     missed: Array
+    """Share of the observations in which a gate in view is not detected."""
     length: Array
+    """Mean duration of such a gap."""
     half_side: Array
+    """a: half of the gate's side, as the detector assumes it."""
     known_tilt: Array
+    """Standard deviation of a gate's tilt that is known without an image."""
     smoothing: Array
+    """Time constant of the filter on the detected positions; 0: none."""
 
 
 def start(values: GateDetection, moment: Moment) -> dict[str, Any]:

@@ -33,16 +33,23 @@ class GateFilter(NamedTuple):
     range: Array
     """Corners further away are not detected [m]."""
     position: Array
-    """Standard deviations of the error at the start: this and the next four."""
+    """Standard deviation of the position error at the start, for each axis."""
     velocity: Array
+    """The same of the velocity."""
     attitude: Array
+    """The same of the attitude."""
     acc_bias: Array
+    """The same of the accelerometer's bias, as the filter assumes it."""
     gyro_bias: Array
+    """The same of the gyroscope's bias, as the filter assumes it."""
     acc_noise: Array
-    """IMU errors that the filter assumes: noise densities, then random walks of the biases."""
+    """Noise density of the accelerometer that the filter assumes."""
     gyro_noise: Array
+    """Noise density of the gyroscope that the filter assumes."""
     acc_walk: Array
+    """Random walk of the accelerometer's bias that the filter assumes."""
     gyro_walk: Array
+    """Random walk of the gyroscope's bias that the filter assumes."""
 
 
 def estimate(values: GateFilter) -> FilterSettings:

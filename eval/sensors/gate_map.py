@@ -18,10 +18,15 @@ class GateMap(NamedTuple):
     """Values of `gate_map`."""
 
     shift: Array
+    """t: standard deviation of the shift of all gates, for each axis."""
     yaw: Array
+    """psi: standard deviation of the rotation of the map about the vertical."""
     scale: Array
+    """k: standard deviation of the map's relative error of scale."""
     moved: Array
+    """m_i: standard deviation of each gate's own displacement, for each axis."""
     turned: Array
+    """Standard deviation of each gate's own rotation about the vertical."""
 
 
 def start(values: GateMap, moment: Moment) -> dict[str, Any]:

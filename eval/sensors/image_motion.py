@@ -18,7 +18,9 @@ class ImageMotion(NamedTuple):
     """Values of `image_motion`."""
 
     exposure: Array
+    """Exposure time of a row."""
     readout: Array
+    """Time between the first and the last row."""
 
 
 def start(values: ImageMotion, moment: Moment) -> Array:

@@ -18,15 +18,25 @@ class Imu(NamedTuple):
     """Values of `imu`."""
 
     gyro_noise: Array
+    """s_w: noise density of the gyroscope."""
     gyro_bias: Array
+    """b_w: standard deviation of its bias at the start."""
     gyro_walk: Array
+    """Random walk of that bias."""
     gyro_limit: Array
+    """Largest measurable rate."""
     acc_noise: Array
+    """s_a: noise density of the accelerometer."""
     acc_bias: Array
+    """b_a: standard deviation of its bias at the start."""
     acc_walk: Array
+    """Random walk of that bias."""
     acc_limit: Array
+    """Largest measurable specific force."""
     acc_per_thrust: Array
+    """k: standard deviation of an error in proportion to the thrust."""
     vibration: Array
+    """v: noise of the accelerometer in proportion to the thrust."""
 
 
 def start(values: Imu, moment: Moment) -> dict[str, Any]:

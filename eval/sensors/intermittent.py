@@ -26,9 +26,13 @@ class StateLoss(NamedTuple):
     """Values of `state_loss`."""
 
     share: Array
+    """Share of the observations without track."""
     length: Array
+    """Mean duration of a loss."""
     acceleration: Array
+    """a: standard deviation of the acceleration with which the estimate runs away."""
     jump: Array
+    """Standard deviation of the position's jump at the end, for each axis."""
 
 
 def state_loss_start(values: StateLoss, moment: Moment) -> dict[str, Any]:
@@ -82,7 +86,9 @@ class Fault(NamedTuple):
     """Values of the faults below."""
 
     share: Array
+    """Share of the observations with the fault."""
     length: Array
+    """Mean duration of the fault."""
 
 
 def _fault(usual_share: tuple[float, float], **others: Any) -> Sensor:

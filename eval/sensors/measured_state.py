@@ -125,7 +125,7 @@ SENSOR = Sensor(
     stage="state",
     summary="Errors of an estimated state with a size, a bias and a colour for every axis",
     equation="p + b_p + n_p + d, (1 + k) v + R (b_v + n_v), R Exp(b_R + n_R); n = s (sqrt(f) e_f "
-    "+ sqrt(1 - f) e), e' = a e + sqrt(1 - a^2) white, a = exp(-dt / lasts), e_f alike; "
+    "+ sqrt(1 - f) e), e' = a e + sqrt(1 - a^2) white, a = exp(-dt / lasts), e_f in the same way; "
     "d' = d + c sqrt(|dp|) white",
     source="first-order Gauss-Markov processes (Gelb 1974, Applied Optimal Estimation); the "
     "numbers by `suite identify --sensors`",

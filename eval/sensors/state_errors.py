@@ -29,10 +29,15 @@ class StateDrift(NamedTuple):
     """Values of `state_drift`."""
 
     position: Array
+    """s_p: drift of the position, for each axis, over the root of the distance."""
     yaw: Array
+    """s_y: drift of the heading over the root of the distance."""
     yaw_turning: Array
+    """s_t: drift of the heading over the root of the turned angle."""
     scale: Array
+    """k: standard deviation of the relative error of distances and velocity."""
     flown: Array
+    """Distance flown before the trial."""
 
 
 def state_drift_start(values: StateDrift, moment: Moment) -> dict[str, Any]:
@@ -105,11 +110,17 @@ class StateNoise(NamedTuple):
     """Values of `state_noise`."""
 
     position: Array
+    """s_p: standard deviation of the position, for each axis."""
     velocity: Array
+    """s_v: standard deviation of the velocity, for each axis."""
     attitude: Array
+    """s_R: standard deviation of the attitude, for each axis."""
     velocity_bias: Array
+    """b_v: standard deviation of a trial's constant error, body axes."""
     attitude_bias: Array
+    """b_R: standard deviation of a trial's constant error, body axes."""
     correlation: Array
+    """Correlation time of the noise; 0: independent at every observation."""
 
 
 def state_noise_start(values: StateNoise, moment: Moment) -> dict[str, Any]:
@@ -167,8 +178,11 @@ class Delay(NamedTuple):
     """Values of `delay`."""
 
     state: float
+    """Mean age of the state."""
     image: float
+    """Mean age of the image."""
     jitter: float
+    """Largest relative deviation of an age from its mean."""
 
 
 def delay_ages(values: Delay) -> Ages:

@@ -18,7 +18,7 @@ from tracks.common.names import unknown_name
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Time a hot path against a plain implementation of the same; without a name, list them."""
+    """Compare the speed of a core function with a plain implementation; without NAME, list all."""
 
     name: tyro.conf.Positional[str] = ""
     """Which benchmark. Without it all are listed."""

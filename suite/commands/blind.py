@@ -23,7 +23,7 @@ class Config(Command):
 
     what: tyro.conf.Positional[Literal["make", "run", "score", "strengths", "plan"]]
     """make: write a set of cases; run: `suite diagnose` on each; score: compare the answers with
-    the truth; strengths: the table of detectable strengths again; plan: which flights separate
+    the truth; strengths: compute the table of detectable strengths; plan: which flights separate
     --effects."""
     out: Path = Path("runs/blind")
     """Folder of the set; the same command again continues where it stopped."""

@@ -45,8 +45,8 @@ class Config(Command):
     no_recording: Advanced[bool] = False
     """Do not write recording.rrd (for rerun): the held-out flights, measured and simulated."""
     accept: Advanced[tuple[str, ...]] = ()
-    """Faults of the logs (names that suite check prints) which you know, and which then do not stop
-    the command."""
+    """Continue in spite of these faults of the logs; the names are those that suite check
+    prints."""
     seed: Advanced[Seed] = 0
     """Seed of the permutation test, the intervals and simulated noise."""
 

@@ -15,7 +15,7 @@ from tracks.common.files import check_no_input
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Find thrust, inertia, lag, delay, rate gains and drag of a quadrotor in its flight logs.
+    """Estimate thrust, inertia, lag, delay, rate gains and drag of a quadrotor from flight logs.
 
     With --sensors, the errors of its state estimate instead.
     """
@@ -33,8 +33,8 @@ class Config(Command):
     leave: Advanced[tuple[str, ...]] = ()
     """Keep these as they are in --vehicle: any of drag, motors, inertia, lag, loop."""
     accept: Advanced[tuple[str, ...]] = ()
-    """Faults of the logs (names that suite check prints) which you know, and which then do not stop
-    the command."""
+    """Continue in spite of these faults of the logs; the names are those that suite check
+    prints."""
 
     def written(self) -> list[Path]:
         """Return the folders into which no other command may write meanwhile."""

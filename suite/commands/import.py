@@ -51,7 +51,7 @@ class Config(Command):
     start: Advanced[Annotated[float, Range(0.0, 1e9)]] = 0.0
     """Leave out what is earlier [s after the file's first sample]."""
     end: Advanced[Annotated[float, Range(0.0, 1e9)] | None] = None
-    """Leave out what is later [s after the file's first sample]. Without it nothing."""
+    """Leave out rows after this time [s after the file's first sample]. Without it none."""
     keep_ground: Advanced[bool] = False
     """Keep the time before take-off and after landing."""
     partial: bool = False

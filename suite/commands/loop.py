@@ -14,7 +14,7 @@ from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Close the loop and show what the Delta Action Model changes, on the same seeds.
+    """Fly, find what the simulation lacks, fine-tune for it, and fly again, next to a control.
 
     The same command again continues where it was stopped.
     """
@@ -55,8 +55,8 @@ class Config(Command):
     """Gradient steps of the Delta Action Model's fit. Without it 1500, with quick 500; with a
     hidden vehicle 200."""
     no_delta: Advanced[bool] = False
-    """With a hidden vehicle: leave out the Delta Action Models and the fine-tunings under them,
-    which take half the time."""
+    """With a hidden vehicle: leave out the Delta Action Models and the fine-tunings with them.
+    This halves the time."""
     set: Advanced[tuple[str, ...]] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")

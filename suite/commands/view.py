@@ -21,29 +21,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Fly trials of a run again and write a rerun recording, pictures and a video of them."""
+    """Fly trials of a suite eval again; write a recording for rerun, pictures and a video."""
 
     run: tyro.conf.Positional[str]
     """The folder (--out) of a suite eval, or a policy: a shipped name, a checkpoint's folder or a
     file."""
     pick: Literal["first", "failed", "passed"] = "first"
-    """Which trials of the run: the first ones, or the first that failed or passed."""
+    """Which trials of the run: the first ones, or the first that failed or that succeeded."""
     count: Annotated[int, Range(1, 1000)] = 3
     """How many trials at most."""
     track: str = "all"
-    """For a policy: zigzag, circular, ellipse, all of these, a track file, or several."""
+    """If RUN is a policy: zigzag, circular, ellipse, all of these, a track file, or several."""
     difficulty: str = "3"
-    """For a policy: level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    """If RUN is a policy: level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
     vehicle: str = "reference"
-    """For a policy: a shipped vehicle's name or a vehicle file (.toml)."""
+    """If RUN is a policy: a shipped vehicle's name or a vehicle file (.toml)."""
     seed: Seed = 0
-    """For a policy: the trials' seed."""
+    """If RUN is a policy: the trials' seed."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     out: Path = Path("runs/view")
     """Folder for the pictures (PNG), the video and the GIF."""
     rerun: Advanced[Path | None] = None
-    """The recording (.rrd). Without it trials.rrd in the folder."""
+    """File of the recording (.rrd, for rerun). Without it trials.rrd in --out."""
     video: bool = False
     """Also write a video (MP4) of the first trial; takes about its length."""
     gif: bool = False

@@ -268,11 +268,12 @@ def texts_of(cls: type) -> dict[str, str]:
     found = dict[str, str]()
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
-            found.update(_own_texts(base))
+            found.update(field_texts(base))
     return found
 
 
-def _own_texts(cls: type) -> dict[str, str]:
+def field_texts(cls: type) -> dict[str, str]:
+    """Return the text below each field of one class, without its bases, read from the source."""
     try:
         source = inspect.getsource(cls)
     except OSError:

@@ -9,14 +9,14 @@ GROUPS: dict[str, dict[str, str]] = {
     "Fly": {
         "eval": "judge policies: success rates, speeds and lap times, with intervals",
         "compare": "compare success rates of evaluations on the same trials, with a test",
-        "view": "a recording, pictures and a video of trials",
+        "view": "write a recording, pictures and a video of trials",
         "collect": "fly a policy and record every flight as a log",
         "fly": "fly a policy in real time over MAVLink, as a companion computer does",
     },
     "Train": {
         "train": "train a policy by backpropagation through quadrotors or a point mass",
-        "delta": "fit the Delta Action Model to recorded flights",
-        "loop": "train, fly, record, fit the Delta Action Model, fine-tune, fly again",
+        "delta": "fit a Delta Action Model, a network that corrects the action, to flights",
+        "loop": "fly, find what the simulation lacks, fine-tune for it, fly again",
         "export": "write a policy as torch program, ONNX and C",
     },
     "Logs": {
@@ -32,9 +32,9 @@ GROUPS: dict[str, dict[str, str]] = {
         "effects": "describe the physical effects that a vehicle file may hold",
         "reproduce": "make the published tables and charts",
         "blind": "test the diagnosis on cases with hidden effects: make, run, score",
-        "bench": "time a hot path against a plain implementation of the same",
+        "bench": "compare the speed of a core function with a plain implementation",
         "completion": "print the shell completion for bash or zsh",
-        "info": "versions, devices, memory and commit, for bug reports",
+        "info": "print versions, devices, memory and commit, for bug reports",
     },
 }
 """Group -> command -> one-line summary; the command NAME lives in suite/commands/NAME.py."""

@@ -72,10 +72,11 @@ class Evaluation(SimulatedFlights):
     """For policies with a speed input: 0 (careful) to 1 (a race); with several values all trials
     are flown at each. Without it each policy flies at its own default speed."""
     deadline_s: Advanced[Annotated[float, Range(0.0, 3600.0, above=True)] | None] = None
-    """A policy that takes longer than this for an answer ends the trials of that answer (up to 128,
-    in one batch) as timed out [s]. Without it a policy may take any time."""
+    """If an answer of the policy takes longer than this, the trials that wait for it (up to 128, in
+    one batch) end as timed out [s]. Without it a policy may take any time."""
     monitor: Advanced[bool] = False
-    """Fly every policy a second time with the safety monitor around it, on the same trials."""
+    """Also fly every policy a second time on the same trials, inside the safety monitor that limits
+    its actions."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class PointMassConfig:
     lag_mean: Annotated[float, Range(0.1, 1000.0)] = 12.0
     """Mean rate at which the acceleration follows the command [1/s]."""
     lag_std: Annotated[float, Range(0.0, 1000.0)] = 2.0
-    """Its standard deviation over worlds [1/s]."""
+    """Standard deviation of that rate over worlds [1/s]."""
     drag: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
     """Range of the linear drag along the body's x and y [1/s]."""
     drag_up: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.1, 0.8)
@@ -112,34 +112,37 @@ class LossConfig:
     """
 
     clearance: Annotated[float, Range(0.0, 1e6)] = 3.0
-    """Weight of L_clearance, with the paper's lambda_C [1]."""
+    """Weight of L_clearance, which keeps the drone away from solids; it includes the paper's
+    lambda_C [1]."""
     collide: Annotated[float, Range(0.0, 1e6)] = 0.2
-    """Weight of L_collide; the paper's lambda_C of 3 stops the drone in front of gates [1]."""
+    """Weight of L_collide, which penalises contact with solids. The paper's lambda_C of 3 stops the
+    drone in front of gates [1]."""
     acceleration: Annotated[float, Range(0.0, 1e6)] = 1e-2
-    """lambda_a [s^4/m^2]."""
+    """Weight lambda_a of L_a, the squared acceleration [s^4/m^2]."""
     jerk: Annotated[float, Range(0.0, 1e6)] = 1e-3
-    """lambda_j [s^6/m^2]."""
+    """Weight lambda_j of L_j, the squared jerk [s^6/m^2]."""
     progress: Annotated[float, Range(0.0, 1e6)] = 1.2
-    """lambda_p of L_p [s/m]."""
+    """Weight lambda_p of L_p, the speed towards the gate [s/m]."""
     speed_range: Annotated[tuple[float, float], Range(0.1, 100.0, ordered=True)] = (1.5, 7.0)
     """Commanded speed at an input of 0 and just below 1, for a policy with `spec.speed_input`.
     Progress counts up to the commanded speed, and the excess costs as much; at 1 there is no limit
     [m/s]."""
     progress_norm: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """Weight of L_p^norm, the ablation's direction-only progress [1]."""
+    """Weight of L_p^norm, a progress loss of the paper's ablation that rewards the direction of
+    flight alone [1]."""
     projection: Annotated[float, Range(0.0, 1e6)] = 0.0
-    """lambda_proj of L_proj, the scalar substitute for the field [1/m^2]."""
+    """Weight lambda_proj of L_proj, a scalar loss that replaces the field [1/m^2]."""
     approach_m: Annotated[float, Range(0.0, 100.0)] = 0.0
     """If the drone is off a gate's axis or beyond its plane, progress is measured towards a point
-    on the axis before the gate, as far before it as the drone is off, up to this distance. On the
-    straight line to the centre the frame would be in the way. 0: always the centre [m]."""
+    on the axis before the gate, as far before it as the drone is off, up to this distance. The
+    straight line to the centre would hit the frame. 0: always towards the centre [m]."""
     pass_first: bool = False
     """Whether the step that passes a gate measures progress towards the next gate instead of the
-    passed one: faster, and less careful at these weights."""
+    passed one. Policies then fly faster and less carefully at these weights."""
     projection_decay: Annotated[float, Range(0.0, 1000.0)] = 0.5
-    """beta_3 of L_proj [1/m]."""
+    """beta_3: decay of L_proj with the distance to the gate [1/m]."""
     safety_radius_m: Annotated[float, Range(0.0, 10.0)] = 0.2
-    """r_q, the drone's radius with its margin [m]."""
+    """r_q: the drone's radius with a margin, for L_clearance and L_collide [m]."""
     field_gain: Annotated[float, Range(0.0, 1e6)] = 10.0
     """Gradient per step, of the loss before averaging over time and batch, that u_A adds at the
     centre of a 1 m gate to a velocity across it [1/m]; 0 turns the field off."""
@@ -170,7 +173,7 @@ class EpisodeConfig:
     """The encoder's gradient is taken from every N-th image of a rollout, from a random first one
     on, and weighted by N: neighbouring images are similar. Must divide `steps`."""
     gates: Annotated[int, Range(1, 8)] = 8
-    """Gates of a track: the first ones of the eight that it is made with."""
+    """Number of gates of a track: its first ones, of eight."""
     difficulty: Annotated[tuple[float, float], Range(0.0, 1.0, ordered=True)] = (0.0, 1.0)
     """Range of the tracks' difficulty."""
     rest_share: Share = 0.3
@@ -217,10 +220,10 @@ class OptimizerConfig:
     warmup: Annotated[int, Range(0, 10**9)] = 20
     """Gradient steps of linear warm-up of each phase; the first has a learning rate of 0."""
     memory: Annotated[float, Range(0.0, 1.0, below=True)] = 0.99
-    """Adam's beta_2: a short memory, because gradients of the first crashes are ten times
-    larger."""
+    """Adam's beta_2. It is below the usual 0.999, because the first crashes have ten times
+    larger gradients, which must be forgotten soon."""
     clip: Annotated[float, Range(0.0, 1e12)] = 1.0
-    """Largest global norm of a gradient; 0 does not clip."""
+    """A gradient of a larger global norm is scaled down to it; 0: never."""
 
 
 @dataclass(frozen=True)
