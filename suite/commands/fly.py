@@ -25,7 +25,7 @@ class Config(Command):
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     monitor: bool = False
-    """Fly with the safety monitor of `suite eval --monitor` around the policy."""
+    """Fly with the safety monitor of `suite eval --monitor`, which limits the policy's actions."""
     link: str = ""
     """udpin:HOST:PORT or udpout:HOST:PORT of a vehicle with MAVLink, for one flight. Without it a
     vehicle is simulated in real time on this machine."""
