@@ -133,9 +133,9 @@ def pooled(row: Summary, name: str, trials: int) -> Interval:
 
 def _main(rows: Sequence[Summary], trials: int) -> Grid:
     source, theirs = paper.ablation()
-    headers = ["setting", "lambda_p", "success cross [%]", "pooled", "paper",
-               "collision-free rate [%]",
-               "pooled", "paper", "v_max [m/s]", "most", "paper", "gates", "diverged"]  # fmt: skip
+    headers = ["setting", "lambda_p", "success cross [%]", "pooled [%]", "paper [%]",
+               "collision-free rate [%]", "pooled [%]", "paper [%]",
+               "v_max [m/s]", "largest [m/s]", "paper [m/s]", "gates", "diverged"]  # fmt: skip
     lines = []
     for row in rows:
         printed = theirs.get(row.key)

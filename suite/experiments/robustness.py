@@ -49,7 +49,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
     if alone:
         parts["Every effect at its usual size"] = [
             Picture(effects_chart(effects), "Success under each effect; dashed: undisturbed"),
-            condition_grid(effects, effects[0], ("effect", "total")),
+            condition_grid(effects, effects[0], ("effect", "size in this row")),
         ]
     if grown:
         parts["Growing disturbances"] = [
