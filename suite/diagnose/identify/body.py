@@ -1,51 +1,55 @@
-"""Fits of `suite identify` to the force and the torque on the body.
+"""Fits thrust and drag to the body's translation, and inertia, lag and delay to its rotation.
 
-Force: translation, given the measured attitude. Where no flight has an attitude, thrust is along
-the path's acceleration less gravity, and only its size is compared (differential flatness;
-Mellinger and Kumar 2011).
+Force: the measured acceleration, given the measured attitude. Where no flight has an attitude, the
+thrust points along the path's acceleration minus gravity, and only its size is compared
+(differential flatness; Mellinger and Kumar 2011).
 
-Torque: rotation, given the motors, as changes within a window.
+Torque: changes of the measured body rates, given what drives the rotors. `identify.py` calls both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from suite.diagnose.data.view import WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.identify.drive import Driven
-from suite.diagnose.identify.fit import Z95, Fitted, Known, Rows, Unknown, fit
+from suite.diagnose.identify.drive import DrivenVehicle, TrialVehicle
+from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit
 from suite.diagnose.identify.grid import IMU_ACC, LEANING, ROTOR_NOISE, FlightGrid
 
-WIDTH_S = 0.4
+FORCE_WIDTH_S = 0.4
+"""Width of the windows over which forces are averaged [s]."""
 BLOCK_S = 2.0
-PUSHES = {"pwm": "pwm", "rotors": "rotor_speed"}
-"""By drive, the signal that gives the thrust; for all others the commanded thrust."""
-TURNS = {**PUSHES, "torques": "torque_cmd_b"}
-"""By drive, the signal that gives the torque."""
-SLOW = 2.0
-"""Without an attitude, windows faster than this are left out: a drag across the thrust would add to
-its size, by 0.3 % at this speed and 0.4 1/s [m/s]."""
-LEVEL = np.array([True, True, False])
-"""A flight's trim of the attitude is free; along z it would be the thrust."""
+"""Errors this far apart count as independent [s]."""
+THRUST_SIGNALS = {"pwm": "pwm", "rotors": "rotor_speed"}
+"""By drive, the signal that determines the thrust; for other drives the commanded thrust."""
+TORQUE_SIGNALS = {**THRUST_SIGNALS, "torques": "torque_cmd_b"}
+"""By drive, the signal that determines the torque."""
+SLOW_M_S = 2.0
+"""Without an attitude, faster windows are left out: a drag across the thrust would add to its size,
+by 0.3 % at this speed and 0.4 1/s [m/s]."""
+FORCE_OFFSETS = np.array([True, True, False])
+"""Body axes along which each flight has a free constant, its trim of attitude. Along z a constant
+would be the thrust."""
 
 
-def unknowns_of_force(
-    driven: Driven, voltage: bool, leaning: bool = False, scale: float = 0.0
+def force_unknowns(
+    driven: DrivenVehicle, voltage: bool, leaning: bool = False, scale: float = 0.0
 ) -> list[Unknown]:
-    """Return the numbers of the force; their starts are those of the vehicle file.
+    """Return the numbers that forces identify, from their values in the vehicle file.
 
     Args:
         driven: the start.
-        voltage: whether the flights have one.
-        leaning: whether no flight has an attitude.
+        voltage: whether all flights have a battery voltage.
+        leaning: whether no flight has an attitude; drag is then fitted along body z only.
         scale: logarithm of the thrust's scale in the vehicle file.
     """
-    floor = 0.004 if leaning else 0.001
-    unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, floor)]
+    method_error = 0.004 if leaning else 0.001
+    unknowns = [Unknown("thrust", scale, -2.0, 2.0, 0.25, 1e-3, method_error)]
     if driven.drive == "pwm":
         unknowns.append(Unknown("curve", driven.curve, -0.1, 1.0, 0.35, 1e-2, 0.02))
         if voltage:
@@ -57,218 +61,250 @@ def unknowns_of_force(
 
 def fit_force(
     flights: Sequence[FlightGrid],
-    driven: Driven,
+    driven: DrivenVehicle,
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
 ) -> Fitted:
-    """Return the thrust's and the drag's numbers.
+    """Fit the numbers of thrust and drag.
 
     Args:
         flights: on their grids, with positions; all with an attitude, or none.
         driven: the start.
-        unknowns: from `unknowns_of_force`.
+        unknowns: from `force_unknowns`.
         fixed: numbers that are not fitted, `lag` and `late` among them.
+
+    Raises:
+        NoWholeWindow: if no window has all signals.
     """
-    return fit(together([_force(flight, driven) for flight in flights], unknowns, fixed), unknowns)
+    residuals = [_force_residuals(flight, driven) for flight in flights]
+    return fit(stacked_residuals(residuals, unknowns, fixed, driven.at), unknowns)
 
 
-Residuals = Callable[[Mapping[str, float]], Rows]
-"""From all numbers to the residuals of one flight."""
+Model = TypeVar("Model")
+"""What the residuals of all flights need of an evaluation: a trial vehicle, or the numbers."""
+ForceResiduals = Callable[[TrialVehicle], Rows]
+"""From a trial vehicle to the residuals of one flight."""
 
 
-def together(
-    residuals: Sequence[Residuals], unknowns: Sequence[Unknown], fixed: Mapping[str, float]
+def stacked_residuals(
+    residuals: Sequence[Callable[[Model], Rows]],
+    unknowns: Sequence[Unknown],
+    fixed: Mapping[str, float],
+    model_at: Callable[[dict[str, float]], Model],
 ) -> Callable[[np.ndarray], list[Rows]]:
-    """Return the residuals of all flights by the values of `unknowns`, with the numbers `fixed`."""
+    """Return a function from the values of `unknowns` to the residuals of all flights.
+
+    Args:
+        residuals: one function a flight.
+        unknowns: names of the values.
+        fixed: further numbers, by name.
+        model_at: makes of all numbers what each of `residuals` takes, once an evaluation.
+    """
     names = [unknown.name for unknown in unknowns]
 
-    def of(value: np.ndarray) -> list[Rows]:
-        numbers = {**fixed, **dict(zip(names, value, strict=True))}
-        return [one(numbers) for one in residuals]
+    def evaluate(value: np.ndarray) -> list[Rows]:
+        model = model_at({**fixed, **dict(zip(names, value, strict=True))})
+        return [one(model) for one in residuals]
 
-    return of
+    return evaluate
 
 
-def _force(flight: FlightGrid, driven: Driven) -> Residuals:
-    pushes = PUSHES.get(driven.drive, "thrust_cmd")
-    moved = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
+def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResiduals:
+    """Return measured minus modelled accelerations of `flight` in body axes."""
+    thrust = THRUST_SIGNALS.get(driven.drive, "thrust_cmd")
+    motion = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
-    needs = (moved, pushes, LEANING if leaning else "rot_w")
-    form, rows = flight.form(WIDTH_S, needs), flight.rows(turned=True)
-    path = flight.form(WIDTH_S, needs, slope=True) if moved == "pos_w" else form
+    needs = (motion, thrust, LEANING if leaning else "rot_w")
+    form, rows = flight.form(FORCE_WIDTH_S, needs), flight.rows(attitude_of_path=True)
+    path = flight.form(FORCE_WIDTH_S, needs, slope=True) if motion == "pos_w" else form
     if leaning:
-        slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW
+        slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW_M_S
         form, path = form.take(slow), path.take(slow)
-    takes = path.mean if moved == IMU_ACC else path.change
-    measured = takes @ np.nan_to_num(flight.known[moved])
+    to_acceleration = path.mean if motion == IMU_ACC else path.change
+    measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
     axes = slice(2 if leaning else 0, 3)
 
-    def residuals(numbers: Mapping[str, float]) -> Rows:
-        acc_w, _ = driven.acting(flight, rows, numbers)
-        away = (to_body @ (measured - form.mean @ acc_w)[..., None])[..., 0]
-        return Rows(away[:, axes], block_of(form), LEVEL[axes])
+    def residuals(vehicle: TrialVehicle) -> Rows:
+        acc_w, _ = vehicle.accelerations(flight, rows)
+        error_b = (to_body @ (measured_w - form.mean @ acc_w)[..., None])[..., 0]
+        return Rows(error_b[:, axes], block_of(form), FORCE_OFFSETS[axes])
 
     return residuals
 
 
 def block_of(form: WeakForm) -> np.ndarray:
-    """Return the number (M,) of the block that each bump's middle is in."""
+    """Return the number (M,) of the block of `BLOCK_S` that contains each window's middle."""
     return (form.middle_s / BLOCK_S).astype(int)
 
 
 TORQUE_WIDTH_S = 0.2
-BAND = TORQUE_WIDTH_S / (2.0 * np.pi)
-"""Torques are compared as changes within a window, without its mean: slow parts of the motors'
-torque balance trim and flapping and rotate nothing. Times this they are accelerations."""
-STILL = np.array([False, False, False])
-DILUTED = ("inertia_x", "inertia_y", "yaw")
+"""Width of the windows in which changes of rate are compared [s]."""
+TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
+"""Factor from an angular acceleration to the change of rate in a window. The mean over a window is
+removed: the slow part of the motors' torque balances trim and flapping and rotates nothing [s]."""
+NO_OFFSETS = np.array([False, False, False])
+"""No axis has a free constant."""
+NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
 """Numbers that noise of the rotor speeds biases, by axis."""
-KNOWN = ("thrust", "curve", "battery")
-"""The force's numbers that the torque is built on."""
+FORCE_NUMBERS = ("thrust", "curve", "battery")
+"""Numbers of the force fit on which the torque depends."""
+LATEST_S, LATE_STEP_S = 0.13, 0.012
+"""Largest total delay that is tried before a fit, and the step between trials [s]."""
 
 
-def lag_and_delay(lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the numbers of what lies between a command and the rotors' thrust.
+def lag_unknowns(lag_s: float, delay_s: float) -> list[Unknown]:
+    """Return the total delay `late` from command to thrust, and the rotors' `lag` in it [s].
 
-    Slow flights identify how late it is in all, `late`, and not how much of that is the lag.
+    Slow flights identify the total, but not the lag's share.
     """
     late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
     return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
 
 
-def unknowns_of_torque(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the numbers of the torque; all but lag and delay are logarithms of ratios.
+def torque_unknowns(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
+    """Return the numbers that torques identify; all but lag and delay are logarithms of ratios.
 
-    That of the inertia about z is over the other two's mean, which it follows where it is not
-    identifiable. Without known torques `yaw` is of what turns the body about z, over that inertia.
+    `inertia_z` is relative to the mean of the other two, and keeps that ratio where it is not
+    identifiable. `yaw` is the yaw torque over the inertia about z; a drive by commanded torques
+    has none.
     """
-    lags = lag_and_delay(lag_s, delay_s)
-    axes = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
-    room = 0.5 if drive == "torques" else 0.25
-    axes.append(Unknown("inertia_z", 0.0, -1.0, 1.0, room, 1e-2, 0.015))
+    lags = lag_unknowns(lag_s, delay_s)
+    inertia = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
+    widest_z = 0.5 if drive == "torques" else 0.25
+    inertia.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
     if drive == "torques":
-        return [*axes, *lags]
+        return [*inertia, *lags]
     yaw = Unknown("yaw", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015)
-    return [*axes, yaw] if drive == "rotors" else [*axes, yaw, *lags]
+    return [*inertia, yaw] if drive == "rotors" else [*inertia, yaw, *lags]
 
 
 def fit_torque(
     flights: Sequence[FlightGrid],
-    driven: Driven,
+    driven: DrivenVehicle,
     unknowns: Sequence[Unknown],
     fixed: Mapping[str, float],
     held: Sequence[str] = (),
-    known: Known | None = None,
+    known: KnownNumbers | None = None,
 ) -> Fitted:
-    """Return inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
+    """Fit inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
-    Noise in measured rotor speeds makes every slope smaller, by its share in the driving torque's
-    variance (errors in variables; Fuller 1987, Sec. 1.1): the inertia would seem larger, the yaw
-    torque smaller. The model is multiplied by the remaining share (the reliability ratio); half of
-    the correction counts as its uncertainty. A number at a limit is left as it was.
+    Noise in measured rotor speeds lowers every slope by its share in the driving torque's variance
+    (errors in variables; Fuller 1987, Sec. 1.1): the inertia would seem larger and the yaw torque
+    smaller. The model is therefore multiplied by the share that is not noise (the reliability
+    ratio); half of this correction counts as its uncertainty. A number that reaches its limit is
+    reset to its start and held.
 
     Args:
         flights: on their grids, with body rates.
         driven: the start.
-        unknowns: from `unknowns_of_torque`.
+        unknowns: from `torque_unknowns`.
         fixed: numbers that are not fitted, `lag` and `late` among them.
-        held: numbers that are left as they are, with their uncertainty.
+        held: numbers that keep their start, with their uncertainty.
         known: numbers of the force among `fixed`, with their covariance.
+
+    Raises:
+        NoWholeWindow: if no window has all signals.
     """
-    known, steps = known or Known(), {"thrust": 1e-3}
+    known, steps = known or KnownNumbers(), {"thrust": 1e-3}
     unknowns = [
         *unknowns,
         *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in known.names),
     ]
-    begun, held = tuple(unknowns), list(held)
+    original, held = tuple(unknowns), list(held)
     forms = [
-        flight.form(TORQUE_WIDTH_S, ("rate_b", TURNS[driven.drive]), slope=True)
+        flight.form(TORQUE_WIDTH_S, ("rate_b", TORQUE_SIGNALS[driven.drive]), slope=True)
         for flight in flights
     ]
-    start = {**fixed, **{unknown.name: unknown.start for unknown in unknowns}}
-    reliability = _reliability(flights, forms, driven, start)
-    unsure: dict[str, float] = dict(zip(DILUTED, -0.5 * np.log(reliability), strict=True))
+    start = driven.at({**fixed, **{unknown.name: unknown.start for unknown in unknowns}})
+    reliability = _reliability(flights, forms, start)
+    correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
     unknowns = [
-        u._replace(floor=float(np.hypot(u.floor, Z95 * unsure.get(u.name, 0.0)))) for u in unknowns
+        u._replace(method_error=float(np.hypot(u.method_error, Z95 * correction.get(u.name, 0.0))))
+        for u in unknowns
     ]
-    parts = zip(flights, forms, strict=True)
-    residuals = together([_torque(*part, driven, reliability) for part in parts], unknowns, fixed)
+    measured = [_rate_change(*pair) for pair in zip(flights, forms, strict=True)]
+    flight_residuals = [
+        _torque_residuals(*part, reliability) for part in zip(flights, forms, measured, strict=True)
+    ]
+    residuals = stacked_residuals(flight_residuals, unknowns, fixed, driven.at)
     if any(unknown.name == "late" for unknown in unknowns):
-        best = _likeliest(unknowns, residuals, forms, flights)
-        unknowns = [u._replace(start=best) if u.name == "late" else u for u in unknowns]
+        late_s = _best_correlated_delay(unknowns, residuals, measured)
+        unknowns = [u._replace(start=late_s) if u.name == "late" else u for u in unknowns]
     while True:
-        found = fit(residuals, unknowns, held, known)
-        value = dict(zip((u.name for u in unknowns), found.value, strict=True))
-        beyond = [
+        fitted = fit(residuals, unknowns, held, known)
+        at_limit = [
             u.name
-            for u in unknowns
-            if u.name in unsure and found.has(u.name) and not u.low < value[u.name] < u.high
+            for u, value in zip(unknowns, fitted.value, strict=True)
+            if u.name in correction and fitted.has(u.name) and not u.low < value < u.high
         ]
-        if not beyond:
-            return replace(found, unknowns=begun)
-        held += beyond
+        if not at_limit:
+            return replace(fitted, unknowns=original)
+        held += at_limit
 
 
-def _torque(
-    flight: FlightGrid, form: WeakForm, driven: Driven, reliability: np.ndarray
-) -> Residuals:
-    turned, rows = _turned(flight, form), flight.rows(turned=False)
+def _torque_residuals(
+    flight: FlightGrid, form: WeakForm, measured: np.ndarray, reliability: np.ndarray
+) -> ForceResiduals:
+    """Return measured minus modelled changes of the body rates of `flight`."""
+    rows = flight.rows(attitude_of_path=False)
 
-    def residuals(numbers: Mapping[str, float]) -> Rows:
-        _, turn_b = driven.acting(flight, rows, numbers)
+    def residuals(vehicle: TrialVehicle) -> Rows:
+        _, turn_b = vehicle.accelerations(flight, rows)
         if (reliability < 1.0).any():
-            _, alone_b = driven.acting(flight, rows, numbers, powered=False)
-            turn_b = alone_b + reliability * (turn_b - alone_b)
-        return Rows(turned - BAND * (form.mean @ turn_b), block_of(form), STILL)
+            _, unpowered_b = vehicle.accelerations(flight, rows, powered=False)
+            turn_b = unpowered_b + reliability * (turn_b - unpowered_b)
+        error_b = measured - TO_RATE_S * (form.mean @ turn_b)
+        return Rows(error_b, block_of(form), NO_OFFSETS)
 
     return residuals
 
 
-def _turned(flight: FlightGrid, form: WeakForm) -> np.ndarray:
-    return np.asarray(BAND * (form.change @ np.nan_to_num(flight.known["rate_b"])))
+def _rate_change(flight: FlightGrid, form: WeakForm) -> np.ndarray:
+    """Return the measured change of the body rates (M, 3) in each window [rad/s]."""
+    return np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
 
 
 def _reliability(
-    flights: Sequence[FlightGrid],
-    forms: Sequence[WeakForm],
-    driven: Driven,
-    numbers: Mapping[str, float],
+    flights: Sequence[FlightGrid], forms: Sequence[WeakForm], vehicle: TrialVehicle
 ) -> np.ndarray:
-    """Return the share (3,) of the torque's variance that is no noise of the rotor speeds."""
-    noise, whole = np.zeros(3), np.zeros(3)
+    """Return the share (3,) of the modelled torque's variance that rotor-speed noise is not."""
+    if vehicle.driven.drive != "rotors":
+        return np.ones(3)
+    noise_power, power = np.zeros(3), np.zeros(3)
     for flight, form in zip(flights, forms, strict=True):
-        if driven.drive != "rotors":
-            break
-        rows = flight.rows(turned=False)
-        speed = flight.known["rotor_speed"]
-        noisy = {**flight.known, "rotor_speed": speed + flight.known[ROTOR_NOISE]}
-        turned, other = (
-            form.mean @ driven.acting(one, rows, numbers)[1]
-            for one in (flight, flight._replace(known=noisy))
+        rows = flight.rows(attitude_of_path=False)
+        noisier = flight.signals["rotor_speed"] + flight.signals[ROTOR_NOISE]
+        noisy_flight = flight._replace(signals={**flight.signals, "rotor_speed": noisier})
+        turn_b, noisy_turn_b = (
+            form.mean @ vehicle.accelerations(one, rows)[1] for one in (flight, noisy_flight)
         )
-        noise += ((other - turned) ** 2).sum(axis=0)
-        whole += (turned**2).sum(axis=0)
-    return np.maximum(1.0 - noise / np.maximum(whole, TINY), TINY)
+        noise_power += ((noisy_turn_b - turn_b) ** 2).sum(axis=0)
+        power += (turn_b**2).sum(axis=0)
+    return np.maximum(1.0 - noise_power / np.maximum(power, TINY), TINY)
 
 
-def _likeliest(
+def _best_correlated_delay(
     unknowns: Sequence[Unknown],
     residuals: Callable[[np.ndarray], list[Rows]],
-    forms: Sequence[WeakForm],
-    flights: Sequence[FlightGrid],
+    measured: Sequence[np.ndarray],
 ) -> float:
-    """Return how late the model's turning is most like the measured one, whatever its size."""
+    """Return the total delay [s] at which modelled and measured roll and pitch correlate best.
+
+    Args:
+        unknowns: the numbers, `late` among them.
+        residuals: of all flights, by their values.
+        measured: (M, 3) changes of the body rates of each flight.
+    """
     value = np.array([unknown.start for unknown in unknowns])
     late = [unknown.name for unknown in unknowns].index("late")
-    trials = np.array([value[late], *np.arange(0.0, 0.13, 0.012)])
-    measured = [_turned(*part) for part in zip(flights, forms, strict=True)]
+    trials = np.array([value[late], *np.arange(0.0, LATEST_S, LATE_STEP_S)])
     scores = np.zeros(len(trials))
     for k, trial in enumerate(trials):
         value[late] = max(trial, 0.0)
         for rows, turned in zip(residuals(value), measured, strict=True):
             if len(turned):
-                model, turned = (one - np.median(one, 0) for one in (turned - rows.value, turned))
-                size = np.sqrt((model**2).sum(axis=0) * (turned**2).sum(axis=0))
-                scores[k] += ((model * turned).sum(axis=0) / np.maximum(size, 1e-12))[:2].sum()
+                model, data = (v - np.median(v, axis=0) for v in (turned - rows.value, turned))
+                size = np.sqrt((model**2).sum(axis=0) * (data**2).sum(axis=0))
+                scores[k] += ((model * data).sum(axis=0) / np.maximum(size, TINY))[:2].sum()
     return float(trials[int(np.argmax(scores))])

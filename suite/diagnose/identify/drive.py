@@ -1,7 +1,8 @@
-"""The input (drive) of flights, and the accelerations of a vehicle with trial numbers under it.
+"""Models the accelerations of a vehicle from the signals that drive its flights.
 
-The equations are those of the plant, as in the views of a diagnosis. Effects of the start vehicle
-that scale one of its numbers are merged into that number first.
+The drive is what determines the rotors' thrust: measured rotor speeds, motor commands, or commanded
+torques, rates and thrust. The equations are those of the simulated vehicle in `eval/`. The fits of
+`suite identify` change the vehicle's numbers and compare the accelerations with the measured ones.
 """
 
 from __future__ import annotations
@@ -28,38 +29,46 @@ DRIVES = {
     "rates": ("thrust_cmd", "rate_cmd_b"),
     "thrust": ("thrust_cmd",),
 }
-"""Signals by drive; the first that all flights have counts."""
+"""Required signals by drive. The first drive whose signals all flights have is used."""
+KNOWN_MOTORS = ("rotors", "pwm")
+"""Drives that determine each rotor's thrust; the others give commands to a controller."""
+LEAST_LAG_S = 1e-4
+"""A shorter lag of the rotors counts as none [s]."""
+LEAST_VOLTS = 0.1
+"""Lower measured voltages are raised to this, so that a power of them is finite [V]."""
 
 
-def drive_of(flights: Sequence[FlightGrid]) -> str:
-    """Return the name of what drives all of `flights`.
+def common_drive(flights: Sequence[FlightGrid]) -> str:
+    """Return the name of the drive that all `flights` have.
 
     Raises:
-        ValueError: where they share nothing.
+        ValueError: if there is none.
     """
     for name, signals in DRIVES.items():
         if all(flight.has(*signals) for flight in flights):
             return name
     raise ValueError(
         "the flights share no drive: every one needs rotor speeds, motor commands (pwm_1 to "
-        "pwm_4), or a thrust command; those of another kind can be identified apart"
+        "pwm_4), or a thrust command; identify flights of each kind separately"
     )
 
 
-def with_battery(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
-    """Return the flights with the best known motor thrust.
+def with_known_thrust(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
+    """Return the flights in which the motors' thrust is known best.
 
-    It depends on the battery: where some flights have its voltage, the others are left out.
+    Under motor commands it depends on the battery. Flights without a voltage are then left out if
+    others have one.
     """
-    have = [flight for flight in flights if flight.has("voltage")]
-    return have if have and drive == "pwm" else list(flights)
+    with_voltage = [flight for flight in flights if flight.has("voltage")]
+    return with_voltage if with_voltage and drive == "pwm" else list(flights)
 
 
-def with_motors(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
-    """Return the vehicle with `[motors]`: full speed at full command where it had none.
+def with_motor_map(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle with a table `[motors]`, the map from motor command to thrust.
 
-    Flights without a voltage give them an exponent of 0. The nominal voltage then has no effect;
-    it is set to the median voltage of the flights that have one.
+    A new table gives full speed at full command. Its voltage exponent is 0 for flights without a
+    voltage. An exponent of 0 makes the nominal voltage meaningless, so it becomes the flights'
+    median.
     """
     motors = vehicle.motors
     if motors is None:
@@ -67,45 +76,47 @@ def with_motors(flights: Sequence[FlightGrid], vehicle: Vehicle) -> Vehicle:
         motors = MotorMap((0.0, vehicle.rotors.thrust_max), 1.0, exponent)
     elif motors.voltage_exponent:
         return vehicle
-    return replace(vehicle, motors=replace(motors, voltage=_volts(flights, motors.voltage)))
+    return replace(vehicle, motors=replace(motors, voltage=_median_volts(flights, motors.voltage)))
 
 
-def _volts(flights: Sequence[FlightGrid], otherwise: float) -> float:
-    have = [f.known["voltage"] for f in flights if f.has("voltage")]
-    return float(np.nanmedian(np.concatenate(have))) if have else otherwise
+def _median_volts(flights: Sequence[FlightGrid], default: float) -> float:
+    """Return the median voltage of the flights [V], or `default` where none has a voltage."""
+    volts = [f.signals["voltage"] for f in flights if f.has("voltage")]
+    return float(np.nanmedian(np.concatenate(volts))) if volts else default
 
 
 @dataclass(frozen=True)
-class Driven:
-    """A vehicle to start from, and what drives its flights; numbers are by their names.
+class DrivenVehicle:
+    """The start vehicle of a fit, and the drive of its flights.
 
-    Those of motors are about a usual command and voltage: there `thrust` is the logarithm of what
-    they give over what the start's do, and `curve` the quadratic part's share.
+    Methods take `numbers`, the fitted numbers by name. A missing one keeps the start's value.
+    `thrust` is the logarithm of a ratio to the start. For motors it is taken at the usual command
+    and voltage, and `curve` is the quadratic term's share of the thrust there.
     """
 
     start: Vehicle
     drive: str
     """One of `DRIVES`."""
-    command: float = 1.0
-    """Usual motor command."""
-    volts: float = 1.0
-    """Usual voltage [V]."""
+    usual_command: float = 1.0
+    """Median motor command of the flights."""
+    usual_volts: float = 1.0
+    """Median voltage of the flights [V]."""
 
     @property
     def motors(self) -> MotorMap:
-        """The start's motors; none drive flights of another kind."""
+        """The start's motors; a placeholder under drives other than motor commands."""
         return self.start.motors or MotorMap((0.0, 1.0), 1.0, 0.0)
 
     @property
     def usual_thrust(self) -> tuple[float, float]:
-        """Linear and quadratic part of what the start's motors give as usual [N]."""
+        """Linear and quadratic term of the start's thrust at the usual command and voltage [N]."""
         first, second = self.motors.thrust
-        applied = self.command * (self.volts / self.motors.voltage) ** self.battery
+        applied = self.usual_command * (self.usual_volts / self.motors.voltage) ** self.battery
         return first * applied, second * applied**2
 
     @property
     def curve(self) -> float:
-        """Share of the quadratic part in the start's usual thrust."""
+        """Share of the quadratic term in the start's usual thrust."""
         return self.usual_thrust[1] / sum(self.usual_thrust)
 
     @property
@@ -114,32 +125,35 @@ class Driven:
         return self.motors.voltage_exponent
 
     def motor_map(self, numbers: Mapping[str, float]) -> MotorMap:
-        """Return `[motors]` with `numbers`."""
+        """Return the table `[motors]` at `numbers`."""
         curve, battery = numbers.get("curve", self.curve), numbers.get("battery", self.battery)
-        size = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
-        per = (self.motors.voltage / self.volts) ** battery / self.command
-        thrust = (float(size * (1.0 - curve) * per), float(size * curve * per**2))
-        return MotorMap(thrust, self.motors.voltage, float(battery))
+        thrust = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
+        per_applied = (self.motors.voltage / self.usual_volts) ** battery / self.usual_command
+        first, second = thrust * (1.0 - curve) * per_applied, thrust * curve * per_applied**2
+        return MotorMap((float(first), float(second)), self.motors.voltage, float(battery))
 
     def thrust_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return that of the rotors, which their measured speeds identify alone."""
+        """Return the rotors' thrust coefficient; only measured rotor speeds identify it."""
         scale = float(np.exp(numbers.get("thrust", 0.0))) if self.drive == "rotors" else 1.0
         return self.start.rotors.thrust_coefficient * scale
 
     def torque_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return that of the rotors: `yaw` is of torque about z over the inertia there."""
-        scaled = numbers.get("thrust", 0.0) if self.drive == "rotors" else 0.0
-        turning = numbers.get("yaw", 0.0) + inertia_ratio(numbers)[2] + scaled
-        return self.start.rotors.torque_coefficient * float(np.exp(turning))
+        """Return the rotors' torque coefficient.
+
+        `yaw` is the logarithm of the ratio of yaw torque to inertia about z.
+        """
+        thrust = numbers.get("thrust", 0.0) if self.drive == "rotors" else 0.0
+        log_ratio = numbers.get("yaw", 0.0) + log_inertia_ratio(numbers)[2] + thrust
+        return self.start.rotors.torque_coefficient * float(np.exp(log_ratio))
 
     def drag(self, numbers: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the linear drag [1/s]."""
-        had = self.start.effects.get("linear_drag")
-        begun = (0.0, 0.0, 0.0) if had is None else had.coefficient
-        return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", begun, strict=True))
+        """Return the linear drag along body axes [1/s]."""
+        effect = self.start.effects.get("linear_drag")
+        start = (0.0, 0.0, 0.0) if effect is None else effect.coefficient
+        return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", start, strict=True))
 
-    def plant(self, numbers: Mapping[str, float]) -> Plant:
-        """Return the plant with `numbers`, and with all effects of the start that act by state."""
+    def at(self, numbers: Mapping[str, float]) -> TrialVehicle:
+        """Return the vehicle at `numbers`, with all effects of the start that depend on state."""
         effects = {n: v for n, v in self.start.effects.items() if EFFECTS[n].by_state}
         effects["linear_drag"] = EFFECTS["linear_drag"].values(self.drag(numbers))
         if self.drive not in KNOWN_MOTORS:
@@ -150,76 +164,90 @@ class Driven:
             thrust_coefficient=self.thrust_coefficient(numbers),
             torque_coefficient=self.torque_coefficient(numbers),
         )
-        inertia = np.asarray(self.start.inertia) * np.exp(inertia_ratio(numbers))
-        vehicle = replace(self.start, rotors=rotors, inertia=_three(inertia), effects=effects)
-        return make_plant(vehicle, LONGEST_S)
+        inertia = np.asarray(self.start.inertia) * np.exp(log_inertia_ratio(numbers))
+        vehicle = replace(self.start, rotors=rotors, inertia=_triple(inertia), effects=effects)
+        return TrialVehicle(self, numbers, make_plant(vehicle, LONGEST_S))
 
     def rotor_speed(self, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the rotors' speeds (G, 4): measured, or by their commands [rad/s].
+        """Return the rotor speeds (G, 4) [rad/s]: measured, or from their commands.
 
-        Commands come behind `lag`, and behind it and the delay together by `late`.
+        Commands act after a delay and a first-order lag, see `after_delay_and_lag`.
         """
-        known = flight.known
+        signals = flight.signals
         if self.drive == "rotors":
-            return known["rotor_speed"]
+            return signals["rotor_speed"]
         if self.drive == "pwm":
             vehicle = replace(self.start, motors=self.motor_map(numbers))
-            volts = np.maximum(known["voltage"], 0.1) if flight.has("voltage") else None
-            # The usual voltage counts where none was measured.
-            volts = np.full(len(flight.time_s), self.volts) if volts is None else volts
-            wanted = motor_speed(vehicle, known["pwm"], volts)
+            volts = np.full(len(flight.time_s), self.usual_volts)
+            if flight.has("voltage"):
+                volts = np.maximum(signals["voltage"], LEAST_VOLTS)
+            commanded = motor_speed(vehicle, signals["pwm"], volts)
         else:
-            each = 0.25 * self.start.mass * np.maximum(known["thrust_cmd"], 0.0)
-            wanted = np.sqrt(each / self.start.rotors.thrust_coefficient)[:, None] * np.ones(4)
-        return behind(wanted, numbers)
+            thrust = 0.25 * self.start.mass * np.maximum(signals["thrust_cmd"], 0.0)
+            speed = np.sqrt(thrust / self.start.rotors.thrust_coefficient)
+            commanded = speed[:, None] * np.ones(4)
+        return after_delay_and_lag(commanded, numbers)
 
-    def acting(
-        self,
-        flight: FlightGrid,
-        rows: FlightRows,
-        numbers: Mapping[str, float],
-        powered: bool = True,
+
+@dataclass(frozen=True)
+class TrialVehicle:
+    """A vehicle with trial numbers; its equations are set up once for all flights."""
+
+    driven: DrivenVehicle
+    numbers: Mapping[str, float]
+    plant: Plant
+
+    def accelerations(
+        self, flight: FlightGrid, rows: FlightRows, powered: bool = True
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return dv/dt in the world and dw/dt in body axes (G, 3) on the `rows` of `flight`.
 
-        Rotors stand still where their speed is unknown, or not `powered`.
+        The rotors' speed is 0 where it is unknown, and everywhere if not `powered`.
         """
-        plant = self.plant(numbers)
         if powered:
-            rows = rows._replace(rotor_speed=np.nan_to_num(self.rotor_speed(flight, numbers)))
-        acc_w, turn_b = accelerations_on(plant, rows, flight.has("voltage"))
-        if self.drive == "torques":
-            torque_b = np.nan_to_num(behind(flight.known["torque_cmd_b"], numbers))
+            speed = self.driven.rotor_speed(flight, self.numbers)
+            rows = rows._replace(rotor_speed=np.nan_to_num(speed))
+        acc_w, turn_b = accelerations_on(self.plant, rows, flight.has("voltage"))
+        if self.driven.drive == "torques":
+            commanded = after_delay_and_lag(flight.signals["torque_cmd_b"], self.numbers)
+            torque_b = np.nan_to_num(commanded)
             wrench = Wrench(np.zeros_like(torque_b), torque_b)
-            _, turn_b = accelerations(plant, motion_of(plant, rows), wrench)
+            _, turn_b = accelerations(self.plant, motion_of(self.plant, rows), wrench)
         return acc_w, turn_b
 
 
-def driven_by(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) -> Driven:
-    """Return `vehicle` under what drives `flights`, about what is usual there."""
+def driven_vehicle(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) -> DrivenVehicle:
+    """Return `vehicle` under `drive`, with the usual command and voltage of `flights`."""
     if drive != "pwm":
-        return Driven(vehicle, drive)
+        return DrivenVehicle(vehicle, drive)
     assert vehicle.motors is not None
-    usual = float(np.nanmedian(np.concatenate([f.known["pwm"].ravel() for f in flights])))
-    return Driven(vehicle, drive, usual, _volts(flights, vehicle.motors.voltage))
+    commands = np.concatenate([f.signals["pwm"].ravel() for f in flights])
+    volts = _median_volts(flights, vehicle.motors.voltage)
+    return DrivenVehicle(vehicle, drive, float(np.nanmedian(commands)), volts)
 
 
-def inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the logarithms (3,) of the inertia over the start's."""
+def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the logarithms (3,) of the inertia over the start's.
+
+    `inertia_z` is relative to the mean of the other two.
+    """
     x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
     return np.array([x, y, 0.5 * (x + y) + z])
 
 
-def behind(values: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return held commands (G, C) behind what lies between them and the rotors."""
+def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
+    """Return held `commands` (G, C) as the rotors follow them.
+
+    `numbers["lag"]` is the rotors' time constant, `numbers["late"]` its sum with the delay [s].
+    """
     lag_s = numbers["lag"]
-    return lagged(delayed(values, numbers["late"] - lag_s), lag_s)
+    return lagged(delayed(commands, numbers["late"] - lag_s), lag_s)
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return what held `values` (G, ...) were `delay_s` ago; before the first row, the first.
+    """Return held `values` (G, ...) as they were `delay_s` ago; before the first row, the first.
 
-    A value that holds from one grid point to the next is met half of it later.
+    A value is a mean over one step of the grid, so its time is the middle of the step.
     """
     count = len(values)
     place = np.clip(np.arange(count) - delay_s / STEP_S - 0.5, 0.0, count - 1.0)
@@ -229,80 +257,82 @@ def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
 
 
 def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
-    """Return `values` (G, C), joined by lines, behind a first-order lag."""
-    if lag_s <= 1e-4:
+    """Return `values` (G, C), linear between grid points, after a first-order lag."""
+    if lag_s <= LEAST_LAG_S:
         return values
-    whole = filled(values)
-    # The state at a grid point has seen the steps before it, each at its mean.
-    before = 0.5 * (np.concatenate([whole[:1], whole[:-1]]) + whole)
-    return np.where(np.isfinite(values), follow_lag(before, STEP_S, lag_s), np.nan)
+    complete = filled(values)
+    # The lag's input over each step is the mean of the step's two ends.
+    step_mean = 0.5 * (np.concatenate([complete[:1], complete[:-1]]) + complete)
+    return np.where(np.isfinite(values), follow_lag(step_mean, STEP_S, lag_s), np.nan)
 
 
 def filled(values: np.ndarray) -> np.ndarray:
-    """Return `values` (G, C) with the last known in the place of NaN."""
+    """Return `values` (G, C) in which each incomplete row repeats the last complete one."""
     good = np.isfinite(values).all(axis=1)
     last = np.maximum.accumulate(np.where(good, np.arange(len(values)), 0))
     first = int(np.argmax(good))
     return np.nan_to_num(values[np.maximum(last, first)])
 
 
-KNOWN_MOTORS = ("rotors", "pwm")
-"""Drives under which the rotors' thrusts are known, and not only commanded."""
-OWN = ("motor_lag", "inertia_scale", "rate_gain")
-"""Effects that scale or replace a number which is fitted."""
+MERGED = ("motor_lag", "inertia_scale", "rate_gain")
+"""Effects that scale or replace a fitted number."""
 FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
-"""Effects that are entries of what is found, and start from where the file has them."""
+"""Effects whose own parameters are fitted, from their values in the start's file."""
 
 
-def with_own_numbers(vehicle: Vehicle, known_motors: bool) -> Vehicle:
-    """Return `vehicle` with the numbers that its effects scale or replace, without these.
+def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
+    """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    It flies as before. Next to the identified number they would count twice.
+    It flies as before. Otherwise the effect would act a second time on the fitted number.
 
     Args:
-        vehicle: as it was given.
-        known_motors: the motors' own thrust is fitted, and no scale of what was commanded, so that
-            the effect of that name is one of these as well.
+        vehicle: the start of the fit.
+        known_motors: whether the motors' thrust is fitted; `thrust_scale` is then merged as well.
 
     Raises:
-        ValueError: where no file may hold such numbers, as of rotors that are too weak to hover.
+        ValueError: if a merged number is not allowed in a vehicle file, as of rotors that are too
+            weak to hover.
     """
-    names = (*OWN, "thrust_scale") if known_motors else OWN
-    own = {name: values for name, values in vehicle.effects.items() if name in names}
-    if not own:
+    names = (*MERGED, "thrust_scale") if known_motors else MERGED
+    merged = {name: values for name, values in vehicle.effects.items() if name in names}
+    if not merged:
         return vehicle
     rotors, motors = vehicle.rotors, vehicle.motors
-    true = make_plant(vehicle, 1.0 / vehicle.controller.frequency, own).constants
-    push = float(true.thrust_coefficient[0])
+    scaled = make_plant(vehicle, 1.0 / vehicle.controller.frequency, merged).constants
+    thrust_coefficient = float(scaled.thrust_coefficient[0])
     if motors is not None:
-        first, second = np.asarray(motors.thrust) * (push / rotors.thrust_coefficient)
+        thrust_ratio = thrust_coefficient / rotors.thrust_coefficient
+        first, second = np.asarray(motors.thrust) * thrust_ratio
         motors = replace(motors, thrust=(float(first), float(second)))
-    rotors = replace(rotors, thrust_coefficient=push, time_constant=float(true.time_constant))
-    found = replace(
+    lag_s = float(scaled.time_constant)
+    result = replace(
         vehicle,
-        rotors=rotors,
+        rotors=replace(rotors, thrust_coefficient=thrust_coefficient, time_constant=lag_s),
         motors=motors,
-        controller=replace(vehicle.controller, rate_gain=_three(true.rate_gain)),
-        effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in own}),
+        controller=replace(vehicle.controller, rate_gain=_triple(scaled.rate_gain)),
+        effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in merged}),
     )
     try:
-        # The scale of the inertia may be more than a body can have; the fit makes it possible.
-        check_vehicle(found)
+        # The scaled inertia is not checked: it may be impossible, and the fit corrects it.
+        check_vehicle(result)
     except ValueError as error:
-        raise ValueError(f"{vehicle.name} with its {', '.join(own)}: {error}") from error
-    return replace(found, inertia=_three(true.inertia))
+        raise ValueError(f"{vehicle.name} with its {', '.join(merged)}: {error}") from error
+    return replace(result, inertia=_triple(scaled.inertia))
 
 
-def unknown_to_the_fits(vehicle: Vehicle) -> Sequence[str]:
-    """Return the effects of a start that no fit takes into account, and that stay in its file.
+def unmodelled_effects(vehicle: Vehicle) -> list[str]:
+    """Return the vehicle's effects that no fit models; they stay in its file.
 
     Force and torque model all effects that depend on the state.
     """
-    known = (*OWN, *FITTED)
-    unknown = {n for n, e in EFFECTS.items() if not e.by_state or e.late is not None}
-    return [name for name in vehicle.effects if name in unknown and name not in known]
+    return [
+        name
+        for name in vehicle.effects
+        if (not EFFECTS[name].by_state or EFFECTS[name].late is not None)
+        and name not in (*MERGED, *FITTED)
+    ]
 
 
-def _three(values: np.ndarray) -> tuple[float, float, float]:
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
     x, y, z = values
     return float(x), float(y), float(z)

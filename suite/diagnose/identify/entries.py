@@ -1,4 +1,4 @@
-"""What the fits found, as entries of a vehicle file, and a vehicle with them."""
+"""Converts fitted numbers into entries of a vehicle file, and makes the vehicle that has them."""
 
 from __future__ import annotations
 
@@ -12,152 +12,163 @@ from eval.effects import EFFECTS
 from eval.effects.interface import at
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.identify.drive import Driven, inertia_ratio
+from suite.diagnose.identify.drive import DrivenVehicle, log_inertia_ratio
 from suite.diagnose.identify.fit import Fitted
-from suite.diagnose.identify.numbers import DELAY, Derived, Number, number
+from suite.diagnose.identify.numbers import DELAY, Formula, Number, number_from
+
+INERTIAS = ("inertia_x", "inertia_y", "inertia_z")
+"""Names of the fitted numbers of the inertia."""
+EFFECTS_TABLE = "effects."
+"""Prefix of the key of an effect's parameter."""
 
 
-def inertia_of(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the inertia (3,); about z it is scaled as the others where it is not identified."""
-    found = np.asarray(vehicle.inertia) * np.exp(inertia_ratio(numbers))
-    # No body has more about one axis than about the other two together.
-    return np.minimum(found, found.sum() - found)
+def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the inertia (3,) at fitted `numbers` [kg m^2].
+
+    Where `inertia_z` is missing, it changes by the mean of the other two's changes. The largest is
+    limited to the sum of the others, as in every rigid body.
+    """
+    inertia = np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers))
+    return np.minimum(inertia, inertia.sum() - inertia)
 
 
-class _Entries(list[Number]):
-    """Entries of a vehicle file from one fit."""
-
-    def __init__(self, fitted: Fitted) -> None:
-        super().__init__()
-        self.fitted, self.names = fitted, {unknown.name for unknown in fitted.unknowns}
-
-    def add(self, key: str, unit: str, derived: Derived, *needs: str, room: float = np.inf) -> None:
-        """Add an entry whose components need these numbers of the fit."""
-        self.append(number(key, unit, self.fitted, derived, [(name,) for name in needs], room))
-
-
-def of_force(driven: Driven, fitted: Fitted) -> list[Number]:
+def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
     """Return the entries that the force identifies: motors or rotors, and drag."""
-    entries = _Entries(fitted)
-    if "thrust" in entries.names and driven.drive == "pwm":
-        thrust = lambda n: np.array(driven.motor_map(n).thrust)  # noqa: E731
-        exponent = lambda n: np.array([driven.motor_map(n).voltage_exponent])  # noqa: E731
-        entries.add("motors.thrust", "N", thrust, "thrust", "thrust")
-        entries.add("motors.voltage_exponent", "1", exponent, "battery")
-    elif "thrust" in entries.names and driven.drive == "rotors":
+    rows: list[tuple[str, str, Formula, Sequence[str]]] = []
+    if "thrust" in fitted.names and driven.drive == "pwm":
+        motor_map = driven.motor_map
+        rows += [
+            ("motors.thrust", "N", lambda n: motor_map(n).thrust, ("thrust", "thrust")),
+            ("motors.voltage_exponent", "1", lambda n: motor_map(n).voltage_exponent, ("battery",)),
+        ]
+    elif "thrust" in fitted.names and driven.drive == "rotors":
         key, unit = "rotors.thrust_coefficient", "N/(rad/s)^2"
-        entries.add(key, unit, lambda n: np.array([driven.thrust_coefficient(n)]), "thrust")
-    elif "thrust" in entries.names:
-        key = "effects.thrust_scale.scale"
-        entries.add(key, "1", lambda n: np.array([np.exp(n["thrust"])]), "thrust")
-    if "drag_z" in entries.names:
-        axes, key = (f"drag_{axis}" for axis in "xyz"), "effects.linear_drag.coefficient"
-        entries.add(key, "1/s", lambda n: np.array(driven.drag(n)), *axes)
-    return entries
+        rows.append((key, unit, driven.thrust_coefficient, ("thrust",)))
+    elif "thrust" in fitted.names:
+        rows.append(("effects.thrust_scale.scale", "1", lambda n: np.exp(n["thrust"]), ("thrust",)))
+    if "drag_z" in fitted.names:
+        axes = [f"drag_{axis}" for axis in "xyz"]
+        rows.append(("effects.linear_drag.coefficient", "1/s", driven.drag, axes))
+    return [number_from(fitted, *row) for row in rows]
 
 
-def of_torque(driven: Driven, fitted: Fitted, scale: float, lag_s: float) -> list[Number]:
+def torque_entries(
+    driven: DrivenVehicle, fitted: Fitted, log_thrust: float, lag_s: float
+) -> list[Number]:
     """Return the entries that the torque identifies: inertia, yaw torque, lag and delay.
 
     Args:
         driven: the start.
-        fitted: the torque's fit.
-        scale: logarithm of the thrust's scale, by the force.
-        lag_s: of the rotors, where the fit has none [s].
+        fitted: result of the torque's fit.
+        log_thrust: logarithm of the thrust's scale, from the force's fit.
+        lag_s: lag of the rotors, where this fit has none [s].
     """
-    entries, vehicle = _Entries(fitted), driven.start
-    inertias = ("inertia_x", "inertia_y", "inertia_z")
-    if "inertia_x" in entries.names:
-        entries.add("inertia", "kg m^2", lambda n: inertia_of(vehicle, n), *inertias)
-    if "yaw" in entries.names:
-        # Torque per inertia is what is seen. The inertia about z counts as far as it is
-        # identified; the rest of it is held fixed.
-        turns = [name for name in inertias if fitted.has(name)]
+    entries, vehicle = list[Number](), driven.start
+    if "inertia_x" in fitted.names:
+        inertia = number_from(
+            fitted, "inertia", "kg m^2", lambda n: inertia_from(vehicle, n), INERTIAS
+        )
+        entries.append(inertia)
+    if "yaw" in fitted.names:
+        # Flights show the ratio of torque to inertia about z. The inertia's uncertainty counts as
+        # far as the inertia is identified; otherwise it is held fixed.
+        identified = [name for name in INERTIAS if fitted.has(name)]
 
-        def twist(n: Mapping[str, float]) -> np.ndarray:
-            numbers = {name: n[name] for name in (*turns, "yaw")}
-            return np.array([driven.torque_coefficient({**numbers, "thrust": scale})])
+        def torque_coefficient(n: Mapping[str, float]) -> float:
+            numbers = {name: n[name] for name in (*identified, "yaw")}
+            return driven.torque_coefficient({**numbers, "thrust": log_thrust})
 
-        entries.add("rotors.torque_coefficient", "N m/(rad/s)^2", twist, "yaw")
-    return [*entries, *of_loop(vehicle, fitted, lag_s)]
+        key, unit = "rotors.torque_coefficient", "N m/(rad/s)^2"
+        entries.append(number_from(fitted, key, unit, torque_coefficient, ("yaw",)))
+    return [*entries, *loop_entries(vehicle, fitted, lag_s)]
 
 
-def of_loop(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
-    """Return the entries of lag, delay and rate gains, as far as the fit has them."""
-    entries = _Entries(fitted)
-    if "lag" in entries.names:
-        entries.add("rotors.time_constant", "s", lambda n: np.array([n["lag"]]), "lag")
-    if "late" in entries.names:
-        # It is as uncertain as the lag, however well their sum is identified: the file keeps
-        # the sum.
-        room = fitted.unknowns[fitted.index("late")].room
-        late = lambda n: np.array([n["late"] - n.get("lag", lag_s)])  # noqa: E731
-        entries.add(DELAY, "s", late, "late", room=room)
-    if "gain_x" in entries.names:
-        gain, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{axis}" for axis in "xyz"]
-        gains = lambda n: gain * np.exp([n[name] for name in names])  # noqa: E731
-        entries.add("controller.rate_gain", "1/s", gains, *names)
+def loop_entries(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
+    """Return the entries of lag, delay and rate gains that the fit has.
+
+    `lag_s` is the rotors' lag where the fit has none [s].
+    """
+    entries = []
+    if "lag" in fitted.names:
+        lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
+        entries.append(lag)
+    if "late" in fitted.names:
+        # The delay is at least as uncertain as the lag, however exact their sum is. The file has a
+        # delay that keeps the sum.
+        widest = fitted.unknowns[fitted.index("late")].max_half_width
+        delay_s: Formula = lambda n: n["late"] - n.get("lag", lag_s)  # noqa: E731
+        entries.append(number_from(fitted, DELAY, "s", delay_s, ("late",), widest))
+    if "gain_x" in fitted.names:
+        start, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
+        gains: Formula = lambda n: start * np.exp([n[name] for name in names])  # noqa: E731
+        entries.append(number_from(fitted, "controller.rate_gain", "1/s", gains, names))
     return entries
 
 
-def enter(vehicle: Vehicle, entries: Iterable[Number]) -> tuple[Vehicle, list[Number], list[str]]:
-    """Return the vehicle with what was identified, its entries, and how they differ.
+def with_entries(
+    vehicle: Vehicle, entries: Iterable[Number]
+) -> tuple[Vehicle, list[Number], list[str]]:
+    """Enter identified numbers into a vehicle.
 
-    A delay that flights deny is no entry of the vehicle.
+    Returns:
+        The vehicle, the entries with the values that its file has, and a line for people for each
+        value that had to differ from the fitted one. A delay of 0 is no entry.
     """
     numbers, notes = [], []
     for entry in entries:
-        held = allowed(vehicle, entry)
-        vehicle = put(vehicle, held)
-        gone = entry.key == DELAY and entry.is_entered and held.value == [0.0]
-        if not gone:
-            numbers.append(held)
+        clipped = _clipped(vehicle, entry)
+        vehicle = with_entry(vehicle, clipped)
+        removed = entry.key == DELAY and entry.is_entered and clipped.value == [0.0]
+        if not removed:
+            numbers.append(clipped)
         for k, span in enumerate(entry.ci95):
-            was, now = entry.value[k], held.value[k]
-            if span is None or was == now:
+            fitted, allowed = entry.value[k], clipped.value[k]
+            if span is None or fitted == allowed:
                 continue
             part = f"[{k}]" if len(entry.value) > 1 else ""
-            then = "the file has none" if gone else f"the file has {now:.4g}, the nearest it may"
-            found = f"{was:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
-            notes.append(f"{entry.key}{part}: these flights give {found}; {then}")
+            given = f"{fitted:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
+            then = f"the file has {allowed:.4g}, the nearest allowed value"
+            if removed:
+                then = "the file has none"
+            notes.append(f"{entry.key}{part}: these flights give {given}; {then}")
     return vehicle, numbers, notes
 
 
-def allowed(vehicle: Vehicle, entry: Number) -> Number:
-    """Return an entry with the values nearest to its own that a file may hold.
-
-    Its intervals stay those of the flights.
-    """
+def _clipped(vehicle: Vehicle, entry: Number) -> Number:
+    """Return an entry with the nearest values that a file may hold; its intervals stay."""
     table, _, _ = entry.key.rpartition(".")
-    if not table.startswith("effects."):
+    if not table.startswith(EFFECTS_TABLE):
         return entry
-    parameter = EFFECTS[table.removeprefix("effects.")].parameters[0]
+    parameter = EFFECTS[table.removeprefix(EFFECTS_TABLE)].parameters[0]
     low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
     return entry._replace(value=[min(max(v, low), high) for v in entry.value])
 
 
-def put(vehicle: Vehicle, entry: Number) -> Vehicle:
-    """Return the vehicle with what was identified of an `allowed` entry; the rest of it stays."""
+def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
+    """Return the vehicle with the values of `entry` if these flights determine it.
+
+    The inertia is not entered here: `identify` sets it from all its numbers.
+    """
     if not entry.is_entered:
         return vehicle
-    changed = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
+    value = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
     table, _, key = entry.key.rpartition(".")
-    if table.startswith("effects."):
-        name = table.removeprefix("effects.")
-        effects = {**vehicle.effects, name: EFFECTS[name].values(changed)}
-        if entry.key == DELAY and changed == 0.0:
+    if table.startswith(EFFECTS_TABLE):
+        name = table.removeprefix(EFFECTS_TABLE)
+        effects = {**vehicle.effects, name: EFFECTS[name].values(value)}
+        if entry.key == DELAY and value == 0.0:
             del effects[name]
         return replace(vehicle, effects=MappingProxyType(effects))
     if not table:
         return vehicle
-    return replace(vehicle, **{table: replace(getattr(vehicle, table), **{key: changed})})
+    return replace(vehicle, **{table: replace(getattr(vehicle, table), **{key: value})})
 
 
-def fast_enough(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
-    """Return a vehicle that its rotors hold up, as they did in flights with these measured speeds.
+def with_reachable_speed(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
+    """Return a vehicle whose rotors are fast enough to hover.
 
-    Where its `speed_max` is too low for that it becomes the highest speed of the flights, but for
-    one in a hundred, as telemetry may be wild.
+    If its `speed_max` is too low for that, the 99th percentile of the flights' measured `speeds`
+    (G, 4) [rad/s] replaces it: the highest speed of a log may be an outlier.
     """
     try:
         check_vehicle(vehicle)

@@ -1,6 +1,7 @@
-"""Flights on a fine grid, on which what drives them can be late by any part of a row.
+"""Resamples a flight log on a grid of 4 ms, for the fits of `suite identify`.
 
-Their equations are compared in the smooth bumps of `data/view.py`, as those of the views are.
+On so fine a grid, a command can be delayed by a fraction of a log row. The fits compare measured
+and modelled accelerations as weighted means over short windows (`data/view.py`, the weak form).
 """
 
 from __future__ import annotations
@@ -21,81 +22,85 @@ from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
 from tracks.geometry.rotation import quat_to_rot, rot_to_quat
 
 STEP_S = 0.004
-"""Of the grid [s]."""
+"""Step of the grid [s]."""
 MEMORY_S = 0.4
-"""What was commanded longer ago than this acts no more [s]."""
+"""Commands older than this have no effect [s]."""
 HOLE_STEPS = 4.0
-"""Rows further apart than so many median steps are a hole, over which nothing is compared."""
+"""Rows further apart than this many median steps are a hole; no window reaches across it."""
 ROTOR_NOISE = "rotor_noise"
-"""A draw of noise as large as that of the rotor speeds' rows: what it does to a window theirs does
-as well."""
+"""Signal: random noise as large as that of the measured rotor speeds, to see its effect on a
+window."""
 LEANING = "leaning"
-"""The attitude of the path, where none was measured."""
+"""Signal: the attitude that the path's acceleration requires, where none was measured."""
 IMU_ACC = "imu_acc_w"
-"""The acceleration by the accelerometer, where no position was measured."""
+"""Signal: the acceleration by the accelerometer, where no position was measured."""
 PATH_VELOCITY = "path_velocity"
-"""The velocity of the path, where none was measured."""
+"""Signal: the velocity by differences of the position, where none was measured."""
+PATH_SLOPE_S = 0.05
+"""The path's velocity is the difference of positions this long before and after [s]."""
 VOLTAGE_S = 0.04
-"""The voltage's noise is averaged over about this [s]."""
+"""The voltage is averaged over about this time, to reduce its noise [s]."""
 
 
 class FlightGrid(NamedTuple):
-    """One flight at G times, every `STEP_S`; NaN where it is not known."""
+    """One flight at G times, `STEP_S` apart; NaN where a signal is missing."""
 
     name: str
     time_s: np.ndarray
-    """(G,)."""
-    known: dict[str, np.ndarray]
-    """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, and what drives."""
+    """(G,) since the flight's first row."""
+    signals: dict[str, np.ndarray]
+    """(G, ...) by name: rot_w, vel_w, pos_w, rate_b, commands and rotor speeds."""
     in_turn: tuple[str, ...] = ()
-    """Those of which a row has some columns only, as of motors polled one after another."""
+    """Signals of which each row has some columns only, as of motors polled one after another."""
 
     def has(self, *names: str) -> bool:
-        """Return whether these signals are there."""
-        return all(name in self.known for name in names)
+        """Return whether the flight has all of these signals."""
+        return all(name in self.signals for name in names)
 
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
-        """Return bumps of `width_s` in which all of `needs` is known; `slope` as `weak_form` has.
+        """Return the windows of `width_s` in which all signals of `needs` are present.
 
-        They begin a while after the first row: what was commanded before it still acts then.
+        `slope` is as in `weak_form`. No window begins in the first `MEMORY_S`, where commands from
+        before the first row still act.
         """
         good = self.time_s >= MEMORY_S
         for name in needs:
-            values = self.known[name]
+            values = self.signals[name]
             good &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         return weak_form(self.time_s, good, width_s, np.inf, slope)
 
-    def rows(self, turned: bool) -> FlightRows:
+    def rows(self, attitude_of_path: bool) -> FlightRows:
         """Return the grid as rows of a view, without rotor speeds and with zeros for NaN.
 
         Args:
-            turned: the attitude counts although it may be one of the path, whose yaw is none.
+            attitude_of_path: use the path's attitude where none was measured; its yaw is arbitrary.
         """
-        attitude = self.known.get("rot_w", self.known.get(LEANING) if turned else None)
-        count, still = len(self.time_s), np.zeros((len(self.time_s), 3))
-        volts = self.known.get("voltage", np.zeros(count))
-        vel_w = self.known.get("vel_w", self.known.get(PATH_VELOCITY, still))
-        if attitude is None:  # a velocity in unknown axes acts on nothing
-            attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), still
-        measured = (self.known.get("pos_w", still), attitude, vel_w)
-        pos_w, rot_w, vel_w, rate_b = map(
-            np.nan_to_num, (*measured, self.known.get("rate_b", still))
+        attitude = self.signals.get(
+            "rot_w", self.signals.get(LEANING) if attitude_of_path else None
         )
-        speed, good = np.zeros((count, 4)), np.ones(count, dtype=bool)
-        drop = volts[0] - volts
-        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, speed, drop, good)
+        count = len(self.time_s)
+        zeros = np.zeros((count, 3))
+        volts = self.signals.get("voltage", np.zeros(count))
+        vel_w = self.signals.get("vel_w", self.signals.get(PATH_VELOCITY, zeros))
+        if attitude is None:  # without an attitude the velocity in body axes is unknown
+            attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), zeros
+        measured = (self.signals.get("pos_w", zeros), attitude, vel_w)
+        pos_w, rot_w, vel_w, rate_b = map(
+            np.nan_to_num, (*measured, self.signals.get("rate_b", zeros))
+        )
+        rotor_speed, good = np.zeros((count, 4)), np.ones(count, dtype=bool)
+        voltage_drop = volts[0] - volts
+        return FlightRows(self.time_s, pos_w, rot_w, vel_w, rate_b, rotor_speed, voltage_drop, good)
 
 
 def grid_of(log: FlightLog) -> FlightGrid:
-    """Return `log` on the grid."""
-    imu_acc_w = specific_force_w(log)
+    """Return `log` on the grid: measurements interpolated, commands held from row to row."""
     time_s = log.time_s - log.time_s[0]
-    grid = np.arange(0.0, time_s[-1], STEP_S)
-    known: dict[str, np.ndarray] = {}
+    grid_s = np.arange(0.0, time_s[-1], STEP_S)
     measured = {
         "pos_w": log.pos_w,
         "vel_w": None if log.velocity_derived else log.vel_w,
-        IMU_ACC: imu_acc_w,
+        IMU_ACC: specific_force_w(log),
         "rate_b": log.rate_b,
         "rotor_speed": log.rotor_speed,
     }
@@ -106,86 +111,90 @@ def grid_of(log: FlightLog) -> FlightGrid:
         "torque_cmd_b": log.torque_cmd_b,
         "rotor_speed_cmd": log.rotor_speed_cmd,
     }
-    there = {name: v for name, v in (measured | commanded).items() if v is not None and _enough(v)}
-    in_turn = tuple(name for name, values in there.items() if _whole_rows(values) < 2)
-    for name, values in there.items():
-        known[name] = (joined if name in measured else _held)(time_s, values, grid)
-    if "rotor_speed" in there:
-        known[ROTOR_NOISE] = joined(time_s, noise_like(there["rotor_speed"]), grid)
-    if "pos_w" in known and "vel_w" not in known:
-        known[PATH_VELOCITY] = _slope(known["pos_w"])
-    if _whole_rows(log.quat_wxyz) > 1:
-        known["rot_w"] = attitude_on(time_s, log.quat_wxyz, grid)
-        turning = turning_of(time_s, log.quat_wxyz)
-        if "rate_b" not in known and _enough(turning):
-            known["rate_b"] = joined(time_s, turning, grid)
-    elif {"pos_w", "vel_w"} & {*known}:
-        known[LEANING] = attitude_on(time_s, np.asarray(rot_to_quat(leaning(log))), grid)
+    logged = {name: v for name, v in (measured | commanded).items() if v is not None and _enough(v)}
+    in_turn = tuple(name for name, values in logged.items() if _complete_rows(values) < 2)
+    signals: dict[str, np.ndarray] = {}
+    for name, values in logged.items():
+        signals[name] = (interpolated if name in measured else _held)(time_s, values, grid_s)
+    if "rotor_speed" in logged:
+        signals[ROTOR_NOISE] = interpolated(time_s, noise_like(logged["rotor_speed"]), grid_s)
+    if "pos_w" in signals and "vel_w" not in signals:
+        signals[PATH_VELOCITY] = _path_velocity(signals["pos_w"])
+    if _complete_rows(log.quat_wxyz) > 1:
+        signals["rot_w"] = attitude_at(time_s, log.quat_wxyz, grid_s)
+        rate_b = turning_of(time_s, log.quat_wxyz)
+        if "rate_b" not in signals and _enough(rate_b):
+            signals["rate_b"] = interpolated(time_s, rate_b, grid_s)
+    elif {"pos_w", "vel_w"} & {*signals}:
+        signals[LEANING] = attitude_at(time_s, np.asarray(rot_to_quat(leaning(log))), grid_s)
     if log.voltage is not None and _enough(log.voltage):
         good = np.isfinite(log.voltage)
-        volts = np.interp(grid, time_s[good], log.voltage[good])
-        known["voltage"] = _smoothed(volts, round(VOLTAGE_S / STEP_S))
-    return FlightGrid(log.name, grid, known, in_turn)
+        volts = np.interp(grid_s, time_s[good], log.voltage[good])
+        signals["voltage"] = _averaged(volts, round(VOLTAGE_S / STEP_S))
+    return FlightGrid(log.name, grid_s, signals, in_turn)
 
 
 def _enough(values: np.ndarray) -> bool:
-    """Return whether every column has two rows at least, between which something is known."""
+    """Return whether every column has at least two rows, so that it can be interpolated."""
     return bool(np.all(np.isfinite(values).sum(axis=0) > 1))
 
 
-def _whole_rows(values: np.ndarray) -> int:
+def _complete_rows(values: np.ndarray) -> int:
+    """Return the number of rows in which all columns are present."""
     return int(np.isfinite(values.reshape(len(values), -1)).all(axis=1).sum())
 
 
-def joined(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) joined by lines, each column over the rows that have it.
+def interpolated(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
+    """Return `values` (T, C) at `time_s` (T,), interpolated linearly to `grid_s`, as (G, C).
 
-    (G, C) on `grid`, NaN in holes and beyond a column's rows.
+    Each column uses its own rows. It is NaN in holes and outside these rows.
     """
-    out = np.empty((len(grid), values.shape[1]))
+    out = np.empty((len(grid_s), values.shape[1]))
     for k, column in enumerate(values.T):
         good = np.isfinite(column)
-        out[:, k] = np.interp(grid, time_s[good], column[good])
-        out[_in_hole(time_s[good], grid), k] = np.nan
+        out[:, k] = np.interp(grid_s, time_s[good], column[good])
+        out[_in_hole(time_s[good], grid_s), k] = np.nan
     return out
 
 
-def attitude_on(time_s: np.ndarray, quat: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return attitudes (G, 3, 3) of quaternions (T, 4), as `joined`."""
-    found = joined(time_s, on_one_side(quat), grid)
-    return quat_to_rot(found / np.linalg.norm(found, axis=1, keepdims=True))
+def attitude_at(time_s: np.ndarray, quat_wxyz: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
+    """Return rotations (G, 3, 3), body to world, of quaternions (T, 4); NaN as `interpolated`."""
+    mixed = interpolated(time_s, on_one_side(quat_wxyz), grid_s)
+    return quat_to_rot(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 
 
-def _slope(pos_w: np.ndarray) -> np.ndarray:
-    """Return the velocity (G, 3) over 0.1 s of a path, for forces that go with it."""
-    reach = round(0.05 / STEP_S)
+def _path_velocity(pos_w: np.ndarray) -> np.ndarray:
+    """Return the velocity (G, 3) by central differences of positions; NaN at both ends."""
+    reach = round(PATH_SLOPE_S / STEP_S)
     out = np.full_like(pos_w, np.nan)
     out[reach:-reach] = (pos_w[2 * reach :] - pos_w[: -2 * reach]) / (2 * reach * STEP_S)
     return out
 
 
-def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return what is held from row to row as its means from grid point to grid point.
+def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
+    """Return commands held from row to row, as means (G, ...) over each step of the grid.
 
-    A row's stamp is mostly between two of them: taken at the points it would come late.
+    A row's time is usually between two grid points. Sampling at the points would delay it.
     """
-    wide = np.asarray(values.reshape(len(values), -1), dtype=float)
-    ends, out = np.append(grid, grid[-1] + STEP_S), np.empty((len(grid), wide.shape[1]))
-    for k, column in enumerate(wide.T):
+    flat = np.asarray(values.reshape(len(values), -1), dtype=float)
+    ends_s, out = np.append(grid_s, grid_s[-1] + STEP_S), np.empty((len(grid_s), flat.shape[1]))
+    for k, column in enumerate(flat.T):
         good = np.isfinite(column)
-        rows = Signal(time_s[good], column[good, None])
-        out[:, k] = held(rows, ends)[:-1, 0]
-        out[_in_hole(rows.time_s, grid), k] = np.nan
-    return out.reshape(len(grid), *values.shape[1:])
+        signal = Signal(time_s[good], column[good, None])
+        out[:, k] = held(signal, ends_s)[:-1, 0]
+        out[_in_hole(signal.time_s, grid_s), k] = np.nan
+    return out.reshape(len(grid_s), *values.shape[1:])
 
 
-def _in_hole(t: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    wide = np.diff(t) > HOLE_STEPS * float(np.median(np.diff(t)))
-    at = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
-    return wide[at] | (grid < t[0]) | (grid > t[-1])
+def _in_hole(time_s: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
+    """Return which grid points (G,) are between distant rows, or outside all rows."""
+    is_hole = np.diff(time_s) > HOLE_STEPS * float(np.median(np.diff(time_s)))
+    row = np.clip(np.searchsorted(time_s, grid_s, side="right") - 1, 0, len(time_s) - 2)
+    return is_hole[row] | (grid_s < time_s[0]) | (grid_s > time_s[-1])
 
 
-def _smoothed(values: np.ndarray, count: int) -> np.ndarray:
+def _averaged(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the moving average of `values` (G,) over about `count` points, an odd number."""
     count = max(1, min(count, len(values) // 4)) | 1
     padded = np.pad(values, count // 2, mode="edge")
     return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")

@@ -1,4 +1,4 @@
-"""Fitted numbers as those of a vehicle file, and what flights do not identify, in words."""
+"""Entries of a vehicle file with their intervals, and explanations of what is not identified."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import UNSEEN
@@ -13,96 +14,94 @@ from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
+"""Key of the command delay."""
 
 
 class Number(NamedTuple):
     """One entry of a vehicle file, with its intervals."""
 
     key: str
-    """As in the file, with a dot between table and key."""
+    """Key in the file, after its table and a dot."""
     unit: str
     value: list[float]
+    """Value of each component."""
     ci95: list[tuple[float, float] | None]
-    """Of each component; None where it was left as it was."""
+    """95 % interval of each component; None for one that is not identified."""
     follows: bool = False
-    """Not identified, but in the file: the difference of an identified sum and another number."""
+    """Whether a component is not identified but in the file, as the difference between an
+    identified sum and another number."""
 
     @property
     def is_identified(self) -> bool:
-        """Whether any component was identified."""
+        """Whether any component is identified."""
         return any(span is not None for span in self.ci95)
 
     @property
     def is_entered(self) -> bool:
-        """Whether the file has it from these flights."""
+        """Whether these flights determine the file's value."""
         return self.is_identified or self.follows
 
 
-Derived = Callable[[Mapping[str, float]], np.ndarray]
-"""Values of a file's entry from the fit's numbers."""
+Formula = Callable[[Mapping[str, float]], ArrayLike]
+"""From the fit's numbers by name to an entry's value, or its values (V,)."""
 
 
-def values_of(fitted: Fitted) -> dict[str, float]:
-    """Return all numbers of a fit by name."""
-    return {u.name: float(v) for u, v in zip(fitted.unknowns, fitted.value, strict=True)}
-
-
-def number(
+def number_from(
+    fitted: Fitted,
     key: str,
     unit: str,
-    fitted: Fitted,
-    derived: Derived,
-    needs: Sequence[Sequence[str]],
-    room: float = np.inf,
+    formula: Formula,
+    needs: Sequence[str],
+    max_half_width: float = np.inf,
 ) -> Number:
-    """Return an entry of the file, its intervals from the fit's by the slopes of `derived`.
+    """Return an entry of the file; its intervals follow from the fit's covariance.
 
     Args:
-        key: of the file.
-        unit: of the values.
-        fitted: the fit.
-        derived: the values.
-        needs: for each value, the numbers of which one at least must be identified.
-        room: a value whose interval reaches further than this to either side is not
-            identified, and follows from the others.
+        fitted: result of a fit.
+        key: key in the file.
+        unit: unit of the values.
+        formula: the values by the fit's numbers; its slopes are finite differences.
+        needs: for each value, the number that must be identified.
+        max_half_width: a value with a wider interval to either side is not identified, and
+            `follows` from the others.
     """
-    names = [unknown.name for unknown in fitted.unknowns]
-    value = np.atleast_1d(derived(values_of(fitted)))
-    slopes = np.zeros((len(value), len(names)))
+    values = np.atleast_1d(formula(fitted.values()))
+    slopes = np.zeros((len(values), len(fitted.unknowns)))
     for k, unknown in enumerate(fitted.unknowns):
-        up, down = values_of(fitted), values_of(fitted)
+        up, down = fitted.values(), fitted.values()
         up[unknown.name] += unknown.step
         down[unknown.name] -= unknown.step
-        change = np.atleast_1d(derived(up)) - np.atleast_1d(derived(down))
+        change = np.atleast_1d(formula(up)) - np.atleast_1d(formula(down))
         slopes[:, k] = change / (2.0 * unknown.step)
-    half = Z95 * np.sqrt(np.maximum(np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes), 0))
-    seen = [any(fitted.has(name) for name in need if name in names) for need in needs]
+    variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
+    half = Z95 * np.sqrt(np.maximum(variance, 0.0))
+    is_known = [fitted.has(name) for name in needs]
     spans = [
-        (float(v - h), float(v + h)) if there and h <= room else None
-        for v, h, there in zip(value, half, seen, strict=True)
+        (float(v - h), float(v + h)) if known and h <= max_half_width else None
+        for v, h, known in zip(values, half, is_known, strict=True)
     ]
-    follows = any(there and span is None for there, span in zip(seen, spans, strict=True))
-    return Number(key, unit, [float(v) for v in value], spans, follows)
+    follows = any(known and span is None for known, span in zip(is_known, spans, strict=True))
+    return Number(key, unit, values.tolist(), spans, follows)
 
 
-def as_json(numbers: Sequence[Number]) -> dict[str, Any]:
-    """Return the identified entries for JSON: a plain value where there is one component."""
-    found = {}
-    for entry in numbers:
-        if not entry.is_identified:
+def numbers_json(numbers: Sequence[Number]) -> dict[str, Any]:
+    """Return the identified entries for JSON; a single component is a plain value, not a list."""
+    entries = {}
+    for number in numbers:
+        if not number.is_identified:
             continue
-        one = len(entry.value) == 1
-        spans = [None if span is None else list(span) for span in entry.ci95]
-        found[entry.key] = {
-            "value": entry.value[0] if one else entry.value,
-            "unit": entry.unit,
-            "ci95": spans[0] if one else spans,
+        is_single = len(number.value) == 1
+        spans = [None if span is None else list(span) for span in number.ci95]
+        entries[number.key] = {
+            "value": number.value[0] if is_single else number.value,
+            "unit": number.unit,
+            "ci95": spans[0] if is_single else spans,
         }
-    return found
+    return entries
 
 
-def lines_of_numbers(numbers: Sequence[Number]) -> list[str]:
-    """Return a line with the interval of every identified component, for people."""
+def number_lines(numbers: Sequence[Number]) -> list[str]:
+    """Return a line for people with the interval of every identified component."""
     return [
         f"{entry.key}{f'[{k}]' if len(entry.value) > 1 else ''} = {value:.4g}: "
         f"{span[0]:.4g} to {span[1]:.4g} {entry.unit}"
@@ -129,28 +128,29 @@ WHY = {
     "gain_y": "rate_gain about y: the body hardly pitches",
     "gain_z": "rate_gain about z: the body hardly yaws",
 }
-"""What was fitted and not identified, and what the flights lack for it."""
-STILL = "no body rates and no attitude in these logs"
-NEVER = "these logs have no stretch with both"
-"""Where the columns are there, and holes in them leave no window whole."""
+"""By a fitted number's name: what it is, and why flights may not identify it."""
+NO_RATES = "no body rates and no attitude in these logs"
+NEVER_BOTH = "these logs have no stretch with both"
+"""Reason where the columns exist, but holes in them leave no complete window."""
 
 
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
-    """Return what was fitted and no fit has identified.
+    """Return a line for people for each number that was fitted and that no fit has identified.
 
     Args:
-        fitted: what was fitted, by the fit's name.
-        entries: of the vehicle file, by their keys.
+        fitted: results of the fits, by the fit's name.
+        entries: entries of the vehicle file, by their keys.
     """
-    seen = {u.name for found in fitted.values() for u in found.unknowns if found.has(u.name)}
-    names = dict.fromkeys(name for found in fitted.values() for name in found.not_identified)
-    lines = [WHY[name] for name in names if name not in seen and name in WHY]
-    late = [values_of(found)["late"] for found in fitted.values() if found.has("late")]
-    if late and not entries[DELAY].is_identified:
-        rest = max(entries[DELAY].value[0], 0.0)
+    fits = list(fitted.values())
+    identified = {name for fit in fits for name in fit.names if fit.has(name)}
+    names = dict.fromkeys(name for fit in fits for name in fit.not_identified)
+    lines = [WHY[name] for name in names if name not in identified and name in WHY]
+    total_s = [fit.values()["late"] for fit in fits if fit.has("late")]
+    if total_s and not entries[DELAY].is_identified:
+        delay_s = max(entries[DELAY].value[0], 0.0)
         lines.append(
-            f"command_delay: only that it and the rotors' lag make {late[-1]:.3g} s together; of "
-            f"that the file's lag leaves {rest:.3g} s, which is its delay"
+            f"command_delay: only its sum with the rotors' lag, {total_s[-1]:.3g} s; the file's "
+            f"delay, {delay_s:.3g} s, is this sum minus the file's lag"
         )
     return lines
 
@@ -163,64 +163,65 @@ def not_attempted(
     leave: Sequence[str],
     broken: Collection[str] = (),
 ) -> list[str]:
-    """Return what was not even fitted, since the logs have no such columns, or none whole.
+    """Return a line for people for each number that was not fitted, with the missing signal.
 
     Args:
         flights: on their grids.
         vehicle: the start.
-        drive: what drove the flights.
-        fitted: what was fitted, by the fit's name.
-        leave: what was not to be fitted.
-        broken: fits for which the logs have the columns, and no stretch in which all of them go on.
+        drive: name of the flights' drive, one of `DRIVES`.
+        fitted: results of the fits, by the fit's name.
+        leave: parts that the user chose not to fit.
+        broken: names of fits for which the logs have the columns, but no complete window.
     """
     lines = []
 
-    def anywhere(*names: str) -> bool:
+    def any_has(*names: str) -> bool:
         return any(flight.has(*names) for flight in flights)
 
-    if anywhere(IMU_ACC):
+    if any_has(IMU_ACC):
         lines += UNSEEN
     force = fitted.get("force")
     if force is None:
         if not {"drag", "motors"} <= set(leave):
             why = "these logs have no stretch with a position"
             if "force" in broken:
-                slow = "" if anywhere("rot_w") else ", slow enough to do without an attitude"
-                why = f"{NEVER} the path and what drove the motors{slow}"
+                slow = "" if any_has("rot_w") else ", slow enough to do without an attitude"
+                why = f"{NEVER_BOTH} the path and the motors' commands or speeds{slow}"
             lines.append(f"thrust and drag: {why}")
-    elif "drag" not in leave and not any(u.name == "drag_x" for u in force.unknowns):
+    elif "drag" not in leave and "drag_x" not in force.names:
         lines.append(
             "drag along body x and y: without an attitude a force across the thrust equals "
             "a body that leans"
         )
-    if drive == "pwm" and "motors" not in leave and not anywhere("voltage"):
+    if drive == "pwm" and "motors" not in leave and not any_has("voltage"):
         motors = vehicle.motors
-        by = "it is 0, so that none counts"
+        effect = "it is 0, so the voltage has no effect"
         if motors is not None and motors.voltage_exponent:
-            by = f"the thrust that they show is taken for that at {motors.voltage:.4g} V"
-        lines.append(f"voltage_exponent: these logs have no voltage; {by}")
+            effect = f"their thrust is assumed to be that at {motors.voltage:.4g} V"
+        lines.append(f"voltage_exponent: these logs have no voltage; {effect}")
     if "torque" not in fitted and "inertia" not in leave:
+        why = NO_RATES
         if drive in ("rates", "thrust"):
-            lines.append(
-                "inertia and torque_coefficient: commanded rates and thrust contain no "
-                "torques; that needs motor commands, rotor speeds or commanded torques"
+            why = (
+                "commanded rates and thrust contain no torques; that needs motor commands, rotor "
+                "speeds or commanded torques"
             )
-        else:
-            why = f"{NEVER} body rates and what drove the motors" if "torque" in broken else STILL
-            lines.append(f"inertia and torque_coefficient: {why}")
-    lags = any(u.name == "late" for found in fitted.values() for u in found.unknowns)
-    if not lags and "lag" not in leave:
-        why = STILL
+        elif "torque" in broken:
+            why = f"{NEVER_BOTH} body rates and the motors' commands or speeds"
+        lines.append(f"inertia and torque_coefficient: {why}")
+    has_lag = any("late" in fit.names for fit in fitted.values())
+    if not has_lag and "lag" not in leave:
+        why = NO_RATES
         if "rotors" in broken:
-            why = f"{NEVER} measured and commanded rotor speeds"
+            why = f"{NEVER_BOTH} measured and commanded rotor speeds"
         elif drive == "rotors":
             why = (
-                "measured rotor speeds are past them; that needs commanded ones (motor_cmd_1 to "
-                "motor_cmd_4) as well, and all four in every row"
+                "measured rotor speeds do not contain them; that needs commanded ones "
+                "(motor_cmd_1 to motor_cmd_4) as well, and all four in every row"
             )
         elif {"torque", "loop"} & set(broken):
-            why = f"{NEVER} body rates and what was commanded"
-        elif drive in ("rates", "thrust") and anywhere("rate_b"):
+            why = f"{NEVER_BOTH} body rates and commands"
+        elif drive in ("rates", "thrust") and any_has("rate_b"):
             why = "commanded thrust contains none; that needs the gains of a nominal rate loop"
         lines.append(f"time_constant and command_delay: {why}")
     if "loop" not in fitted and "loop" not in leave:
@@ -228,42 +229,45 @@ def not_attempted(
         if vehicle.controller.kind != "p":
             why = f"the rate loop: settings of a {vehicle.controller.kind} loop are not fitted"
         elif "loop" in broken:
-            why = f"rate_gain: {NEVER} body rates and commanded ones"
+            why = f"rate_gain: {NEVER_BOTH} body rates and commanded ones"
         lines.append(why)
     return lines
 
 
 def notes_on(
-    flights: Sequence[FlightGrid], without_voltage: Collection[str], begun: Vehicle, found: Vehicle
+    flights: Sequence[FlightGrid],
+    without_voltage: Collection[str],
+    start: Vehicle,
+    identified: Vehicle,
 ) -> list[str]:
-    """Return what was done with flights and vehicle that the numbers do not show.
+    """Return lines for people on treatment of flights and vehicle that the numbers do not show.
 
     Args:
         flights: on their grids.
-        without_voltage: names of flights without a voltage, where others have one.
-        begun: the start.
-        found: what became of it.
+        without_voltage: names of flights without a voltage, if others have one.
+        start: the vehicle before.
+        identified: the vehicle with the identified numbers.
     """
     lines = [
-        f"{flight.name}: no row has all columns of {', '.join(flight.in_turn)}; each is taken by "
-        "its own rows, so that what is fast is blurred, and a delay too short by up to half of "
+        f"{flight.name}: no row has all columns of {', '.join(flight.in_turn)}; each column uses "
+        "its own rows. That blurs fast changes, and makes a delay too short by up to half of "
         "their distance"
         for flight in flights
         if flight.in_turn
     ]
     if without_voltage:
         lines.append(
-            f"no voltage in {', '.join(sorted(without_voltage))}: the other flights alone identify "
-            "what depends on the motors' thrust"
+            f"no voltage in {', '.join(sorted(without_voltage))}: these flights do not count where "
+            "the motors' thrust does"
         )
-    motors, had = found.motors, begun.motors
-    volts = any(flight.has("voltage") for flight in flights)
-    if volts and motors is not None and (had is None or motors.voltage != had.voltage):
-        lines.append(f"motors.voltage = {motors.voltage:.4g} V, the usual one of these flights")
-    if found.rotors.speed_max != begun.rotors.speed_max:
+    motors, before = identified.motors, start.motors
+    has_voltage = any(flight.has("voltage") for flight in flights)
+    if has_voltage and motors is not None and (before is None or motors.voltage != before.voltage):
+        lines.append(f"motors.voltage = {motors.voltage:.4g} V, the median of these flights")
+    if identified.rotors.speed_max != start.rotors.speed_max:
         lines.append(
-            f"rotors.speed_max = {found.rotors.speed_max:.4g} rad/s, which these flights reach: by "
-            f"the thrust that they show, {begun.rotors.speed_max:.4g} rad/s would be too slow to "
+            f"rotors.speed_max = {identified.rotors.speed_max:.4g} rad/s, which these flights "
+            f"reach: with the identified thrust, {start.rotors.speed_max:.4g} rad/s is too slow to "
             "hover"
         )
     return lines

@@ -1,4 +1,4 @@
-"""From flight logs to a vehicle file with the numbers that they identify."""
+"""Reads flight logs, identifies the vehicle's numbers, and writes a vehicle file with them."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from suite.common.provenance import stamp
 from suite.delta.run import flight_files
 from suite.diagnose.data.sampling import without_slow_rotors
 from suite.diagnose.estimate.parameters import refuse_own_motion
-from suite.diagnose.identify.drive import unknown_to_the_fits
+from suite.diagnose.identify.drive import unmodelled_effects
 from suite.diagnose.identify.identify import Identified, identify
-from suite.diagnose.identify.numbers import as_json, lines_of_numbers
+from suite.diagnose.identify.numbers import number_lines, numbers_json
 
 SCHEMA = 1
+"""Version of the JSON that `suite identify` prints."""
 PARTS = ("drag", "motors", "inertia", "lag", "loop")
-"""What `--leave` may name."""
-MADE = "by suite identify"
-"""In the first line of a vehicle file that this command wrote."""
+"""Allowed values of `--leave`."""
+MADE_BY = "by suite identify"
+"""Mark in the first line of a vehicle file that this command wrote."""
 
 
 def identify_files(
@@ -39,15 +40,15 @@ def identify_files(
         flights: logs or folders of them.
         vehicle: file or shipped name to start from.
         out: the vehicle file to write.
-        leave: of `PARTS`, what stays as it is.
-        console: for people.
-        accept: faults of the interface that are known, and go on all the same.
+        leave: those of `PARTS` that are not fitted.
+        console: for progress.
+        accept: names of interface faults (wrong units, signs, clocks) that do not stop the command.
 
     Returns:
-        What `--json` prints.
+        The JSON object that `--json` prints.
 
     Raises:
-        ValueError: for flights or a vehicle that cannot be used.
+        ValueError: if flights or vehicle cannot be used.
     """
     for part in leave:
         if part not in PARTS:
@@ -61,28 +62,27 @@ def identify_files(
     logs, slow = without_slow_rotors(logs)
     warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")
-    if unknown := unknown_to_the_fits(start):
-        warnings = [
-            *warnings,
-            f"{start.name} has {', '.join(unknown)}: the fits do not model them, so the "
-            "estimates include their share, and they stay in the file; start without them",
-        ]
-    found = identify(logs, start, leave)
-    head = _head(found, vehicle)
+    if unmodelled := unmodelled_effects(start):
+        warnings.append(
+            f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "
+            "estimates include their share, and they stay in the file; start without them"
+        )
+    identified = identify(logs, start, leave)
+    header = _header(identified, vehicle)
     try:
-        save_vehicle(found.vehicle, out, head)
+        save_vehicle(identified.vehicle, out, header)
     except ValueError as error:
-        raise ValueError(f"{out}: not written: {error}\n{head}") from error
+        raise ValueError(f"{out}: not written: {error}\n{header}") from error
     return {
         "vehicle": str(out),
         "start": vehicle,
-        "drive": found.drive,
-        "parameters": as_json(found.numbers),
-        "not_identified": list(found.not_identified),
-        "left": found.left,
-        "flights": list(found.flights),
+        "drive": identified.drive,
+        "parameters": numbers_json(identified.numbers),
+        "not_identified": list(identified.not_identified),
+        "left": identified.residual_rms,
+        "flights": list(identified.flights),
         "findings": findings,
-        "warnings": [*warnings, *found.notes],
+        "warnings": [*warnings, *identified.notes],
         **stamp(SCHEMA, None),
     }
 
@@ -96,13 +96,14 @@ def is_identified(vehicle: str) -> bool:
     path = Path(vehicle)
     if not path.is_file():
         return False
-    first = path.read_text(encoding="utf-8").partition("\n")[0]
-    return first.startswith("#") and MADE in first
+    first_line = path.read_text(encoding="utf-8").partition("\n")[0]
+    return first_line.startswith("#") and MADE_BY in first_line
 
 
-def _head(found: Identified, start: str) -> str:
-    flights = _counted(len(found.flights))
-    lines = [f"From {start} {MADE}, {flights} ({found.drive}); 95 % intervals:"]
-    lines += lines_of_numbers(found.numbers)
-    lines += [f"not identifiable: {text}" for text in found.not_identified]
+def _header(identified: Identified, start: str) -> str:
+    """Return the comment at the top of the vehicle file: numbers, and what is not identifiable."""
+    flights = _counted(len(identified.flights))
+    lines = [f"From {start} {MADE_BY}, {flights} ({identified.drive}); 95 % intervals:"]
+    lines += number_lines(identified.numbers)
+    lines += [f"not identifiable: {text}" for text in identified.not_identified]
     return "\n".join(lines)

@@ -1,16 +1,16 @@
-"""Size, autocorrelation and drift of an estimate's errors, fitted to their variogram.
+"""Fits size, autocorrelation and drift of a state estimate's errors to their variogram.
 
-The variogram, half the mean squared difference of errors a lag apart, is for two first-order
-Gauss-Markov processes, a fast one with a share f of the variance v, and a random walk with the
-distance (c^2 a metre, at the speed s)
+The variogram g(l) is half the mean squared difference of errors at times a lag l apart. A constant
+bias does not change it (Cressie 1993, "Statistics for spatial data", section 2.4). The model has
+two first-order Gauss-Markov processes: a fast one with the share f of the variance v, and a slow
+one. A random walk with the distance adds to them, of variance c^2 per metre at the speed s:
 
     g(l) = v (1 - f exp(-l / T_f) - (1 - f) exp(-l / T)) + c^2 s l / 2
 
-whatever constant bias a flight has (Cressie 1993, "Statistics for spatial data", section 2.4). The
-drift is fitted at lags of seconds; then the others at lags up to one second and at the variance
-about each flight's mean, v (1 - m) + c^2 s D / 6, where m is the share of the variance that the
-mean of a flight of length D contains. Each stretch of a flight has a variogram of its own; their
-disagreement gives the intervals.
+The drift c is fitted first, at lags of seconds. The other parameters are fitted at lags up to one
+second, and at the variance about each flight's mean, v (1 - m) + c^2 s D / 6. There D is the
+flight's duration, and m the variance of its mean over v. Each stretch of 5 s has its own variogram;
+their disagreement gives the intervals.
 """
 
 from __future__ import annotations
@@ -25,48 +25,51 @@ from scipy.stats import chi2
 from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, acting
+from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, significant
 
 SHORT_S = 1.0
-"""Colours are compared up to this lag [s]."""
-SHORT, LONG = 40, 8
-"""Lags up to `SHORT_S`, and those that show a drift."""
+"""The autocorrelation is fitted up to this lag [s]."""
+SHORT_LAGS, LONG_LAGS = 40, 8
+"""Number of lags up to `SHORT_S`, and of those that show a drift."""
 LONG_S, LONGEST = 2.0, 1.0 / 3.0
-"""A drift shows from this lag on [s], up to this share of the shortest flight."""
+"""A drift is fitted from this lag on [s], up to this share of the shortest flight."""
 LEAST_S = 0.01
-"""The shortest correlation time that is tried [s]; the longest is that of a drift's lags."""
+"""Least correlation time in the fit [s]; the largest is that of a drift's lags."""
 TINY_S = 1e-6
-FASTER = (-7.0, -0.7)
-"""Logarithm of the fast correlation time over the other."""
-NOTHING = Interval(0.0, 0.0, 0.0)
+"""Correlation times are at least this in divisions [s]."""
+LOG_RATIO = (-7.0, -0.7)
+"""Bounds of log T_f / T, the fast correlation time over the slow one."""
+LONGEST_NEW = 0.3
+"""A fast correlation time below this share of a row's step counts as 0: no row shows it [1]."""
+ZERO = Interval(0.0, 0.0, 0.0)
 
 
 class Series(NamedTuple):
-    """One error along one flight."""
+    """One error along one flight of T rows."""
 
     value: np.ndarray
-    """(T,) NaN where it is missing."""
+    """(T,) error; NaN where it is missing."""
     speed: np.ndarray
-    """(T,) [m/s]; zeros where no drift is fitted."""
+    """(T,) speed of the vehicle [m/s]; zeros for an error without drift."""
     step_s: float
 
     @property
     def duration_s(self) -> float:
-        """Of the flight [s]."""
+        """Duration of the flight [s]."""
         return len(self.value) * self.step_s
 
 
 class Coloured(NamedTuple):
-    """Parameters of one error."""
+    """Parameters of one error; coloured means correlated in time."""
 
     noise: Interval
     """Standard deviation without bias and drift, in the error's unit."""
     fast: Interval
-    """Share of its variance that changes fast [1]."""
+    """Share of the variance in the fast process [1]."""
     fast_s: Interval
-    """Correlation time of that share; 0 where it is new in every row [s]."""
+    """Correlation time of the fast process; 0 if its values are independent from row to row [s]."""
     lasts_s: Interval
-    """Correlation time of the rest [s]."""
+    """Correlation time of the slow process [s]."""
     drift: Interval
     """Random walk with the distance [unit/sqrt(m)]."""
     bias: Interval
@@ -78,85 +81,89 @@ class Coloured(NamedTuple):
         The flight's mean is subtracted, which removes a share of a slow error.
         """
         colour = Colour(self.fast.value, self.fast_s.value, self.lasts_s.value)
-        plain, lost = colour.correlation(lag_s), colour.of_mean(duration_s)
-        return (plain - lost) / (1.0 - lost)
+        mean_share = colour.mean_variance(duration_s)
+        return (colour.correlation(lag_s) - mean_share) / (1.0 - mean_share)
 
 
 class Colour(NamedTuple):
     """Correlation of noise in time."""
 
     fast: float
-    """Share [1]."""
+    """Share of the variance in the fast process [1]."""
     fast_s: float
+    """Correlation time of the fast process [s]."""
     lasts_s: float
+    """Correlation time of the slow process [s]."""
 
     def correlation(self, lag_s: np.ndarray) -> np.ndarray:
         """Return the autocorrelation (L,) at lags [s]."""
         fast, slow = (np.exp(-lag_s / max(t, TINY_S)) for t in (self.fast_s, self.lasts_s))
         return self.fast * fast + (1.0 - self.fast) * slow
 
-    def of_mean(self, duration_s: float) -> float:
-        """Return the variance of the mean over `duration_s`, over that of the noise."""
-        both = ((self.fast, self.fast_s), (1.0 - self.fast, self.lasts_s))
-        return sum(share * _of_mean(max(t, TINY_S) / duration_s) for share, t in both)
+    def mean_variance(self, duration_s: float) -> float:
+        """Return the variance of the mean over `duration_s`, relative to the noise's variance."""
+        processes = ((self.fast, self.fast_s), (1.0 - self.fast, self.lasts_s))
+        return sum(share * _mean_variance(max(t, TINY_S) / duration_s) for share, t in processes)
 
 
-class _Rows(NamedTuple):
-    """Variograms of B stretches at L lags."""
-
-    value: np.ndarray
-    """(B, L)."""
-    weight: np.ndarray
-    """(B, L) share of the pairs of rows at that lag."""
-    speed: np.ndarray
-    """(B, 1) mean [m/s]."""
-    flight: np.ndarray
-    """(B,)."""
-
-
-def _of_mean(ratio: float) -> float:
+def _mean_variance(ratio: float) -> float:
+    """Return the same for one process of a correlation time of `ratio` durations."""
     return 2.0 * ratio * (1.0 - ratio * (1.0 - float(np.exp(-1.0 / ratio))))
 
 
+class _Variograms(NamedTuple):
+    """Variograms of B stretches at L lags."""
+
+    value: np.ndarray
+    """(B, L) half the mean squared difference."""
+    weight: np.ndarray
+    """(B, L) share of the pairs of rows at that lag."""
+    speed: np.ndarray
+    """(B, 1) mean speed [m/s]."""
+    flight: np.ndarray
+    """(B,) number of the flight."""
+
+
 def fit_colour(flights: Sequence[Series]) -> Coloured | None:
-    """Return size, colour and drift; None where the flights hold less than two stretches."""
+    """Fit size, autocorrelation and drift; None if the flights have less than two stretches."""
     step_s = max(flight.step_s for flight in flights)
-    rows = _variograms(flights, np.linspace(step_s, max(SHORT_S, step_s), SHORT))
-    if rows is None:
+    lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT_LAGS)
+    variograms = _variograms(flights, lag_s)
+    if variograms is None:
         return None
-    drift = _drift(flights) if any(flight.speed.any() for flight in flights) else NOTHING
-    best = _noise(flights, rows, 0.0)
-    if acting(drift):
-        # A slow noise resembles a drift at long lags; one that lasts as long as these is a drift.
+    drift = _drift(flights) if any(flight.speed.any() for flight in flights) else ZERO
+    best = _noise(flights, variograms, lag_s, 0.0)
+    if significant(drift):
+        # At long lags a slow noise resembles a drift. Noise that lasts longer counts as a drift.
         if best.colour.lasts_s > LONG_S:
-            best = _noise(flights, rows, drift.value**2)
+            best = _noise(flights, variograms, lag_s, drift.value**2)
         else:
             drift = drift._replace(value=0.0, low=0.0)
-    log_v, share, _, _ = best.theta
-    half, colour, sd = best.half, best.colour, float(np.exp(0.5 * log_v))
+    log_variance, share, _, _ = best.theta
+    half, colour, sd = best.half, best.colour, float(np.exp(0.5 * log_variance))
     low, high = np.clip([share - half[1], share + half[1]], 0.0, 1.0)
-    fast_s = _spread(colour.fast_s, float(np.hypot(half[2], half[3])))
-    if colour.fast and colour.fast_s < 0.3 * step_s:  # no row shows that it lasts
+    fast_s = _from_log(colour.fast_s, float(np.hypot(half[2], half[3])))
+    if colour.fast and colour.fast_s < LONGEST_NEW * step_s:
         colour = colour._replace(fast_s=0.0)
         fast_s = Interval(0.0, 0.0, min(fast_s.high, step_s))
     return Coloured(
-        _spread(sd, 0.5 * half[0]),
+        _from_log(sd, 0.5 * half[0]),
         Interval(float(share), float(low), float(high)),
         fast_s,
-        _spread(colour.lasts_s, half[3]),
+        _from_log(colour.lasts_s, half[3]),
         drift,
         _bias(flights, sd**2, colour),
     )
 
 
-def _spread(value: float, half: float) -> Interval:
-    """Return the interval of a number from that of its logarithm."""
-    wide = float(np.exp(half))
-    return Interval(value, value / wide, value * wide)
+def _from_log(value: float, half: float) -> Interval:
+    """Return the interval of `value`; its logarithm has the half-width `half`."""
+    factor = float(np.exp(half))
+    return Interval(value, value / factor, value * factor)
 
 
 class _Noise(NamedTuple):
-    """Noise that was fitted."""
+    """Fitted noise."""
 
     theta: np.ndarray
     """(4,) log v, f, log T_f / T, log T."""
@@ -174,76 +181,81 @@ def _colour(theta: np.ndarray) -> Colour:
     return Colour(float(theta[1]), float(np.exp(theta[2] + theta[3])), float(np.exp(theta[3])))
 
 
-def _noise(flights: Sequence[Series], rows: _Rows, walk: float) -> _Noise:
-    """Return the noise next to a random walk of `walk` a metre.
+def _noise(
+    flights: Sequence[Series], variograms: _Variograms, lag_s: np.ndarray, walk: float
+) -> _Noise:
+    """Fit the noise in addition to a random walk of variance `walk` per metre.
 
-    A fast part is there only where its share is significant.
+    The fast process is used only if its share is significant. `lag_s` (L,) is of `variograms`.
     """
-    step_s = max(flight.step_s for flight in flights)
-    lag_s = np.linspace(step_s, max(SHORT_S, step_s), SHORT)
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
-    about = _variograms(flights, None)
-    assert about is not None
-    # The variance counts as all short lags together: they say where the variogram ends.
-    measured = np.concatenate([rows.value, about.value], axis=1)
-    weight = np.concatenate([rows.weight, SHORT * about.weight], axis=1)
-    size = float((about.weight * about.value).sum()) + 1e-300
+    about_mean = _variograms(flights, None)
+    assert about_mean is not None
+    # The variance is the variogram's limit at long lags. It counts as much as all short lags.
+    measured = np.concatenate([variograms.value, about_mean.value], axis=1)
+    weight = np.concatenate([variograms.weight, SHORT_LAGS * about_mean.weight], axis=1)
+    size = float((about_mean.weight * about_mean.value).sum()) + 1e-300
 
     def model(theta: np.ndarray) -> np.ndarray:
         variance, colour = np.exp(theta[0]), _colour(theta)
-        plain = variance * (1.0 - colour.correlation(lag_s))
-        whole = variance * (1.0 - colour.of_mean(duration_s))
-        drifted = 0.5 * walk * rows.speed * np.append(lag_s, duration_s / 3.0)
-        return np.append(plain, whole) + drifted
+        at_lags = variance * (1.0 - colour.correlation(lag_s))
+        about_mean = variance * (1.0 - colour.mean_variance(duration_s))
+        drifted = 0.5 * walk * variograms.speed * np.append(lag_s, duration_s / 3.0)
+        return np.append(at_lags, about_mean) + drifted
 
     def residual(theta: np.ndarray) -> np.ndarray:
         return (np.sqrt(weight) * (measured - model(theta)) / size).ravel()
 
     longest = max(LONGEST * duration_s, 2.0 * LONG_S)
-    low = np.array([np.log(size) - 10.0, 0.0, FASTER[0], np.log(LEAST_S)])
-    high = np.array([np.log(size) + 3.0, 1.0, FASTER[1], np.log(longest)])
+    low = np.array([np.log(size) - 10.0, 0.0, LOG_RATIO[0], np.log(LEAST_S)])
+    high = np.array([np.log(size) + 3.0, 1.0, LOG_RATIO[1], np.log(longest)])
 
-    def fitted(free: list[int], begin: np.ndarray) -> _Noise:
-        def among(some: np.ndarray) -> np.ndarray:
-            theta = begin.copy()
-            theta[free] = some
+    def fitted(free: list[int], start: np.ndarray) -> _Noise:
+        """Fit the entries of theta at `free`; the others keep their start."""
+
+        def complete(values: np.ndarray) -> np.ndarray:
+            theta = start.copy()
+            theta[free] = values
             return theta
 
-        found = least_squares(
-            lambda some: residual(among(some)), begin[free], bounds=(low[free], high[free])
+        best = least_squares(
+            lambda values: residual(complete(values)), start[free], bounds=(low[free], high[free])
         )
         half = np.zeros(4)
-        slope = -found.jac.reshape(*weight.shape, len(free))
-        half[free] = np.minimum(_half_widths(slope, found.fun, rows.flight), 20.0)
-        return _Noise(among(found.x), half, float(found.cost))
+        slope = -best.jac.reshape(*weight.shape, len(free))
+        half[free] = np.minimum(_half_widths(slope, best.fun, variograms.flight), 20.0)
+        return _Noise(complete(best.x), half, float(best.cost))
 
-    alone = fitted([0, 3], np.array([np.log(size), 0.0, -1.5, np.log(0.3)]))
-    begins = [np.array([np.log(size), 0.3, ratio, np.log(0.5)]) for ratio in (-1.5, -4.0)]
-    both = min((fitted([0, 1, 2, 3], begin) for begin in begins), key=lambda one: one.cost)
-    return both if both.theta[1] > both.half[1] and both.theta[1] < 1.0 - both.half[1] else alone
+    slow = fitted([0, 3], np.array([np.log(size), 0.0, -1.5, np.log(0.3)]))
+    starts = [np.array([np.log(size), 0.3, ratio, np.log(0.5)]) for ratio in (-1.5, -4.0)]
+    mixed = min((fitted([0, 1, 2, 3], start) for start in starts), key=lambda noise: noise.cost)
+    return mixed if mixed.half[1] < mixed.theta[1] < 1.0 - mixed.half[1] else slow
 
 
 def _drift(flights: Sequence[Series]) -> Interval:
-    """Return the random walk with the distance, by the variogram's slope at long lags."""
+    """Fit the random walk with the distance to the variogram's slope at long lags."""
     longest = LONGEST * min(flight.duration_s for flight in flights)
     if longest < 2.0 * LONG_S:
-        return NOTHING
-    lag_s = np.geomspace(LONG_S, longest, LONG)
-    rows = _variograms(flights, lag_s)
-    if rows is None:
-        return NOTHING
-    root = np.sqrt(rows.weight)[..., None]
-    slope = np.stack([np.ones_like(rows.weight), 0.5 * rows.speed * lag_s], axis=-1) * root
-    flat = slope.reshape(-1, 2)
-    theta = np.linalg.lstsq(flat, (root[..., 0] * rows.value).ravel(), rcond=None)[0]
-    residual = (root[..., 0] * rows.value).ravel() - flat @ theta
-    half = _half_widths(slope, residual, rows.flight)[1]
+        return ZERO
+    lag_s = np.geomspace(LONG_S, longest, LONG_LAGS)
+    variograms = _variograms(flights, lag_s)
+    if variograms is None:
+        return ZERO
+    root = np.sqrt(variograms.weight)
+    columns = [np.ones_like(root), 0.5 * variograms.speed * lag_s]
+    slope = np.stack(columns, axis=-1) * root[..., None]
+    flat, measured = slope.reshape(-1, 2), (root * variograms.value).ravel()
+    theta = np.linalg.lstsq(flat, measured, rcond=None)[0]
+    half = _half_widths(slope, measured - flat @ theta, variograms.flight)[1]
     ends = np.clip([theta[1], theta[1] - half, theta[1] + half], 0.0, None)
     return Interval(*(float(v) for v in np.sqrt(ends)))
 
 
-def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Rows | None:
-    """Return the variograms; without lags the squares about each flight's mean, in their place."""
+def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variograms | None:
+    """Return the variograms of all stretches at lags (L,), or None for less than two stretches.
+
+    Without lags the value is the mean square about each flight's mean, and L is 1.
+    """
     values, counts, speeds, flight_of = [], [], [], []
     for number, flight in enumerate(flights):
         stretch = (np.arange(len(flight.value)) * flight.step_s / STRETCH_S).astype(int)
@@ -253,38 +265,51 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Rows | 
         else:
             lags = np.rint(lag_s / flight.step_s).astype(int)
             squares = [0.5 * (flight.value[k:] - flight.value[:-k]) ** 2 for k in lags]
-        good = [np.isfinite(square) for square in squares]
-        of = [stretch[: len(ok)][ok] for ok in good]
-        total = [np.bincount(a, s[ok], size) for a, s, ok in zip(of, squares, good, strict=True)]
-        count = np.stack([np.bincount(a, minlength=size) for a in of], axis=1)
-        there = count.any(axis=1)
-        values.append((np.stack(total, axis=1) / np.maximum(count, 1))[there])
-        counts.append(count[there])
+        totals, pairs = [], []
+        for square in squares:
+            good = np.isfinite(square)
+            where = stretch[: len(good)][good]
+            totals.append(np.bincount(where, square[good], size))
+            pairs.append(np.bincount(where, minlength=size))
+        total, count = np.stack(totals, axis=1), np.stack(pairs, axis=1)
+        used = count.any(axis=1)
+        values.append((total / np.maximum(count, 1))[used])
+        counts.append(count[used])
         speed = np.bincount(stretch, np.nan_to_num(flight.speed)) / np.bincount(stretch)
-        speeds.append(speed[there, None])
-        flight_of.append(np.full(there.sum(), number))
-    pairs = np.concatenate(counts)
-    if len(pairs) < 2 or not pairs.any(axis=0).all():
+        speeds.append(speed[used, None])
+        flight_of.append(np.full(used.sum(), number))
+    every = np.concatenate(counts)
+    if len(every) < 2 or not every.any(axis=0).all():
         return None
-    weight = pairs / pairs.sum(axis=0)
-    speed = np.concatenate(speeds)
-    return _Rows(np.concatenate(values), weight, speed, np.concatenate(flight_of))
+    return _Variograms(
+        np.concatenate(values),
+        every / every.sum(axis=0),
+        np.concatenate(speeds),
+        np.concatenate(flight_of),
+    )
 
 
 def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the half-widths (K,) of the 95 % intervals, by how stretches and flights disagree."""
-    left = residual.reshape(*slope.shape[:2], 1)
-    chi = (left[..., 0] ** 2).sum(axis=1)
-    equations = NormalEquations(*products(slope, left), chi, flight)
+    """Return the half-widths (K,) of the 95 % intervals, by how stretches and flights disagree.
+
+    Args:
+        slope: (B, L, K) of the model.
+        residual: (B * L,) of the fit.
+        flight: (B,) number of each stretch's flight.
+    """
+    residual = residual.reshape(*slope.shape[:2], 1)
+    chi2 = (residual[..., 0] ** 2).sum(axis=1)
+    equations = NormalEquations(*products(slope, residual), chi2, flight)
     return intervals95(equations, DIFFER_P, leave_out=True, noise_share=0.0).half_width
 
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
-    """Return the size of the constant part of a flight: its mean, less the mean of the noise."""
-    seen = [flight for flight in flights if np.isfinite(flight.value).any()]
-    means, count = np.array([np.nanmean(flight.value) for flight in seen]), len(seen)
-    noise = variance * np.mean([colour.of_mean(f.duration_s) for f in seen])
+    """Return the standard deviation of a flight's constant error, without the noise's mean."""
+    flights = [flight for flight in flights if np.isfinite(flight.value).any()]
+    means, count = np.array([np.nanmean(flight.value) for flight in flights]), len(flights)
+    noise = variance * np.mean([colour.mean_variance(f.duration_s) for f in flights])
     power = float((means**2).mean())
+    # A sum of `count` squared normal variables has a chi-square distribution.
     ends = (power * count / chi2.ppf(share, count) for share in (0.975, 0.025))
     low, high = (np.sqrt(max(end - noise, 0.0)) for end in ends)
     return Interval(float(np.sqrt(max(power - noise, 0.0))), float(low), float(high))

@@ -1,4 +1,8 @@
-"""A sensors file from flights that have an estimate and a reference, and its held-out check."""
+"""Identifies a sensors file from flights, and checks it on held-out flights.
+
+A sensors file describes the errors of what a policy observes. Here these are the errors of an
+on-board state estimate, relative to a reference pose such as motion capture in the same log.
+"""
 
 from __future__ import annotations
 
@@ -17,45 +21,49 @@ from eval.sensors.sensors_file import save_sensors, sensor_set
 from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
-from suite.diagnose.identify.numbers import Number, as_json, lines_of_numbers
+from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
 from suite.diagnose.sensors.colour import SHORT_S, Coloured, Series, fit_colour
 from suite.diagnose.sensors.errors import (
     Errors,
     Lateness,
-    acting,
     errors_of,
     fit_lateness,
-    without,
+    significant,
+    without_scale,
 )
 
 SCHEMA = 1
+"""Version of the JSON that `suite identify --sensors` prints."""
 WITHIN = 0.2
-"""A model fits where its autocorrelation is within this of the measured one at every lag."""
-COUNTS = 0.2
-"""Measured autocorrelations from here on are compared in relative terms as well."""
+"""A model fits if its autocorrelation is within this of the measured one at every lag."""
+LEAST_RELATIVE = 0.2
+"""Least measured autocorrelation for a relative comparison as well."""
+ZERO = Interval(0.0, 0.0, 0.0)
 
 
 class Fitted(NamedTuple):
-    """Errors of an estimate, fitted to flights."""
+    """Model of an estimate's errors, fitted to flights."""
 
     lateness: Lateness
     axes: Mapping[str, Coloured]
-    """By axis, those that could be fitted."""
+    """By axis, for axes with enough data."""
     drift: Interval
-    """Of the position, over its axes [m/sqrt(m)]."""
+    """Random walk of the position, averaged over its axes [m/sqrt(m)]."""
 
 
 class HeldOut(NamedTuple):
-    """The fitted autocorrelation of one axis against that of flights that it was not fitted to."""
+    """Fitted autocorrelation of one axis, compared with that of held-out flights."""
 
     lag_s: float
-    """Where they differ most [s]."""
+    """Lag at which they differ most [s]."""
     measured: float
+    """Autocorrelation of the held-out flights there."""
     fitted: float
+    """Autocorrelation of the model there."""
     largest: float
-    """The largest difference, in units of the autocorrelation at lag 0."""
+    """Largest difference, in units of the autocorrelation at lag 0."""
     relative: float
-    """The largest difference over the measured value, where that is at least `COUNTS`."""
+    """Largest difference over the measured value, where that is at least `LEAST_RELATIVE`."""
     size_ratio: float
     """Fitted standard deviation over the held-out one."""
 
@@ -66,56 +74,58 @@ class HeldOut(NamedTuple):
 
 
 def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
-    """Return the errors of the estimate in flights.
+    """Fit the errors of the estimate in flights.
 
     Raises:
         FlightLogError: for a log without an estimate or without a reference.
     """
     lateness, flights = fit_lateness(logs)
     axes = {}
-    for c, axis in enumerate(AXES):
-        found = fit_colour(_series(flights, lateness, c))
-        if found is not None:
-            axes[axis] = found
+    for channel, axis in enumerate(AXES):
+        coloured = fit_colour(_series(flights, lateness, channel))
+        if coloured is not None:
+            axes[axis] = coloured
     drifts = [axes[axis].drift for axis in AXES[:3] if axis in axes]
-    mean = (float(np.sqrt(np.mean(np.square(ends)))) for ends in zip(*drifts, strict=True))
-    return Fitted(lateness, axes, Interval(*mean) if drifts else Interval(0.0, 0.0, 0.0))
+    rms = (float(np.sqrt(np.mean(np.square(ends)))) for ends in zip(*drifts, strict=True))
+    return Fitted(lateness, axes, Interval(*rms) if drifts else ZERO)
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
-    """Return by axis how a model fitted to half of the flights differs from the other half.
+    """Compare a model that was fitted to half of the flights with the other half, by axis.
 
-    Both halves are held out in turn, and the worse counts; nothing is held out of one flight.
+    Both halves are held out in turn, and the larger difference counts. One flight gives no
+    comparison.
     """
     worst: dict[str, HeldOut] = {}
     for half in (0, 1) if len(logs) > 1 else ():
         fitted = fit_sensors(logs[half::2])
-        late_s = acting(fitted.lateness.delay_s)
-        other = [errors_of(log, late_s) for log in logs[1 - half :: 2]]
-        for c, axis in enumerate(AXES):
-            series = _series(other, fitted.lateness, c)
+        late_s = significant(fitted.lateness.delay_s)
+        flights = [errors_of(log, late_s) for log in logs[1 - half :: 2]]
+        for channel, axis in enumerate(AXES):
+            series = _series(flights, fitted.lateness, channel)
             if axis not in fitted.axes or not any(np.isfinite(s.value).any() for s in series):
                 continue
-            found = _compared(fitted.axes[axis], series)
-            if axis not in worst or found.largest > worst[axis].largest:
-                worst[axis] = found
+            compared = _compare(fitted.axes[axis], series)
+            if axis not in worst or compared.largest > worst[axis].largest:
+                worst[axis] = compared
     return worst
 
 
-def _compared(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
+def _compare(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
+    """Compare a model's autocorrelation with that of held-out flights, up to `SHORT_S`."""
     step_s = max(flight.step_s for flight in series)
     lags = np.arange(round(SHORT_S / step_s) + 1)
-    duration_s = float(np.mean([len(flight.value) * flight.step_s for flight in series]))
+    duration_s = float(np.mean([flight.duration_s for flight in series]))
     variance, measured = _autocorrelation(series, lags)
     model = fitted.correlation(lags * step_s, duration_s)
-    off = np.abs(model - measured)
-    most, count = int(off.argmax()), np.abs(measured) >= COUNTS
+    difference = np.abs(model - measured)
+    worst, large = int(difference.argmax()), np.abs(measured) >= LEAST_RELATIVE
     return HeldOut(
-        float(lags[most] * step_s),
-        float(measured[most]),
-        float(model[most]),
-        float(off[most]),
-        float((off[count] / np.abs(measured[count])).max()),
+        float(lags[worst] * step_s),
+        float(measured[worst]),
+        float(model[worst]),
+        float(difference[worst]),
+        float((difference[large] / np.abs(measured[large])).max()),
         float(fitted.noise.value / np.sqrt(variance)),
     )
 
@@ -126,55 +136,54 @@ def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float,
     for flight in series:
         centred = flight.value - np.nanmean(flight.value)
         for place, lag in enumerate(lags.tolist()):
-            both = centred[lag:] * centred[: len(centred) - lag]
-            total[place] += np.nansum(both)
-            pairs[place] += np.isfinite(both).sum()
+            product = centred[lag:] * centred[: len(centred) - lag]
+            total[place] += np.nansum(product)
+            pairs[place] += np.isfinite(product).sum()
     covariance = total / np.maximum(pairs, 1)
     return float(covariance[0]), covariance / covariance[0]
 
 
 def _series(flights: Sequence[Errors], lateness: Lateness, channel: int) -> list[Series]:
-    """Return one error of every flight, less what a scale explains."""
-    found = []
+    """Return one error of every flight, without the part by the velocity's scale."""
+    series, can_drift = [], AXES[channel].startswith("position")
     for flight in flights:
-        values = without(flight, acting(lateness.velocity_scale))[:, channel]
+        values = without_scale(flight, significant(lateness.velocity_scale))[:, channel]
         speed = np.linalg.norm(flight.vel_b, axis=1)
-        drifts = AXES[channel].startswith("position")
-        found.append(Series(values, speed if drifts else 0.0 * speed, flight.step_s))
-    return found
+        series.append(Series(values, speed if can_drift else 0.0 * speed, flight.step_s))
+    return series
 
 
 def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
     """Return each parameter of the sensors file with its interval and its unit."""
-    found = {"delay.state": (fitted.lateness.delay_s, "s")}
-    for axis, one in fitted.axes.items():
+    parameters = {"delay.state": (fitted.lateness.delay_s, "s")}
+    for axis, coloured in fitted.axes.items():
         unit = GROUPS[axis.split("_")[0]][0]
-        found |= {
-            f"measured_state.{axis}": (one.noise, unit),
-            f"measured_state.{axis}_bias": (one.bias, unit),
-            f"measured_state.{axis}_lasts": (one.lasts_s, "s"),
+        parameters |= {
+            f"measured_state.{axis}": (coloured.noise, unit),
+            f"measured_state.{axis}_bias": (coloured.bias, unit),
+            f"measured_state.{axis}_lasts": (coloured.lasts_s, "s"),
         }
-        if one.fast.value:
-            found[f"measured_state.{axis}_fast"] = (one.fast, "1")
-            found[f"measured_state.{axis}_fast_lasts"] = (one.fast_s, "s")
-    found["measured_state.velocity_scale"] = (fitted.lateness.velocity_scale, "1")
-    found["measured_state.position_drift"] = (fitted.drift, "m/sqrt(m)")
-    return found
+        if coloured.fast.value:
+            parameters[f"measured_state.{axis}_fast"] = (coloured.fast, "1")
+            parameters[f"measured_state.{axis}_fast_lasts"] = (coloured.fast_s, "s")
+    parameters["measured_state.velocity_scale"] = (fitted.lateness.velocity_scale, "1")
+    parameters["measured_state.position_drift"] = (fitted.drift, "m/sqrt(m)")
+    return parameters
 
 
 def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> dict[str, Any]:
     """Fit a sensors model to the estimates in flight logs, and write its file.
 
     Args:
-        flights: logs or folders of them; those without an estimate are named and left out.
+        flights: logs or folders of them; a log without an estimate gives a warning.
         out: the sensors file to write.
-        console: for people.
+        console: for progress.
 
     Returns:
-        What `--json` prints.
+        The JSON object that `--json` prints.
 
     Raises:
-        ValueError: where no log holds both an estimate and a reference.
+        ValueError: if no log has both an estimate and a reference, or no axis has enough data.
     """
     logs, warnings = read_flights(flight_files(flights), partial=True)
     used, seconds, refused = [], 0.0, []
@@ -196,20 +205,20 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "the estimate and the reference in the same rows"
         )
     parameters = parameters_of(fitted)
-    head = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
+    header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
     numbers = [
-        Number(key, unit, [one.value], [(one.low, one.high)])
-        for key, (one, unit) in parameters.items()
+        Number(key, unit, [interval.value], [(interval.low, interval.high)])
+        for key, (interval, unit) in parameters.items()
     ]
-    head += lines_of_numbers(numbers)
-    save_sensors(sensor_set(_values(parameters), out.stem), out, "\n".join(head))
+    header += number_lines(numbers)
+    save_sensors(sensor_set(_file_values(parameters), out.stem), out, "\n".join(header))
     return {
         "sensors": str(out),
-        "parameters": as_json(numbers),
-        "delay_by_part": {k: list(one) for k, one in fitted.lateness.by_part.items()},
+        "parameters": numbers_json(numbers),
+        "delay_by_part": {part: list(delay) for part, delay in fitted.lateness.by_part.items()},
         "held_out": {
-            axis: {**one._asdict(), "fits": one.fits, "within": WITHIN}
-            for axis, one in checked.items()
+            axis: {**compared._asdict(), "fits": compared.fits, "within": WITHIN}
+            for axis, compared in checked.items()
         },
         "flights": [log.name for log in used],
         "warnings": warnings,
@@ -218,24 +227,25 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
 
 
 def say_held_out(result: Mapping[str, Any], console: Console) -> None:
-    """Print how the model fits flights that it was not fitted to."""
+    """Print how the model fits held-out flights; `result` is from `identify_sensors`."""
     if result["held_out"]:
         console.say("autocorrelation up to 1 s on flights that the model was not fitted to:")
-    for axis, one in result["held_out"].items():
-        fits = "fits" if one["fits"] else "does not fit"
+    for axis, compared in result["held_out"].items():
+        fits = "fits" if compared["fits"] else "does not fit"
         console.say(
-            f"  {axis} {fits}: {one['fitted']:.2f}, measured {one['measured']:.2f}, at a lag of "
-            f"{one['lag_s']:.2f} s where they differ most (allowed {one['within']:g})"
+            f"  {axis} {fits}: {compared['fitted']:.2f}, measured {compared['measured']:.2f}, at a "
+            f"lag of {compared['lag_s']:.2f} s where they differ most (allowed "
+            f"{compared['within']:g})"
         )
 
 
-def _values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:
-    """Return the entries of the file; a delay, scale or drift that may be zero is left out."""
+def _file_values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:
+    """Return the entries of the file, without a delay, scale or drift that may be zero."""
     models: dict[str, dict[str, float]] = {}
-    for key, (one, _) in parameters.items():
+    for key, (interval, _) in parameters.items():
         model, name = key.split(".")
         noise = model == "measured_state" and name not in ("velocity_scale", "position_drift")
-        value = one.value if noise else acting(one)
+        value = interval.value if noise else significant(interval)
         limits = next(p for p in SENSORS.find(model).parameters if p.name == name)
         value = min(max(value, float(limits.low)), float(limits.high))  # pyright: ignore[reportArgumentType]
         if noise or value:

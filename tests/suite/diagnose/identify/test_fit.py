@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.fit import Known, NothingWhole, Rows, Unknown, fit
+from suite.diagnose.identify.fit import KnownNumbers, NoWholeWindow, Rows, Unknown, fit
 
 SLOPE = Unknown("slope", 0.0, -10.0, 10.0, 1.0, 1e-3)
 BLIND = Unknown("blind", 4.0, -10.0, 10.0, 1.0, 1e-3)
@@ -59,14 +59,14 @@ def test_what_is_known_widens_what_depends_on_it():
     def both(value):
         return residuals(np.array([value[0] + value[1]]))
 
-    known = Known(("other",), np.array([[0.1**2]]))
+    known = KnownNumbers(("other",), np.array([[0.1**2]]))
     found = fit(both, [SLOPE, Unknown("other", 0.5, -9.0, 9.0, 1.0, 1e-3)], known=known)
     alone = fit(residuals, [SLOPE])
     np.testing.assert_allclose(found.value, [1.5, 0.5], atol=0.02)
     wanted = np.hypot(alone.half_width[0], 1.96 * 0.1)
     np.testing.assert_allclose(found.half_width[0], wanted, rtol=1e-6)
     assert np.isnan(found.half_width[1]) and not found.has("other") and found.not_identified == ()
-    np.testing.assert_allclose(found.as_known("other", "none").covariance, [[0.01]])
+    np.testing.assert_allclose(found.known_numbers("other", "none").covariance, [[0.01]])
 
 
 def test_the_methods_own_errors_do_not_go_out_of_a_difference():
@@ -101,5 +101,5 @@ def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
 
 
 def test_nothing_to_compare_is_said():
-    with pytest.raises(NothingWhole):
+    with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.identify.drive import Driven
+from suite.diagnose.identify.drive import DrivenVehicle
 from suite.diagnose.identify.fit import Fitted, Unknown
-from suite.diagnose.identify.flapping import flapping_of, one_sigma_off, perturbed
+from suite.diagnose.identify.flapping import flapping_of, one_sigma_off, perturbed_vehicles
 from tests.support import identified as known
 from tests.support.real_flights import VEHICLE, flights
 
@@ -59,8 +59,8 @@ def test_what_is_off_has_the_covariance_of_the_fit_and_no_other_number():
 
 def test_motors_are_off_by_their_covariance_and_inertia_by_its_own():
     start = known.start()
-    driven = Driven(start, "pwm", command=0.5, volts=15.0)
-    found = perturbed(start, driven, FORCE, TORQUE)
+    driven = DrivenVehicle(start, "pwm", usual_command=0.5, usual_volts=15.0)
+    found = perturbed_vehicles(start, driven, FORCE, TORQUE)
     assert len(found) == 4
     hover = [v.motors.thrust[0] * 0.5 + v.motors.thrust[1] * 0.25 for v in found[:2] if v.motors]
     np.testing.assert_allclose(

@@ -8,7 +8,7 @@ import pytest
 from eval.judging.statistics import wilson
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.identify import identify
-from suite.diagnose.identify.numbers import as_json
+from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
 from tests.support.fleets import Fleet, logs_of
 from tests.support.tools import program
@@ -104,7 +104,7 @@ TURNING = ("inertia", "lag")
 
 def test_a_hover_tells_thrust_and_says_what_it_cannot():
     found = identify(known.logs("pwm", 0, known.HOVER), known.start(), leave=TURNING)
-    estimated = as_json(found.numbers)
+    estimated = numbers_json(found.numbers)
     assert "motors.thrust" in estimated
     words = " ".join(found.not_identified)
     assert "drag along body x: too slow" in words
@@ -139,7 +139,7 @@ def test_without_an_attitude_the_thrust_is_told_and_the_drag_is_said_to_need_one
 def test_without_attitude_and_rates_what_turns_is_listed_as_not_identified():
     logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz", "rate_b")
     found = identify(logs, known.start())
-    assert "motors.thrust" in as_json(found.numbers)
+    assert "motors.thrust" in numbers_json(found.numbers)
     words = " ".join(found.not_identified)
     assert "inertia and torque_coefficient: no body rates" in words
     assert "time_constant and command_delay: no body rates" in words
@@ -153,7 +153,7 @@ def test_without_rates_the_attitude_tells_the_inertia(coverage, fleet):
 
 def test_without_positions_the_rates_tell_what_turns():
     found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
-    assert "rotors.torque_coefficient" in as_json(found.numbers)
+    assert "rotors.torque_coefficient" in numbers_json(found.numbers)
     assert any(
         line.startswith("thrust and drag: these logs have no") for line in found.not_identified
     )
@@ -190,11 +190,11 @@ def test_a_file_from_flights_with_or_without_a_voltage_starts_flights_with_or_wi
     assert {key for key, _ in motor_pulls(later)} == {"thrust", "voltage_exponent"}
     assert np.max(np.abs(list(motor_pulls(later).values()))) < 2.5
     again = identify(without_voltage(with_it), begun.vehicle)
-    assert "motors.thrust" in as_json(again.numbers)
+    assert "motors.thrust" in numbers_json(again.numbers)
     after = again.vehicle.motors
     assert after is not None and after == replace(motors, thrust=after.thrust)
     (line,) = [text for text in again.not_identified if text.startswith("voltage_exponent")]
-    assert ("taken for that at 16.4" in line) == first
+    assert ("assumed to be that at 16.4" in line) == first
 
 
 def motor_pulls(found):
@@ -215,12 +215,12 @@ def motor_pulls(found):
 
 def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
     found = known.found("pwm")
-    assert "effects.command_delay.delay" not in as_json(found.numbers)
+    assert "effects.command_delay.delay" not in numbers_json(found.numbers)
     # Their sum is identified, and the file has it, however its lag shares it.
     rest = found.vehicle.effects["command_delay"].delay
-    together = known.vehicle().rotors.time_constant + known.DELAY
-    assert found.vehicle.rotors.time_constant + rest == pytest.approx(together, abs=0.004)
-    assert any(line.startswith("command_delay: only that it and") for line in found.not_identified)
+    stacked_residuals = known.vehicle().rotors.time_constant + known.DELAY
+    assert found.vehicle.rotors.time_constant + rest == pytest.approx(stacked_residuals, abs=0.004)
+    assert any(line.startswith("command_delay: only its sum with") for line in found.not_identified)
 
 
 @pytest.mark.parametrize(
@@ -232,14 +232,14 @@ def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
 )
 def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column, key, line):
     found = identify(cut(known.logs(drive, 0), column), known.start())
-    assert key in as_json(found.numbers)
+    assert key in numbers_json(found.numbers)
     assert any(text.startswith(line) and "with both" in text for text in found.not_identified)
 
 
 def test_a_flight_whose_commands_stop_early_takes_nothing_from_the_others():
     logs = known.logs("pwm", 0)
-    found = as_json(identify([*logs[:3], *cut(logs[3:], "pwm")], known.start()).numbers)
-    alone = as_json(known.found("pwm", 3).numbers)
+    found = numbers_json(identify([*logs[:3], *cut(logs[3:], "pwm")], known.start()).numbers)
+    alone = numbers_json(known.found("pwm", 3).numbers)
     assert set(found) == set(alone)
     for key, entry in found.items():
         np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
@@ -293,8 +293,8 @@ def test_flights_without_a_voltage_leave_the_motors_to_those_that_have_one():
     assert np.max(np.abs(list(off.values()))) < 2.5
     (note,) = found.notes
     assert note.startswith("no voltage in flight_3: ")
-    alone = as_json(known.found("pwm", 3).numbers)
-    for key, entry in as_json(found.numbers).items():
+    alone = numbers_json(known.found("pwm", 3).numbers)
+    for key, entry in numbers_json(found.numbers).items():
         np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
 
 

@@ -5,13 +5,18 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from suite.diagnose.identify.body import lag_and_delay
-from suite.diagnose.identify.drive import behind
+from suite.diagnose.identify.body import lag_unknowns
+from suite.diagnose.identify.drive import after_delay_and_lag
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
-from suite.diagnose.identify.loop import air_torques, couplings, fit_rotor_lag, followed
+from suite.diagnose.identify.loop import (
+    air_torque_unknowns,
+    coupling_unknowns,
+    fit_rotor_lag,
+    loop_rates,
+)
 from tests.support.vehicles import PLAIN
 
-COUPLED = {unknown.name: unknown.start for unknown in couplings(PLAIN)}
+COUPLED = {unknown.name: unknown.start for unknown in coupling_unknowns(PLAIN)}
 
 
 def test_a_step_is_followed_by_one_over_the_gain():
@@ -21,7 +26,7 @@ def test_a_step_is_followed_by_one_over_the_gain():
     flight = FlightGrid("made", time_s, {"rate_cmd_b": command})
     gain = PLAIN.controller.rate_gain[0]
     fast = replace(PLAIN, controller=replace(PLAIN.controller, frequency=10_000.0))
-    rate = followed(flight, fast, {"lag": 0.0, "late": 0.02, **COUPLED})[:, 0]
+    rate = loop_rates(flight, fast, {"lag": 0.0, "late": 0.02, **COUPLED})[:, 0]
     reached = np.interp(0.82 + 1.0 / gain, time_s, rate)
     np.testing.assert_allclose(reached, 1.0 - np.exp(-1.0), atol=0.01)
     np.testing.assert_allclose(rate[-1], 1.0, atol=1e-3)
@@ -47,7 +52,7 @@ def test_what_the_controller_makes_up_for_comes_as_late_as_the_rotors():
     command = np.stack([wanted(t) for t in time_s])
     flight = FlightGrid("made", time_s, {"rate_cmd_b": command})
     # The command is joined here, not held: `delayed` takes it for half a step later.
-    rate = followed(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
+    rate = loop_rates(flight, fast, {"lag": lag_s, "late": lag_s - 0.5 * STEP_S, **COUPLED})
     # The plain linear loop is 0.085 rad/s off.
     assert np.abs(rate - exact)[200:].max() < 0.02
 
@@ -63,21 +68,21 @@ def test_moving_air_turns_by_its_torque_over_the_gain():
     # The body is turned by 90 degrees: its x axis is the world's y.
     known["vel_w"][100:] = [-2.0, -3.0, 0.0]
     flight = FlightGrid("made", STEP_S * np.arange(count), known)
-    assert [one.name for one in air_torques([flight])] == ["air_x", "air_y"]
+    assert [one.name for one in air_torque_unknowns([flight])] == ["air_x", "air_y"]
     numbers = {"lag": 0.03, "late": 0.03, **COUPLED, "air_x": 0.5, "air_y": 0.4}
-    rate = followed(flight, PLAIN, numbers)
+    rate = loop_rates(flight, PLAIN, numbers)
     gain = PLAIN.controller.rate_gain
     np.testing.assert_allclose(rate[-1], [0.5 * 2.0 / gain[0], 0.4 * 3.0 / gain[1], 0.0], rtol=1e-3)
     bare = FlightGrid("made", flight.time_s, {"rate_cmd_b": known["rate_cmd_b"]})
-    assert air_torques([flight, bare]) == []
+    assert air_torque_unknowns([flight, bare]) == []
 
 
 def test_rotors_behind_their_commands_tell_lag_and_delay():
     rng = np.random.default_rng(0)
     asked = np.repeat(1000.0 + 50.0 * rng.normal(size=(500, 4)), 5, axis=0)
-    speed = behind(asked, {"lag": 0.04, "late": 0.052}) + rng.normal(size=asked.shape)
+    speed = after_delay_and_lag(asked, {"lag": 0.04, "late": 0.052}) + rng.normal(size=asked.shape)
     time_s = STEP_S * np.arange(len(asked))
     flight = FlightGrid("made", time_s, {"rotor_speed": speed, "rotor_speed_cmd": asked})
-    found = fit_rotor_lag([flight], lag_and_delay(0.02, 0.0))
+    found = fit_rotor_lag([flight], lag_unknowns(0.02, 0.0))
     late, lag = found.value
     np.testing.assert_allclose([late - lag, lag], [0.012, 0.04], atol=0.001)

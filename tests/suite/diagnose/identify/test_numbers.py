@@ -33,8 +33,8 @@ def test_the_sum_of_lag_and_delay_is_reported_where_neither_is_identified():
     fitted["torque"].value[:] = [0.042, 0.03]
     lines = not_identified(fitted, {DELAY: Number(DELAY, "s", [0.012], [None], True)})
     assert lines[-1] == (
-        "command_delay: only that it and the rotors' lag make 0.042 s together; of that the file's "
-        "lag leaves 0.012 s, which is its delay"
+        "command_delay: only its sum with the rotors' lag, 0.042 s; the file's delay, 0.012 s, is "
+        "this sum minus the file's lag"
     )
     (line,) = not_identified(fitted, {DELAY: Number(DELAY, "s", [0.012], [(0.01, 0.014)])})
     assert line.startswith("time_constant")
@@ -55,7 +55,7 @@ TORQUE = {"torque": found("inertia_x", "late", "lag")}
         ("rates", ["thrust_cmd"], FORCE | {"loop": found("gain_x", "late", "lag")}, [],
          ["inertia and torque_coefficient: commanded rates"]),
         ("rotors", ["rotor_speed"], FORCE | {"torque": found("inertia_x")}, ["loop"],
-         ["time_constant and command_delay: measured rotor speeds are past"]),
+         ["time_constant and command_delay: measured rotor speeds do not contain"]),
         ("torques", ["torque_cmd_b"], FORCE | TORQUE, [], ["rate_gain: these logs"]),
         ("pwm", ["pwm", "voltage"], FORCE | TORQUE | {"loop": found("gain_x")}, [], []),
     ],
@@ -94,7 +94,8 @@ def test_columns_that_never_go_on_together_are_reported(drive, fitted, broken, w
 
 
 @pytest.mark.parametrize(
-    ("exponent", "end"), [(0.0, "it is 0, so that none counts"), (1.2, "taken for that at 16 V")]
+    ("exponent", "end"),
+    [(0.0, "so the voltage has no effect"), (1.2, "assumed to be that at 16 V")],
 )
 def test_without_a_voltage_the_one_that_counts_is_reported(exponent, end):
     vehicle = replace(PLAIN, motors=MotorMap((1.0, 4.0), 16.0, exponent))
@@ -109,8 +110,8 @@ def test_what_was_done_with_the_flights_is_reported():
         motors=MotorMap((1.0, 4.0), 15.2),
         rotors=replace(PLAIN.rotors, speed_max=2500.0),
     )
-    words = ["made: no row has all columns of rotor_speed", "no voltage in a, b: the other flights",
-             "motors.voltage = 15.2 V, the usual", "rotors.speed_max = 2500 rad/s"]  # fmt: skip
+    words = ["made: no row has all columns of rotor_speed", "no voltage in a, b: these flights",
+             "motors.voltage = 15.2 V, the median", "rotors.speed_max = 2500 rad/s"]  # fmt: skip
     lines = notes_on([turns], {"b", "a"}, PLAIN, after)
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.flights.trajectory import Trajectory
-from suite.diagnose.identify.drive import Driven
+from suite.diagnose.identify.drive import DrivenVehicle
 from suite.diagnose.identify.grid import grid_of
 from tests.support.fleets import (
     DELAY,
@@ -38,9 +38,9 @@ def test_motor_commands_make_the_rotors_turn_as_they_did(flown):
     true = fleet.truth
     lag_s, delay_s = true.rotors.time_constant, true.effects[DELAY].delay
     numbers = {"lag": lag_s, "late": lag_s + delay_s}
-    speed = Driven(true, "pwm", 1.0, 16.0).rotor_speed(grid_of(log), numbers)[100:]
+    speed = DrivenVehicle(true, "pwm", 1.0, 16.0).rotor_speed(grid_of(log), numbers)[100:]
     thrust = true.rotors.thrust_coefficient * speed**2
-    wanted = true.rotors.thrust_coefficient * grid_of(rotors).known["rotor_speed"][100:] ** 2
+    wanted = true.rotors.thrust_coefficient * grid_of(rotors).signals["rotor_speed"][100:] ** 2
     assert np.abs(thrust - wanted).max() < 0.02 * wanted.mean()
     assert log.thrust_cmd is None and log.rotor_speed is None
 

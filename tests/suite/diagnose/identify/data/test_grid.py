@@ -20,7 +20,7 @@ def grid(values):
 def test_bumps_are_exact_on_lines_and_parabolas():
     time_s = STEP_S * np.arange(500)
     flight = grid(3.0 + 2.0 * time_s + 5.0 * time_s**2)
-    values = flight.known["x"]
+    values = flight.signals["x"]
     form, path = (flight.form(0.2, ("x",), slope) for slope in (False, True))
     assert form.middle_s[0] >= 0.4
     slope = (form.change @ values)[:, 0]
@@ -54,8 +54,8 @@ def test_commands_hold_until_the_next_row_and_measurements_are_joined():
     )
     flight = grid_of(log)
     at = round(0.996 / STEP_S)
-    assert flight.known["pwm"][at, 0] == 0.0
-    np.testing.assert_allclose(flight.known["rate_b"][at, 0], 0.8)
+    assert flight.signals["pwm"][at, 0] == 0.0
+    np.testing.assert_allclose(flight.signals["rate_b"][at, 0], 0.8)
     assert not flight.has("voltage")
 
 
@@ -65,7 +65,7 @@ def test_a_command_counts_from_its_stamp_wherever_that_is_on_the_grid():
     still, up = np.zeros((401, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (401, 1))
     asked = rng.standard_normal((401, 4))
     log = FlightLog("made", time_s, still, up, still, still, pwm=asked)
-    held = grid_of(log).known["pwm"]
+    held = grid_of(log).signals["pwm"]
     for k in (0, 17, 100, 250):
         fine = STEP_S * (k + (np.arange(4000) + 0.5) / 4000)
         mean = asked[np.searchsorted(time_s, fine, side="right") - 1].mean(axis=0)
@@ -78,7 +78,7 @@ def test_rates_that_are_not_logged_come_of_the_attitude():
     quat = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=1)
     still, none = np.zeros((200, 3)), np.full((200, 3), np.nan)
     log = FlightLog("made", time_s, still, quat, still, none, pwm=np.zeros((200, 4)))
-    rate_b = grid_of(log).known["rate_b"]
+    rate_b = grid_of(log).signals["rate_b"]
     known = np.asarray(np.isfinite(rate_b).all(axis=1))
     assert known[10:-10].all()
     np.testing.assert_allclose(rate_b[known], np.tile([0.8, 0.0, 0.0], (known.sum(), 1)), atol=1e-9)
@@ -104,19 +104,19 @@ def test_motors_that_are_logged_in_turn_are_each_taken_by_their_own_rows():
     ramp = np.add.outer(100.0 * SECONDS, [0.0, 10.0, 20.0, 30.0])
     flight = grid_of(logged(rotor_speed=in_turn(ramp), pwm=in_turn(np.full((COUNT, 4), 0.5))))
     assert flight.in_turn == ("rotor_speed", "pwm")
-    known = flight.known["rotor_speed"]
+    known = flight.signals["rotor_speed"]
     good = np.asarray(np.isfinite(known).all(axis=1))
     assert good[10:-10].all()
     wanted = np.add.outer(100.0 * flight.time_s[good], [0.0, 10.0, 20.0, 30.0])
     np.testing.assert_allclose(known[good], wanted)
-    np.testing.assert_allclose(flight.known["pwm"][10:-10], 0.5)
+    np.testing.assert_allclose(flight.signals["pwm"][10:-10], 0.5)
     assert grid_of(logged(rotor_speed=ramp)).in_turn == ()
 
 
 def test_motors_in_turn_are_as_noisy_as_they_are():
     rng = np.random.default_rng(0)
     speed = in_turn(1000.0 + 8.0 * rng.standard_normal((COUNT, 4)))
-    noise = grid_of(logged(rotor_speed=speed)).known[ROTOR_NOISE]
+    noise = grid_of(logged(rotor_speed=speed)).signals[ROTOR_NOISE]
     assert np.isfinite(noise[10:-10]).all()
     # On the grid it is joined by lines, which leaves two thirds of the variance.
     assert np.nanstd(noise) == pytest.approx(8.0 * np.sqrt(2.0 / 3.0), rel=0.15)
@@ -137,4 +137,4 @@ def test_a_signal_of_one_row_is_none(name):
 def test_an_attitude_or_a_voltage_of_one_row_is_none():
     quat, volts = np.full((COUNT, 4), np.nan), np.full(COUNT, np.nan)
     quat[0], volts[0] = [1.0, 0.0, 0.0, 0.0], 15.0
-    assert not {"rot_w", "voltage"} & {*grid_of(logged(quat_wxyz=quat, voltage=volts)).known}
+    assert not {"rot_w", "voltage"} & {*grid_of(logged(quat_wxyz=quat, voltage=volts)).signals}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.plant import make_plant
-from suite.diagnose.identify.drive import unknown_to_the_fits, with_own_numbers
+from suite.diagnose.identify.drive import unmodelled_effects, with_merged_effects
 from suite.diagnose.identify.identify import identify
 from tests.support import identified as known
 from tests.support.vehicles import PLAIN, with_effects
@@ -22,8 +22,8 @@ SAID = with_effects(
 
 
 def test_the_vehicle_flies_as_before():
-    own = with_own_numbers(SAID, True)
-    assert list(own.effects) == ["clock_offset"] == list(unknown_to_the_fits(own))
+    own = with_merged_effects(SAID, True)
+    assert list(own.effects) == ["clock_offset"] == list(unmodelled_effects(own))
     before, after = (make_plant(vehicle, 0.002).constants for vehicle in (SAID, own))
     for name in (
         "inertia",
@@ -36,15 +36,15 @@ def test_the_vehicle_flies_as_before():
 
 
 def test_a_scale_of_commanded_thrust_stays_where_no_motor_is_known():
-    assert "thrust_scale" in with_own_numbers(SAID, False).effects
+    assert "thrust_scale" in with_merged_effects(SAID, False).effects
 
 
 def test_a_scale_with_which_it_could_not_hover_is_refused_before_the_work():
     weak = with_effects(PLAIN, thrust_scale=(0.3,))
     slow = replace(weak, rotors=replace(weak.rotors, speed_max=1500.0))
     with pytest.raises(ValueError, match="plain with its thrust_scale: .*too weak to hover"):
-        with_own_numbers(slow, True)
-    assert with_own_numbers(slow, False) == slow
+        with_merged_effects(slow, True)
+    assert with_merged_effects(slow, False) == slow
 
 
 @pytest.mark.parametrize("drive", [pytest.param("rates", marks=pytest.mark.slow), "pwm"])
