@@ -88,8 +88,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         rivals = ", ".join(effect["alternatives"])
         same = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
         console.say(f"  {effect['name']}{same}")
-        for one in sorted(components(effect), key=lambda one: not one.found):
-            shown, between = one.shown()
+        for one in sorted(components(effect), key=lambda one: not one.is_significant):
+            shown, between = one.texts()
             console.say(f"    {one.label}: {shown}" + (f", 95 %: {between}" if between else ""))
     if result["warnings"]:
         console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")

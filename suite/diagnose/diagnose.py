@@ -1,4 +1,8 @@
-"""From flights and a vehicle to a diagnosis: every source through the same steps, one verdict."""
+"""Diagnoses a vehicle file: finds the physical effects that explain how flights differ from it.
+
+Each source of evidence (whole flights in rollouts of 1 s, forces, torques) goes through the same
+steps (`sources/examine.py`). One verdict follows from all their findings.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +18,17 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.estimate.parameters import ParameterSpace, implausible, with_fitted
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import examine, one_cause, without_names
-from suite.diagnose.sources.rollout_source import late_by
+from suite.diagnose.sources.rollout_source import pose_delays
 from suite.diagnose.sources.rollouts import by_rollouts
-from suite.diagnose.sources.source import Finding, Given, Source, Sources, TestedEffect
+from suite.diagnose.sources.source import DiagnosisInput, Finding, Source, SourceSet, TestedEffect
 from suite.diagnose.sources.views import by_views
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import integrator_of
 
-SOURCES: dict[str, Callable[[Given, Sequence[Source]], Sources | None]] = {
-    "rollouts": by_rollouts,
-    "views": by_views,
-}
-"""What makes evidence of flights, by name. Each is given the sources of those before it, and
-returns None where it has nothing to add to them."""
+SourceMaker = Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]
+"""Makes sources from the input and the sources before it; None if it adds none."""
+SOURCES: dict[str, SourceMaker] = {"rollouts": by_rollouts, "views": by_views}
+"""Makers of the sources of evidence, by name, in their order."""
 
 
 def diagnose(
@@ -41,49 +43,52 @@ def diagnose(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> Diagnosis:
-    """Find what explains how `logs` differ from `vehicle`, or from `references` of it.
+    """Find the effects that explain how `logs` differ from `vehicle`, or from `references`.
 
     Args:
-        logs: flights; a fifth of them, at least one, is held out (of a lone flight, the last
+        logs: flights; a fifth of them, at least one, is held out (of a single flight, the last
             30 %).
-        vehicle: the one that the simulation used.
-        references: flights of the same vehicle before what changed.
-        by: the source of evidence, one of `SOURCES`, or "auto": all that the logs allow.
-        drive: what the model's input is: "commands", "motors", or "auto".
-        integrator: how the flights' bodies were moved: "continuous", as every real one, "euler",
-            as MuJoCo's steps of the rate loop's period do it, or "auto": what the logs have.
-        say: receives a line for people about each step.
-        seed: of the null's draws.
-        limits: of every step.
+        vehicle: the vehicle that the simulation used.
+        references: flights of the same vehicle before a change, to find that change.
+        by: the source of evidence, one of `SOURCES`, or "auto" for all that the logs allow.
+        drive: input of the model: "commands", "motors" (measured rotor speeds), or "auto".
+        integrator: integration of the flights' bodies: "continuous" for real ones, "euler" for
+            MuJoCo's steps of the rate loop's period, or "auto" for the one that the logs state.
+        say: receives a line of progress for people.
+        seed: seed of all random draws.
+        limits: thresholds of every step.
 
     Raises:
-        ValueError: where no flight can be used, or not in the way that was chosen.
+        ValueError: if no flight can be used, or not with the chosen source or drive.
     """
-    began = time.monotonic()
+    start_s = time.monotonic()
     if by not in ("auto", *SOURCES):
         raise ValueError(f"by = {by!r}; allowed: {', '.join(('auto', *SOURCES))}")
     chosen = by != "auto"
-    given = Given(logs, vehicle, references, drive, integrator, say, limits, chosen)
+    given = DiagnosisInput(logs, vehicle, references, drive, integrator, say, limits, chosen)
     makers = [make for name, make in SOURCES.items() if by in ("auto", name)]
-    found = _diagnosed(given, makers, seed)
-    flown = found.main.source.rollouts
-    if integrator == "auto" and flown and integrator_of(logs, "auto") == "continuous":
-        if found.main.source.stepped(found.main.search):
-            say("pose and rates are apart by half a step: once more, as MuJoCo's Euler steps")
-            again = replace(given, integrator="euler", chosen=True)
-            stepped = _diagnosed(again, makers[:1], seed)
-            if not late_by(stepped.main.search):
-                words = "flown as if by MuJoCo's Euler steps, which explain half a step between "
-                words += "pose and rates; --integrator continuous does without"
-                found = replace(stepped, warnings=[*stepped.warnings, words])
-    return replace(found, seconds=time.monotonic() - began)
+    result = _diagnose(given, makers, seed)
+    main = result.main
+    is_continuous = integrator == "auto" and integrator_of(logs, "auto") == "continuous"
+    if main.source.rollouts and is_continuous and main.source.explained_by_steps(main.search):
+        say("pose and rates differ by half a step: repeating with MuJoCo's Euler steps")
+        euler = _diagnose(replace(given, integrator="euler", chosen=True), makers[:1], seed)
+        if not pose_delays(euler.main.search):
+            words = (
+                "MuJoCo's Euler steps explain half a step between pose and rates, so the model "
+                "uses them; --integrator continuous prevents this"
+            )
+            result = replace(euler, warnings=[*euler.warnings, words])
+    return replace(result, seconds=time.monotonic() - start_s)
 
 
 def _diagnosed(
-    given: Given, makers: Sequence[Callable[[Given, Sequence[Source]], Sources | None]], seed: int
+    given: DiagnosisInput,
+    makers: Sequence[Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]],
+    seed: int,
 ) -> Diagnosis:
     """Return the diagnosis by the sources that `makers` make."""
-    flights = Sources((), (), "")
+    flights = SourceSet((), (), "")
     for make in makers:
         more = make(given, flights.sources)
         flights = flights if more is None else flights.joined(more)
@@ -92,27 +97,29 @@ def _diagnosed(
         finding, notes = examine(source, findings, given.say, seed)
         findings.append(finding)
         warnings += notes
-    found, notes = one_cause(findings)
+    unique, notes = one_cause(findings)
     warnings += notes
-    tested, limits = tested_in(found, flights), found[0].source.limits
-    verdict = verdict_on(found, bool(tested or any(one.names for one in found)), limits)
-    names = [name for one in found for name in one.names]
+    tested, limits = tested_in(unique, flights), unique[0].source.limits
+    names = [named for finding in unique for named in finding.names]
+    verdict = verdict_on(unique, bool(tested or names), limits)
     if verdict.label == "unknown" and names:
-        labels = ", ".join(name.candidate.label for name in names)
-        warnings.append(f"nearest in the catalogue, but it leaves most of the gap: {labels}")
-        found = tuple(without_names(one, seed) if one.names else one for one in found)
-        tested = tested_in(found, flights)
-        verdict = verdict_on(found, bool(tested), limits)
-    for one in found:
-        for name in one.names:
-            far = implausible(one.source.space, one.theta, name.candidate, limits)
-            warnings += [f"implausible: {words}, beyond three times what is usual" for words in far]
+        labels = ", ".join(named.candidate.label for named in names)
+        warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
+        unique = tuple(without_names(one, seed) if one.names else one for one in unique)
+        tested = tested_in(unique, flights)
+        verdict = verdict_on(unique, bool(tested), limits)
+    for finding in unique:
+        for named in finding.names:
+            large = implausible(finding.source.space, finding.theta, named.candidate, limits)
+            warnings += [
+                f"implausible: {words}, over three times the usual size" for words in large
+            ]
     return Diagnosis(
         verdict=verdict,
-        findings=found,
+        findings=unique,
         flights=flights,
         nominal=given.vehicle,
-        vehicle=with_names(given.vehicle, found, tested),
+        vehicle=with_names(given.vehicle, unique, tested),
         references=tuple(log.name for log in given.references),
         warnings=warnings,
         seconds=0.0,
@@ -126,29 +133,31 @@ class Verdict(NamedTuple):
     label: str
     """no_gap, named, partly or unknown."""
     share_left: float = 0.0
-    """What is left of the gap on held-out flights [1]."""
+    """Share of the gap on held-out flights that remains [1]."""
     where: str | None = None
-    """What the remaining error goes with, in words."""
+    """For people: quantity that the remaining error depends on."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what it was found from."""
+    """Result of a diagnosis."""
 
     verdict: Verdict
     findings: tuple[Finding, ...]
-    """By source, in their order."""
-    flights: Sources
+    """One for each source, in their order."""
+    flights: SourceSet
+    """The sources of evidence from these flights."""
     nominal: Vehicle
     """The vehicle that the simulation used."""
     vehicle: Vehicle
-    """With the named effects in place of what the nominal one has of them."""
+    """The nominal vehicle with the named effects."""
     references: tuple[str, ...]
-    """Names of the flights before a change, where one was searched for."""
+    """Names of the flights before a change, if one was searched for."""
     warnings: list[str]
     seconds: float
+    """Duration of the diagnosis [s]."""
     seed: int
-    """Of all draws."""
+    """Seed of all random draws."""
 
     @property
     def label(self) -> str:
@@ -157,17 +166,17 @@ class Diagnosis:
 
     @property
     def main(self) -> Finding:
-        """The finding that shows most."""
+        """The finding with names, or else the one whose error can be explained best."""
         return main_of(self.findings)
 
     @property
     def named(self) -> list[tuple[Finding, NamedEffect]]:
-        """Every name that stands, with what found it."""
-        return [(finding, name) for finding in self.findings for name in finding.names]
+        """Every named effect, with its finding."""
+        return [(finding, named) for finding in self.findings for named in finding.names]
 
     @property
     def tested(self) -> tuple[TestedEffect, ...]:
-        """The effects that were named by tests of their own."""
+        """The effects that separate tests named."""
         return tested_in(self.findings, self.flights)
 
     @property
@@ -177,26 +186,26 @@ class Diagnosis:
 
     @property
     def limits(self) -> Thresholds:
-        """By what it was judged."""
+        """Thresholds of its steps."""
         return self.main.source.limits
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return the finding that shows most: one with names, else where most can be explained."""
+    """Return the finding with names, or else the one whose error can be explained best."""
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
 
-def tested_in(findings: Sequence[Finding], flights: Sources) -> tuple[TestedEffect, ...]:
-    """Return the effects that were named by tests of their own."""
+def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEffect, ...]:
+    """Return the effects that separate tests named: random wind and rotor lag."""
     winds = [one.remaining.wind for one in findings]
     return (*(wind for wind in winds if wind is not None), *flights.tested)
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
-    """Return the verdict: on the sources that name something, or on all where none does.
+    """Return the verdict, by the findings with names, or by all if there are none.
 
-    `named` is whether an effect was named, in the search or by a test of its own. An oscillating
-    force always remains: no fitted parameter reproduces it.
+    `named` is whether the search or a separate test named an effect. An oscillating force always
+    counts as unexplained, since no fitted parameter reproduces it.
     """
     judged = [one for one in findings if one.names] or findings
     swings = [one.remaining.swing for one in findings if one.remaining.swing]
@@ -212,12 +221,12 @@ def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> 
 def with_names(
     nominal: Vehicle, findings: Sequence[Finding], tested: Sequence[TestedEffect]
 ) -> Vehicle:
-    """Return the vehicle with what was named in place of what it has of it."""
+    """Return the vehicle with the named effects; they replace its own of the same names."""
     space = findings[0].source.space
     theta, names = np.array(space.array("start")), list[str]()
-    for one in findings:
-        for name in one.names:
-            at = list(name.candidate.indices)
-            theta[at] = one.theta[at]
-            names.append(name.candidate.name)
+    for finding in findings:
+        for named in finding.names:
+            indices = list(named.candidate.indices)
+            theta[indices] = finding.theta[indices]
+            names.append(named.candidate.name)
     return with_fitted(nominal, space, theta, names, {one.name: one.values for one in tested})

@@ -1,8 +1,8 @@
-"""From flight logs to diagnosis.json, vehicle.toml, report.html, a recording and a plan."""
+"""Reads flight logs, diagnoses them, and writes the results: JSON, vehicle file, report, plan."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 from eval.logs.faults.check import CheckContext, check_before_diagnosis, lines_of, not_examined
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import write_report
 from suite.delta.run import flight_files
@@ -50,26 +49,30 @@ def diagnose_files(
     relevance: tuple[float, float, float] = THRESHOLDS.relevance,
     accept: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Diagnose flights in files; write what was found and return what diagnosis.json holds.
+    """Diagnose flights in files, and write the results.
 
     Args:
         paths: flight logs, or folders of them.
         vehicle_name: a vehicle file or a shipped name.
         out: folder for the files.
         console: for progress and warnings.
-        drive: what the model's input is: "auto", "commands" or "motors".
-        integrator: how the bodies were moved: "auto", "continuous" or "euler".
-        compare_delta: fit a Delta Action Model to the same flights and compare it.
-        plan: write flights that separate what these could not.
+        drive: input of the model: "auto", "commands" or "motors" (measured rotor speeds).
+        integrator: integration of the bodies: "auto", "continuous" or "euler".
+        compare_delta: fit a Delta Action Model (a network that corrects the dynamics) to the same
+            flights and compare it.
+        plan: write flights that separate effects which these flights do not.
         fly: fly the plan in simulation with this vehicle.
         recording: write a recording for rerun.
-        seed: of all draws.
-        reference: flights of the same vehicle before what changed: find what has changed since.
+        seed: seed of all random draws.
+        reference: flights of the same vehicle before a change, to find that change.
         relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of a finding.
-        accept: faults of the interface that are known, and go on all the same.
+        accept: names of interface faults (wrong units, signs, clocks) that do not stop the command.
+
+    Returns:
+        The content of diagnosis.json.
 
     Raises:
-        ValueError: for flights or a vehicle file that cannot be used.
+        ValueError: if flights or vehicle file cannot be used.
     """
     limits = replace(THRESHOLDS, relevance=relevance)
     vehicle = load_vehicle(vehicle_name)
@@ -85,12 +88,12 @@ def diagnose_files(
     for warning in warnings:
         console.note(f"warning: {warning}")
     shown = len(warnings)
-    result = diagnose(
+    diagnosis = diagnose(
         logs, vehicle, before, drive=drive, integrator=integrator, say=console.note, seed=seed,
         limits=limits,
     )  # fmt: skip
-    found: dict[str, Any] = diagnosis_json(result)
-    flown, files = result.main.source.rollouts, {"vehicle.toml", "diagnosis.json"}
+    result: dict[str, Any] = diagnosis_json(diagnosis)
+    flown, files = diagnosis.main.source.rollouts, {"vehicle.toml", "diagnosis.json"}
     if flown is None:
         wanted = {
             "--compare-delta": compare_delta,
@@ -99,46 +102,41 @@ def diagnose_files(
             "--drive": drive != "auto",
             "--integrator": integrator != "auto",
         }
-        unused = [flag for flag, given in wanted.items() if given]
+        unused = [flag for flag, is_given in wanted.items() if is_given]
         warnings += [f"{flag} needs rollouts, which these flights do not allow" for flag in unused]
-    found["warnings"] = [*warnings, *found["warnings"]]
+    result["warnings"] = [*warnings, *result["warnings"]]
     if flown is not None:
         mismatches = actuator_mismatches(flown.logs, flown.vehicle, flown.limits)
-        found["actuators"], found["black_box"] = actuators_json(mismatches), None
+        result["actuators"], result["black_box"] = actuators_json(mismatches), None
         if compare_delta:
             config = BlackBoxConfig(seed=seed)
             with console.progress("fitting the Delta Action Model", 1.0) as show:
-                compared = compare_black_box(flown, result.main, config, show)
-            found["black_box"] = black_box_json(compared, seed)
+                compared = compare_black_box(flown, diagnosis.main, config, show)
+            result["black_box"] = black_box_json(compared, seed)
         if plan or truth is not None:
             folder = out / "plan"
-            found["plan"] = write_plan_of(found, folder)
+            result["plan"] = write_plan_of(result, folder)
             if truth is not None:
-                sigma = of_rollouts(result.main.search.last).noise.sigma
-                found["plan"] = fly_plan(found["plan"], sigma, vehicle, truth, folder, seed)
-            found["warnings"] += found["plan"].pop("warnings", [])
-            files |= {"plan/plan.json"} if found["plan"].get("flights") else set()
+                sigma = of_rollouts(diagnosis.main.search.last).noise.sigma
+                result["plan"] = fly_plan(result["plan"], sigma, vehicle, truth, folder, seed)
+            result["warnings"] += result["plan"].pop("warnings", [])
+            files |= {"plan/plan.json"} if result["plan"].get("flights") else set()
         if recording:
-            fitted = result.main.theta if result.main.names else None
+            fitted = diagnosis.main.theta if diagnosis.main.names else None
             write_rollouts(out / "recording.rrd", flown, fitted)
             files.add("recording.rrd")
-    found["findings"], found["not_examined"] = findings, not_examined(logs)
-    found["identified"] = is_identified(vehicle_name)
-    found = {**plain(found), **stamp(SCHEMA, seed)}
-    toml = _vehicle_file(result.vehicle, vehicle, found, out)
-    write_report(out / "report.html", page(result, found, toml, files))
-    for warning in found["warnings"][shown:]:
-        console.note(f"warning: {warning}")
-    if found["verdict"] == "no_gap" and found["not_examined"]:
-        console.note(f"not examined: {', '.join(found['not_examined'])}")
-    write_json(out / "diagnosis.json", found)
-    return found
-
-
-def _vehicle_file(named: Vehicle, given: Vehicle, found: Mapping[str, Any], out: Path) -> str:
-    """Write the vehicle with what was `named` into the folder `out`, and return the file's text."""
-    names = ", ".join(effect["name"] for effect in found["effects"]) or "nothing"
+    result["findings"], result["not_examined"] = findings, not_examined(logs)
+    result["identified"] = is_identified(vehicle_name)
+    result = {**plain(result), **stamp(SCHEMA, seed)}
+    names = ", ".join(effect["name"] for effect in result["effects"]) or "none"
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "vehicle.toml"
-    save_vehicle(named, path, f"{given.name} with what suite diagnose named: {names}")
-    return path.read_text(encoding="utf-8")
+    header = f"{vehicle.name} with the effects that suite diagnose named: {names}"
+    save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
+    toml = (out / "vehicle.toml").read_text(encoding="utf-8")
+    write_report(out / "report.html", page(diagnosis, result, toml, files))
+    for warning in result["warnings"][shown:]:
+        console.note(f"warning: {warning}")
+    if result["verdict"] == "no_gap" and result["not_examined"]:
+        console.note(f"not examined: {', '.join(result['not_examined'])}")
+    write_json(out / "diagnosis.json", result)
+    return result

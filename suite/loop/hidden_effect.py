@@ -124,7 +124,7 @@ def verdict(
 def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
     gap = diagnosis["gap"]
     rows = [
-        (effect["name"], ", ".join(effect["alternatives"]), one.label, *one.shown())
+        (effect["name"], ", ".join(effect["alternatives"]), one.label, *one.texts())
         for effect in diagnosis["effects"]
         for one in components(effect)
     ]
@@ -237,7 +237,7 @@ LOOP = Loop(
         )
         for name, whose in MODELS.items()
     ),
-    shown=(
+    texts=(
         Shown(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
         Shown(
             NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"

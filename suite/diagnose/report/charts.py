@@ -1,4 +1,4 @@
-"""Charts of a diagnosis as PNG, and held-out flights as a recording for rerun."""
+"""Draws the charts of a diagnosis, and records held-out flights for rerun (rerun.io, a viewer)."""
 
 from __future__ import annotations
 
@@ -23,25 +23,28 @@ from tracks.geometry.rotation import exp_rot, rot_to_quat
 BEFORE, AFTER, WRONG, BOX = "#8b93a1", "#2463c9", "#e0892b", "#7a5cb8"
 """Colours: vehicle as given, with the named effects, with a wrong effect, with a black box."""
 FLOOR = "#1d2430"
+"""Colour of the noise floor and of measurements."""
+OTHERS = "#c3c8d1"
+"""Colour of candidates that were not named."""
 SHOWN = 14
-"""Candidates in the chart."""
+"""Number of candidates in the chart."""
 
 
 def gains_chart(
     scores: Sequence[CandidateScore], threshold: float | None, named: set[str]
 ) -> bytes:
-    """Return a chart of the gains of the best candidates, and the gain that chance reaches.
+    """Draw the gains of the best candidates as a PNG, and the gain that chance reaches.
 
     Args:
         scores: best first.
-        threshold: gain that the best of all candidates reaches by chance once in a hundred.
-        named: labels of what was named.
+        threshold: gain that the best of all candidates reaches by chance with 1 % probability.
+        named: labels of the named effects.
     """
     shown = list(scores[:SHOWN])[::-1]
     figure = Figure(figsize=(8.2, 0.6 + 0.27 * len(shown)), layout="constrained")
     axes = figure.subplots()
     gains = np.maximum([s.gain for s in shown], 0.0)
-    colours = [AFTER if s.candidate.label in named else "#c3c8d1" for s in shown]
+    colours = [AFTER if s.candidate.label in named else OTHERS for s in shown]
     axes.barh(range(len(shown)), gains, color=colours, height=0.7)
     axes.set_yticks(range(len(shown)), [s.candidate.label for s in shown])
     if threshold is not None and threshold > 0.0:
@@ -57,12 +60,12 @@ def gains_chart(
 
 
 def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, seed: int) -> bytes:
-    """Return gaps with their intervals, and each rollout's error against its speed.
+    """Draw gaps with their intervals as a PNG, and each rollout's error by its speed.
 
     Args:
         rows: label, gap and colour, from top to bottom.
-        speed: (W,) of the held-out rollouts at their starts [m/s]; None where none was flown.
-        seed: of the intervals' draws.
+        speed: (W,) speeds of the held-out rollouts at their starts [m/s]; None without rollouts.
+        seed: seed of the intervals' draws.
     """
     figure = Figure(figsize=(11.0, 3.4 if speed is not None else 2.0), layout="constrained")
     left, *others = figure.subplots(1, 1 if speed is None else 2, squeeze=False)[0]
@@ -84,13 +87,13 @@ def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, se
 
 
 def black_box_chart(sides: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return the gaps of the named effect and of the black box, for one or two comparisons.
+    """Draw the gaps of named effects and black box as a PNG, for one or two comparisons.
 
-    `sides` are those of the JSON.
+    `sides` are entries of `black_box` in diagnosis.json.
     """
     figure = Figure(figsize=(11.0, 2.4), layout="constrained")
     for axes, side in zip(figure.subplots(1, 2), sides, strict=False):
-        rows = [(label, one["gap"], one["ci95"], hue) for label, one, hue in labelled_gaps(side)]
+        rows = [(label, gap["gap"], gap["ci95"], hue) for label, gap, hue in labelled_gaps(side)]
         _gap_bars(axes, rows, 1.0)
         titled(axes, f"Gap on {side['judged_on']}")
     for axes in figure.axes[len(sides) :]:
@@ -99,7 +102,7 @@ def black_box_chart(sides: Sequence[Mapping[str, Any]]) -> bytes:
 
 
 def labelled_gaps(side: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any], str]]:
-    """Return label, gap and colour of what is compared on a side, from top to bottom."""
+    """Return label, gap and colour of each compared model, from top to bottom."""
     rows = [
         ("as given", side["before"], BEFORE),
         ("named effect", side["named"], AFTER),
@@ -138,7 +141,7 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
 
 
 def series_chart(series: Series) -> bytes:
-    """Return a held-out stretch as measured and as simulated."""
+    """Draw a held-out stretch as measured and as simulated, as a PNG."""
     figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     axes = figure.subplots()
     axes.plot(series.time_s, series.measured, color=FLOOR, lw=1.6, label="measured")
@@ -151,10 +154,15 @@ def series_chart(series: Series) -> bytes:
 
 
 def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Path:
-    """Write rollouts of 1 s over what was held out, as given and as `fitted` (P,), as `.rrd`.
+    """Write held-out flights, measured and in rollouts of 1 s, as a recording (.rrd).
+
+    Args:
+        path: the file.
+        flown: the simulated flights.
+        fitted: (P,) parameters with the named effects; None if nothing was named.
 
     Raises:
-        OSError: where the file cannot be written; nothing is left under its name.
+        OSError: if the file cannot be written; no partial file remains.
     """
     windows, simulated = flown.simulated(fitted)
     flights = []
@@ -162,9 +170,11 @@ def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Pa
         rows = np.flatnonzero(windows.flight == number)
         simulations = []
         for label, residual in simulated.items():
-            found = [_rollout(take(windows, row), residual[row]) for row in rows]
-            whole = [one for one in found if one is not None]
-            tracks, errors = [one[0] for one in whole], [one[1] for one in whole]
+            rollouts = [_rollout(take(windows, row), residual[row]) for row in rows]
+            tracks, errors = [], []
+            for track, error in filter(None, rollouts):
+                tracks.append(track)
+                errors.append(error)
             simulations.append(Simulation(label, tracks, errors))
         log = flown.logs[int(number)]
         flights.append(Compared(log.name, _measured(log, flown.since_s), simulations))
@@ -172,6 +182,7 @@ def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Pa
 
 
 def _measured(log: FlightLog, first_s: float) -> Track:
+    """Return the measured state of a flight from `first_s` on."""
     time_s = log.time_s - log.time_s[0]
     rows = time_s >= first_s - 1e-6
     fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
@@ -179,26 +190,26 @@ def _measured(log: FlightLog, first_s: float) -> Track:
 
 
 def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[Track, np.ndarray] | None:
-    """Return one rollout and its errors (T, 4) at the rows with a pose; None where it diverged."""
+    """Return one rollout at its T rows with a pose, and its errors (T, 4); None if it diverged.
+
+    The errors are those of position [m], velocity [m/s], attitude [deg] and rates [rad/s].
+    """
     seen = np.asarray(window.seen)
     rows = seen[:, 0] & seen[:, 3]
     if rows.sum() < 2 or not np.isfinite(residual[rows]).all():
         return None
     error = np.where(seen, residual, np.nan)[rows]
-    sine = np.linalg.norm(error[:, 3:6], axis=1, keepdims=True)
+    pos_w, attitude_b, vel_w, rate_b = np.split(error[:, :12], 4, axis=1)
+    # The attitude's error is the rotation axis times the sine of the angle.
+    sine = np.linalg.norm(attitude_b, axis=1, keepdims=True)
     angle = np.arcsin(np.clip(sine, 0.0, 1.0))
-    # The attitude's error is the sine of the angle that is left to what was measured.
-    turn = -error[:, 3:6] * angle / np.maximum(sine, 1e-12)
-    rot_w = np.asarray(window.row_rot_w)[rows] @ exp_rot(turn)
+    turn = -attitude_b * angle / np.maximum(sine, 1e-12)
     track = Track(
         window.start_s + np.asarray(window.row_s)[rows],
-        np.asarray(window.row_pos_w)[rows] - error[:, :3],
-        rot_to_quat(rot_w),
-        np.asarray(window.row_vel_w)[rows] - error[:, 6:9],
-        np.asarray(window.row_rate_b)[rows] - error[:, 9:12],
+        np.asarray(window.row_pos_w)[rows] - pos_w,
+        rot_to_quat(np.asarray(window.row_rot_w)[rows] @ exp_rot(turn)),
+        np.asarray(window.row_vel_w)[rows] - vel_w,
+        np.asarray(window.row_rate_b)[rows] - rate_b,
     )
-    lengths = [np.linalg.norm(error[:, at], axis=1) for at in (slice(0, 3), slice(6, 9))]
-    errors = np.stack(
-        [*lengths, np.rad2deg(angle[:, 0]), np.linalg.norm(error[:, 9:12], axis=1)], axis=1
-    )
-    return track, errors
+    pos, vel, rate = (np.linalg.norm(part, axis=1) for part in (pos_w, vel_w, rate_b))
+    return track, np.stack([pos, vel, np.rad2deg(angle[:, 0]), rate], axis=1)

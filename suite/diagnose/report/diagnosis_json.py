@@ -1,4 +1,4 @@
-"""A diagnosis as the JSON that others read."""
+"""Converts a diagnosis into the content of diagnosis.json (schema: docs/diagnosis.md)."""
 
 from __future__ import annotations
 
@@ -16,61 +16,57 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.actuators import ActuatorMismatch
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
-from suite.diagnose.verdict.gap import Gap
-
-SIZES = ("force", "torque", "drift")
-"""Of an effect: mean acceleration over half a second [m/s^2], angular acceleration [rad/s^2] and
-distance after a second [m], as RMS over the flights."""
-
+from suite.diagnose.verdict.gap import EffectSize, Gap
 
 LEAST_SHOWN = 0.001
 """Smaller gaps are printed as less than this, in units of the noise, m/s^2 or rad/s^2."""
 
 
-def diagnosis_json(found: Diagnosis) -> dict[str, Any]:
-    """Return what diagnosis.json has of the names and of the gap."""
-    main, control = found.main, found.main.control
-    limits = found.limits
-    swing = next((one.remaining.swing for one in found.findings if one.remaining.swing), None)
+def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the entries of diagnosis.json on the named effects and the gap.
+
+    It may contain named tuples and arrays, which `tracks.common.files.plain` converts.
+    """
+    main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.limits
+    swings = [one.remaining.swing for one in diagnosis.findings if one.remaining.swing]
+    swing = swings[0] if swings else None
+    named = [effect for _, effect in diagnosis.named]
+    pairs = [(effect.candidate.name, rival) for effect in named for rival in effect.rivals]
     entries: dict[str, Any] = {
-        "verdict": found.label,
-        "effects": effects_json(found),
+        "verdict": diagnosis.label,
+        "effects": effects_json(diagnosis),
         "negligible": [
-            {"name": name, "size": size.as_json(), "relevant": False}
-            for one in found.findings
+            {"name": name, "size": size, "relevant": False}
+            for one in diagnosis.findings
             for name, size in one.negligible
         ],
-        "relevance": dict(zip(SIZES, limits.relevance, strict=True)),
-        "separate_with": list(
-            dict.fromkeys(
-                advice(one.candidate.name, rival) for _, one in found.named for rival in one.rivals
-            )
-        ),
-        "driven_by": found.flights.driven_by,
-        "seconds": found.seconds,
-        "warnings": found.warnings,
-        "gap": gap_json(found),
-        "views": [one.source.name for one in found.findings if one.names] or [main.source.name],
+        "relevance": dict(zip(EffectSize._fields, limits.relevance, strict=True)),
+        "separate_with": list(dict.fromkeys(advice(*pair) for pair in pairs)),
+        "driven_by": diagnosis.flights.driven_by,
+        "seconds": diagnosis.seconds,
+        "warnings": diagnosis.warnings,
+        "gap": gap_json(diagnosis),
+        "views": [one.source.name for one in diagnosis.findings if one.names] or [main.source.name],
         "control": control
         and {
             "effect": control[0],
             "after": control[1].rms,
-            "after_ci95": control[1].ci95(found.seed, limits),
+            "after_ci95": control[1].ci95(diagnosis.seed, limits),
         },
         "unexplained": {
-            "share": found.verdict.share_left,
-            "where": found.verdict.where,
+            "share": diagnosis.verdict.share_left,
+            "where": diagnosis.verdict.where,
             "swing": swing and {"period_s": swing.period_s, "length_m": swing.length_m},
             **main.remaining.details,
         },
-        "reference": list(found.references),
+        "reference": list(diagnosis.references),
     }
-    return {"headline": headline(found, entries), **entries}
+    return {"headline": headline(diagnosis, entries), **entries}
 
 
-def gap_json(found: Diagnosis) -> dict[str, Any]:
-    """Return the gap of the finding that shows most, and the channels of all."""
-    main, seed, limits = found.main, found.seed, found.limits
+def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the gap of the main finding, and the channels of all findings."""
+    main, seed, limits = diagnosis.main, diagnosis.seed, diagnosis.limits
     return {
         "measure": main.source.measure,
         "before": main.before.rms,
@@ -90,66 +86,69 @@ def gap_json(found: Diagnosis) -> dict[str, Any]:
                 }
                 for channel, value in channels.items()
             }
-            for one in found.findings
+            for one in diagnosis.findings
             for group, channels in one.before.channels.items()
         },
         **main.remaining.gap_details,
-        "held_out": [short_name(name) for name in found.flights.held_out],
+        "held_out": [short_name(name) for name in diagnosis.flights.held_out],
     }
 
 
-def effects_json(found: Diagnosis) -> list[dict[str, Any]]:
-    """Return the named effects, one entry for all names of one effect."""
+def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return the named effects, with one entry for all names of an effect (such as motors)."""
     searched = [
-        _effect(one, name, names)
-        for one in found.findings
-        for name, names in one.by_effect().items()
+        _effect(finding, name, names)
+        for finding in diagnosis.findings
+        for name, names in finding.by_effect().items()
     ]
     tested = [
         {
-            "name": one.name,
+            "name": effect.name,
             "alternatives": [],
-            "parameters": one.parameters,
-            "gap_removed": one.gap_removed,
-            "p_value": one.p_value,
+            "parameters": effect.parameters,
+            "gap_removed": effect.gap_removed,
+            "p_value": effect.p_value,
             "size": None,
             "relevant": True,
-            "view": one.view,
+            "view": effect.view,
         }
-        for one in found.tested
+        for effect in diagnosis.tested
     ]
     return [*searched, *tested]
 
 
-def _effect(finding: Finding, name: str, ones: Sequence[NamedEffect]) -> dict[str, Any]:
-    indices = sorted(i for one in ones for i in one.candidate.indices)
-    width, undecided = finding.half_width, _undecided(finding, ones)
-    size = finding.sizes.get(name)
+def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
+    """Return the entry of the effect `name`, which has `names` in `finding`."""
+    indices = sorted(index for named in names for index in named.candidate.indices)
+    width, undecided = finding.half_width, _undecided(finding, names)
     return {
         "name": name,
-        "alternatives": sorted({rival for one in ones for rival in one.rivals} - {name}),
+        "alternatives": sorted({rival for named in names for rival in named.rivals} - {name}),
         "parameters": parameters_json(
             finding.source.space, name, indices, finding.theta, width, undecided
         ),
-        "gap_removed": finding.removed(ones),
-        "p_value": max(one.p_value for one in ones),
-        "size": size and size.as_json(),
+        "gap_removed": finding.removed(names),
+        "p_value": max(named.p_value for named in names),
+        "size": finding.sizes.get(name),
         "relevant": True,
         "view": finding.source.name,
     }
 
 
-def _undecided(finding: Finding, ones: Sequence[NamedEffect]) -> list[int]:
-    """Return the places of an effect's other parameters, one at a time, that fit as well."""
-    taken = {i for one in ones for i in one.candidate.indices}
-    near = finding.source.limits.rival_chi2
+def _undecided(finding: Finding, names: Sequence[NamedEffect]) -> list[int]:
+    """Return the indices of other motors' parameters of an effect that fit as well."""
+    fitted = {index for named in names for index in named.candidate.indices}
+    space, near = finding.source.space, finding.source.limits.rival_chi2
+
+    def is_near(index: int) -> bool:
+        label = f"{space.entries[index].effect} {_motor_number(space, index)}"
+        return any(named.worse_by.get(label, np.inf) <= near for named in names)
+
     return [
-        i
-        for i, entry in enumerate(finding.source.space.entries)
-        if entry.effect == ones[0].candidate.name and i not in taken
-        and any(one.worse_by.get(f"{entry.effect} {(entry.component or 0) + 1}", np.inf) <= near
-                for one in ones)
-    ]  # fmt: skip
+        index
+        for index, entry in enumerate(space.entries)
+        if entry.effect == names[0].candidate.name and index not in fitted and is_near(index)
+    ]
 
 
 def parameters_json(
@@ -160,104 +159,110 @@ def parameters_json(
     half_width: Mapping[int, float],
     undecided: Sequence[int] = (),
 ) -> dict[str, Any]:
-    """Return the parameters of the effect `name` as diagnosis.json has them.
+    """Return the parameters of the effect `name` as in diagnosis.json.
 
     Args:
-        space: of the vehicle.
-        name: of the effect.
-        indices: places of its numbers that were fitted, in order.
-        theta: (P,) all numbers.
-        half_width: of the 95 % intervals, by place.
-        undecided: places of its numbers that could stand in place of a fitted one.
+        space: parameters of the vehicle.
+        name: name of the effect.
+        indices: indices of its fitted parameters, in order.
+        theta: (P,) all parameters.
+        half_width: half-widths of the 95 % intervals, by index.
+        undecided: indices of other motors' parameters that fit as well, for an effect of one motor.
     """
 
-    def one(index: int) -> tuple[float, list[float]]:
+    def value_and_interval(index: int) -> tuple[float, list[float]]:
         entry = space.entries[index]
         value, width = float(theta[index]), half_width[index]
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for parameter in EFFECTS[name].parameters:
         if parameter.one_at_a_time:
-            values = [one(i) for i in indices]
-            which = [_number(space, i) for i in indices]
-            lone = len(which) == 1
-            could = [*which, *(_number(space, i) for i in undecided)]
-            spans = [[min(could), max(could)]] if lone else [[k, k] for k in which]
-            found["index"] = {
-                "value": which[0] if lone else which,
-                "unit": "1",
-                "ci95": spans[0] if lone else spans,
-            }
-            found[parameter.name] = {
-                "value": values[0][0] if lone else [v for v, _ in values],
-                "unit": parameter.unit,
-                "ci95": values[0][1] if lone else [c for _, c in values],
-            }
+            values, spans = zip(*map(value_and_interval, indices), strict=True)
+            motors = [_motor_number(space, index) for index in indices]
+            is_single = len(motors) == 1
+            possible = [*motors, *(_motor_number(space, index) for index in undecided)]
+            ranges = [[min(possible), max(possible)]] if is_single else [[k, k] for k in motors]
+            for key, unit, columns in (
+                ("index", "1", (motors, ranges)),
+                (parameter.name, parameter.unit, (values, spans)),
+            ):
+                value, ci95 = (column[0] if is_single else list(column) for column in columns)
+                entries[key] = {"value": value, "unit": unit, "ci95": ci95}
             continue
-        at = {space.entries[i].component: i for i in indices
-              if space.entries[i].parameter == parameter.name}  # fmt: skip
-        if not at:
+        by_component = {
+            space.entries[index].component: index
+            for index in indices
+            if space.entries[index].parameter == parameter.name
+        }
+        if not by_component:
             continue
         if parameter.size:
-            parts = [one(at[k]) if k in at else (None, None) for k in range(parameter.size)]
-            value, ci = [v for v, _ in parts], [c for _, c in parts]
+            parts = [
+                value_and_interval(by_component[k]) if k in by_component else (None, None)
+                for k in range(parameter.size)
+            ]
+            value, ci95 = map(list, zip(*parts, strict=True))
         else:
-            value, ci = one(at[None])
-        found[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci}
-    return found
+            value, ci95 = value_and_interval(by_component[None])
+        entries[parameter.name] = {"value": value, "unit": parameter.unit, "ci95": ci95}
+    return entries
 
 
-def _number(space: ParameterSpace, index: int) -> int:
+def _motor_number(space: ParameterSpace, index: int) -> int:
+    """Return the number of the motor, from 1, that the parameter at `index` belongs to."""
     return (space.entries[index].component or 0) + 1
 
 
-def headline(found: Diagnosis, entries: Mapping[str, Any]) -> str:
-    """Return the answer in a few sentences; `entries` is the rest of the JSON."""
-    main, words = found.main, [answer(entries)]
-    if found.named:
+def headline(diagnosis: Diagnosis, entries: Mapping[str, Any]) -> str:
+    """Return the answer in a few sentences; `entries` are the other entries of the JSON."""
+    main, words = diagnosis.main, [answer(entries)]
+    if diagnosis.named:
         source = main.source
         words.append(
             f"On held-out flights the {source.subject} falls from {_figure(main.before.rms)} to "
             f"{_figure(main.after.rms)} {source.unit}."
         )
-    words += [one.words or f"Named: {one.name}." for one in found.tested]
-    if found.verdict.where:
-        words.append(f"Unexplained: {found.verdict.where}.")
+    words += [effect.words or f"Named: {effect.name}." for effect in diagnosis.tested]
+    if diagnosis.verdict.where:
+        words.append(f"Unexplained: {diagnosis.verdict.where}.")
     return " ".join(words)
 
 
 def _figure(value: float) -> str:
-    """Return a gap for people; noise-free logs give some of 1e-10."""
+    """Return a gap for people; logs without noise give values such as 1e-10."""
     return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
 def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
-    """Return the entry `actuators`: measured rotor speeds against commanded ones."""
+    """Return the entry `actuators`: measured rotor speeds compared with commanded ones."""
     return [{**one._asdict(), "followed": one.followed} for one in mismatches]
 
 
-def black_box_json(found: BlackBoxComparisons, seed: int) -> dict[str, Any]:
+def black_box_json(comparisons: BlackBoxComparisons, seed: int) -> dict[str, Any]:
     """Return the entry `black_box`; `seed` is of the intervals' draws."""
+    outside = comparisons.outside
     return {
-        "held_out": _comparison(found.held_out, seed),
-        "outside": found.outside and _comparison(found.outside, seed),
-        "split_m_s": found.split_m_s,
-        "seconds": found.seconds,
+        "held_out": _comparison(comparisons.held_out, seed),
+        "outside": outside and _comparison(outside, seed),
+        "split_m_s": comparisons.split_m_s,
+        "seconds": comparisons.seconds,
     }
 
 
-def _comparison(found: BlackBoxComparison, seed: int) -> dict[str, Any]:
+def _comparison(comparison: BlackBoxComparison, seed: int) -> dict[str, Any]:
+    """Return the gaps of given vehicle, named effects and black box on the same stretches."""
     return {
-        "judged_on": found.judged_on,
-        "stretches": {"fitted": found.fitted, "judged": found.judged},
-        "before": _gap(found.before, seed),
-        "named": None if found.named is None else _gap(found.named, seed),
-        "black_box": _gap(found.black_box, seed),
+        "judged_on": comparison.judged_on,
+        "stretches": {"fitted": comparison.fitted, "judged": comparison.judged},
+        "before": _gap(comparison.before, seed),
+        "named": None if comparison.named is None else _gap(comparison.named, seed),
+        "black_box": _gap(comparison.black_box, seed),
     }
 
 
 def _gap(gap: Gap, seed: int) -> dict[str, Any]:
+    """Return a gap with its interval, and the errors of rollouts by horizon and group."""
     return {
         "gap": gap.rms,
         "ci95": gap.ci95(seed),

@@ -1,4 +1,4 @@
-"""The page of a report: answer, picture and next steps first, then folded sections of evidence."""
+"""Assembles the report of a diagnosis: answer, chart and next steps, then folded details."""
 
 from __future__ import annotations
 
@@ -31,68 +31,73 @@ TITLES = {
     "partly": "partly explained",
     "unknown": "cause unknown",
 }
-"""By verdict."""
+"""Part of the page's title, by verdict."""
 FILES = (
-    ("vehicle.toml", "the vehicle with what was named; every command takes it"),
+    ("vehicle.toml", "the vehicle with the named effects; every command takes it"),
     ("diagnosis.json", "all numbers of this page"),
     ("recording.rrd", "held-out flights measured and simulated, before and after, for rerun"),
-    ("plan/plan.json", "flights that separate what these could not"),
+    ("plan/plan.json", "flights that separate effects which these flights do not"),
 )
-"""Next to the report, where they were written."""
+"""Files next to the report, and their description."""
 LEAST_FLOOR = 1e-9
-"""A noise floor below this is that of what no log measured, in any unit."""
+"""A smaller noise floor, in any unit, is that of a channel that no log measured."""
+NOTHING_NAMED = "Nothing was named: the vehicle file is unchanged."
 TOTALS = (
-    "Values are totals: what the vehicle file had of an effect is replaced. Of the gap: the "
-    "share that this effect takes away when it is added last. Chance gives a false name with "
-    "a probability of at most {chance:.1g}."
+    "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
+    "effect removes when it is added last. Chance gives a false name with a probability of at most "
+    "{chance:.1g}."
 )
 CHANNELS = (
-    "RMS errors on flights that took no part in finding or fitting anything. Noise floor: what the "
-    "measurement noise alone gives, in rollouts that of the start and of the row compared. "
-    "Repeatability: how far the means of flights of the unchanged vehicle lie apart. Closed: the "
-    "share of the variance within a flight that the named effects explain; black box: the share "
-    "that a regression without physics explains, fitted to the same flights."
+    "RMS errors on held-out flights. Noise floor: the error by measurement noise alone; in rollouts "
+    "by noise of the start and of the compared row. Repeatability: the spread of the means of "
+    "flights of the unchanged vehicle. Closed: the share of the variance within a flight that the "
+    "named effects explain. Black box: the share that a regression without physics explains; it is "
+    "fitted to the same flights."
 )
 
 
-def page(diagnosis: Diagnosis, found: Mapping[str, Any], toml: str, files: set[str]) -> Report:
-    """Return the report of a diagnosis; `found` is its JSON, and the words are taken from there.
+def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[str]) -> Report:
+    """Return the report of a diagnosis.
 
-    `toml` is the text of the vehicle file that was written, `files` lists which of `FILES` exist.
+    Args:
+        diagnosis: the diagnosis.
+        result: its JSON, which has all sentences.
+        toml: text of the vehicle file that was written.
+        files: those of `FILES` that exist.
     """
-    gap, flown = found["gap"], diagnosis.main.source.rollouts
-    after = f" → {gap['after']:.3g}" if found["effects"] else ""
+    gap, flown = result["gap"], diagnosis.main.source.rollouts
+    after = f" → {gap['after']:.3g}" if result["effects"] else ""
     facts = {
-        "verdict": found["verdict"],
+        "verdict": result["verdict"],
         "gap on held-out flights": f"{gap['before']:.3g}{after} {diagnosis.main.source.unit}",
         "noise floor": f"{gap['noise_floor']:.3g}",
         "held out": _few(gap["held_out"]),
-        "driven by": found["driven_by"],
-        "took": f"{found['seconds']:.0f} s",
+        "driven by": result["driven_by"],
+        "took": f"{result['seconds']:.0f} s",
     }
     if diagnosis.references:
         facts["reference"] = f"{len(diagnosis.references)} flights"
     details = [
         Section("Errors on held-out flights", [channels_grid(gap["channels"])]),
         *([logs_section(flown.logs), noise_section(diagnosis)] if flown else []),
-        *actuators_section(found),
+        *actuators_section(result),
         candidates_section(diagnosis),
-        rivals_section(diagnosis, found),
-        residual_section(found),
-        evidence_section(diagnosis, found),
+        rivals_section(diagnosis, result),
+        residual_section(result),
+        evidence_section(diagnosis, result),
         agreement_section(diagnosis),
     ]
     return Report(
-        title=f"Diagnosis: {TITLES[found['verdict']]}",
-        lead=found["headline"],
+        title=f"Diagnosis: {TITLES[result['verdict']]}",
+        lead=result["headline"],
         facts=facts,
         sections=[
-            Section("What to do next", [Steps(next_steps(found))]),
+            Section("What to do next", [Steps(next_steps(result))]),
             *_measured(diagnosis),
-            *([Section("Warnings", found["warnings"])] if found["warnings"] else []),
-            *_findings(found.get("findings", ())),
-            Section("The answer in numbers", _answer(found)),
-            _written(found, toml, files),
+            *([Section("Warnings", result["warnings"])] if result["warnings"] else []),
+            *_findings(result.get("findings", ())),
+            Section("The answer in numbers", _answer(result)),
+            _written(result, toml, files),
             *(replace(section, folded=True) for section in details),
         ],
     )
@@ -104,7 +109,7 @@ def _few(names: list[str]) -> str:
 
 
 def _measured(diagnosis: Diagnosis) -> list[Section]:
-    """Return measured, simulated, and simulated with what was named, as a picture."""
+    """Return a chart of a held-out stretch: measured, simulated, and with the named effects."""
     main = diagnosis.main
     series = main.source.series(main.search)
     if series is None:
@@ -113,61 +118,58 @@ def _measured(diagnosis: Diagnosis) -> list[Section]:
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
-    """Return the faults of the logs that were corrected, or that may be there."""
+    """Return a table of faults of the logs (such as wrong units), corrected or suspected."""
+    keys = ("flight", "signal", "status", "fault", "evidence", "fix")
     rows = [
-        tuple(
-            str(one[key] or "")
-            for key in ("flight", "signal", "status", "fault", "evidence", "fix")
-        )
-        for one in findings
-        if one["status"] in ("corrected", "doubt")
+        [str(finding[key] or "") for key in keys]
+        for finding in findings
+        if finding["status"] in ("corrected", "doubt")
     ]
-    headers = ["log", "signal", "status", "fault", "evidence", "fix"]
+    headers = ["log", *keys[1:]]
     return [Section("Findings about the logs", [grid("", headers, rows)])] if rows else []
 
 
 def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Grid:
-    """Return the gap by channel; a channel that no log measured has no row."""
-    more = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
-    every = [one for values in channels.values() for one in values.values()]
-    shown = [key for key in more if any(key in one for one in every)]
+    """Return a table of the gap by channel, without channels that no log measured."""
+    optional = {"repeatability": ".3g", "closed": ".0%", "explainable": ".0%"}
+    errors = [error for values in channels.values() for error in values.values()]
+    shown = [key for key in optional if any(key in error for error in errors)]
     rows = []
     for group, values in channels.items():
-        for channel, one in values.items():
-            floor = one["noise_floor"]
+        for channel, error in values.items():
+            floor = error["noise_floor"]
             if floor < LEAST_FLOOR:
                 continue
             unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
-            tone = "good" if one["after"] < 1.2 * floor else ""
-            row = cells(group, f"{channel}{unit}", f"{one['before']:.4g}")
-            row += [Cell(f"{one['after']:.4g}", tone), *cells(f"{floor:.4g}")]
-            texts = ["" if one.get(k) is None else format(one[k], more[k]) for k in shown]
+            tone = "good" if error["after"] < 1.2 * floor else ""
+            row = cells(group, f"{channel}{unit}", f"{error['before']:.4g}")
+            row += [Cell(f"{error['after']:.4g}", tone), *cells(f"{floor:.4g}")]
+            texts = ["" if error.get(k) is None else format(error[k], optional[k]) for k in shown]
             rows.append([*row, *cells(*texts)])
-    names = {"explainable": "black box"}
-    headers = ["", "channel", "as given", "with what was named", "noise floor"]
-    headers += [names.get(key, key) for key in shown]
+    headers = ["", "channel", "as given", "with the named effects", "noise floor"]
+    headers += ["black box" if key == "explainable" else key for key in shown]
     return Grid("", headers, rows, note=CHANNELS)
 
 
-def _answer(found: Mapping[str, Any]) -> list[Part]:
+def _answer(result: Mapping[str, Any]) -> list[Part]:
     """Return the named effects, their equations and their parameters."""
-    effects = found["effects"]
+    effects = result["effects"]
     if not effects:
-        return ["Nothing was named: the vehicle file is as it was."]
+        return [NOTHING_NAMED]
     rows = [
         (
             effect["name"],
             ", ".join(effect["alternatives"]) or "none",
             effect["view"],
-            one.label,
-            *one.shown(),
+            component.label,
+            *component.texts(),
             "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
         )
         for effect in effects
-        for one in sorted(components(effect), key=lambda one: not one.found)
+        for component in sorted(components(effect), key=lambda one: not one.is_significant)
     ]
-    about = [EFFECTS[effect["name"]] for effect in effects]
-    words: list[Part] = [f"{one.name}: {one.equation}." for one in about]
+    names = [effect["name"] for effect in effects]
+    words: list[Part] = [f"{name}: {EFFECTS[name].equation}." for name in names]
     words += in_words([(e["name"], *e["alternatives"]) for e in effects])
     headers = [
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
@@ -176,25 +178,26 @@ def _answer(found: Mapping[str, Any]) -> list[Part]:
     return [*words, grid("", headers, rows, note)]
 
 
-def _written(found: Mapping[str, Any], toml: str, files: set[str]) -> Section:
-    words = "Nothing was named: the vehicle file is as it was."
-    if found["effects"]:
+def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
+    """Return the section on written files and planned flights."""
+    words = NOTHING_NAMED
+    if result["effects"]:
         words = "The vehicle file with the named effects, for every other command (--vehicle)."
     links = [(path, words) for path, words in FILES if path in files]
     parts: list[Part] = [words, Details("vehicle.toml", toml), Links(links)]
-    plan = found.get("plan")
+    plan = result.get("plan")
     if plan:
         rows = [
             (
-                way["file"],
-                way["trajectory"]["kind"],
-                f"{way['trajectory']['duration_s']:g} s",
-                f"{way['top_speed']:.1f} m/s",
-                f"{way['top_acceleration']:.1f} m/s²",
-                " x ".join(f"{size:.1f}" for size in way["room"]) + " m",
-                way["flown"] or "",
+                flight["file"],
+                flight["trajectory"]["kind"],
+                f"{flight['trajectory']['duration_s']:g} s",
+                f"{flight['top_speed']:.1f} m/s",
+                f"{flight['top_acceleration']:.1f} m/s²",
+                " x ".join(f"{size:.1f}" for size in flight["room"]) + " m",
+                flight["flown"] or "",
             )
-            for way in plan["flights"]
+            for flight in plan["flights"]
         ]
         headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs", "flown as"]
         parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))

@@ -1,4 +1,7 @@
-"""A report's sections: logs, noise, actuators, candidates, rivals, remaining error, evidence."""
+"""Builds the folded sections of a diagnosis report, from its logs to its evidence.
+
+Each function returns one section, from the diagnosis or from its JSON (`result`).
+"""
 
 from __future__ import annotations
 
@@ -25,11 +28,13 @@ from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid
 
 SHOWN = 12
-"""Logs in the table."""
+"""Largest number of logs in the table."""
+RIVALS = 6
+"""Largest number of alternatives to an effect in the table."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
-    """Return what the logs hold."""
+    """Return a table of the logs."""
     headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
     more = len(logs) - SHOWN
     rows = [_facts(log) for log in logs[:SHOWN]]
@@ -37,8 +42,8 @@ def logs_section(logs: Sequence[FlightLog]) -> Section:
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
-    """Return the row of a log; rows are incomplete where a part of state or command is missing."""
-    there = {
+    """Return a table row on a log; a log's row is incomplete if it lacks state or command."""
+    optional = {
         "commands": log.thrust_cmd is not None,
         "velocity": not log.velocity_derived,
         "rotor speeds": log.rotor_speed is not None,
@@ -55,12 +60,12 @@ def _facts(log: FlightLog) -> tuple[str, ...]:
         f"{1e3 * float(steps.max()):.0f} ms",
         f"{100 * float(1.0 - log.whole.mean()):.1f} %",
         f"{speed.max():.1f} m/s" if len(speed) else "",
-        ", ".join(name for name, is_there in there.items() if is_there) or "none",
+        ", ".join(name for name, is_logged in optional.items() if is_logged) or "none",
     )
 
 
 def noise_section(diagnosis: Diagnosis) -> Section:
-    """Return the noise of every channel."""
+    """Return a table of the measurement noise of every channel."""
     sigma = of_rollouts(diagnosis.main.search.last).noise.sigma
     rows = [
         (f"{name} [{UNITS[name]}]", ", ".join(f"{v:.3g}" for v in values))
@@ -68,82 +73,83 @@ def noise_section(diagnosis: Diagnosis) -> Section:
         if np.isfinite(values := sigma[place]).any()
     ]
     words = (
-        "Standard deviation by axis, estimated from the residual of measured minus simulated "
-        "without its slow part. Everything below is in units of it; where the gap does not exceed "
-        "that of the noise, the verdict is no_gap."
+        "Standard deviation by axis, estimated from measured minus simulated values without their "
+        "slow part. Squared errors below are in units of it. If the gap does not exceed that of "
+        "the noise, the verdict is no_gap."
     )
     return Section("The measurement noise", [words, grid("", ["measured", "noise"], rows)])
 
 
-def actuators_section(found: Mapping[str, Any]) -> list[Section]:
-    """Return measured rotor speeds compared with commanded ones; nothing without measured ones.
-
-    `found` is the JSON.
-    """
-    if not found.get("actuators"):
+def actuators_section(result: Mapping[str, Any]) -> list[Section]:
+    """Return a comparison of measured and commanded rotor speeds; empty without measured ones."""
+    if not result.get("actuators"):
         return []
     words = (
-        f"The model is driven by {found['driven_by']}. The difference between commanded and "
-        "measured rotor speeds is caused by the flight controller and the motors, not by the air: "
-        "integrators and filters which the nominal rate loop lacks are visible here."
+        f"The input of the model is {result['driven_by']}. The flight controller and the motors "
+        "cause the difference between commanded and measured rotor speeds, not the air. It shows "
+        "integrators and filters that the nominal rate loop lacks."
     )
-    grids = [_mismatch(one) for one in found["actuators"]]
+    grids = [_mismatch(mismatch) for mismatch in result["actuators"]]
     return [Section("Actuators, apart from the air", [words, *grids])]
 
 
-def _mismatch(one: Mapping[str, Any]) -> Grid:
+def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
+    """Return a table on the rotor speeds by one kind of command."""
+
     def spread(pair: Sequence[float]) -> str:
         return f"{pair[0]:.2f} ± {pair[1]:.2f}"
 
-    given = f"{100 * max(one['followed'], 0.0):.0f} % of the change is given"
+    explained = f"{100 * max(mismatch['followed'], 0.0):.0f} % of the variance is explained"
+    turn = ", ".join(map(spread, mismatch["turn"]))
     rows = [
-        ("speeds change by", f"{one['spread']:.1f} rad/s"),
-        ("difference, with the vehicle file's lag", f"{one['rms']:.1f} rad/s ({given})"),
-        ("lag that fits best", f"{1e3 * one['time_constant']:.1f} ms"),
-        ("delay before it", f"{1e3 * one['delay']:.1f} ms"),
-        ("measured over commanded, by rotor", ", ".join(f"{s:.4f}" for s in one["scale"])),
-        ("difference with these", f"{one['rms_fitted']:.1f} rad/s"),
-        ("excess thrust", f"{spread(one['thrust'])} m/s²"),
-        ("excess angular acceleration, x y z", f"{', '.join(map(spread, one['turn']))} rad/s²"),
+        ("standard deviation of the speeds", f"{mismatch['spread']:.1f} rad/s"),
+        ("difference, with the vehicle file's lag", f"{mismatch['rms']:.1f} rad/s ({explained})"),
+        ("lag that fits best", f"{1e3 * mismatch['time_constant']:.1f} ms"),
+        ("delay before it", f"{1e3 * mismatch['delay']:.1f} ms"),
+        ("measured over commanded, by rotor", ", ".join(f"{s:.4f}" for s in mismatch["scale"])),
+        ("difference with these", f"{mismatch['rms_fitted']:.1f} rad/s"),
+        ("excess thrust", f"{spread(mismatch['thrust'])} m/s²"),
+        ("excess angular acceleration, x y z", f"{turn} rad/s²"),
     ]
     note = "± is the spread over the flights."
-    return grid(f"Against the {one['commanded_by']}", ["", ""], rows, note)
+    return grid(f"Compared with the {mismatch['commanded_by']}", ["", ""], rows, note)
 
 
 HORIZON = "0.5 s"
 """Of the rollouts in the comparison with the black box."""
 BLACK_BOX = (
-    "Next to it a Delta Action Model: a recurrent network that corrects the body's acceleration "
-    "and turning from velocity, attitude and command, fitted by gradients through the same "
-    "rollouts of the same flights. It has no name and no number to write into a vehicle file."
+    "For comparison, a Delta Action Model was fitted to the same flights: a recurrent network that "
+    "corrects the body's acceleration and angular acceleration from velocity, attitude and "
+    "command. It is fitted by gradients through the same rollouts. It names no cause, and has no "
+    "number to write into a vehicle file."
 )
-
-
-RIVALS = 6
-"""Largest number of alternatives to an effect in the table."""
+"""Explanation of the black box."""
+LEAST_P = 0.0005
+"""P-values up to this are left out: they are the least that the null's draws give."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
     """Return the gain of each candidate alone, by source."""
     parts: list[Part] = []
-    for one in diagnosis.findings:
-        scores, limits = one.search.first, one.source.limits
+    for finding in diagnosis.findings:
+        scores, limits = finding.search.first, finding.source.limits
         if not scores:
             continue
-        named, least = {candidate.label for candidate in one.search.candidates}, 0.0005
+        named = {candidate.label for candidate in finding.search.candidates}
         rows = [
             f"{s.candidate.label:32}{s.gain:>12.1f}"
-            + (f"{s.p_value:>8.4f}  " if s.p_value > least else " " * 10)
+            + (f"{s.p_value:>8.4f}  " if s.p_value > LEAST_P else " " * 10)
             + ("named" if s.candidate.label in named else "")
             for s in scores
         ]
         head = f"{'effect':32}{'gain':>12}{'p':>8}"
         parts += [
-            f"{one.source.name.capitalize()}: all {len(scores)} candidates, each fitted alone "
+            f"{finding.source.name.capitalize()}: all {len(scores)} candidates, each fitted alone "
             "before anything was named. The gain is the fall of the whitened squared error on "
-            "stretches that its fit did not see; p is how often the best of all candidates gains "
-            f"as much by chance, left out below {least:g}. One name follows another while p is at "
-            f"most {limits.name_p_value:g}; then all are refitted jointly.",
+            "stretches that were left out of its fit; p is the probability that the best of all "
+            f"candidates gains as much by chance, left out up to {LEAST_P:g}. Effects are named "
+            f"one after another while p is at most {limits.name_p_value:g}; then all are refitted "
+            "jointly.",
             Picture(
                 gains_chart(scores, scores[0].chance, named), "The best fourteen; blue were named."
             ),
@@ -152,52 +158,52 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
     return Section("The candidates", parts)
 
 
-def rivals_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
-    """Return what was fitted in place of each named effect; `found` is the JSON."""
+def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
+    """Return a table of other effects that were fitted instead of each named one (rivals)."""
     rows = []
-    for _, one in diagnosis.named:
-        ordered = sorted(one.worse_by.items(), key=lambda item: item[1])
+    for _, named in diagnosis.named:
+        ordered = sorted(named.worse_by.items(), key=lambda item: item[1])
         for label, worse_by in ordered[:RIVALS]:
-            same = label.rstrip(" 1234") in one.rivals
-            verdict = Cell("not separable", "bad") if same else Cell("ruled out")
-            rows.append([*cells(one.candidate.label, label, f"{worse_by:.1f}"), verdict])
-    headers = ["named", "in its place", "worse by", ""]
+            is_rival = label.rstrip(" 1234") in named.rivals
+            verdict = Cell("not separable", "bad") if is_rival else Cell("ruled out")
+            rows.append([*cells(named.candidate.label, label, f"{worse_by:.1f}"), verdict])
+    headers = ["named", "alternative", "worse by", ""]
     note = (
-        "Worse by: squared error in units of the noise, with one for each parameter that is "
-        "fitted; 9 is three standard errors. What was not fitted in a name's place was too far off."
+        "Worse by: squared error in units of the noise, plus one for each fitted parameter; 9 is "
+        "three standard errors. Effects without a row were too far off to be fitted."
     )
     parts: list[Part] = [Grid("", headers, rows, note=note)] if rows else []
     if not diagnosis.named:
-        parts.append("Nothing was named, so that nothing has a rival.")
-    elif not found["separate_with"]:
-        parts.append("No other name explains the same flights as well.")
-    return Section("What could stand in its place", parts)
+        parts.append("Nothing was named, so there are no alternatives.")
+    elif not result["separate_with"]:
+        parts.append("No other effect explains the same flights as well.")
+    return Section("Alternatives to the named effects", parts)
 
 
-def residual_section(found: Mapping[str, Any]) -> Section:
-    """Return the residual after the named effects; `found` is the JSON."""
-    left = found["unexplained"]
+def residual_section(result: Mapping[str, Any]) -> Section:
+    """Return the error that remains with the named effects, and its structure."""
+    remaining = result["unexplained"]
     words = "No structure beyond the measurement noise remains."
-    if left["where"]:
-        words = f"{100 * left['share']:.0f} % of the gap remains: {left['where']}."
+    if remaining["where"]:
+        words = f"{100 * remaining['share']:.0f} % of the gap remains: {remaining['where']}."
     parts: list[Part] = [words]
-    if left.get("shapes"):
-        rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in left["shapes"]]
+    if remaining.get("shapes"):
+        shapes = remaining["shapes"]
+        rows = [(s["label"], f"{s['gain']:.1f}", f"{s['p_value']:.3f}") for s in shapes]
         note = (
             "A force or torque outside the catalogue, as a simple function of the state: its gain "
             "on left-out stretches, and its p-value."
         )
-        parts.append(
-            grid("Shapes without a name", ["remaining error as a", "gain", "p"], rows, note)
-        )
-        rows = [(axis, f"{p:.2g}") for axis, p in left["coloured"].items()]
-        note = "P-value: how often noise alone has as much energy in a smooth disturbance."
+        headers = ["remaining error as a", "gain", "p"]
+        parts.append(grid("Functions of the state", headers, rows, note))
+        rows = [(axis, f"{p:.2g}") for axis, p in remaining["coloured"].items()]
+        note = "P-value: probability that noise alone has as much energy in a smooth disturbance."
         parts.append(grid("Random disturbances", ["axis", "p"], rows, note))
     return Section("Remaining error", parts)
 
 
-def evidence_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
-    """Return the gap on held-out flights, with controls; `found` is the JSON."""
+def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
+    """Return the gap on held-out flights: as given, with the named effects, with a wrong one."""
     seed, main = diagnosis.seed, diagnosis.main
     gaps = [("as given", main.before, BEFORE)]
     if main.control is not None:
@@ -205,19 +211,16 @@ def evidence_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
     if len(main.without) > 1:
         gaps += [(f"without {label}", gap, BEFORE) for label, gap in main.without.items()]
     if main.names:
-        gaps.append(("with what was named", main.after, AFTER))
+        gaps.append(("with the named effects", main.after, AFTER))
     before, floor = main.before.rms, main.before.floor
     rows = [
         (label, *_gap_cells(gap.rms, gap.ci95(seed), before, floor, 3)) for label, gap, _ in gaps
     ]
-    held = ", ".join(found["gap"]["held_out"])
-    words = (
-        f"{main.source.measure}. Held out: {held}; they took no part in finding or fitting "
-        "anything."
-    )
+    held = ", ".join(result["gap"]["held_out"])
+    words = f"{main.source.measure}. Held out of search and fits: {held}."
     note = (
-        "95 % by drawing neighbouring stretches in blocks. Wrong: the best effect that is neither "
-        "named nor a rival, fitted to the same flights in the same way."
+        "95 %: bootstrap over blocks of neighbouring stretches. Wrong: the best effect that is "
+        "neither named nor an alternative, fitted to the same flights in the same way."
     )
     flown, speed = main.source.rollouts, None
     if flown is not None:
@@ -228,22 +231,22 @@ def evidence_section(diagnosis: Diagnosis, found: Mapping[str, Any]) -> Section:
         grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
     ]
     if flown is not None:
-        parts += _black_box(found.get("black_box"))
+        parts += _black_box(result.get("black_box"))
     return Section("The evidence", parts)
 
 
-def _black_box(found: Mapping[str, Any] | None) -> list[Part]:
-    """Return the comparison with a Delta Action Model; `found` is its JSON, None without one."""
-    if found is None:
+def _black_box(result: Mapping[str, Any] | None) -> list[Part]:
+    """Return the comparison with a Delta Action Model; `result` is its JSON, None without one."""
+    if result is None:
         return [
-            "A black box on the same split, and outside the speeds of its fit: "
-            "suite diagnose --compare-delta."
+            "suite diagnose --compare-delta compares this with a black box, on the same flights "
+            "and on faster ones than those of its fit."
         ]
-    sides = [side for side in (found["held_out"], found["outside"]) if side]
+    sides = [side for side in (result["held_out"], result["outside"]) if side]
     chart = Picture(black_box_chart(sides), "Bars are 95 %; 1 is the noise floor.")
     parts: list[Part] = [BLACK_BOX, chart, *map(_comparison, sides)]
-    if found["outside"] is None:
-        parts.append("There are too few stretches to fit slow ones and judge fast ones.")
+    if result["outside"] is None:
+        parts.append("There are too few stretches to fit slow ones and test on fast ones.")
     return parts
 
 
@@ -251,38 +254,40 @@ AGREEMENT = (
     "The fall of the squared error of each flight with parameters that were fitted to the others, "
     "in units of independent noise. An effect is named only if all flights but one agree."
 )
+"""Explanation of the table of flights."""
 
 
 def agreement_section(diagnosis: Diagnosis) -> Section:
-    """Return what each source compares, and whether the flights agree on the names."""
+    """Return the compared quantity of each source, and each flight's support of the effects."""
     parts: list[Part] = [
-        f"{one.source.name}: {one.source.about}, in means or stretches of "
-        f"{one.source.horizon_s:g} s; driven by {diagnosis.flights.driven_by}."
-        for one in diagnosis.findings
+        f"{finding.source.name}: {finding.source.about}, in means or stretches of "
+        f"{finding.source.horizon_s:g} s; driven by {diagnosis.flights.driven_by}."
+        for finding in diagnosis.findings
     ]
-    for one, name in diagnosis.named:
-        if name.gains:
-            rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(name.gains)]
-            title = f"{one.source.name}: {name.candidate.label}"
+    for finding, named in diagnosis.named:
+        if named.gains:
+            rows = [(f"{k + 1}", f"{gain:.1f}") for k, gain in enumerate(named.gains)]
+            title = f"{finding.source.name}: {named.candidate.label}"
             parts.append(grid(title, ["fitted flight", "gain"], rows, AGREEMENT))
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
 
 
 def _comparison(side: Mapping[str, Any]) -> Grid:
+    """Return a table of the black box, the named effects and the given vehicle on a side."""
     before = side["before"]["gap"]
     rows = [
         (
             label,
-            *_gap_cells(one["gap"], one["ci95"], before, 1.0, 2),
-            *(f"{error:.3g}" for error in one["rollouts"][HORIZON].values()),
+            *_gap_cells(gap["gap"], gap["ci95"], before, 1.0, 2),
+            *(f"{error:.3g}" for error in gap["rollouts"][HORIZON].values()),
         )
-        for label, one, _ in labelled_gaps(side)
+        for label, gap, _ in labelled_gaps(side)
     ]
     names = [f"{group} [{UNITS[group]}]" for group in side["before"]["rollouts"][HORIZON]]
     headers = ["", "gap", "95 %", "removed", *names]
     count = side["stretches"]
     note = (
-        f"{count['fitted']} stretches fitted, {count['judged']} judged. The last columns: RMS "
+        f"{count['fitted']} stretches fitted, {count['judged']} tested. The last columns: RMS "
         f"errors of rollouts of {HORIZON}."
     )
     return grid(f"On {side['judged_on']}", headers, rows, note)
@@ -291,7 +296,7 @@ def _comparison(side: Mapping[str, Any]) -> Grid:
 def _gap_cells(
     gap: float, ci95: Sequence[float], before: float, floor: float, digits: int
 ) -> tuple[str, str, str]:
-    """Return a gap, its interval, and the share of `before` above the floor that it removes."""
+    """Return as texts a gap, its interval, and the removed share of `before` above the floor."""
     removed = ""
     if gap != before and before > floor:
         removed = f"{100 * (before - gap) / (before - floor):.0f} %"

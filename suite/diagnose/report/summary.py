@@ -1,4 +1,7 @@
-"""A diagnosis in words: the answer, its size on these flights, and what to do next."""
+"""Writes a diagnosis in words: the answer, its size on these flights, and what to do next.
+
+All functions take the JSON of a diagnosis, so that the console and the report say the same.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ VERDICTS = {
     "partly": "This explains a part of the gap between simulation and flights.",
     "unknown": "Simulation and flights differ, and no effect of the catalogue explains it.",
 }
+"""A sentence for each verdict."""
 CHANGES = {
     "no_gap": "Nothing that the flights agree on has changed since the reference flights.",
     "named": "This explains what has changed since the reference flights.",
@@ -23,34 +27,36 @@ CHANGES = {
     "unknown": "Something has changed since the reference flights, and no effect of the catalogue "
     "explains it.",
 }
+"""The same if a change since reference flights was searched for."""
 USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loop (--vehicle)."
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
-def answer(found: Mapping[str, Any]) -> str:
-    """Return what is wrong with the vehicle file, by how much, and what it explains.
+def answer(result: Mapping[str, Any]) -> str:
+    """Return the named effects, their sizes, and a sentence for the verdict.
 
     Args:
-        found: what diagnosis.json holds.
+        result: content of diagnosis.json.
     """
-    words = [_named(effect) for effect in found["effects"]]
-    words.append((CHANGES if found["reference"] else VERDICTS)[found["verdict"]])
-    if found["verdict"] == "no_gap" and found["negligible"]:
-        names = ", ".join(entry["name"] for entry in found["negligible"])
+    words = [_effect_words(effect) for effect in result["effects"]]
+    words.append((CHANGES if result["reference"] else VERDICTS)[result["verdict"]])
+    if result["verdict"] == "no_gap" and result["negligible"]:
+        names = ", ".join(entry["name"] for entry in result["negligible"])
         words.append(f"Significant but too small to matter: {names}.")
     return " ".join(words)
 
 
-def _named(effect: Mapping[str, Any]) -> str:
+def _effect_words(effect: Mapping[str, Any]) -> str:
+    """Return a sentence on a named effect, and one on its size on these flights."""
     names = " or ".join([effect["name"], *effect["alternatives"]])
-    about = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
+    summary = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
     values = []
-    for one in components(effect):
-        if one.found:
-            label, _, unit = one.label.partition(" [")
+    for component in components(effect):
+        if component.is_significant:
+            label, _, unit = component.label.partition(" [")
             unit = unit.rstrip("]")
-            values.append(f"{label} {one.value:.3g} {'' if unit == '1' else unit}".rstrip())
-    words = f"{about} ({names}){': ' if values else ''}{', '.join(values)}."
+            values.append(f"{label} {component.value:.3g} {'' if unit == '1' else unit}".rstrip())
+    words = f"{summary} ({names}){': ' if values else ''}{', '.join(values)}."
     size = effect.get("size")
     if size is None:
         return words
@@ -60,28 +66,28 @@ def _named(effect: Mapping[str, Any]) -> str:
     return f"{words} On these flights it causes {', '.join(parts[:-1])} and {parts[-1]} (RMS)."
 
 
-def next_steps(found: Mapping[str, Any]) -> list[str]:
-    """Return what to do after a verdict, most useful first.
+def next_steps(result: Mapping[str, Any]) -> list[str]:
+    """Return advice on what to do after a verdict, most useful first.
 
     Args:
-        found: what diagnosis.json holds.
+        result: content of diagnosis.json.
     """
-    return list(_STEPS[found["verdict"]](found))
+    return list(_STEPS[result["verdict"]](result))
 
 
-def _no_gap(found: Mapping[str, Any]) -> Iterator[str]:
+def _no_gap(result: Mapping[str, Any]) -> Iterator[str]:
     yield "Use the vehicle file as it is."
-    if found.get("not_examined"):
-        yield f"These logs do not show: {', '.join(found['not_examined'])}. Log that as well."
+    if result.get("not_examined"):
+        yield f"These logs do not show: {', '.join(result['not_examined'])}. Log that as well."
     yield "If your task is faster than these flights, fly faster or turn harder, and repeat this."
 
 
-def _separate(found: Mapping[str, Any]) -> Iterator[str]:
-    for effect in found["effects"]:
+def _separate(result: Mapping[str, Any]) -> Iterator[str]:
+    for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
             start = f"{effect['name']} from "
-            flights = [line for line in found["separate_with"] if line.startswith(start)]
+            flights = [line for line in result["separate_with"] if line.startswith(start)]
             yield (
                 f"These flights do not separate {names}. Decide by what is known of the vehicle, "
                 f"or fly what separates {'; '.join(flights)}. suite diagnose --plan writes such "
@@ -89,36 +95,36 @@ def _separate(found: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _explained(found: Mapping[str, Any]) -> Iterator[str]:
+def _explained(result: Mapping[str, Any]) -> Iterator[str]:
     yield USE
-    yield from _separate(found)
+    yield from _separate(result)
     yield "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
 
 
-def _partly(found: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{USE} Its values are approximate; on held-out flights it is closer than the given file."
-    yield from _separate(found)
+def _partly(result: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{USE} Its values are approximate; on held-out flights it is closer than your file."
+    yield from _separate(result)
     yield CHECK
-    yield from _unexplained(found)
+    yield from _unexplained(result)
 
 
-def _unknown(found: Mapping[str, Any]) -> Iterator[str]:
+def _unknown(result: Mapping[str, Any]) -> Iterator[str]:
     yield CHECK
-    if found.get("identified"):
+    if result.get("identified"):
         yield "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
     else:
         yield "Run suite identify if the numbers of the vehicle file were never estimated."
-    yield from _unexplained(found)
+    yield from _unexplained(result)
     yield "Otherwise add an effect to the catalogue, or fit a correction with suite delta."
 
 
-def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
-    if found["unexplained"]["where"]:
+def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
+    if result["unexplained"]["where"]:
         yield (
-            "Search for the cause of what is unexplained; the report's section Remaining error "
-            "shows on what it depends."
+            "Search for the cause of the unexplained error; the report's section Remaining error "
+            "shows the quantity that it depends on."
         )
-    swing = found["unexplained"].get("swing")
+    swing = result["unexplained"].get("swing")
     if swing:
         yield (
             "If the vehicle carries a load on a line, weigh it and write mass and length = "
@@ -127,10 +133,9 @@ def _unexplained(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
-
-
-UNSEEN = "not identifiable"
-"""Shown in place of a value that no flight identifies."""
+"""By verdict."""
+NOT_IDENTIFIABLE = "not identifiable"
+"""Text in place of a value that no flight identifies."""
 
 
 class Component(NamedTuple):
@@ -139,71 +144,75 @@ class Component(NamedTuple):
     label: str
     """Parameter, axis and unit."""
     value: float | None
+    """Value, or None if it is not identifiable."""
     ci95: tuple[float, float] | None
+    """95 % interval."""
     neutral: float | None
-    """The value with which nothing acts, where it is the same for every vehicle."""
+    """Value at which the effect does not act, if it is the same for every vehicle."""
 
     @property
-    def found(self) -> bool:
-        """Whether there is a value that is not the neutral one, as far as its interval shows."""
+    def result(self) -> bool:
+        """Whether there is a value that differs significantly from the neutral one."""
         if self.value is None or self.ci95 is None or self.neutral is None:
             return self.value is not None
         return not self.ci95[0] <= self.neutral <= self.ci95[1]
 
-    def shown(self) -> tuple[str, str]:
-        """Return the value and its interval, in as many digits as the interval supports."""
+    def texts(self) -> tuple[str, str]:
+        """Return value and interval as texts, in as many digits as the interval supports."""
         if self.value is None:
-            return UNSEEN, ""
+            return NOT_IDENTIFIABLE, ""
         if self.ci95 is None:
             return f"{self.value:.4g}", ""
         numbers = (self.value, *self.ci95)
         value, low, high = (in_digits(number, numbers) for number in numbers)
-        if not self.found:
+        if not self.is_significant:
             value = f"not different from {self.neutral:g}"
         return value, f"{low} to {high}"
 
 
 def in_digits(number: float, interval: Sequence[float]) -> str:
-    """Return `number` with two significant digits of half the width of (value, low, high)."""
+    """Return `number` rounded to two significant digits of the interval's half-width.
+
+    `interval` is (value, low, high). Small numbers, and those with no digit behind the point, are
+    written with an exponent.
+    """
     half, size = 0.5 * (interval[2] - interval[1]), max(abs(n) for n in interval)
     if half <= 0.0 or not np.isfinite(half):
         return f"{number:.4g}"
-    last = int(np.floor(np.log10(half) + 1e-6)) - 1
-    if size < 1e-3 or last > 0:
-        return f"{number:.{max(int(np.floor(np.log10(size))) - last, 0)}e}" if size else "0"
-    return f"{number:.{-last}f}"
+    last_power = int(np.floor(np.log10(half) + 1e-6)) - 1  # power of ten of the last digit
+    if size < 1e-3 or last_power > 0:
+        digits = max(int(np.floor(np.log10(size))) - last_power, 0) if size else 0
+        return f"{number:.{digits}e}" if size else "0"
+    return f"{number:.{-last_power}f}"
 
 
 def components(effect: Mapping[str, Any]) -> Iterator[Component]:
     """Yield every number of a named `effect`, an entry of diagnosis.json."""
-    known = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
-    neutrals = {p.name: p.neutral for p in known if not callable(p.neutral)}
-    one_at_a_time = {p.name for p in known if p.one_at_a_time}
+    parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
+    neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
+    by_motor = {p.name for p in parameters if p.one_at_a_time}
     for name, entry in effect["parameters"].items():
         value, span, unit = entry["value"], entry["ci95"], entry["unit"]
-        neutral = neutrals.get(name)
-        if name == "index" and one_at_a_time:
-            # Each of several motors has a line of its own with its number.
+        if name == "index" and by_motor:
+            # The labels below contain the numbers of several motors.
             if not isinstance(value, list):
-                sure = span is None or span[0] == span[1]
-                yield Component(name, *_one(value, None if sure else span), None)
+                is_certain = span is None or span[0] == span[1]
+                yield Component(name, value, None if is_certain else _pair(span), None)
             continue
+        neutral = neutrals.get(name)
         if not isinstance(value, list):
-            yield Component(f"{name} [{unit}]", *_one(value, span), neutral)
+            yield Component(f"{name} [{unit}]", value, _pair(span), neutral)
             continue
-        which = effect["parameters"].get("index", {}).get("value")
+        motors = effect["parameters"].get("index", {}).get("value")
         axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
-        if name in one_at_a_time and isinstance(which, list):
-            axes = which
-        for k, one in enumerate(value):
-            between = span[k] if span else None
-            yield Component(f"{name} {axes[k]} [{unit}]", *_one(one, between), neutral)
+        if name in by_motor and isinstance(motors, list):
+            axes = motors
+        for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
+            yield Component(f"{name} {axis} [{unit}]", number, _pair(pair), neutral)
 
 
-def _one(
-    value: float | None, span: Sequence[float] | None
-) -> tuple[float | None, tuple[float, float] | None]:
-    return value, None if span is None else (float(span[0]), float(span[1]))
+def _pair(span: Sequence[float] | None) -> tuple[float, float] | None:
+    return None if span is None else (float(span[0]), float(span[1]))
 
 
 def cells(*texts: str) -> list[Cell]:

@@ -1,4 +1,4 @@
-"""The source `whole`: errors of simulated stretches of 1 s (rollouts) against the flights."""
+"""The source of evidence `whole`: errors of simulated stretches of 1 s (rollouts) of flights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from suite.diagnose.data.windows import (
     UNITS,
     FlightWindows,
 )
-from suite.diagnose.estimate.gauss_newton import gauss_newton_step
+from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
 from suite.diagnose.estimate.parameters import Candidate, make_space
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.moments import ForceModel
@@ -53,11 +53,13 @@ from suite.diagnose.verdict.rollout_gap import (
 )
 
 SHAPES = 5
-"""Largest number of shapes of the residual in the report."""
+"""Largest number of shapes of the residual (functions of the state) in the report."""
+CLEAR_NOISE = 4.0
+"""Squared errors above this many noise variances count as clear in a chart [1]."""
 
 
 def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
-    """Return the evidence of `evaluation`, which is one of rollouts."""
+    """Return the evidence of `evaluation` with its type; it must be one of rollouts."""
     assert isinstance(evaluation.evidence, RolloutEvidence)
     return evaluation.evidence
 
@@ -68,113 +70,116 @@ class RolloutSource(Source):
 
     flown: Rollouts
     coarser: FlightWindows | None = None
-    """The fitted windows with every second rotor speed, where measured ones are the input."""
+    """The fitted windows with every second rotor speed, if measured ones are the input."""
     coarser_share: float = 0.5
-    """Share of what that changes an effect by which is the model's own error [1]."""
+    """Share of an effect's change under `coarser` that is the model's own error [1]."""
+
+    @property
+    def rollouts(self) -> Rollouts:
+        """The simulated flights, see `Source`."""
+        return self.flown
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
         flown, noise = self.flown, of_rollouts(found.last).noise
         return measure(flown.model, theta, flown.held, noise, self.limits)
 
-    def worse(self, before: Gap, after: Gap) -> bool:
+    def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""
         return after.above(before, overlap(self.limits), 0, self.limits)
 
-    def shows(self, found: SearchResult, one: Candidate) -> bool:
-        """Return whether held-out flights would show it, see `Source`."""
+    def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
+        """Return whether held-out flights are sensitive to `candidate`, see `Source`."""
         model, held = self.flown.model, self.flown.held
-        theta, own = found.estimate.theta, list(one.indices)
+        theta, indices = found.estimate.theta, list(candidate.indices)
         offset = true_starts(model, theta, held)
-        linear = model.linearise(theta, offset, held, [*own, *model.starts])
+        linear = model.linearise(theta, offset, held, [*indices, *model.starts])
         whitening = make_whitening(linear, of_rollouts(found.last).noise, held, self.limits)
-        slope = block_of(whitening, linear, own, held).slope
-        moved = theta[own] - self.flown.start[own]
-        expected = float(((slope @ moved) ** 2).sum()) * overlap(self.limits)
-        return bool(expected > self.limits.shown_chi2)
+        slope = block_of(whitening, linear, indices, held).slope
+        change = theta[indices] - self.flown.start[indices]
+        expected_chi2 = float(((slope @ change) ** 2).sum()) * overlap(self.limits)
+        return bool(expected_chi2 > self.limits.shown_chi2)
 
-    def matters(self, gap: Gap) -> bool:
+    def is_relevant(self, gap: Gap) -> bool:
         """Return whether rollout errors may exceed the noise by a relevant amount.
 
-        The upper end of the 95 % interval is compared. Rollouts overlap: only as many count as
-        independent as fit into the flights without overlap.
+        The upper end of the error's 95 % interval is compared. Rollouts overlap, so the number of
+        independent ones is that of a second each.
         """
         force, torque, drift = self.limits.relevance
         independent = max(len(self.flown.held.flight) * self.limits.gap_stride_s, 1.0)
-        wide = 1.0 + 1.96 / np.sqrt(2.0 * independent)
+        # A standard deviation of n normal errors has the relative standard error 1 / sqrt(2 n).
+        upper = 1.0 + Z95 / np.sqrt(2.0 * independent)
 
-        def beyond(horizon: str, group: str) -> float:
+        def excess(horizon: str, group: str) -> float:
             error, floor = gap.channels[horizon][group]
-            return float(np.sqrt(max((wide * error) ** 2 - floor**2, 0.0)))
+            return float(np.sqrt(max((upper * error) ** 2 - floor**2, 0.0)))
 
         return bool(
-            beyond("1 s", "position") >= drift
-            or beyond("0.5 s", "velocity") >= FORCE_S * force
-            or beyond("0.1 s", "rates") >= TORQUE_S * torque
+            excess("1 s", "position") >= drift
+            or excess("0.5 s", "velocity") >= FORCE_S * force
+            or excess("0.1 s", "rates") >= TORQUE_S * torque
         )
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
-        """Return what the names do on the fitted flights, see `Source`.
+        """Return the sizes of the named effects on the fitted flights, see `Source`.
 
-        Where measured rotor speeds drive, what the model's own error makes of an effect does not
-        count at the upper end: half of what every second rotor speed alone changes it by, where an
-        error of second order would make a third (step doubling; Hairer, Norsett & Wanner 1993,
-        Sec. II.4). Where rows are further apart than the rotors' lag, the change is the torque that
-        the rows are estimated not to show, which is known to a factor of two: twice it counts.
+        If measured rotor speeds are the input, the model's own error is subtracted at the upper
+        end. It is half of an effect's change with every second rotor speed only; an error of second
+        order would be a third (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). Rows
+        further apart than the rotors' lag do not show all torque. The change then estimates the
+        missing torque to a factor of two, so that twice the change is subtracted.
         """
         model, estimate, indices = self.flown.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
         slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
-        width, away, own = found.half_widths(), found.moved, np.zeros(len(indices))
+        width, change, model_error = found.half_widths(), found.moved, np.zeros(len(indices))
         if self.coarser is not None and len(indices):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
-            how = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
-            equations = weighed_by(model, self.coarser, linear, *how)[1].equations
+            options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
+            equations = weighed_by(model, self.coarser, linear, *options)[1].equations
             moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
-            own = self.coarser_share * np.abs(moved)
+            model_error = self.coarser_share * np.abs(moved)
 
         def size_of(moved: np.ndarray) -> EffectSize:
             return rollout_size(moved, windows)
 
         sizes = {}
-        for name in dict.fromkeys(one.candidate.name for one in found.named):
-            at = [k for k, i in enumerate(indices) if model.space.entries[i].effect == name]
-            sure = np.sign(away[at]) * np.maximum(np.abs(away[at]) - own[at], 0.0)
-            upper = upper_size(slope[..., at], sure, width[at], size_of)
-            sizes[name] = (size_of(slope[..., at] @ away[at]), upper)
+        for name in dict.fromkeys(named.candidate.name for named in found.named):
+            own = [k for k, i in enumerate(indices) if model.space.entries[i].effect == name]
+            least = np.maximum(np.abs(change[own]) - model_error[own], 0.0)
+            upper = upper_size(slope[..., own], np.sign(change[own]) * least, width[own], size_of)
+            sizes[name] = (size_of(slope[..., own] @ change[own]), upper)
         return sizes
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
-        """Return the structure in what `found` leaves, see `Source`.
+        """Return the structure in the error that remains after `found`, see `Source`.
 
-        Where there is structure, random wind and an oscillating force are tested: no fitted
-        parameter reproduces them.
+        If there is structure, random wind and an oscillating force are tested: no fitted parameter
+        reproduces them.
         """
         structure, wind = self._structure(found, seed)
         details = {
             "shapes": [shape._asdict() for shape in structure.shapes[:SHAPES]],
             "coloured": structure.coloured,
         }
-        named = bool(found.named)
-        share = share_left(*gaps) if named else 0.0
-        if not self.matters(gaps[1]):
+        share = share_left(*gaps) if found.named else 0.0
+        if not self.is_relevant(gaps[1]):
             return Remaining(False, share, details=details)
         slow = of_rollouts(found.last).slow_errors(found.last.block)
         where = structure_where(slow, structure, self.flown.rotor_input, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
-        if swing:
-            wind = None
-        elif wind:
+        if wind and not swing:
             return Remaining(False, share_left(*gaps), wind=wind, details=details)
-        if where or swing:
-            share = share if named else 1.0
+        if (where or swing) and not found.named:
+            share = 1.0
         return Remaining(bool(where or swing), share, where, swing=swing, details=details)
 
     def _structure(
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
-        """Return the structure in what `found` leaves, and the wind that may have made it."""
+        """Return the structure in the remaining error, and the wind that may cause it."""
         evidence, limits, model = of_rollouts(found.last), self.limits, self.flown.model
         windows, whitening = evidence.trusted, evidence.whitening
         equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
@@ -184,7 +189,7 @@ class RolloutSource(Source):
         if not any(p <= limits.colour_p_value for p in forces):
             return residual, None
         wind = find_turbulence(model, found.estimate.theta, equations, limits)
-        # Wind is one explanation and a shape over the state another: the better one counts.
+        # Wind competes with a force that is a simple function of the state.
         shape = residual.shapes[0]
         if wind is None or (shape.p_value <= limits.shape_p_value and shape.gain > wind.ratio):
             return residual, None
@@ -200,69 +205,75 @@ class RolloutSource(Source):
         )
 
     def _swing(self, theta: np.ndarray) -> Swing | None:
-        """Return the swing in what translation under the measured attitude leaves at `theta`."""
+        """Return an oscillating force in the flights' force errors at `theta` (P,), if any."""
         flown = self.flown
         try:
             flights = ready(flown.logs, flown.vehicle, self.limits).smoothed[FORCE.name]
-        except ValueError:  # rollouts need other stretches than this test does
+        except ValueError:  # no flight meets the conditions of the force view
             return None
         voltage = all(log.voltage is not None for log in flown.logs)
         model = ForceModel(flown.vehicle, make_space(flown.vehicle), voltage)
         return swing_left(ViewEvidence(FORCE, model, flights, self.limits), theta)
 
-    def stepped(self, found: SearchResult) -> bool:
-        """Return whether pose and rates are apart by what MuJoCo's Euler steps make of them."""
-        step = 1.0 / self.flown.vehicle.controller.frequency
-        late = late_by(found).values()
-        return any(abs(offset) <= self.limits.integrator_share * step for offset in late)
+    def explained_by_steps(self, found: SearchResult) -> bool:
+        """Return whether MuJoCo's Euler steps explain the named delay between pose and rates."""
+        step_s = 1.0 / self.flown.vehicle.controller.frequency
+        delays_s = pose_delays(found).values()
+        return any(abs(delay_s) <= self.limits.integrator_share * step_s for delay_s in delays_s)
 
     def model_error(self, found: SearchResult) -> float:
         """Return the share of the noise floor that is the model's own error, see `Source`.
 
-        It is that of the group of channels in which it is largest.
+        It is the largest share among the groups of channels (position, attitude, velocity, rates).
         """
         groups, sigma = len(STATE_GROUPS), of_rollouts(found.last).noise.sigma
         least = np.array(self.limits.least_noise)[:groups]
-        raised = least > np.array(THRESHOLDS.least_noise)[:groups]
-        whole = np.sqrt(np.nan_to_num(sigma[: 3 * groups].reshape(-1, 3) ** 2).mean(axis=1))
-        share = np.where(raised, least / np.maximum(whole, 1e-12), 0.0)
+        # The model's error raises the least noise, see `with_model_error`.
+        is_raised = least > np.array(THRESHOLDS.least_noise)[:groups]
+        noise = np.sqrt(np.nan_to_num(sigma[: 3 * groups].reshape(-1, 3) ** 2).mean(axis=1))
+        share = np.where(is_raised, least / np.maximum(noise, TINY), 0.0)
         return float(min(share.max(), 1.0))
 
     def series(self, found: SearchResult) -> Series:
-        """Return a held-out flight along the axis where the error is best seen, see `Source`."""
+        """Return a held-out flight along the axis with the clearest error, see `Source`."""
         windows, simulated = self.flown.simulated(found.estimate.theta if found.named else None)
         sigma = of_rollouts(found.last).noise.sigma
+        rows = np.asarray(windows.flight) == windows.flight[0]
         measured = {
-            "position": windows.row_pos_w,
-            "velocity": windows.row_vel_w,
-            "rates": windows.row_rate_b,
+            group: np.asarray(values)[rows]
+            for group, values in (
+                ("position", windows.row_pos_w),
+                ("velocity", windows.row_vel_w),
+                ("rates", windows.row_rate_b),
+            )
         }
-        of = np.asarray(windows.flight) == windows.flight[0]
-        seen = np.asarray(windows.seen)[of]
-        first = next(iter(simulated.values()))[of]
+        seen = np.asarray(windows.seen)[rows]
+        errors = {label: values[rows] for label, values in simulated.items()}
+        error_as_given = next(iter(errors.values()))
 
-        def missed(group: str, axis: int) -> float:
+        def relative_error(group: str, axis: int) -> float:
             """Return the squared error beyond noise, over the variance of the motion."""
-            at = SLICES[group].start + axis
-            there = seen[..., at] & np.isfinite(first[..., at])
-            if not there.any():
+            channel = SLICES[group].start + axis
+            known = seen[..., channel] & np.isfinite(error_as_given[..., channel])
+            if not known.any():
                 return -np.inf
-            error, motion = first[..., at][there], np.asarray(measured[group])[of][..., axis][there]
-            noise = float(sigma[at]) ** 2
-            return float(((error**2).mean() - 4.0 * noise) / max(float(motion.var()), noise))
+            error, motion = error_as_given[..., channel][known], measured[group][..., axis][known]
+            noise = float(sigma[channel]) ** 2
+            excess = float((error**2).mean() - CLEAR_NOISE * noise)
+            return excess / max(float(motion.var()), noise)
 
-        every = ((group, axis) for group in measured for axis in range(3))
-        group, axis = max(every, key=lambda one: missed(*one))
-        at = SLICES[group].start + axis
-        time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[of]
-        value = np.where(seen[..., at], np.asarray(measured[group])[of][..., axis], np.nan)
+        axes = [(group, axis) for group in measured for axis in range(3)]
+        group, axis = max(axes, key=lambda pair: relative_error(*pair))
+        channel = SLICES[group].start + axis
+        time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[rows]
+        value = np.where(seen[..., channel], measured[group][..., axis], np.nan)
 
         def line(values: np.ndarray) -> np.ndarray:
             """Return one line that breaks between rollouts."""
             return np.pad(values, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
 
         frame = "body" if group == "rates" else "world"
-        lines = {label: line(value - apart[of][..., at]) for label, apart in simulated.items()}
+        lines = {label: line(value - error[..., channel]) for label, error in errors.items()}
         return Series(
             line(time_s),
             line(value),
@@ -279,13 +290,13 @@ def structure_where(
     rotor_input: bool,
     limits: Thresholds = THRESHOLDS,
 ) -> str | None:
-    """Return in words what the structure in a residual depends on; None where it is noise.
+    """Return in words the quantity that a structured residual depends on; None if it is noise.
 
     Args:
-        slow_errors: as `RolloutEvidence.slow_errors` has them.
+        slow_errors: energy of slow errors and its expectation, from `RolloutEvidence.slow_errors`.
         residual: the structure.
-        rotor_input: whether measured rotor speeds are the input, whose noise is less certain.
-        limits: above which structure is not noise.
+        rotor_input: whether measured rotor speeds are the input; their noise is less certain.
+        limits: thresholds above which structure is not noise.
     """
     slow, expected = slow_errors
     shape = residual.shapes[0] if residual.shapes else None
@@ -308,14 +319,14 @@ def structure_where(
 
 
 def _loudest(slow: np.ndarray, expected: np.ndarray) -> str:
-    """Return the channels with most energy (12,) beyond what is expected, in words."""
+    """Return in words the three channels with most energy (12,) relative to the expected one."""
     energy = np.maximum(slow / np.maximum(expected, 1e-9) - 1.0, 0.0)
     loudest = [k for k in np.argsort(-energy)[:3] if energy[k] > 0]
     return "errors of " + ", ".join(f"{STATE_GROUPS[k // 3]} {'xyz'[k % 3]}" for k in loudest)
 
 
-def late_by(found: SearchResult) -> dict[str, float]:
-    """Return by named effect the delay of logged poses that it gives [s]."""
+def pose_delays(found: SearchResult) -> dict[str, float]:
+    """Return by named effect the delay of the logged pose that it describes [s]."""
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
     return {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}

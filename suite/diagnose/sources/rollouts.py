@@ -1,4 +1,8 @@
-"""Makes the source `whole` from flights: stretches of 1 s, of which some are held out."""
+"""Makes the source of evidence `whole`, which compares simulated stretches of 1 s with flights.
+
+Such a stretch is a rollout: it starts from a measured state, and commands or rotor speeds drive it.
+Some stretches are fitted, the others held out.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +26,31 @@ from suite.diagnose.evidence.rollouts import (
     weighed_by,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
-from suite.diagnose.sources.source import Given, Source, Sources
+from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import another_controller, integrator_of, rotors_are_input
 from suite.diagnose.verdict.rollout_gap import MEASURE, Rollouts, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
+ROUNDING_S = 1e-6
+"""Start times that differ by less are equal [s]."""
 
 
-def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
-    """Return the source of rollouts; None where the logs lack a signal that a rollout needs.
+def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
+    """Make the source of rollouts.
 
-    None also where no effect of the catalogue brings rollouts of 1 s near the flights, unless this
-    source was chosen by name.
+    Args:
+        given: the input of the diagnosis.
+        before: sources that exist already; rollouts come first or not at all.
+
+    Returns:
+        The source, or None if the logs lack a signal that a rollout needs. None also if no effect
+        of the catalogue brings rollouts of 1 s near the flights and this source was not chosen by
+        name.
 
     Raises:
-        ValueError: where no flight can be used, or not in the way that was chosen.
+        ValueError: if no flight can be used, or not with the chosen drive.
     """
     logs, vehicle = given.logs, given.vehicle
     if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
@@ -46,63 +58,63 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
     if given.drive == "auto" and not rotor_input:
-        rotor_input = _flown_by_another(logs, vehicle, given.limits)
+        rotor_input = _needs_rotor_input(logs, vehicle, given.limits)
         if rotor_input:
             warnings.append(
-                "the nominal rate loop does not give the measured rotor speeds; they drive"
+                "the nominal rate loop does not reproduce the measured rotor speeds, so these are "
+                "the model's input"
             )
     space, limits = make_space(vehicle), given.limits
     voltage = all(log.voltage is not None for log in logs)
     model = RolloutModel(vehicle, space, rotor_input, voltage, integrator)
-    whole, notes = cut(logs, vehicle, rotor_input, limits=limits, integrator=integrator)
-    if whole is None:
+    windows, notes = cut(logs, vehicle, rotor_input, limits=limits, integrator=integrator)
+    if windows is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
-    _enough(len(whole.flight), limits)  # before anything is compiled
-    count = len(whole.flight)
+    count = len(windows.flight)
+    _check_count(count, limits)  # before anything is compiled
     given.say(
-        f"{count} stretches of 1 s of {len(np.unique(whole.flight))} flights: about "
+        f"{count} stretches of 1 s of {len(np.unique(windows.flight))} flights: about "
         f"{BASE_S + count * STRETCH_S:.0f} s, and half a minute more the first time on a machine"
     )
-    begin = start_estimate(model, whole)
-    linear = model.linearise(begin.theta, begin.free, whole, None)
-    good = _sound(linear, limits)
+    start = start_estimate(model, windows)
+    linear = model.linearise(start.theta, start.free, windows, None)
+    good = _finite(linear, limits)
     if not good.all():
-        broken = int((~good).sum())
-        warnings.append(f"{broken} stretches left out: the model's flight from there diverges")
-    rough = None
-    if integrator != "euler" or rotor_input:  # a simulator's own steps are exact
-        rough = cut(logs, vehicle, rotor_input, LENGTH_S, limits, integrator, whole)[0]
-    whole, linear = take(whole, good), _take(linear, good)
-    if rough is not None:
-        rough = take(rough, good)
-        limits = with_model_error(model, begin, whole, linear, rough, limits)
+        diverged = int((~good).sum())
+        warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
+    coarser = None
+    if integrator != "euler" or rotor_input:  # with a simulator's own steps there is no step error
+        coarser = cut(logs, vehicle, rotor_input, LENGTH_S, limits, integrator, windows)[0]
+    windows, linear = take(windows, good), _take(linear, good)
+    if coarser is not None:
+        coarser = take(coarser, good)
+        limits = with_model_error(model, start, windows, linear, coarser, limits)
     most = limits.hopeless_chi2
-    if not given.chosen and least_left(model, whole, linear, limits, most) > most:
+    if not given.chosen and least_left(model, windows, linear, limits, most) > most:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
-    informed = information(linear, whole, model.size, limits)
-    inside, names = choose_held_out(logs, whole.flight, whole.start_s, informed, limits)
-    count = int(inside.sum())
-    _enough(count, limits)
+    informed = information(linear, windows, model.size, limits)
+    is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)
+    count = int(is_fitted.sum())
+    _check_count(count, limits)
     if count < limits.few_windows:
         warnings.append(
-            f"{count} stretches of 1 s to fit: too few for a null of their own, so "
-            "the null is drawn from the measured noise"
+            f"{count} stretches of 1 s to fit: too few for a permutation test, so the null "
+            "distribution is drawn from the measured noise"
         )
-    windows, apart = take(whole, inside), take(whole, ~inside)
+    fitted, held_apart = take(windows, is_fitted), take(windows, ~is_fitted)
     has = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
-    among = candidates(space, voltage, has if rotor_input else has | {"command"})
-    given.say(f"{len(windows.flight)} stretches of 1 s to fit, {len(apart.flight)} held out")
-    held = _held_out(given, rotor_input, apart, limits, integrator)
-    lone = bool(np.isin(held.flight, windows.flight).any())
-    since_s = float(np.min(held.start_s)) if lone else 0.0
+    single = candidates(space, voltage, has if rotor_input else has | {"command"})
+    given.say(f"{len(fitted.flight)} stretches of 1 s to fit, {len(held_apart.flight)} held out")
+    held = _held_out(given, rotor_input, held_apart, limits, integrator)
+    is_lone_flight = bool(np.isin(held.flight, fitted.flight).any())
+    since_s = float(np.min(held.start_s)) if is_lone_flight else 0.0
     dense = all(
         log.rotor_speed is None
         or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
         for log in logs
     )
-    flown = Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits)
     source = RolloutSource(
         name="whole",
         about="whole flights, in rollouts of a second",
@@ -110,25 +122,24 @@ def by_rollouts(given: Given, before: Sequence[Source]) -> Sources | None:
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        known=weighed_by(model, windows, _take(linear, inside), limits),
-        start=start_estimate(model, windows),
-        among=[*among, *composites(among)],
+        weighed=weighed_by(model, fitted, _take(linear, is_fitted), limits),
+        start=start_estimate(model, fitted),
+        candidates=[*single, *composites(single)],
         limits=limits,
         small_explains=True,
-        rollouts=flown,
-        flown=flown,
-        coarser=take(rough, inside) if rough is not None and rotor_input else None,
+        flown=Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits),
+        coarser=take(coarser, is_fitted) if coarser is not None and rotor_input else None,
         coarser_share=0.5 if dense else 2.0,
     )
     driven_by = "measured rotor speeds" if rotor_input else "commands"
-    return Sources((source,), names, driven_by, tuple(warnings))
+    return SourceSet((source,), names, driven_by, tuple(warnings))
 
 
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
-    """Return whether rollouts can be simulated.
+    """Return whether rollouts of these flights can be simulated.
 
-    The logs must be complete, with measured rotor speeds, or with commands to a rate loop without
-    integrators and filters.
+    The logs must have all signals of the state, and either measured rotor speeds or commands to a
+    rate loop without integrators and filters.
     """
     return not any(
         log.partial or (log.rotor_speed is None and (log.rate_cmd_b is None or remembers(vehicle)))
@@ -136,30 +147,26 @@ def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     )
 
 
-def _flown_by_another(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
-    """Return whether another controller flew, so that measured rotor speeds have to drive.
+def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
+    """Return whether another controller flew, so that the input must be measured rotor speeds.
 
     Raises:
-        ValueError: where one did, and some flights have no rotor speeds.
+        ValueError: if so, and some flights have no rotor speeds.
     """
     if not another_controller(logs, vehicle, limits):
         return False
     without = [log.name for log in logs if log.rotor_speed is None]
     if without:
         raise ValueError(
-            "the nominal rate loop does not give the rotor speeds that some flights have, and "
-            f"{', '.join(without)} has none to drive by: diagnose the others alone, or with "
-            "--drive commands all by what was commanded"
+            "the nominal rate loop does not reproduce the rotor speeds that some flights have, and "
+            f"{', '.join(without)} has none as an input: diagnose the other flights without it, or "
+            "use the commands of all with --drive commands"
         )
     return True
 
 
-def _enough(count: int, limits: Thresholds) -> None:
-    """Refuse fewer stretches than can be fitted.
-
-    Raises:
-        ValueError: with the number of stretches and the least one.
-    """
+def _check_count(count: int, limits: Thresholds) -> None:
+    """Raise a ValueError if `count` stretches are too few to fit."""
     if count < limits.least_windows:
         raise ValueError(
             f"{count} stretches of 1 s to fit, at least {limits.least_windows} are needed: fly "
@@ -171,11 +178,11 @@ def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
     return Linearisation(*(part[chosen] for part in linear))
 
 
-def _sound(linear: Linearisation, limits: Thresholds) -> np.ndarray:
-    """Return which windows (W,) the model flies to their end.
+def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
+    """Return which windows (W,) the model simulates without divergence.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if it diverges in all.
     """
     residual = linear.residual
     good = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
@@ -189,12 +196,17 @@ def _sound(linear: Linearisation, limits: Thresholds) -> np.ndarray:
 
 
 def _held_out(
-    given: Given, rotor_input: bool, apart: FlightWindows, limits: Thresholds, integrator: str
+    given: DiagnosisInput,
+    rotor_input: bool,
+    windows: FlightWindows,
+    limits: Thresholds,
+    integrator: str,
 ) -> FlightWindows:
-    """Return overlapping windows over what is held out, of which `apart` do not overlap."""
-    if not len(apart.flight):
-        raise ValueError("nothing is left to hold out: fly longer, or log a second flight")
-    how = (rotor_input, limits.gap_stride_s, limits, integrator)
-    many, _ = cut(given.logs, given.vehicle, *how, only=np.unique(apart.flight).tolist())
-    assert many is not None
-    return take(many, many.start_s >= apart.start_s.min() - 1e-6)
+    """Return overlapping windows over the held-out time, which `windows` cover without overlap."""
+    if not len(windows.flight):
+        raise ValueError("no stretch can be held out: fly longer, or log a second flight")
+    flights = np.unique(windows.flight).tolist()
+    options = (rotor_input, limits.gap_stride_s, limits, integrator)
+    overlapping, _ = cut(given.logs, given.vehicle, *options, only=flights)
+    assert overlapping is not None
+    return take(overlapping, overlapping.start_s >= windows.start_s.min() - ROUNDING_S)

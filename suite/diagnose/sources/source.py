@@ -1,8 +1,9 @@
-"""Base class of a source of evidence: what it fits, what it holds out, how it judges effects.
+"""Interface of a source of evidence, which compares flights with the model in one way.
 
-A new source is one subclass of `Source` and one function that makes it from flights, with an entry
-in `SOURCES` (`suite/diagnose/diagnose.py`). Search, held-out test, relevance, verdict, JSON and
-report use only this interface.
+A source may compare, for example, whole flights (rollouts), forces or torques. It fits some flights
+and holds others out to test the result. A new source is one subclass of `Source` and one function
+that makes it from flights, with an entry in `SOURCES` (`suite/diagnose/diagnose.py`). Search,
+held-out test, relevance, verdict, JSON and report use only this interface.
 """
 
 from __future__ import annotations
@@ -26,96 +27,108 @@ from suite.diagnose.verdict.disturbances import Swing
 from suite.diagnose.verdict.gap import EffectSize, Gap
 from suite.diagnose.verdict.rollout_gap import Rollouts
 
+LEAST_GAP = 1e-9
+"""A gap above the noise floor is at least this in divisions, in the gap's unit."""
+
 
 class TestedEffect(NamedTuple):
-    """An effect that is named by a separate test, not by the search: rotor lag, random wind."""
+    """An effect that a separate test named, not the search: rotor lag or random wind."""
 
     name: str
     values: Any
-    """What a vehicle file holds of it."""
+    """The effect's entry in a vehicle file."""
     parameters: Mapping[str, Any]
-    """As diagnosis.json has them: value, unit and 95 % interval of each."""
+    """Value, unit and 95 % interval of each parameter, as in diagnosis.json."""
     gap_removed: float | None
+    """Share of the gap that the effect explains [1]."""
     p_value: float
     view: str
-    """In what it was found."""
+    """Name of the source in which it was found."""
     words: str = ""
-    """A sentence for people, where its size needs one."""
+    """A sentence for people, if its size needs an explanation."""
 
 
 class Remaining(NamedTuple):
-    """The residual that the named effects leave."""
+    """The error that remains with the named effects."""
 
     structured: bool
     """Whether it is significantly more than noise."""
     share: float
-    """Of the gap above the noise floor [1]."""
+    """Its share of the gap above the noise floor [1]."""
     where: str | None = None
-    """What it depends on, in words."""
+    """Quantity that it depends on, in words."""
     explainable: float = 0.0
-    """Share of the gap that a black box closes, where one was fitted [1]."""
+    """Share of the gap that a black box (a regression without physics) explains, if fitted [1]."""
     wind: TestedEffect | None = None
     """Random wind that explains it."""
     swing: Swing | None = None
+    """An oscillating force, as of a load on a line."""
     details: Mapping[str, Any] = {}
     """Further entries of `unexplained` in diagnosis.json."""
     gap_details: Mapping[str, Any] = {}
-    """Further entries of `gap`."""
+    """Further entries of `gap` there."""
     channels: Mapping[str, Mapping[str, Any]] = {}
-    """Further entries by channel of the gap."""
+    """Further entries of `gap.channels` there, by group and channel."""
 
 
 class Series(NamedTuple):
-    """A held-out stretch as measured and as simulated, for a picture."""
+    """A held-out stretch as measured and as simulated, for a chart of N points."""
 
     time_s: np.ndarray
-    """(N,); NaN where a line breaks."""
+    """(N,) time; NaN where a line breaks."""
     measured: np.ndarray
-    """(N,)."""
+    """(N,) measured values."""
     simulated: Mapping[str, np.ndarray]
-    """(N,) by what it is called."""
+    """(N,) simulated values, by their label in the legend."""
     label: str
-    """What is shown, along which axis, in which unit."""
+    """Quantity, axis and unit."""
     caption: str
+    """Text below the chart."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source(ABC):
-    """One kind of evidence from flights: some flights are fitted, the others held out."""
+    """One way to compare flights with the model; some flights are fitted, the others held out.
+
+    The gap is the error of the model on the held-out flights.
+    """
 
     name: str
-    """As `views` of a diagnosis has it."""
+    """Name in `views` of diagnosis.json."""
     about: str
-    """What is compared under what, for people."""
+    """For people: compared quantity, and the signals that are given."""
     subject: str
-    """What the gap is an error of, for people."""
+    """For people: the quantity whose error the gap is."""
     unit: str
-    """Of the gap."""
+    """Unit of the gap."""
     measure: str
-    """How the gap is measured, for people."""
+    """For people: definition of the gap."""
     horizon_s: float
-    """Over which it is measured [s]."""
-    known: tuple[Evidence, Block]
-    """The fitted flights, weighed where the search begins, and their block there."""
+    """Length of the windows over which the gap is measured [s]."""
+    weighed: tuple[Evidence, Block]
+    """The fitted flights with weights at the start of the search, and their linearisation there."""
     start: Estimate
     """The vehicle file's parameters, from which the search starts."""
-    among: Sequence[Candidate]
-    """The candidates."""
+    candidates: Sequence[Candidate]
+    """Effects that the search tries."""
     limits: Thresholds
-    keeps_small: bool = False
-    """Whether effects below the threshold of relevance are named, too: a change is judged by how
-    flights differ."""
+    names_small: bool = False
+    """Whether effects below the threshold of relevance are named. True for a change since reference
+    flights, which is compared with the spread between flights instead."""
     small_explains: bool = False
-    """Whether the residual is computed with effects that are too small to be named."""
-    otherwise: Source | None = None
-    """The source that is searched where this one names nothing."""
-    rollouts: Rollouts | None = None
-    """The simulated flights, for recordings, plans and a fitted network; None without rollouts."""
+    """Whether the remaining error is computed with effects that are too small to be named."""
+    fallback: Source | None = None
+    """Source that is searched if this one names nothing."""
+
+    @property
+    def rollouts(self) -> Rollouts | None:
+        """The simulated flights, for recordings, plans and a fitted network, if there are any."""
+        return None
 
     @property
     def space(self) -> ParameterSpace:
         """The catalogue's parameters."""
-        return self.known[0].space
+        return self.weighed[0].space
 
     @abstractmethod
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
@@ -123,26 +136,32 @@ class Source(ABC):
 
     @abstractmethod
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
-        """Return what `found` leaves; `gaps` are those before and after, `seed` is of draws."""
+        """Return the error that remains after `found`.
+
+        Args:
+            found: result of the search.
+            gaps: before and after it.
+            seed: seed of random draws.
+        """
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
-        """Return what explains the fitted flights."""
-        return search(self.known[0], self.start, self.among, say, seed, self.known)
+        """Search for the effects that explain the fitted flights."""
+        return search(self.weighed[0], self.start, self.candidates, say, seed, self.weighed)
 
-    def worse(self, before: Gap, after: Gap) -> bool:
-        """Return whether held-out flights contradict the effects that changed the gap to `after`.
+    def is_worse(self, before: Gap, after: Gap) -> bool:
+        """Return whether held-out flights contradict effects that change the gap to `after`.
 
-        Both the whole error and the error within flights have to grow: a flight's own trim may
-        raise the first alone.
+        Both the total error and the error within flights have to grow: a different trim of a
+        held-out flight may raise the total alone.
         """
         return after.rms >= before.rms and float(after.energy.sum()) >= float(before.energy.sum())
 
-    def shows(self, found: SearchResult, one: Candidate) -> bool:
-        """Return whether held-out flights are sensitive enough to show `one` at its fitted size."""
-        del found, one
+    def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
+        """Return whether held-out flights are sensitive to `candidate` at its fitted size."""
+        del found, candidate
         return False
 
-    def matters(self, gap: Gap) -> bool:
+    def is_relevant(self, gap: Gap) -> bool:
         """Return whether `gap` may exceed the noise by a relevant amount."""
         del gap
         return True
@@ -150,13 +169,13 @@ class Source(ABC):
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
         """Return by effect its size on these flights, and the upper end of that size's interval.
 
-        Empty where that has no physical unit: then no effect is too small.
+        Empty if the size has no physical unit; then no effect counts as too small.
         """
         del found
         return {}
 
-    def stepped(self, found: SearchResult) -> bool:
-        """Return whether the named effects may be caused by a simulator's time steps."""
+    def explained_by_steps(self, found: SearchResult) -> bool:
+        """Return whether a simulator's time steps may cause the named effects."""
         del found
         return False
 
@@ -166,13 +185,13 @@ class Source(ABC):
         return None
 
     def series(self, found: SearchResult) -> Series | None:
-        """Return a held-out stretch for a picture, with what was named where something was."""
+        """Return a held-out stretch for a chart, simulated as given and with named effects."""
         del found
         return None
 
 
 @dataclass(frozen=True)
-class Given:
+class DiagnosisInput:
     """The input of a diagnosis."""
 
     logs: Sequence[FlightLog]
@@ -180,32 +199,33 @@ class Given:
     references: Sequence[FlightLog]
     """Flights of the same vehicle before a change."""
     drive: str
-    """What the model's input is: "commands", "motors" or "auto"."""
+    """Input of the model: "commands", "motors" or "auto"."""
     integrator: str
-    """How the flights' bodies were moved: "continuous", "euler" or "auto"."""
+    """Integration of the flights' bodies: "continuous", "euler" or "auto"."""
     say: Callable[[str], None]
+    """Receives a line of progress for people."""
     limits: Thresholds
     chosen: bool
-    """Whether the source was chosen by name; then it raises an error where it cannot be used."""
+    """Whether the source was chosen by name; then it raises an error if it cannot be used."""
 
 
 @dataclass(frozen=True)
-class Sources:
+class SourceSet:
     """The sources of evidence that flights allow."""
 
     sources: tuple[Source, ...]
     held_out: Sequence[str]
-    """Names of what is held out."""
+    """Names of held-out flights or stretches."""
     driven_by: str
-    """What the model's input is, for people."""
+    """Input of the model, for people."""
     warnings: Sequence[str] = ()
     tested: tuple[TestedEffect, ...] = ()
     compares: tuple[str, ...] = ()
-    """How flights of the unchanged vehicle differ, in words, where a change is searched for."""
+    """For people, if a change is searched for: how flights of the unchanged vehicle differ."""
 
-    def joined(self, more: Sources) -> Sources:
+    def joined(self, more: SourceSet) -> SourceSet:
         """Return these and `more` together."""
-        return Sources(
+        return SourceSet(
             (*self.sources, *more.sources),
             tuple(dict.fromkeys([*self.held_out, *more.held_out])),
             self.driven_by or more.driven_by,
@@ -217,25 +237,27 @@ class Sources:
 
 @dataclass(frozen=True)
 class Finding:
-    """What one source found."""
+    """Result of one source."""
 
     source: Source
     search: SearchResult
     names: tuple[NamedEffect, ...]
-    """The named effects that stand after the comparison with other sources."""
+    """Named effects after the comparison with other sources."""
     before: Gap
+    """Gap of the given vehicle."""
     after: Gap
+    """Gap with the named effects."""
     without: Mapping[str, Gap]
-    """By a named effect's label: the gap with all others."""
+    """By the label of a named effect: the gap with all others."""
     half_width: Mapping[int, float]
-    """Of the 95 % interval, by the place of each named number."""
+    """Half-width of the 95 % interval, by the index of each named parameter."""
     sizes: Mapping[str, EffectSize]
-    """What each named effect does on these flights."""
+    """Size of each named effect on these flights."""
     negligible: tuple[tuple[str, EffectSize], ...]
-    """Effects that are significant and too small to matter."""
+    """Significant effects that are too small to be relevant."""
     remaining: Remaining
     control: tuple[str, Gap] | None = None
-    """A wrong effect fitted in the same way, and its gap."""
+    """A wrong effect that was fitted in the same way, and its gap."""
 
     @property
     def theta(self) -> np.ndarray:
@@ -243,14 +265,14 @@ class Finding:
         return self.search.estimate.theta
 
     def by_effect(self) -> dict[str, list[NamedEffect]]:
-        """Return the names by their effect: one motor is a name of its own."""
-        found: dict[str, list[NamedEffect]] = {}
-        for one in self.names:
-            found.setdefault(one.candidate.name, []).append(one)
-        return found
+        """Return the names by their effect; an effect of one motor is a separate name."""
+        groups: dict[str, list[NamedEffect]] = {}
+        for named in self.names:
+            groups.setdefault(named.candidate.name, []).append(named)
+        return groups
 
     def removed(self, names: Sequence[NamedEffect]) -> float:
-        """Return the share of the gap that `names`, of one effect, take away when added last."""
-        without = max(self.without[one.candidate.label].rms for one in names)
-        whole = max(self.before.rms - self.before.floor, 1e-9)
-        return min(max((without - self.after.rms) / whole, 0.0), 1.0)
+        """Return the share of the gap that `names`, of one effect, remove when added last."""
+        without = max(self.without[named.candidate.label].rms for named in names)
+        total = max(self.before.rms - self.before.floor, LEAST_GAP)
+        return min(max((without - self.after.rms) / total, 0.0), 1.0)

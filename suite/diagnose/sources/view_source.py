@@ -1,7 +1,8 @@
-"""The sources `force` and `torque`, with a black box as the limit of what any model explains.
+"""The sources of evidence `force` and `torque`, which compare mean accelerations with the model.
 
-The black box is a ridge regression without physics, fitted to the same flights. It shows how much
-of the residual could be explained at all, and whether structure remains beyond the named effects.
+Each is a view: one part of the dynamics, with all other signals as measured. A black box, a ridge
+regression without physics, is fitted to the same flights. It estimates how much of the error any
+model could explain, and whether structure remains beyond the named effects.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
+from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.evidence.moments import centred, means_of, units_of
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.change import search_motion_change
@@ -22,8 +24,9 @@ from suite.diagnose.verdict.disturbances import swing_left
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, upper_size, view_size
 
 STRETCH_S = 10.0
-"""Length of the stretch in a picture [s]."""
-WHAT = {"force": "acceleration", "torque": "angular acceleration"}
+"""Length of the stretch in a chart [s]."""
+QUANTITIES = {"force": "acceleration", "torque": "angular acceleration"}
+"""Compared quantity, by the name of a view."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,68 +38,69 @@ class ViewSource(Source):
     """The held-out flights."""
     floor: np.ndarray
     """(3,) standard deviation of a mean acceleration by measurement noise, by body axis."""
-    every: ViewEvidence | None = None
-    """All flights, in which an oscillating force is searched for; None in a torque view."""
+    all_flights: ViewEvidence | None = None
+    """All flights, to search for an oscillating force; None in a torque view."""
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
-        left = self.held.left(theta)
-        # Where only means of flights are compared, each is a flight of its own.
-        own = left.residual if self.held.means else centred(left.residual, left.flight)
-        error = _rms(left.residual)
+        data = self.held.left(theta)
+        # If only means of flights are compared, there is no error within a flight.
+        within = data.residual if self.held.means else centred(data.residual, data.flight)
+        error = np.sqrt((data.residual**2).mean(axis=0))
         channels = {
             "xyz"[k]: Channel(float(error[k]), float(self.floor[k])) for k in self.view.axes
         }
         return Gap(
-            (left.residual**2).sum(axis=1),
-            (own**2).sum(axis=1),
+            (data.residual**2).sum(axis=1),
+            (within**2).sum(axis=1),
             {self.name: channels},
             float(np.sqrt((self.floor**2).sum())),
         )
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
-        """Return what the names do on the fitted flights, see `Source`."""
+        """Return the sizes of the named effects on the fitted flights, see `Source`."""
         block = found.last.block
         assert isinstance(block, ViewBlock)
-        width, away = found.half_widths(), found.moved
+        width, change = found.half_widths(), found.moved
 
         def size_of(moved: np.ndarray) -> EffectSize:
             return view_size(moved, self.view.in_world)
 
         sizes = {}
-        for name in dict.fromkeys(one.candidate.name for one in found.named):
-            at = [k for k, i in enumerate(found.indices) if self.space.entries[i].effect == name]
-            slope = block.data.slope[..., [block.along.index(found.indices[k]) for k in at]]
-            upper = upper_size(slope, away[at], width[at], size_of)
-            sizes[name] = (size_of(slope @ away[at]), upper)
+        for name in dict.fromkeys(named.candidate.name for named in found.named):
+            own = [k for k, i in enumerate(found.indices) if self.space.entries[i].effect == name]
+            slope = block.data.slope[..., [block.along.index(found.indices[k]) for k in own]]
+            upper = upper_size(slope, change[own], width[own], size_of)
+            sizes[name] = (size_of(slope @ change[own]), upper)
         return sizes
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
-        """Return what a black box closes beyond the names, see `Source`."""
+        """Return the error that a black box explains beyond the named effects, see `Source`."""
         shares = self._shares(found)
-        by_axis = shares.left if found.named else shares.explainable
-        share, left = shares.whole(by_axis), shares.whole(shares.left)
+        by_axis = shares.beyond if found.named else shares.explainable
+        share, beyond = shares.total(by_axis), shares.total(shares.beyond)
         rms = float(np.sqrt(share * shares.variance.sum()))
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
-        axis = max(self.view.axes, key=lambda k: float(shares.left[k] * shares.variance[k]))
+        axis = max(self.view.axes, key=lambda k: float(shares.beyond[k] * shares.variance[k]))
         where = (
             f"{self.name} along body {'xyz'[axis]}, of which a regression without physics explains "
-            f"a further {100 * max(float(shares.left[axis]), 0.0):.0f} %"
+            f"a further {100 * max(float(shares.beyond[axis]), 0.0):.0f} %"
         )
         swing = None
-        if self.every is not None:
-            swing = swing_left(self.every, found.estimate.theta)
-            force = self._unexplained(found.estimate.theta, gaps[1], seed)
+        if self.all_flights is not None:
+            swing = swing_left(self.all_flights, found.estimate.theta)
+            force = self._unexplained_force(found.estimate.theta, gaps[1], seed)
             if force and not structured:
-                structured, left = True, max(left, share_of_energy(*gaps, self._noise))
+                structured, beyond = True, max(beyond, share_of_energy(*gaps, self._noise_power))
                 where = (
-                    f"a force of {force:.2g} m/s^2 beyond the noise, which no flown signal predicts"
+                    f"a force of {force:.2g} m/s^2 beyond the noise, which no logged signal "
+                    "predicts"
                 )
-        closed, explainable = shares.whole(shares.closed), shares.whole(shares.explainable)
+        closed, explainable = shares.total(shares.closed), shares.total(shares.explainable)
         return Remaining(
             structured,
-            left,
+            beyond,
             where,
             explainable,
             swing=swing,
@@ -105,56 +109,57 @@ class ViewSource(Source):
         )
 
     @property
-    def _noise(self) -> float:
-        """Mean square that measurement noise gives along the axes that are compared."""
+    def _noise_power(self) -> float:
+        """Mean square of the measurement noise along the compared axes."""
         return float((self.floor[list(self.view.axes)] ** 2).sum())
 
-    def _unexplained(self, theta: np.ndarray, left: Gap, seed: int) -> float:
-        """Return the force [m/s^2] that remains within held-out flights, 0 where it is no finding.
+    def _unexplained_force(self, theta: np.ndarray, gap: Gap, seed: int) -> float:
+        """Return the force [m/s^2] that remains within held-out flights, or 0 if insignificant.
 
-        It has to exceed the noise surely, and both the threshold of relevance and what the flights'
-        constant offsets show attitude and thrust to be known to. The torque has no such test: noise
-        of the rotor speeds is most of what remains of it. `left` is the gap at `theta` (P,).
+        It has to exceed the noise significantly. It also has to exceed the threshold of relevance
+        and the flights' constant offsets, which show the accuracy of attitude and thrust. The
+        torque has no such test, since noise of the rotor speeds dominates its remaining error.
+        `gap` is the gap at `theta` (P,).
         """
-        assert self.every is not None
-        data, limits = self.every.left(theta), self.limits
+        assert self.all_flights is not None
+        data, limits = self.all_flights.left(theta), self.limits
         offset = means_of(data.residual, data.flight)
         trim = limits.unexplained_trim * float(np.sqrt((offset**2).sum(axis=1).mean()))
         least = max(limits.relevance[0], min(trim, limits.unexplained_force))
-        if left.least_energy(seed, limits) < self._noise + least**2:
+        if gap.least_energy(seed, limits) < self._noise_power + least**2:
             return 0.0
-        return float(np.sqrt(left.energy.mean() - self._noise))
+        return float(np.sqrt(gap.energy.mean() - self._noise_power))
 
     def _shares(self, found: SearchResult) -> Shares:
-        """Return which share of the error the names close, and a black box."""
+        """Return the shares of the error that the named effects and a black box explain."""
         evidence = found.last.evidence
         assert isinstance(evidence, ViewEvidence)
         before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
         trim = np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
         if self.held.means:
             power = (before.residual**2).mean(axis=0)
-            closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, 1e-12)
+            closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, TINY)
             return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, trim)
         start, fitted = evidence.left(found.start.theta), evidence.left(found.estimate.theta)
-        inside = np.concatenate([inputs_of(flight) for flight in evidence.flights])
-        outside = np.concatenate([inputs_of(flight) for flight in self.held.flights])
-        whole = fit_black_box(inside, start.residual, start.flight)
-        beyond = fit_black_box(inside, fitted.residual, fitted.flight)
-        closed, explainable, both = (
-            closed_share(before.residual, left, before.flight)
-            for left in (
+        inputs = np.concatenate([inputs_of(flight) for flight in evidence.flights])
+        held_inputs = np.concatenate([inputs_of(flight) for flight in self.held.flights])
+        black_box = fit_black_box(inputs, start.residual, start.flight)
+        beyond_box = fit_black_box(inputs, fitted.residual, fitted.flight)
+        closed, explainable, with_both = (
+            closed_share(before.residual, error, before.flight)
+            for error in (
                 after.residual,
-                before.residual - whole.predict(outside),
-                after.residual - beyond.predict(outside),
+                before.residual - black_box.predict(held_inputs),
+                after.residual - beyond_box.predict(held_inputs),
             )
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
-        return Shares(closed, np.maximum(explainable, closed), both - closed, variance, trim)
+        return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, trim)
 
     def series(self, found: SearchResult) -> Series:
-        """Return the stretch of a held-out flight that the names change most, see `Source`.
+        """Return the stretch of a held-out flight that the named effects change most.
 
-        Where nothing is named, the one with the largest error.
+        If nothing is named, it is the stretch with the largest error. See `Source`.
         """
         before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
         shares = self._shares(found)
@@ -162,60 +167,64 @@ class ViewSource(Source):
         axis = max(self.view.axes, key=lambda k: float(weight[k]))
         rows = before.flight == before.flight[0]
         middle = before.middle_s[rows]
-        apart = before.residual - (after.residual if found.named else 0.0)
-        moved = np.abs(apart[rows, axis])
+        change = before.residual - (after.residual if found.named else 0.0)
+        size = np.abs(change[rows, axis])
         count = max(int((middle < middle[0] + STRETCH_S).sum()), 2)
-        first = int(np.convolve(moved, np.ones(min(count, len(moved))), "valid").argmax())
+        # The sum over each stretch of this length.
+        first = int(np.convolve(size, np.ones(min(count, len(size))), "valid").argmax())
         shown = slice(first, first + count)
         measured = (before.value + before.residual)[rows, axis][shown]
         lines = {"simulated as given": before.value[rows, axis][shown]}
         if found.named:
             named = measured - after.residual[rows, axis][shown]
-            lines["simulated with what was named"] = named
-        what = WHAT.get(self.name, self.name).capitalize()
+            lines["simulated with the named effects"] = named
+        quantity = QUANTITIES.get(self.name, self.name).capitalize()
         return Series(
             middle[shown] - middle[shown][0],
             measured,
             lines,
-            f"{what} along body {'xyz'[axis]} [{self.unit}]",
+            f"{quantity} along body {'xyz'[axis]} [{self.unit}]",
             "A stretch of a held-out flight.",
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSource(ViewSource):
-    """A change that shows only in motion, tested where no mean of a flight has changed."""
+    """A change since reference flights that shows only in motion.
+
+    It is tested if no flight's mean has changed.
+    """
 
     reference: ViewEvidence
     fitted: ViewEvidence
     """The flights after the change."""
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
-        """Return what has changed since the reference flights, see `Source`."""
+        """Search for an effect that has changed since the reference flights, see `Source`."""
         del say, seed
-        found = search_motion_change(self.reference, self.fitted, self.among)
-        evidence, block = self.known
+        found = search_motion_change(self.reference, self.fitted, self.candidates)
+        evidence, block = self.weighed
         none = Evaluation(evidence, self.start, block)
         return found or SearchResult((), self.start, none, none, [], 0.0)
 
 
 class Shares(NamedTuple):
-    """Share of the variance within flights that is explained ('closed'), by body axis (3,) [1]."""
+    """Explained shares of the error's variance within flights, by body axis (3,) [1]."""
 
     closed: np.ndarray
-    """By the named effects."""
+    """Share that the named effects explain."""
     explainable: np.ndarray
-    """By a black box that is fitted to the same flights."""
-    left: np.ndarray
-    """By a black box, beyond the named effects."""
+    """Share that a black box explains, fitted to the same flights."""
+    beyond: np.ndarray
+    """Share that a black box explains beyond the named effects."""
     variance: np.ndarray
-    """Within flights, as given [the view's unit squared]."""
+    """Variance of the error of the given vehicle [the view's unit squared]."""
     repeatability: np.ndarray
     """Spread of flights' means [the view's unit]; NaN with too few flights."""
 
-    def whole(self, by_axis: np.ndarray) -> float:
-        """Return a share by axis (3,) as one of all axes together, at least 0."""
-        return float(max((by_axis * self.variance).sum() / max(self.variance.sum(), 1e-12), 0.0))
+    def total(self, by_axis: np.ndarray) -> float:
+        """Return a share by axis (3,) as the share of all axes together, at least 0."""
+        return float(max((by_axis * self.variance).sum() / max(self.variance.sum(), TINY), 0.0))
 
     def along(self, axis: int) -> dict[str, float | None]:
         """Return the entries of an axis in diagnosis.json."""
@@ -225,18 +234,15 @@ class Shares(NamedTuple):
             "explainable": self.explainable,
         }
         return {
-            key: float(one[axis]) if np.isfinite(one[axis]) else None for key, one in values.items()
+            key: float(shares[axis]) if np.isfinite(shares[axis]) else None
+            for key, shares in values.items()
         }
 
 
-def share_of_energy(before: Gap, after: Gap, noise: float) -> float:
-    """Return the share of the mean energy of `before`, less that of `noise`, that `after` has."""
-    left = max(float(after.energy.mean()) - noise, 0.0)
-    return left / max(float(before.energy.mean()) - noise, left, 1e-12)
-
-
-def _rms(residual: np.ndarray) -> np.ndarray:
-    return np.sqrt((residual**2).mean(axis=0))
+def share_of_energy(before: Gap, after: Gap, noise_power: float) -> float:
+    """Return the ratio of the mean squared errors after and before, both minus `noise_power`."""
+    remaining = max(float(after.energy.mean()) - noise_power, 0.0)
+    return remaining / max(float(before.energy.mean()) - noise_power, remaining, TINY)
 
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -244,67 +250,75 @@ RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 
 
 class BlackBox(NamedTuple):
-    """A fitted black box."""
+    """A fitted ridge regression of an error on K inputs."""
 
-    spread: np.ndarray
-    """(K,) of the inputs."""
+    scale: np.ndarray
+    """(K,) standard deviations of the inputs."""
     weight: np.ndarray
-    """(K, 3)."""
+    """(K, 3) weights of the scaled inputs."""
 
     def predict(self, inputs: np.ndarray) -> np.ndarray:
-        """Return its prediction (M, 3) for `inputs` (M, K)."""
-        return (inputs / self.spread) @ self.weight
+        """Return the predicted error (M, 3) for `inputs` (M, K)."""
+        return (inputs / self.scale) @ self.weight
 
 
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
-    """Return the products (M, K) that a black box sees of a flight, smoothed as the view is."""
-    return flight.form.mean @ _products(flight.rows)
+    """Return the black box's inputs (M, K) from a flight, averaged over the view's windows."""
+    return flight.form.mean @ _features(flight.rows)
 
 
-def fit_black_box(inputs: np.ndarray, left: np.ndarray, flight: np.ndarray) -> BlackBox:
-    """Return the black box that explains `left` (M, 3) best in cross-validation over flights.
+def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> BlackBox:
+    """Fit the black box that explains `error` (M, 3) best in cross-validation over flights.
 
-    Means of flights, which are trims, are subtracted on both sides. `flight` (M,) is the number of
-    each row's flight; a lone flight is split into thirds.
+    Each flight's mean, its trim, is subtracted from inputs (M, K) and error. `flight` (M,) is the
+    number of each row's flight; a single flight is split into thirds.
     """
-    units = units_of(flight)
-    inputs, left = centred(inputs, flight), centred(left, flight)
-    spread = np.maximum(inputs.std(axis=0), 1e-9)
-    scaled = inputs / spread
+    groups = units_of(flight)
+    inputs, error = centred(inputs, flight), centred(error, flight)
+    scale = np.maximum(inputs.std(axis=0), 1e-9)
+    scaled = inputs / scale
 
     def solve(rows: np.ndarray, ridge: float) -> np.ndarray:
         square = scaled[rows].T @ scaled[rows] + ridge * rows.sum() * np.eye(scaled.shape[1])
-        return np.linalg.solve(square, scaled[rows].T @ left[rows])
+        return np.linalg.solve(square, scaled[rows].T @ error[rows])
 
-    errors = []
+    held_errors = []
     for ridge in RIDGES:
-        missed = np.zeros(3)
-        for unit in np.unique(units):
-            out = units == unit
-            missed += ((left[out] - scaled[out] @ solve(~out, ridge)) ** 2).sum(axis=0)
-        errors.append(missed)
-    best = np.argmin(errors, axis=0)
-    every = np.ones(len(units), bool)
-    columns = [solve(every, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
-    none = (left**2).sum(axis=0) <= np.min(errors, axis=0)  # predicting 0 is better
-    return BlackBox(spread, np.where(none, 0.0, np.stack(columns, axis=1)))
+        total = np.zeros(3)
+        for group in np.unique(groups):
+            held = groups == group
+            total += ((error[held] - scaled[held] @ solve(~held, ridge)) ** 2).sum(axis=0)
+        held_errors.append(total)
+    best = np.argmin(held_errors, axis=0)
+    all_rows = np.ones(len(groups), bool)
+    columns = [solve(all_rows, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
+    zero_is_better = (error**2).sum(axis=0) <= np.min(held_errors, axis=0)
+    return BlackBox(scale, np.where(zero_is_better, 0.0, np.stack(columns, axis=1)))
 
 
-def closed_share(left: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the share (3,) of the variance of `left` (M, 3) within flights that is gone."""
-    before = (centred(left, flight) ** 2).sum(axis=0)
-    return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(before, 1e-12)
+def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
+    """Return the share (3,) of the errors' variance within flights that `after` no longer has.
+
+    Both errors are (M, 3); `flight` (M,) is the number of each row's flight.
+    """
+    power = (centred(before, flight) ** 2).sum(axis=0)
+    return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
 
 
-def _products(rows: FlightRows) -> np.ndarray:
-    """Return the inputs (N, K) on every row: what was flown, and its products by two."""
+PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
+"""Sums and differences of the rotors' thrusts, as of collective thrust, roll, pitch and yaw."""
+
+
+def _features(rows: FlightRows) -> np.ndarray:
+    """Return the black box's inputs (N, K) on every row: flown signals and products of two."""
     vel_b = rows.vel_b
-    push = rows.rotor_speed**2
-    push = push / np.maximum(push.mean(), 1e-9)
-    pairs = push @ np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]]).T / 4.0
-    # Near the ground heights matter; far from it no height is like no other.
+    thrust = rows.rotor_speed**2
+    thrust = thrust / np.maximum(thrust.mean(), 1e-9)
+    mixed = thrust @ PATTERNS.T / 4.0
+    # The height matters near the ground only.
     near = 1.0 / (1.0 + np.maximum(rows.pos_w[:, 2:], 0.0))
-    one = np.concatenate([vel_b, rows.rate_b, pairs, near, rows.voltage_drop[:, None]], axis=1)
-    row, column = np.triu_indices(one.shape[1])
+    drop = rows.voltage_drop[:, None]
+    signals = np.concatenate([vel_b, rows.rate_b, mixed, near, drop], axis=1)
+    row, column = np.triu_indices(signals.shape[1])
     speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
-    return np.concatenate([one, one[:, row] * one[:, column], speed * vel_b], axis=1)
+    return np.concatenate([signals, signals[:, row] * signals[:, column], speed * vel_b], axis=1)

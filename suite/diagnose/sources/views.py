@@ -1,4 +1,8 @@
-"""Makes the sources `force` and `torque`, since the vehicle file or since reference flights."""
+"""Makes the sources of evidence `force` and `torque` from flights.
+
+They compare the flights with the vehicle file. With reference flights of the same vehicle, they
+search for a change since those instead.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
 from suite.diagnose.search.change import changed, changed_task
-from suite.diagnose.sources.source import Given, Source, Sources, TestedEffect
+from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet, TestedEffect
 from suite.diagnose.sources.view_source import MotionSource, ViewSource
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
@@ -32,13 +36,18 @@ MEASURE = (
 )
 
 
-def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
-    """Return the sources force and torque of (also partial) flights; None where rollouts are used.
+def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
+    """Make the sources force and torque; flights may lack signals.
 
-    With reference flights the sources are those of what has changed since.
+    Args:
+        given: the input of the diagnosis.
+        before: sources that exist already.
+
+    Returns:
+        The sources, or None if rollouts are used and these were not chosen by name.
 
     Raises:
-        ValueError: for flights that cannot be used, or a lone reference flight.
+        ValueError: if flights cannot be used, or there is only one reference flight.
     """
     if before and not given.chosen:
         return None
@@ -48,9 +57,9 @@ def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
-    among, unseen = candidates(space, voltage, ()), list[str]()
+    allowed, unseen = candidates(space, voltage, ()), list[str]()
     if any(is_inertial(log) for log in [*logs, *references]):
-        among = [one for one in among if EFFECTS[one.name].wind is None]
+        allowed = [one for one in allowed if EFFECTS[one.name].wind is None]
         limits = replace(limits, least_view_share=limits.least_inertial_share)
         unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
     earlier, spread, left_out = _references(given, flights, model, limits)
@@ -58,34 +67,36 @@ def by_views(given: Given, before: Sequence[Source]) -> Sources | None:
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
-    numbers, names = _held(logs, flights, model, limits)
-    inside, held = parted(flights, numbers, limits)
+    held_numbers, held_names = _choose_held_out(logs, flights, model, limits)
+    fitted, held = parted(flights, held_numbers, limits)
     partial = any(log.partial for log in [*logs, *references])
     sources = []
     for view in flights.views:
-        task = ViewEvidence(view, model, inside[view.name], limits)
-        apart = replace(task, flights=held[view.name])
+        evidence = ViewEvidence(view, model, fitted[view.name], limits)
+        held_evidence = replace(evidence, flights=held[view.name])
         floor = flights.floor[view.name]
         if spread is None:
-            every = replace(task, flights=flights.smoothed[FORCE.name]) if view.in_world else None
-            sources.append(_since_file(task, apart, every, among, floor))
+            every = flights.smoothed[FORCE.name]
+            all_flights = replace(evidence, flights=every) if view.in_world else None
+            source = _since_file(evidence, held_evidence, all_flights, allowed, floor)
         else:
             reference = earlier[view.name]
-            one = _since_reference(reference, task, apart, spread, among, floor)
-            sources.append(replace(one, otherwise=None) if partial else one)
+            source = _since_reference(reference, evidence, held_evidence, spread, allowed, floor)
+            source = replace(source, fallback=None) if partial else source
+        sources.append(source)
     lag = None if references else another_lag(logs, vehicle, limits)
-    return Sources(
+    return SourceSet(
         tuple(sources),
-        names,
+        held_names,
         flights.source,
         (*flights.notes, *unseen, *left_out),
-        (_tested(lag),) if lag else (),
-        _compared(spread, len(references)),
+        (_lag_effect(lag),) if lag else (),
+        _spread_words(spread, len(references)),
     )
 
 
-def _tested(lag: RotorLag) -> TestedEffect:
-    """Return the rotors' lag as a named effect: no view depends on it."""
+def _lag_effect(lag: RotorLag) -> TestedEffect:
+    """Return the rotors' lag as a named effect; force and torque do not depend on it."""
     low, high = max(lag.time_constant - lag.half_width, 0.0), lag.time_constant + lag.half_width
     parameters = {
         "time_constant": {"value": lag.time_constant, "unit": "s", "ci95": [low, high]},
@@ -98,7 +109,8 @@ def _tested(lag: RotorLag) -> TestedEffect:
     return TestedEffect(LAG, values, parameters, lag.closed, lag.p_value, "commands", words)
 
 
-def _about(view: View) -> dict[str, Any]:
+def _descriptions(view: View) -> dict[str, Any]:
+    """Return those fields of a source that follow from its view."""
     about = {"about": view.about, "unit": view.unit}
     measure = MEASURE.format(**about, width=view.width_s)
     return {
@@ -108,67 +120,73 @@ def _about(view: View) -> dict[str, Any]:
 
 
 def _since_file(
-    task: ViewEvidence,
+    evidence: ViewEvidence,
     held: ViewEvidence,
-    every: ViewEvidence | None,
-    among: Sequence[Candidate],
+    all_flights: ViewEvidence | None,
+    allowed: Sequence[Candidate],
     floor: np.ndarray,
 ) -> ViewSource:
-    """Return the source of what the vehicle file lacks."""
-    known = task.weighed(task.start)
+    """Return the source that compares flights with the vehicle file."""
+    weighed = evidence.weighed(evidence.start)
     return ViewSource(
-        known=known,
-        start=task.start,
-        among=view_candidates([*among, *composites(among)], known[1]),
-        limits=task.limits,
+        weighed=weighed,
+        start=evidence.start,
+        candidates=view_candidates([*allowed, *composites(allowed)], weighed[1]),
+        limits=evidence.limits,
         held=held,
         floor=floor,
-        every=every,
-        **_about(task.view),
+        all_flights=all_flights,
+        **_descriptions(evidence.view),
     )
 
 
 def _since_reference(
     reference: ViewEvidence,
-    task: ViewEvidence,
+    evidence: ViewEvidence,
     held: ViewEvidence,
     spread: RotorSpread,
-    among: Sequence[Candidate],
+    allowed: Sequence[Candidate],
     floor: np.ndarray,
 ) -> ViewSource:
-    """Return the source of what has changed since the `reference` flights.
+    """Return the source that searches for a change since the `reference` flights.
 
-    Means of flights are compared; where none has changed, what shows in motion.
+    It compares means of flights. If none has changed, its fallback searches for a change that shows
+    in motion.
     """
-    evidence, start = changed(reference, task.flights, spread)
-    known = evidence.again(start)
-    moved = MotionSource(
-        known=known, start=start, among=among, limits=task.limits, held=held, floor=floor,
-        keeps_small=True, reference=reference, fitted=task, **_about(task.view),
-    )  # fmt: skip
+    difference, start = changed(reference, evidence.flights, spread)
+    weighed = difference.again(start)
+    shared: dict[str, Any] = {
+        **_descriptions(evidence.view), "weighed": weighed, "start": start, "floor": floor,
+        "limits": evidence.limits, "names_small": True,
+    }  # fmt: skip
+    in_motion = MotionSource(
+        candidates=allowed, held=held, reference=reference, fitted=evidence, **shared
+    )
     means = replace(changed_task(reference, start.theta, held.flights), means=True)
-    return ViewSource(
-        known=known, start=start, among=view_candidates(among, known[1]), limits=task.limits,
-        held=means, floor=floor, keeps_small=True, otherwise=moved, **_about(task.view),
-    )  # fmt: skip
+    compared = view_candidates(allowed, weighed[1])
+    return ViewSource(candidates=compared, held=means, fallback=in_motion, **shared)
 
 
-def _compared(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
-    """Return in words how much reference flights differ."""
+def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
+    """Return for people how much the `count` reference flights differ."""
     if spread is None:
         return ()
     return (
-        f"The {count} reference flights differ as though each rotor's thrust were off by "
-        f"{100 * spread.share:.1f} % from flight to flight ({spread.freedom} degrees of freedom); "
-        "along an axis its own differences count next to that. A change is named where it stands "
-        "out of them.",
+        f"The {count} reference flights differ as if each rotor's thrust varied by "
+        f"{100 * spread.share:.1f} % from flight to flight ({spread.freedom} degrees of freedom). "
+        "The differences along each axis count as well. A change is named if it exceeds these "
+        "differences significantly.",
     )
 
 
 def _references(
-    given: Given, flights: ViewFlights, model: ForceModel, limits: Thresholds
+    given: DiagnosisInput, flights: ViewFlights, model: ForceModel, limits: Thresholds
 ) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Return the reference flights by view, how they differ, and which were left out."""
+    """Return the reference flights by view, their spread, and a note for each unusable flight.
+
+    Raises:
+        ValueError: if there are less than two, or they differ from the others in their signals.
+    """
     if not given.references:
         return {}, None, ()
     before = ready(given.references, given.vehicle, limits, given.logs)
@@ -176,8 +194,8 @@ def _references(
         raise ValueError(
             "; ".join(
                 [
-                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3: "
-                    "how flights of one vehicle differ is taken from them",
+                    f"--reference has {len(before.names)} flight; at least 2 are needed, better 3, "
+                    "to estimate how flights of one vehicle differ",
                     *before.notes,
                 ]
             )
@@ -185,32 +203,32 @@ def _references(
     if before.views != flights.views or before.source != flights.source:
         raise ValueError(
             f"the reference flights are driven by {before.source} and allow "
-            f"{_allowed(before)}, the others by {flights.source} and {_allowed(flights)}: log both "
-            "alike"
+            f"{_view_words(before)}, the others by {flights.source} and {_view_words(flights)}: "
+            "log the same signals in both"
         )
-    tasks = {
+    earlier = {
         view.name: ViewEvidence(view, model, before.smoothed[view.name], limits)
         for view in flights.views
     }
-    after = [replace(task, flights=flights.smoothed[name]) for name, task in tasks.items()]
-    return tasks, rotor_spread([*tasks.values(), *after]), before.notes
+    later = [replace(one, flights=flights.smoothed[name]) for name, one in earlier.items()]
+    return earlier, rotor_spread([*earlier.values(), *later]), before.notes
 
 
-def _allowed(flights: ViewFlights) -> str:
-    """Return in words which views, axes and means flights allow."""
+def _view_words(flights: ViewFlights) -> str:
+    """Return in words the views of flights, with their axes and the width of their windows."""
     return " and ".join(
         f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
         for view in flights.views
     )
 
 
-def _held(
+def _choose_held_out(
     logs: Sequence[FlightLog], flights: ViewFlights, model: ForceModel, limits: Thresholds
 ) -> tuple[list[int], list[str]]:
-    """Return the numbers and the names of the flights that are held out."""
+    """Return the numbers and the names of the held-out flights, chosen by their information."""
     view = flights.views[0]
-    task = ViewEvidence(view, model, flights.smoothed[view.name], limits)
-    block = task.weighed(task.start)[1]
+    evidence = ViewEvidence(view, model, flights.smoothed[view.name], limits)
+    block = evidence.weighed(evidence.start)[1]
     informed = (block.slope**2).sum(axis=1)
     _, names = choose_held_out(logs, block.flight, np.zeros(len(informed)), informed, limits)
     return [k for k, log in enumerate(logs) if log.name in names], names

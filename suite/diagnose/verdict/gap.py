@@ -107,10 +107,6 @@ class EffectSize(NamedTuple):
         force, torque, drift = limits.relevance
         return self.force >= force or self.torque >= torque or (self.drift or 0.0) >= drift
 
-    def as_json(self) -> dict[str, float | None]:
-        """Return the size as diagnosis.json has it."""
-        return {"force": self.force, "torque": self.torque, "drift": self.drift}
-
     def words(self) -> str:
         """Return the size in a line."""
         drift = "" if self.drift is None else f", {self.drift:.2g} m after 1 s"

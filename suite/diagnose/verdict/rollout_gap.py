@@ -91,7 +91,7 @@ class Rollouts:
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - 1e-6)
         series = {"simulated as given": self.start}
         if fitted is not None:
-            series["simulated with what was named"] = fitted
+            series["simulated with the named effects"] = fitted
         return windows, {
             label: self.model.residual(theta, true_starts(self.model, theta, windows), windows)
             for label, theta in series.items()

@@ -217,7 +217,7 @@ def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch)
     monkeypatch.setattr("suite.diagnose.sources.rollouts.another_controller", lambda *_: True)
     logs = [fly(LAGGED, seed, duration_s=2.0, motors=seed > 0) for seed in range(2)]
     without = next(log.name for log in logs if log.rotor_speed is None)
-    with pytest.raises(ValueError, match=f"{without} has none to drive by: diagnose the others"):
+    with pytest.raises(ValueError, match=f"{without} has none as an input: diagnose the other"):
         diagnose(logs, LAGGED)
 
 

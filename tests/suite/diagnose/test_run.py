@@ -19,7 +19,7 @@ STEPS = (
     "The logs",
     "The measurement noise",
     "The candidates",
-    "What could stand in its place",
+    "Alternatives to the named effects",
     "Remaining error",
     "The evidence",
 )

@@ -19,7 +19,7 @@ from suite.diagnose.evidence.evidence import Evidence
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.search.search import search
-from suite.diagnose.sources.source import Remaining, Source, Sources
+from suite.diagnose.sources.source import Remaining, Source, SourceSet
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.gap import Channel, Gap, share_left
 from tests.support.vehicles import PLAIN
@@ -137,11 +137,11 @@ def as_sources(made):
     fitted = part(made.flight < 3)
     source = ThermometerSource(
         name="air", about="temperatures", subject="temperature", unit="K off", measure="RMS [K]",
-        horizon_s=1.0, known=fitted.weighed(start), start=start,
-        among=[Candidate(name, (p,), name) for name, p in zip(KNOWN, places, strict=True)],
+        horizon_s=1.0, weighed=fitted.weighed(start), start=start,
+        candidates=[Candidate(name, (p,), name) for name, p in zip(KNOWN, places, strict=True)],
         limits=THRESHOLDS, held=part(made.flight == 3),
     )  # fmt: skip
-    return Sources((source,), ("flight 4",), "the weather")
+    return SourceSet((source,), ("flight 4",), "the weather")
 
 
 @pytest.mark.parametrize(("size", "label"), [(0.8, "named"), (0.0, "no_gap")])

@@ -27,7 +27,7 @@ from suite.diagnose.report.sections import (
     residual_section,
 )
 from suite.diagnose.report.summary import (
-    UNSEEN,
+    NOT_IDENTIFIABLE,
     cells,
     components,
     grid,
@@ -88,13 +88,13 @@ def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supp
     entry = {"value": [0.012, 0.0004, None], "ci95": [[0.0119, 0.0121], [-0.001, 0.0018], None],
              "unit": "m"}  # fmt: skip
     x, y, z = components({"name": "com_offset", "parameters": {"offset": entry}})
-    assert (x.label, x.shown()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
-    assert x.found and not y.found and not z.found
-    assert y.shown() == ("not different from 0", "-0.0010 to 0.0018")
-    assert z.shown() == (UNSEEN, "")
+    assert (x.label, x.texts()) == ("offset x [m]", ("0.01200", "0.01190 to 0.01210"))
+    assert x.is_significant and not y.is_significant and not z.is_significant
+    assert y.texts() == ("not different from 0", "-0.0010 to 0.0018")
+    assert z.texts() == (NOT_IDENTIFIABLE, "")
     small = {"value": 1.21e-6, "ci95": [1.1e-6, 1.3e-6], "unit": "kg/rad"}
     (only,) = components({"name": "rotor_drag", "parameters": {"coefficient": small}})
-    assert only.shown() == ("1.21e-06", "1.10e-06 to 1.30e-06")
+    assert only.texts() == ("1.21e-06", "1.10e-06 to 1.30e-06")
     assert in_digits(1234.56, (1234.56, 1200.0, 1270.0)) == "1235"
 
 
@@ -124,7 +124,7 @@ def test_sections_show_the_numbers(drag, flown, found):
     held = evidence_section(drag, {**found, "black_box": compared(drag)}).parts
     assert "too few stretches" in str(held[-1])
     tables = [part for part in held if isinstance(part, Grid)]
-    assert texts(tables[0])[-1][0] == "with what was named" and len(tables) == 2
+    assert texts(tables[0])[-1][0] == "with the named effects" and len(tables) == 2
 
 
 def test_the_facts_of_a_log():

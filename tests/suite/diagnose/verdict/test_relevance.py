@@ -80,7 +80,7 @@ def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
         flown = replace(found_drag.source.flown, held=SimpleNamespace(flight=np.zeros(count)))
         source = replace(found_drag.source, flown=flown, limits=limits)
         groups = dict.fromkeys(("position", "velocity", "rates"), Channel(error, floor))
-        return source.matters(found_drag.before._replace(
+        return source.is_relevant(found_drag.before._replace(
             channels=dict.fromkeys(("0.1 s", "0.5 s", "1 s"), groups)))  # fmt: skip
 
     assert not matters(0.004, 0.001) and matters(0.04, 0.001) and not matters(0.04, 0.05)
