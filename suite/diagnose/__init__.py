@@ -1,1 +1,1 @@
-"""Finding where flights and simulation disagree, and which physical effect is missing."""
+"""Diagnosis: finds which physical effect a simulation lacks, from flights that differ from it."""

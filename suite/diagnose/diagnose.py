@@ -82,11 +82,7 @@ def diagnose(
     return replace(result, seconds=time.monotonic() - start_s)
 
 
-def _diagnosed(
-    given: DiagnosisInput,
-    makers: Sequence[Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]],
-    seed: int,
-) -> Diagnosis:
+def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -> Diagnosis:
     """Return the diagnosis by the sources that `makers` make."""
     flights = SourceSet((), (), "")
     for make in makers:

@@ -1,8 +1,7 @@
-"""Flights that separate effects which the data could not: which, as files, and flown in simulation.
+"""Plans flights that separate effects which the diagnosed flights do not, and simulates them.
 
-`plan.json` holds the numbers that make each trajectory again; a CSV holds where to be, how fast,
-how accelerated and the heading at every hundredth of a second, for autopilots that follow set
-points.
+Each flight is a trajectory: its parameters are in `plan.json`. A CSV has position, velocity,
+acceleration and yaw at every hundredth of a second, for autopilots that follow set points.
 """
 
 from __future__ import annotations
@@ -26,55 +25,57 @@ from tracks.common.provenance import stamp
 from tracks.input.reading import read_json
 
 RATE_HZ = 100.0
-"""Of set points, and of simulated logs, or the nearest rate below that divides the rate loop's."""
-TURNED = 2.1
-"""By which the second flight of each trajectory is turned about z [rad]: one of the two may be
-held out, and their headings differ."""
+"""Rate of set points, and largest rate of simulated logs; theirs divides the rate loop's [Hz]."""
+SECOND_DIRECTION = 2.1
+"""Rotation about z of the second flight of each trajectory [rad]. Two flights with different
+headings allow holding one out."""
 MEASURES = {
     "motor": "Log the rotor speeds as well.",
     "voltage": "Log the battery's voltage as well.",
     "scale": "Better still: weigh the vehicle.",
 }
-"""What to measure as well, by its name in a `Separation`."""
+"""Advice on further measurements, by the name in a `Separation`."""
+ROTOR_NOISE, VOLTAGE_NOISE = 5.0, 0.02
+"""Noise of rotor speeds [rad/s] and voltage [V] where the diagnosed logs have none."""
 FLIGHTS = "flights"
-"""Folder of the simulated logs, within the plan's."""
+"""Folder of the simulated logs, in the plan's folder."""
 
 
-def sets_of(found: Mapping[str, Any]) -> list[set[str]]:
-    """Return the sets of names that a diagnosis (its JSON) could not separate."""
-    return [
-        {effect["name"], *effect["alternatives"]}
-        for effect in found["effects"]
-        if effect["alternatives"]
-    ]
+def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
+    """Return the flights that separate what a diagnosis did not, and advice in words.
 
-
-def ways_for(found: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
-    """Return the flights that separate what `found` could not, and what to do in words."""
-    ways: list[Trajectory] = []
+    `result` is the diagnosis's JSON: each effect with alternatives is to be separated from them.
+    """
+    trajectories: list[Trajectory] = []
     words: list[str] = []
-    for names in sets_of(found):
+    for effect in result["effects"]:
+        if not effect["alternatives"]:
+            continue
+        names = {effect["name"], *effect["alternatives"]}
         entries = separations_of(names)
-        ways += plan_for(names)
-        together = " from ".join(sorted(names))
+        trajectories += plan_for(names)
         if not entries:
+            together = " from ".join(sorted(names))
             words.append(f"To separate {together}: fly fast, with changes of thrust and heading.")
         for entry in entries:
             words.append(f"To separate {' from '.join(entry.pair)}: {entry.words}.")
-            words += [MEASURES[what] for what in entry.measure]
-    ways = list(dict.fromkeys(ways))
-    twice = [turned for way in ways for turned in (way, replace(way, direction=TURNED))]
-    return twice, list(dict.fromkeys(words))
+            words += [MEASURES[name] for name in entry.measure]
+    flights = [
+        flight
+        for trajectory in dict.fromkeys(trajectories)
+        for flight in (trajectory, replace(trajectory, direction=SECOND_DIRECTION))
+    ]
+    return flights, list(dict.fromkeys(words))
 
 
-def write_plan_of(found: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the plan that follows from `found`; return it, with no flights where none is needed.
+def write_plan_of(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Write the plan for a diagnosis (its JSON), and return it; it may have no flights.
 
     An earlier plan in `folder` is removed with its simulated logs, so that they are not mistaken
     for the new ones.
     """
     remove_plan(folder)
-    ways, words = ways_for(found)
+    ways, words = trajectories_for(result)
     if not ways:
         return {
             "flights": [],
@@ -91,20 +92,21 @@ def fly_plan(
     folder: Path,
     seed: int,
 ) -> dict[str, Any]:
-    """Fly `plan` in MuJoCo, write logs as noisy as those that were diagnosed, and return the plan.
+    """Fly `plan` in MuJoCo, and write logs with the noise of the diagnosed ones.
 
     Args:
         plan: from `write_plan_of`.
-        sigma: (19,) noise of each channel in its unit that the logs get; NaN: not logged.
+        sigma: (19,) noise of each channel in its unit; a channel with NaN is not logged.
         nominal: the vehicle that the position controller assumes.
         truth: the vehicle that flies.
-        folder: of the plan.
-        seed: of the noise and of random wind.
+        folder: the plan's folder.
+        seed: seed of noise and random wind.
 
     Returns:
-        The plan, each flight with its log's name in `flown`; `warnings` names those that failed.
+        The plan, with each flight's log in `flown`, and `warnings` about flights that failed.
     """
-    rate_hz = _rate(truth)
+    frequency = truth.controller.frequency
+    rate_hz = frequency / max(1, round(frequency / RATE_HZ))
     sensors = _sensors(sigma, rate_hz, plan["words"])
     flights, warnings = [], []
     for number, flight in enumerate(plan["flights"], 1):
@@ -130,13 +132,11 @@ def fly_plan(
     return {**plan, "warnings": warnings}
 
 
-def _rate(vehicle: Vehicle) -> float:
-    frequency = vehicle.controller.frequency
-    return frequency / max(1, round(frequency / RATE_HZ))
-
-
 def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
-    """Return sensors as noisy as the diagnosed logs; rotor speeds and voltage as `words` want."""
+    """Return sensors with the noise of the diagnosed logs.
+
+    Rotor speeds and voltage are logged as well if the advice in `words` mentions them.
+    """
 
     def noise(group: str) -> float:
         values = sigma[SLICES[group]]
@@ -151,8 +151,8 @@ def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
         gyro=noise("rates"),
         vel=noise("velocity"),
         acc=noise("accelerometer"),
-        rotor=noise("rotor speed") or (5.0 if "rotor speeds" in wanted else 0.0),
-        voltage=0.02 if "voltage" in wanted else 0.0,
+        rotor=noise("rotor speed") or (ROTOR_NOISE if "rotor speeds" in wanted else 0.0),
+        voltage=VOLTAGE_NOISE if "voltage" in wanted else 0.0,
     )
 
 
@@ -163,22 +163,22 @@ COLUMNS = (
     *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
     "yaw",
 )
-"""Of a CSV: time [s], position [m], velocity [m/s], acceleration [m/s^2] in the world; yaw
+"""Columns of a CSV: time [s], position [m], velocity [m/s], acceleration [m/s^2] in the world; yaw
 [rad]."""
 NAME = "plan.json"
 KEYS = ("file", "flown")
-"""Of a flight in it: its set points, and its log where it was flown in simulation."""
+"""Keys of a flight's files in plan.json: its set points, and its log if it was simulated."""
 
 
 def remove_plan(folder: Path) -> None:
-    """Remove what an earlier plan.json in `folder` lists, and itself; other files stay."""
+    """Remove an earlier plan.json in `folder` and the files that it lists; other files stay."""
     path = folder / NAME
     if not path.is_file():
         return
     try:
         listed = [flight.get(key) for flight in read_json(path)["flights"] for key in KEYS]
     except (ValueError, KeyError, TypeError, AttributeError):
-        return  # none of ours; it is written over
+        return  # another program's file, which will be overwritten
     for name in listed:
         if isinstance(name, str) and (folder / name).resolve().is_relative_to(folder.resolve()):
             (folder / name).unlink(missing_ok=True)
@@ -186,9 +186,10 @@ def remove_plan(folder: Path) -> None:
 
 
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
-    """Write `ways`, one a flight, in `folder`; return what plan.json holds.
+    """Write the trajectories `ways`, one a flight, into `folder`.
 
-    `words` are for people: what the flights are for.
+    Returns:
+        The content of plan.json, with the advice in `words`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flights = []
@@ -224,7 +225,7 @@ _SLOW_EIGHT = Trajectory("figure_eight", speed=2.0, size=3.0)
 _HOVER = Trajectory("hover")
 _UP_DOWN = Trajectory("vertical", speed=1.5, size=1.0)
 OTHERWISE = "fly faster, with changes of thrust, speed, heading and height"
-"""What to do where no entry of `SEPARATIONS` applies."""
+"""Advice for effects without an entry in `SEPARATIONS`."""
 
 
 @dataclass(frozen=True)
@@ -234,13 +235,13 @@ class Separation:
     pair: tuple[str, str]
     """Names of the two effects."""
     words: str
-    """What to do, in words."""
+    """Advice for people."""
     blurred: tuple[Trajectory, ...]
     """Flights on which either effect explains the data."""
     separating: tuple[Trajectory, ...]
-    """Flights to add."""
+    """Further flights that separate them."""
     measure: tuple[str, ...] = ()
-    """What to log as well: `motor`, `voltage`, or `scale` for a weighing."""
+    """Further measurements: `motor` (speeds), `voltage`, or `scale` for a weighing."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (
@@ -277,13 +278,13 @@ SEPARATIONS: tuple[Separation, ...] = (
     ),
     Separation(
         ("constant_wind", "frame_tilt"),
-        "fly with at least two headings: turn on and on at speed, over a range of speeds",
+        "fly with at least two headings: keep yawing at speed, over a range of speeds",
         (_SLOW_EIGHT, _HOVER),
         (_SWEEP, _RANGE),
     ),
     Separation(
         ("frame_tilt", "thrust_tilt"),
-        "turn the heading on and on",
+        "keep yawing",
         (_SLOW_EIGHT, _HOVER),
         (_SWEEP, Trajectory("hover", turn="sweep")),
     ),
@@ -321,7 +322,7 @@ SEPARATIONS: tuple[Separation, ...] = (
         ("voltage",),
     ),
 )
-"""Pairs of effects that gentle flights do not separate, and what does."""
+"""Pairs of effects that slow flights do not separate, and flights that do."""
 
 
 def separations_of(names: Iterable[str]) -> list[Separation]:
@@ -336,13 +337,13 @@ def separations_of(names: Iterable[str]) -> list[Separation]:
 def plan_for(names: Iterable[str]) -> list[Trajectory]:
     """Return the flights that separate `names`, each once.
 
-    Without a known pair these are the flights with most excitation: speeds, turns and chirps.
+    Without an entry in `SEPARATIONS`, these are the flights with most excitation.
     """
-    found = [way for entry in separations_of(names) for way in entry.separating]
-    return list(dict.fromkeys(found or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
+    separating = [way for entry in separations_of(names) for way in entry.separating]
+    return list(dict.fromkeys(separating or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line on which flight separates `name` from `rival`."""
-    known = separations_of((name, rival))
-    return f"{name} from {rival}: {known[0].words if known else OTHERWISE}"
+    """Return a line for people on the flight that separates the effects `name` and `rival`."""
+    entries = separations_of((name, rival))
+    return f"{name} from {rival}: {entries[0].words if entries else OTHERWISE}"

@@ -1,4 +1,8 @@
-"""All thresholds of a diagnosis and of the fits that it shares, with unit and reason."""
+"""Thresholds of all steps of a diagnosis and of its fits, with unit and reason.
+
+Terms: a window is a simulated stretch of 1 s; a view compares mean forces or torques instead; a
+name is an effect that the search reports; the null is the distribution without any effect.
+"""
 
 from __future__ import annotations
 
@@ -7,59 +11,61 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Limits of every step, in the order of the steps."""
+    """Thresholds of every step, in the order of the steps."""
 
     most_windows: int = 200
-    """Largest number of simulated stretches of 1 s: more take longer and add little."""
+    """Largest number of windows; more take longer and add little."""
     most_rotor_windows: int = 100
-    """The same where measured rotor speeds are the input: their errors along a stretch are
-    estimated too, which takes twice as long."""
+    """Largest number of windows if measured rotor speeds are the input. Their errors within a
+    window are estimated too, which takes twice as long."""
     most_rows: int = 100_000
-    """Largest number of rows of all flights that force and torque use; longer logs are thinned."""
+    """Largest number of rows of all flights for force and torque; longer logs are thinned."""
     longest_hole_s: float = 0.1
     """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5
-    """Residual of the nominal rate loop's rotor speeds, as a share of how the measured ones change.
-    Above it another controller flew, and the measured rotor speeds are the input [1]."""
+    """Largest residual of the rotor speeds by the nominal rate loop, relative to the standard
+    deviation of the measured ones. Above it another controller flew, and the measured rotor speeds
+    are the input [1]."""
     speed_mean_s: float = 0.1
-    """Rotor speeds are compared with the loop's as means over this time, to average noise [s]."""
+    """Rotor speeds are compared as means over this time, to average noise [s]."""
     still_speed: float = 10.0
     """Smaller changes and errors of rotor speeds are ignored [rad/s]."""
     lag_settled_s: float = 0.2
-    """Left out after the first row and each hole in the log where rotor speeds are compared, until
-    the initial speeds have decayed [s]."""
+    """Time that is left out of the comparison of rotor speeds after the first row and after each
+    hole, until the effect of the unknown initial speeds has decayed [s]."""
     longest_lag_s: float = 0.15
-    """Longest time constant of the rotors that is tried [s]."""
+    """Longest time constant of the rotors in the fit [s]."""
     lag_followed_share: float = 0.99
-    """Least share of the rotor speeds' variance that commands and a lag explain before it counts.
-    Where speeds change little, noise of the rates in the commanded speeds resembles a lag [1]."""
+    """Least share of the rotor speeds' variance that commands and a lag must explain. If speeds
+    change little, noise of the rates in the commanded speeds resembles a lag [1]."""
     lag_closed_share: float = 0.25
     """Least share of the squared error under the vehicle's own lag that another lag removes [1]."""
     lag_least_flights: int = 3
-    """Least number of flights that show it."""
+    """Least number of flights that must show the lag."""
     longest_delay_s: float = 0.06
-    """Longest delay of commands that is tried [s]."""
+    """Longest delay of commands in the fit [s]."""
     delays_tried: int = 9
-    """Delays up to the longest that are tried before the best is refined."""
+    """Number of delays up to the longest that are tried before the best is refined."""
     actuator_flight_s: float = 60.0
-    """Longest flight time that is used to compare rotor speeds [s]."""
+    """Longest flight time for the comparison of rotor speeds [s]."""
     held_out_share: float = 0.2
     """Share of the flights that is held out, at least one [1]."""
     lone_fitted_share: float = 0.7
-    """Share of a lone flight that is fitted; the end is held out [1]."""
+    """Share of a single flight that is fitted; its end is held out [1]."""
     noise_rows: int = 20
-    """Rows to which a polynomial is fitted; its residual is noise, as a model's error is smooth."""
+    """Number of rows to which a polynomial is fitted. Its residual is noise, since a model's error
+    is smooth."""
     rotor_noise_rows: int = 8
-    """The same for rotor speeds that are an input, which change faster."""
+    """The same for measured rotor speeds as an input, which change faster."""
     noise_degree: int = 3
     """Degree of that polynomial."""
     colour_degree: int = 3
-    """Degree of the polynomial that is subtracted from 1 s before noise is modelled as coloured:
-    errors of the start state resemble coloured noise."""
+    """Degree of the polynomial that is subtracted from a window before noise is modelled as
+    coloured (correlated in time): errors of the start state resemble coloured noise."""
     colour_gain: float = 3.0
-    """Rise of the log-likelihood from which noise is modelled as coloured, not white [1]."""
+    """Least rise of the log-likelihood to model noise as coloured, not white [1]."""
     drift_gain: float = 3.0
-    """Rise of the log-likelihood from which an error of the model is assumed as well [1]."""
+    """Least rise of the log-likelihood to assume an error of the model as well [1]."""
     colour_aside: float = 3.0
     """Largest difference of row times between stretches that are compared, in rows."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
@@ -67,149 +73,149 @@ class Thresholds:
     velocity [m/s], rates [rad/s], accelerometer [m/s^2] and rotor speed [rad/s]."""
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
-    """An effect that does less is not reported: force per mass [m/s^2] (0.5 % of the weight),
-    angular acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
+    """Smaller effects are not reported: force per mass [m/s^2] (0.5 % of the weight), angular
+    acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
 
     slow_degree: int = 5
     """Degree of the polynomials over a window on which a model's error is measured."""
     rotor_knot_excess: float = 1.5
-    """Factor on the errors of rotor speeds, for what happens between the knots [1]."""
+    """Factor on the errors of rotor speeds, for errors between the knots [1]."""
     singular: float = 1e-5
     """Smallest independent share of a column; below it Householder's QR is used [1]."""
     fit_rounds: int = 3
-    """Gauss-Newton steps of a fit, where no other number of them is given."""
+    """Gauss-Newton steps of a fit without another stated number."""
     converged: float = 0.05
-    """A fit is done where another round would lower chi-square by less than this [1]."""
+    """A fit ends if another step would lower chi-square by less than this [1]."""
     sign_draws: int = 1999
     """Draws of the null: p-values down to 1/2000."""
     folds: int = 5
-    """Parts into which windows are dealt; each is left out once."""
+    """Parts of the windows in cross-validation; each is left out once."""
     strong_gain: float = 50.0
-    """Gain that noise never reaches: candidates nearly as good as the best are then real, too."""
+    """Gain that noise never reaches; candidates nearly as good as the best are then real, too."""
     alike_share: float = 0.5
     """Share of the best gain from which a group of columns explains about as much [1]."""
     few_windows: int = 10
-    """Signs of fewer windows can be shuffled in too few ways for a p-value of 1 %."""
+    """Signs of fewer windows have too few permutations for a p-value of 1 %."""
     name_p_value: float = 0.001
-    """Chance of a false name at each step of the search."""
+    """Probability of a false name at each step of the search."""
     most_names: int = 4
-    """Effects that are named at most."""
+    """Largest number of named effects."""
     least_name_share: float = 0.003
-    """Least gain of a further effect as a share of the first one's: the fit of the first is not
-    exact and leaves a residual of this size [1]."""
+    """Least gain of a further effect, as a share of the first one's: the fit of the first is not
+    exact and has a residual of this size [1]."""
     short_list: int = 5
     """Candidates that are fitted with the nonlinear model at a step."""
     near_share: float = 0.5
-    """Least linear gain of these candidates as a share of the best one's [1]."""
+    """Least linear gain of these candidates, as a share of the best one's [1]."""
     rival_chi2: float = 9.0
     """A candidate whose chi-square is less than this above the named one's (three sigma) is an
     alternative."""
     rival_share: float = 0.25
-    """So is one that leaves less than this share of what the name explains, where this is less
+    """The same limit as a share of the chi-square that the name explains; the smaller limit counts
     [1]."""
     settle_rounds: int = 3
     """Rounds in which names and alternatives are compared again."""
     trusted_horizons_s: tuple[float, ...] = (1.0, 0.5, 0.25)
-    """Lengths of a window; the longest over which the linearisation holds is used [s]."""
+    """Lengths of a window; the longest over which the linearisation is valid is used [s]."""
     trusted_m: float = 0.15
-    """Position error up to which the linearisation holds [m]."""
+    """Position error up to which the linearisation is valid [m]."""
     trusted_height_share: float = 0.25
-    """The same for height, as a share of it: near the ground the air changes with it [1]."""
+    """The same for the height, as a share of it: the ground effect depends on the height [1]."""
     trusted_rad: float = 0.25
     """The same for attitude [rad]."""
     bilinear_rounds: int = 6
-    """Gauss-Newton steps of a fit of two effects of which one acts through the other."""
+    """Gauss-Newton steps of a fit of two effects if one acts through the other (wind by drag)."""
     last_rounds: int = 10
     """Gauss-Newton steps of the last fit of all names: some effects saturate."""
     first_order_chi2: float = 25.0
-    """A candidate whose linear chi-square exceeds the best one's by more is not fitted."""
+    """A candidate is not fitted if its linear chi-square exceeds the best one's by more."""
     first_order_share: float = 0.1
     """Further allowance, as a share of the best gain: large effects are not linear [1]."""
     diverged_m: float = 50.0
-    """A simulated window that ends this far from the flight has diverged and is left out [m]."""
+    """A simulated window that ends further from the flight has diverged and is left out [m]."""
     least_windows: int = 2
-    """Least number of windows to fit: some are left out in cross-validation."""
+    """Least number of windows to fit; cross-validation leaves some out."""
     integrator_share: float = 0.6
-    """Offset between pose and rates, as a share of a physics step, that an integrator explains
-    [1]."""
+    """Largest time offset between pose and rates, as a share of a physics step, that an integrator
+    explains [1]."""
 
     ground_thrust: float = 0.3
-    """Thrust as a share of the weight; below it a vehicle that does not move is on the ground
-    [1]."""
+    """Thrust, as a share of the weight, below which a vehicle at rest is on the ground [1]."""
     ground_speed: float = 0.3
-    """Speed below which a vehicle stands still [m/s]."""
+    """Speed below which a vehicle is at rest [m/s]."""
     ground_margin_s: float = 1.0
-    """Time before and after standing on the ground in which it takes off or lands [s]."""
+    """Time before and after rest on the ground that counts as take-off and landing [s]."""
     least_flights: int = 3
     """Least number of flights from which the spread of trims between flights is estimated."""
     longest_memory: int = 40
-    """Longest lag of the autocorrelation of a view's errors, in means."""
+    """Longest lag of the autocorrelation of a view's errors, in windows of the view."""
     least_fast_share: float = 0.5
-    """An effect is rejected where fast changes significantly give less than this share of it
+    """An effect is rejected if fast changes significantly confirm less than this share of it
     [1]."""
     least_view_share: float = 0.03
     """Least share of a view's squared error that a named effect explains [1]."""
     least_inertial_share: float = 0.06
     """The same in flights without a position: the uncertainty of their pose has this size [1]."""
     implausible_times: float = 3.0
-    """Beyond so many times its usual size an effect is implausible [1]."""
+    """An effect larger than this many times its usual size is implausible [1]."""
     hopeless_chi2: float = 10.0
-    """Squared error a row, in units of the noise variance, after a fit of all effects together.
-    Above it flights are judged by force and torque, not by rollouts of 1 s."""
+    """Largest squared error a row, in units of the noise variance, after a fit of all effects
+    together. Above it force and torque are used, not rollouts of 1 s."""
     hopeless_windows: int = 16
-    """Stretches of that fit, where the linear one alone exceeds the limit."""
+    """Windows of that fit with the nonlinear model, if the linear one exceeds the limit."""
     hopeless_rounds: int = 6
     """Steps of that fit."""
     view_left_share: float = 0.1
-    """Share of a view's squared error that a black box explains beyond the named effects, above
-    which an effect is missing [1]."""
+    """Largest share of a view's squared error that a black box explains beyond the named effects.
+    Above it an effect is missing [1]."""
     unexplained_trim: float = 1.5
-    """A force that nothing explains counts beyond so many times the flights' own constant offsets:
-    attitude and thrust of a log are known no better than these show [1]."""
+    """An unexplained force counts above this many times the flights' constant offsets, which show
+    the accuracy of attitude and thrust in a log [1]."""
     unexplained_force: float = 0.5
-    """But from here on in any case: an attitude off by 3 degrees, or 5 % of the weight [m/s^2]."""
+    """Upper limit of that threshold: an attitude error of 3 degrees, or 5 % of the weight
+    [m/s^2]."""
     least_rotor_gain: float = 0.01
-    """Rotors are taken to have no influence along an axis below this share of the largest gain
-    [1]."""
+    """Rotors with a smaller gain along an axis, as a share of the largest, count as without
+    influence there [1]."""
     carried_ridge: float = 0.01
     """Ridge weight, for each mean, of the regression of the reference flights' residual [1]."""
     carried_least: float = 0.1
     """Least standard deviation of that regression's inputs [m/s, m/s^2, rad/s^2]."""
     gain_error: float = 0.5
-    """Relative error of a change that an error of the vehicle file may cause along an axis:
-    inertia, arms and rotor torque are no more accurate where they were not identified [1]."""
+    """Relative error of a change along an axis by errors of the vehicle file: inertia, arms and
+    rotor torque that were not identified have such errors [1]."""
     spread_freedom: int = 4
-    """Weight of the spread of all axes next to an axis's own, in degrees of freedom [1]."""
+    """Weight of the spread over all axes, relative to an axis's own, in degrees of freedom [1]."""
     change_p_value: float = 0.02
-    """Chance of a false name of a change, over all candidates and views."""
+    """Probability of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
     """Draws of the null of a change, all candidates together."""
     swing_periods_s: tuple[float, float] = (0.6, 3.5)
     """Periods of pendulums of 0.1 to 3 m [s]."""
     swing_p_value: float = 0.001
-    """Chance of a peak in the spectrum, over all periods."""
+    """Probability of a false peak in the spectrum, over all periods."""
     swing_share: float = 0.15
     """Least share of the force residual's power that oscillates [1]."""
     swing_driven: float = 0.5
-    """Least ratio of residual force to measured acceleration at that period. Below it the peak may
-    be a model error that the flight's own motion excites [1]."""
+    """Least ratio of residual force to measured acceleration at that period. Below it the flight's
+    motion may excite a model error instead [1]."""
     view_block_s: float = 2.0
     """Length of stretches whose errors count as independent in a view [s]."""
 
     bootstrap_draws: int = 1000
     """Draws of the 95 % intervals of a gap."""
     bootstrap_block: int = 4
-    """Neighbouring windows that are drawn together: they overlap (1 s long, 0.25 s apart)."""
+    """Neighbouring windows that are drawn together, since they overlap (1 s long, 0.25 s apart)."""
     gap_stride_s: float = 0.25
-    """From one start to the next of the rollouts that measure the gap [s]."""
+    """Time between the starts of the rollouts that measure the gap [s]."""
     refuting_chi2: float = 25.0
-    """Rise of chi-square on held-out flights from which a name is withdrawn (five sigma)."""
+    """Rise of chi-square on held-out flights above which a name is withdrawn (five sigma)."""
     shown_chi2: float = 9.0
-    """Expected fall of chi-square on held-out flights from which a name without any fall there is
-    withdrawn (three sigma)."""
+    """A name without a fall of chi-square on held-out flights is withdrawn if the expected fall is
+    above this (three sigma)."""
     least_next_to_rest: float = 0.5
     """Least fall of the held-out squared error by a name, as a share of the residual above the
-    noise, where that residual stays significant [1]."""
+    noise, if that residual is significant [1]."""
     cells: int = 4
     """Grid points along x and y of a force that depends on the position."""
     pieces: int = 5
@@ -217,7 +223,7 @@ class Thresholds:
     thrust_reversal: float = 10.0
     """Rate of change of thrust above which only its sign counts [m/s^3]."""
     colours_s: tuple[float, ...] = (0.3, 0.03)
-    """Correlation times of a random disturbance that are tested: a gust's and a rotor's [s]."""
+    """Correlation times of the tested random disturbances, as of gusts and of rotors [s]."""
     disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
     """Quantiles of the information over all directions that set the tested disturbance sizes."""
     informed_share: float = 1e-9
@@ -225,34 +231,34 @@ class Thresholds:
     noise_error: float = 0.02
     """Relative uncertainty of the measured noise power [1]."""
     shape_p_value: float = 0.001
-    """P-value up to which a shape over the state counts as structure in the residual."""
+    """Largest p-value with which a function of the state counts as structure in the residual."""
     colour_p_value: float = 1e-4
     """The same for the energy of a smooth disturbance along an axis."""
     structure: float = 1.15
     """Ratio of slow errors to their expectation above which they are not noise [1]."""
     structure_rotor_input: float = 1.3
-    """The same where measured rotor speeds are the input: their noise is less certain [1]."""
+    """The same if measured rotor speeds are the input; their noise is less certain [1]."""
     unexplained_share: float = 0.7
-    """Share of the gap that may remain for a verdict of `partly`; above it, `unknown` [1]."""
+    """Largest remaining share of the gap for a verdict of `partly`; above it, `unknown` [1]."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
-    """Shortest and longest length of turbulence that is tried [m], and how many."""
+    """Shortest and longest length scale of turbulence in the fit [m], and number of values."""
     wind_intensities: tuple[float, float, int] = (0.02, 8.0, 121)
-    """Least and largest intensity that is tried [m/s], and how many."""
+    """Least and largest intensity in the fit [m/s], and number of values."""
     wind_ratio: float = 10.0
-    """Log-likelihood ratio to no wind from which there is wind."""
+    """Least log-likelihood ratio of wind to no wind."""
     wind_rival_ratio: float = 8.0
-    """Wind is rejected where a disturbance along the body axes has a log-likelihood higher by
-    this."""
+    """Wind is rejected if a disturbance along the body axes has a log-likelihood higher by this."""
     wind_tail: float = 4.0
-    """Standard errors by which the fourth moment of wind may exceed a normal variable's."""
+    """Largest excess of wind's fourth moment over a normal variable's, in standard errors."""
     profile_fall: float = 1.92
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
     check_stride_s: float = 0.5
     """Time between windows in the comparison with a black box [s]."""
     slow_share: float = 0.6
-    """Share of the windows, the slowest, that are fitted while the fast ones are held out [1]."""
+    """Share of the windows, the slowest, that a black box is fitted to; the faster ones are held
+    out [1]."""
     least_judged: int = 6
-    """Least number of windows to fit and to hold out there."""
+    """Least number of windows to fit, and to hold out, in that comparison."""
 
 
 THRESHOLDS = Thresholds()

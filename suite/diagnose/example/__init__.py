@@ -1,1 +1,1 @@
-"""Three short flights with something hidden in them, and the vehicle file that lacks it."""
+"""Three short flights of a vehicle with a hidden effect, and a vehicle file without it."""

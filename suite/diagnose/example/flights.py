@@ -1,6 +1,7 @@
-"""The example's flights: made by MuJoCo from these numbers, logged with noise.
+"""Simulates the example's flights in MuJoCo, and logs them with noise.
 
-`python -m suite.diagnose.example.flights` makes the files next to this one again.
+The vehicle that flies has an effect that the example's vehicle file lacks, for `suite diagnose` to
+find. `python -m suite.diagnose.example.flights` writes the log files next to this file again.
 """
 
 from __future__ import annotations
@@ -21,24 +22,23 @@ from eval.vehicles.vehicle import with_effects
 FOLDER = Path(__file__).parent
 VEHICLE = FOLDER / "vehicle.toml"
 HIDDEN = {"com_offset": ComOffset((0.006, -0.0015, 0.0))}
-"""The battery was strapped on 6 mm too far ahead and 1.5 mm to the right, where `ComOffset` is that
-of the whole vehicle [m]."""
+"""The hidden effect: the vehicle's centre of mass is 6 mm too far ahead and 1.5 mm to the right, as
+by a misplaced battery [m]."""
 WAYS = (
     Trajectory("figure_eight", speed=5.0, size=4.0, turn="wobble"),
     Trajectory("speed_range", speed=7.0, size=6.0, height=2.0, turn="sweep"),
     Trajectory("climb", speed=3.0, size=2.0, direction=1.0),
 )
 SENSORS = Sensors("example", 100.0, pos=0.002, attitude=0.003, gyro=0.02, acc=0.3, lost=0.005)
-"""Motion capture, and the flight controller's gyro and accelerometer."""
+"""Noise of motion capture, and of the flight controller's gyro and accelerometer."""
 SEED = 20
-FINEST = {"pos_w": 14, "quat_wxyz": 14, "rate_b": 12, "acc_b": 9}
-FINEST |= {"thrust_cmd": 12, "rate_cmd_b": 12}
-"""Values are kept to 2^-n of their unit, far below the noise, so that files are small."""
+BITS = {"pos_w": 14, "quat_wxyz": 14, "rate_b": 12, "acc_b": 9, "thrust_cmd": 12, "rate_cmd_b": 12}
+"""Values are rounded to 2^-n of their unit, far below the noise, so that files are small."""
 NOTES = "made by suite/diagnose/example/flights.py; something is hidden in them"
 
 
 def make_flights() -> list[FlightLog]:
-    """Return the example's flights; the same on every machine but for rounding."""
+    """Return the example's flights; they are equal on all machines except for rounding errors."""
     nominal = load_vehicle(str(VEHICLE))
     truth = with_effects(nominal, HIDDEN)
     rng = np.random.default_rng(SEED)
@@ -46,10 +46,10 @@ def make_flights() -> list[FlightLog]:
     for number, flown in enumerate(fly(nominal, truth, WAYS), start=1):
         log = log_of(flown, truth, SENSORS, rng, f"flight_{number}")
         rounded: dict[str, Any] = {}
-        for name, bits in FINEST.items():
+        for name, bits in BITS.items():
             rounded[name] = np.round(getattr(log, name) * 2.0**bits) / 2.0**bits
-        about = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
-        logs.append(replace(log, **rounded, about={**log.about, **about}))
+        metadata = {"vehicle": nominal.name, "source": "simulated", "notes": NOTES, "seed": SEED}
+        logs.append(replace(log, **rounded, about={**log.about, **metadata}))
     return logs
 
 

@@ -1,1 +1,1 @@
-"""The numbers of a vehicle file from flights, each with its interval."""
+"""Identifies the numbers of a vehicle file from flights, each with its interval."""

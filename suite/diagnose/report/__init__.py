@@ -1,1 +1,1 @@
-"""A diagnosis as JSON, HTML and recording."""
+"""Presents a diagnosis as JSON, as a web page, and as a recording for rerun."""

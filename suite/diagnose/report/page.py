@@ -48,10 +48,10 @@ TOTALS = (
     "{chance:.1g}."
 )
 CHANNELS = (
-    "RMS errors on held-out flights. Noise floor: the error by measurement noise alone; in rollouts "
-    "by noise of the start and of the compared row. Repeatability: the spread of the means of "
-    "flights of the unchanged vehicle. Closed: the share of the variance within a flight that the "
-    "named effects explain. Black box: the share that a regression without physics explains; it is "
+    "RMS errors on held-out flights. Noise floor: the error by measurement noise alone (in "
+    "rollouts, noise of the start and of the compared row). Repeatability: the spread of the means "
+    "of flights of the unchanged vehicle. Closed: the share of the variance within a flight that "
+    "the named effects explain. Black box: the share that a regression without physics explains; it is "
     "fitted to the same flights."
 )
 

@@ -1,1 +1,1 @@
-"""Models of sensors and estimators from flights with a reference."""
+"""Identifies error models of on-board state estimates, from flights with a reference pose."""

@@ -1,1 +1,1 @@
-"""Sources of evidence: what each fits and holds out, and how what is found in it is judged."""
+"""Sources of evidence: ways to compare flights with the model, and the steps of a diagnosis."""

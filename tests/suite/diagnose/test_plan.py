@@ -21,8 +21,7 @@ from suite.diagnose.plan import (
     fly_plan,
     plan_for,
     separations_of,
-    sets_of,
-    ways_for,
+    trajectories_for,
     write_plan,
     write_plan_of,
 )
@@ -53,13 +52,12 @@ def test_a_plan_comes_back_from_its_file(tmp_path):
 
 
 def test_the_plan_is_for_the_sets_and_only_for_them():
-    assert sets_of(SET) == [{"rotor_drag", "linear_drag"}]
-    ways, words = ways_for(SET)
+    ways, words = trajectories_for(SET)
     entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
     assert {way.kind for way in ways} == {way.kind for way in entry.separating}
     assert len(ways) == 2 * len(entry.separating) and entry.words in words[0]
     alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
-    assert ways_for(alone) == ([], [])
+    assert trajectories_for(alone) == ([], [])
 
 
 def test_nothing_is_written_where_nothing_is_left_to_tell(tmp_path):

@@ -1,6 +1,6 @@
-"""Two short flights of a real quadrotor as its laboratory published them, cut to the flight.
+"""Two short published flights of a real quadrotor, without their time on the ground.
 
-Their source, licence and what was cut: README.md next to this file, which is part of every copy.
+README.md next to this file states their source, licence and changes; every copy has it.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ import lzma
 from importlib.resources import files
 
 MAPPING = "nanobench.toml"
-"""Of `eval/importers/mappings`; it goes with the logs."""
-KEPT = (".csv.xz", ".yaml", ".md", "LICENSE")
+"""File of `eval/importers/mappings` that imports the logs."""
+ENDINGS = (".csv.xz", ".yaml", ".md", "LICENSE")
+"""Endings of the files to copy."""
 
 
 def real_files() -> dict[str, bytes]:
-    """Return the logs with what belongs to them, unpacked, by name."""
-    found = {}
+    """Return the logs, their mapping and their licence, uncompressed, by file name."""
+    contents = {MAPPING: files("eval.importers.mappings").joinpath(MAPPING).read_bytes()}
     for source in files(__name__).iterdir():
-        if source.name.endswith(KEPT):
-            packed = source.name.endswith(".xz")
-            whole = lzma.decompress(source.read_bytes()) if packed else source.read_bytes()
-            found[source.name.removesuffix(".xz")] = whole
-    shipped = files("eval.importers.mappings")
-    return found | {MAPPING: shipped.joinpath(MAPPING).read_bytes()}
+        if source.name.endswith(ENDINGS):
+            data = source.read_bytes()
+            is_packed = source.name.endswith(".xz")
+            contents[source.name.removesuffix(".xz")] = lzma.decompress(data) if is_packed else data
+    return contents

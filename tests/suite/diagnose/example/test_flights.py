@@ -7,7 +7,7 @@ import numpy as np
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.data.windows import cut
-from suite.diagnose.example.flights import FINEST, FOLDER, HIDDEN, VEHICLE, make_flights
+from suite.diagnose.example.flights import BITS, FOLDER, HIDDEN, VEHICLE, make_flights
 
 FILES = sorted(FOLDER.glob("*.parquet"))
 
@@ -18,7 +18,7 @@ def test_the_files_are_what_the_script_makes():
     for path, log in zip(FILES, made, strict=True):
         kept = read_flight(path)
         assert (kept.integrator, kept.step_s) == (log.integrator, log.step_s) == ("euler", 0.002)
-        for name, bits in FINEST.items():
+        for name, bits in BITS.items():
             # Another machine's rounding may fall to the other side of a step.
             np.testing.assert_allclose(
                 getattr(kept, name), getattr(log, name), rtol=0, atol=1.01 * 2.0**-bits
