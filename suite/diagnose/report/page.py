@@ -51,8 +51,8 @@ CHANNELS = (
     "RMS errors on held-out flights. Noise floor: the error by measurement noise alone (in "
     "rollouts, noise of the start and of the compared row). Repeatability: the spread of the means "
     "of flights of the unchanged vehicle. Closed: the share of the variance within a flight that "
-    "the named effects explain. Black box: the share that a regression without physics explains; it is "
-    "fitted to the same flights."
+    "the named effects explain. Black box: the share that a regression without physics "
+    "explains; it is fitted to the same flights."
 )
 
 
