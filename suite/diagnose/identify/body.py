@@ -81,9 +81,9 @@ def fit_force(
 
 
 Model = TypeVar("Model")
-"""What the residuals of all flights need of an evaluation: a trial vehicle, or the numbers."""
+"""Input of the residuals of each flight: a trial vehicle, or the numbers by name."""
 ForceResiduals = Callable[[TrialVehicle], Rows]
-"""From a trial vehicle to the residuals of one flight."""
+"""Function from a trial vehicle to the residuals of one flight."""
 
 
 def stacked_residuals(

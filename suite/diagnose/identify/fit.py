@@ -68,7 +68,7 @@ class Rows(NamedTuple):
 
 
 Residuals = Callable[[np.ndarray], Sequence[Rows]]
-"""From the values of all numbers to the residuals of every flight."""
+"""Function from the values of all numbers to the residuals of every flight."""
 
 
 class KnownNumbers(NamedTuple):

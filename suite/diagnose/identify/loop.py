@@ -28,7 +28,7 @@ LOOP_WIDTH_S = 0.08
 SPEED_WIDTH_S = 0.16
 """The same for rotor speeds [s]."""
 NumberResiduals = Callable[[Mapping[str, float]], Rows]
-"""From numbers by name to the residuals of one flight."""
+"""Function from numbers by name to the residuals of one flight."""
 
 
 def gain_unknowns() -> list[Unknown]:

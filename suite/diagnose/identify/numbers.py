@@ -1,4 +1,4 @@
-"""Entries of a vehicle file with their intervals, and explanations of what is not identified."""
+"""Makes entries of a vehicle file with intervals, and explains which numbers are not identified."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Number(NamedTuple):
 
 
 Formula = Callable[[Mapping[str, float]], ArrayLike]
-"""From the fit's numbers by name to an entry's value, or its values (V,)."""
+"""Function from the fit's numbers by name to an entry's value, or its values (V,)."""
 
 
 def number_from(
@@ -128,10 +128,10 @@ WHY = {
     "gain_y": "rate_gain about y: the body hardly pitches",
     "gain_z": "rate_gain about z: the body hardly yaws",
 }
-"""By a fitted number's name: what it is, and why flights may not identify it."""
+"""Description of each fitted number, by name, with the reason why flights may not identify it."""
 NO_RATES = "no body rates and no attitude in these logs"
 NEVER_BOTH = "these logs have no stretch with both"
-"""Reason where the columns exist, but holes in them leave no complete window."""
+"""Reason if the columns exist, but no window is without holes."""
 
 
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:

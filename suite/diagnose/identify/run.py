@@ -101,7 +101,7 @@ def is_identified(vehicle: str) -> bool:
 
 
 def _header(identified: Identified, start: str) -> str:
-    """Return the comment at the top of the vehicle file: numbers, and what is not identifiable."""
+    """Return the comment at the top of the vehicle file: all numbers with their intervals."""
     flights = _counted(len(identified.flights))
     lines = [f"From {start} {MADE_BY}, {flights} ({identified.drive}); 95 % intervals:"]
     lines += number_lines(identified.numbers)

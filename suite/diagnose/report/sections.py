@@ -116,7 +116,7 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
 
 
 HORIZON = "0.5 s"
-"""Of the rollouts in the comparison with the black box."""
+"""Length of the rollouts in the comparison with the black box."""
 BLACK_BOX = (
     "For comparison, a Delta Action Model was fitted to the same flights: a recurrent network that "
     "corrects the body's acceleration and angular acceleration from velocity, attitude and "

@@ -133,7 +133,7 @@ def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
-"""By verdict."""
+"""Generators of the advice, by verdict."""
 NOT_IDENTIFIABLE = "not identifiable"
 """Text in place of a value that no flight identifies."""
 

@@ -46,7 +46,7 @@ class Fitted(NamedTuple):
 
     lateness: Lateness
     axes: Mapping[str, Coloured]
-    """By axis, for axes with enough data."""
+    """Parameters of each axis that has enough data."""
     drift: Interval
     """Random walk of the position, averaged over its axes [m/sqrt(m)]."""
 
