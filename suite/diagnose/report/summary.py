@@ -151,7 +151,7 @@ class Component(NamedTuple):
     """Value at which the effect does not act, if it is the same for every vehicle."""
 
     @property
-    def result(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether there is a value that differs significantly from the neutral one."""
         if self.value is None or self.ci95 is None or self.neutral is None:
             return self.value is not None

@@ -80,7 +80,7 @@ def test_the_methods_own_errors_do_not_go_out_of_a_difference():
     def residuals(value):
         return [Rows((y - value[0] * x - value[1] * n)[:, None], block, NONE) for x, n, y in made]
 
-    numbers = [SLOPE._replace(floor=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
+    numbers = [SLOPE._replace(method_error=0.5), Unknown("other", 0.0, -9.0, 9.0, 1.0, 1e-3, 0.5)]
     found = fit(residuals, numbers)
     both = found.covariance
     assert both[0, 1] < 0.0 < both[0, 0] and np.sqrt(both[0, 0]) == pytest.approx(
