@@ -237,7 +237,7 @@ LOOP = Loop(
         )
         for name, whose in MODELS.items()
     ),
-    texts=(
+    shown=(
         Shown(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
         Shown(
             NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
