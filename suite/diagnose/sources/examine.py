@@ -112,12 +112,8 @@ def confirmed(
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
     to lower the gap by a share of the remaining error. An effect is kept if the held-out flights
-    are not sensitive to it, such as the ground effect in high flights.
-
-    Args:
-        source: the source.
-        found: result of its search.
-        gaps: before and after it.
+    are not sensitive to it, such as the ground effect in high flights. `gaps` are those before and
+    after the search.
 
     Returns:
         The result with the confirmed effects, its gap, the gaps without each of these effects, and
@@ -156,12 +152,8 @@ def relevant_part(
 ) -> tuple[SearchResult, Gap, dict[str, EffectSize], list[tuple[str, EffectSize]]]:
     """Leave out the effects below the threshold of relevance.
 
-    If the gap is below that threshold from the start, only faults of the log may be named.
-
-    Args:
-        source: the source.
-        found: result of its search.
-        gaps: before and after it.
+    If the gap is below that threshold from the start, only faults of the log may be named. `gaps`
+    are those before and after the search.
 
     Returns:
         The result with the relevant effects, its gap, the sizes of its effects by name, and the
@@ -190,11 +182,7 @@ def relevant_part(
 
 
 def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
-    """Fit a wrong effect for comparison: the best that is neither named nor a rival of a name.
-
-    Returns:
-        Its label and its gap, or None if no effect remains.
-    """
+    """Return label and gap of a wrong effect: the best one that is neither named nor a rival."""
     excluded = {candidate.name for candidate in found.candidates}
     rivals = [rival for named in found.named for rival in named.rivals]
     excluded |= {name for rival in rivals for name in effects_in(rival)}
@@ -233,13 +221,10 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 
 
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return the named effects of `found` that the evidence of `by` contradicts.
+    """Return the named effects of `found` that the evidence of `by` contradicts, with both values.
 
     The effect's parameters are fitted to that evidence, together with the effects that `by` names.
     They contradict if they differ significantly from those in `found`.
-
-    Returns:
-        Each refused effect, with both values in words.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))

@@ -28,7 +28,7 @@ from suite.diagnose.evidence.rollouts import (
 )
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect
+from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, swing_left
 from suite.diagnose.verdict.gap import (
@@ -38,7 +38,6 @@ from suite.diagnose.verdict.gap import (
     Gap,
     rollout_size,
     share_left,
-    upper_size,
 )
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
@@ -133,7 +132,7 @@ class RolloutSource(Source):
         model, estimate, indices = self.flown.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
         slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
-        width, change, model_error = found.half_widths(), found.moved, np.zeros(len(indices))
+        model_error = np.zeros(len(indices))
         if self.coarser is not None and len(indices):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
@@ -141,17 +140,7 @@ class RolloutSource(Source):
             equations = weighed_by(model, self.coarser, linear, *options)[1].equations
             moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
             model_error = self.coarser_share * np.abs(moved)
-
-        def size_of(moved: np.ndarray) -> EffectSize:
-            return rollout_size(moved, windows)
-
-        sizes = {}
-        for name in dict.fromkeys(named.candidate.name for named in found.named):
-            own = [k for k, i in enumerate(indices) if model.space.entries[i].effect == name]
-            least = np.maximum(np.abs(change[own]) - model_error[own], 0.0)
-            upper = upper_size(slope[..., own], np.sign(change[own]) * least, width[own], size_of)
-            sizes[name] = (size_of(slope[..., own] @ change[own]), upper)
-        return sizes
+        return sizes_by_effect(found, slope, lambda c: rollout_size(c, windows), model_error)
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the structure in the error that remains after `found`, see `Source`.

@@ -104,13 +104,13 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
             "distribution is drawn from the measured noise"
         )
     fitted, held_apart = take(windows, is_fitted), take(windows, ~is_fitted)
-    has = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
-    single = candidates(space, voltage, has if rotor_input else has | {"command"})
+    signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
+    single = candidates(space, voltage, signals if rotor_input else signals | {"command"})
     given.say(f"{len(fitted.flight)} stretches of 1 s to fit, {len(held_apart.flight)} held out")
     held = _held_out(given, rotor_input, held_apart, limits, integrator)
     is_lone_flight = bool(np.isin(held.flight, fitted.flight).any())
     since_s = float(np.min(held.start_s)) if is_lone_flight else 0.0
-    dense = all(
+    rows_are_dense = all(
         log.rotor_speed is None
         or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
         for log in logs
@@ -129,7 +129,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         small_explains=True,
         flown=Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits),
         coarser=take(coarser, is_fitted) if coarser is not None and rotor_input else None,
-        coarser_share=0.5 if dense else 2.0,
+        coarser_share=0.5 if rows_are_dense else 2.0,
     )
     driven_by = "measured rotor speeds" if rotor_input else "commands"
     return SourceSet((source,), names, driven_by, tuple(warnings))

@@ -24,7 +24,7 @@ from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.disturbances import Swing
-from suite.diagnose.verdict.gap import EffectSize, Gap
+from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
 from suite.diagnose.verdict.rollout_gap import Rollouts
 
 LEAST_GAP = 1e-9
@@ -188,6 +188,31 @@ class Source(ABC):
         """Return a held-out stretch for a chart, simulated as given and with named effects."""
         del found
         return None
+
+
+def sizes_by_effect(
+    found: SearchResult,
+    slope: np.ndarray,
+    size_of: Callable[[np.ndarray], EffectSize],
+    model_error: float | np.ndarray = 0.0,
+) -> dict[str, tuple[EffectSize, EffectSize]]:
+    """Return by named effect its size, and the upper end of the size's 95 % interval.
+
+    Args:
+        found: result of a search with K named parameters.
+        slope: (..., K) of the flights' errors along these parameters.
+        size_of: size of a change of the flights' errors.
+        model_error: (K,) changes of the parameters by the model's own error, which do not count at
+            the upper end.
+    """
+    entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
+    least = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
+    sizes = {}
+    for name in dict.fromkeys(named.candidate.name for named in found.named):
+        own = [k for k, index in enumerate(found.indices) if entries[index].effect == name]
+        upper = upper_size(slope[..., own], least[own], width[own], size_of)
+        sizes[name] = (size_of(slope[..., own] @ change[own]), upper)
+    return sizes
 
 
 @dataclass(frozen=True)

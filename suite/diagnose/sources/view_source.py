@@ -19,9 +19,9 @@ from suite.diagnose.evidence.moments import centred, means_of, units_of
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import Remaining, Series, Source
+from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
 from suite.diagnose.verdict.disturbances import swing_left
-from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, upper_size, view_size
+from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, view_size
 
 STRETCH_S = 10.0
 """Length of the stretch in a chart [s]."""
@@ -61,18 +61,8 @@ class ViewSource(Source):
         """Return the sizes of the named effects on the fitted flights, see `Source`."""
         block = found.last.block
         assert isinstance(block, ViewBlock)
-        width, change = found.half_widths(), found.moved
-
-        def size_of(moved: np.ndarray) -> EffectSize:
-            return view_size(moved, self.view.in_world)
-
-        sizes = {}
-        for name in dict.fromkeys(named.candidate.name for named in found.named):
-            own = [k for k, i in enumerate(found.indices) if self.space.entries[i].effect == name]
-            slope = block.data.slope[..., [block.along.index(found.indices[k]) for k in own]]
-            upper = upper_size(slope, change[own], width[own], size_of)
-            sizes[name] = (size_of(slope @ change[own]), upper)
-        return sizes
+        slope = block.data.slope[..., [block.along.index(index) for index in found.indices]]
+        return sizes_by_effect(found, slope, lambda c: view_size(c, self.view.in_world))
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
         """Return the error that a black box explains beyond the named effects, see `Source`."""
