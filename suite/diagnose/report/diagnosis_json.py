@@ -23,10 +23,7 @@ LEAST_SHOWN = 0.001
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the entries of diagnosis.json on the named effects and the gap.
-
-    It may contain named tuples and arrays, which `tracks.common.files.plain` converts.
-    """
+    """Return the entries of diagnosis.json on the named effects and the gap."""
     main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.limits
     swings = [one.remaining.swing for one in diagnosis.findings if one.remaining.swing]
     swing = swings[0] if swings else None
@@ -36,7 +33,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.label,
         "effects": effects_json(diagnosis),
         "negligible": [
-            {"name": name, "size": size, "relevant": False}
+            {"name": name, "size": size._asdict(), "relevant": False}
             for one in diagnosis.findings
             for name, size in one.negligible
         ],
@@ -121,6 +118,7 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
     """Return the entry of the effect `name`, which has `names` in `finding`."""
     indices = sorted(index for named in names for index in named.candidate.indices)
     width, undecided = finding.half_width, _undecided(finding, names)
+    size = finding.sizes.get(name)
     return {
         "name": name,
         "alternatives": sorted({rival for named in names for rival in named.rivals} - {name}),
@@ -129,7 +127,7 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         ),
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
-        "size": finding.sizes.get(name),
+        "size": size and size._asdict(),
         "relevant": True,
         "view": finding.source.name,
     }
