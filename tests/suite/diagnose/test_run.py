@@ -63,7 +63,7 @@ def test_the_numbers_beside_the_names_are_in_the_json(written):
 def test_the_recording_holds_what_was_measured_and_simulated(written):
     found = columns(written / "recording.rrd")
     entities = {entity for entity, _ in found}
-    simulated = ["simulated\\ as\\ given", "simulated\\ with\\ what\\ was\\ named"]
+    simulated = ["simulated\\ as\\ given", "simulated\\ with\\ the\\ named\\ effects"]
     for who in ("measured", *simulated):
         assert f"/flight_0/world/{who}/drone" in entities
         assert f"/flight_0/velocity_x/{who}" in entities
