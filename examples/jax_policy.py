@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from policies.block_policy import BlockPolicy, proven
+from policies.block_policy import BlockPolicy, verify_rows
 from policies.spec import ActionSpec, PolicySpec
 from suite import evaluate_policy
 
@@ -37,7 +37,7 @@ def main(trials: int) -> None:
     ) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(compiled(state, image)), hidden  # (0,) hidden: without memory
 
-    policy = proven(BlockPolicy("jax", SPEC, model, (0,)), "jax_policy")
+    policy = verify_rows(BlockPolicy("jax", SPEC, model, (0,)), "jax_policy")
     results = evaluate_policy(
         policy, track="random", difficulty=0, trials=trials, vehicle="racer5", workers=1
     )

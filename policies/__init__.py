@@ -1,1 +1,1 @@
-"""Policies: the observation, the networks, checkpoints and the shipped policies."""
+"""Policies: their observation, networks, file formats, and the policies that the suite ships."""

@@ -1,8 +1,9 @@
-"""A model of any kind as a `Policy`: it always runs on blocks of one size.
+"""Wrap a model of any kind as a `Policy` that always runs on blocks of the same number of rows.
 
-A trial's outcome must depend on its own row alone. Matrix products of different sizes sum in
-different orders, so the model always gets full blocks, padded with zeros. If that is not enough
-(some kernels treat the last rows of a block differently), each row runs in a block of its own.
+A row is the observation of one trial (one judged flight), and its output must not depend on other
+rows. Matrix products of different sizes sum in different orders, so the model always gets full
+blocks, padded with zeros. If that is not enough (some kernels treat the last rows of a block
+differently), each block contains one row.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ import numpy as np
 from policies.spec import NoAnswer, Note, PolicyError, PolicySpec
 
 Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(state, image, hidden) to (action, hidden) for exactly one block of rows, float32 arrays."""
+"""Maps (state, image, hidden) to (action, hidden) for exactly one block of rows, all float32."""
 
 BLOCK = 64
 """Rows of a block, unless the model has a fixed batch."""
 ROUNDING = 1e-4
-"""Largest relative difference of a row's outputs, alone and in a block."""
+"""Largest relative difference between a row's outputs among different other rows."""
 
 
 @final
@@ -43,31 +44,32 @@ class BlockPolicy:
     rows: int = BLOCK
     """Number of rows of a block that are used, from the first: `block`, or 1."""
     notes: tuple[Note, ...] = ()
-    """Assumptions about its file."""
+    """Assumptions that were made where its file says nothing."""
 
     def start(self, n: int) -> np.ndarray:
-        """Return the recurrent state at the start of n trials, zeros."""
+        """Return the recurrent state at the start of n trials, (n, *hidden_shape) zeros."""
         return np.zeros((n, *self.hidden_shape), np.float32)
 
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (action (n, spec.action.size), hidden'); see `policies.policy.Policy.act`.
+        """Return the actions (n, spec.action.size) and the new state; see `Policy.act`.
 
-        Where the recurrent state overflows, the action is NaN; the judge counts it as a bad action.
+        Where the recurrent state overflows, the action is NaN; the judge (the part of the suite
+        that flies and scores policies) counts it as a bad action.
         """
         hidden = np.where(np.reshape(fresh, (-1, *[1] * len(self.hidden_shape))), 0, hidden)
         inputs = [np.asarray(x, np.float32) for x in (state, image, hidden)]
         if len(state) == self.rows == self.block:
             return _nan_if_overflowed(*self.model(*inputs))
         actions = np.empty((len(state), self.spec.action.size), np.float32)
-        remembered = np.empty_like(inputs[2])
+        next_hidden = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
             used = slice(low, min(low + self.rows, len(state)))
             action, after = self.model(*(self._padded(x[used]) for x in inputs))
             actions[used] = action[: used.stop - low]
-            remembered[used] = after[: used.stop - low]
-        return _nan_if_overflowed(actions, remembered)
+            next_hidden[used] = after[: used.stop - low]
+        return _nan_if_overflowed(actions, next_hidden)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
         if len(rows) == self.block:
@@ -77,16 +79,16 @@ class BlockPolicy:
         return block
 
 
-def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
+def verify_rows(policy: BlockPolicy, where: str) -> BlockPolicy:
     """Test a loaded model, and return a policy whose rows do not influence each other.
 
-    The test runs a block of random rows twice; then some of its rows, each repeated to fill a
-    block, and each among zeros. If a row's output changes by rounding, the returned policy runs one
-    row at a time.
+    The test runs a block of random rows twice. Then it runs some of these rows again: each repeated
+    to fill a block, and each among zeros. If a row's output changes by rounding, the returned
+    policy runs one row at a time.
 
     Args:
-        policy: as loaded.
-        where: the file, for messages.
+        policy: the policy as it was loaded.
+        where: its file, for messages.
 
     Raises:
         PolicyError: where the outputs have wrong shapes, the same inputs give different outputs, or
@@ -94,7 +96,7 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
     """
     rng = np.random.default_rng(0)
     n = policy.block
-    state, image, hidden = _drawn(policy, rng)
+    state, image, hidden = _random_block(policy, rng)
     first = policy.model(state, image, hidden)
     expected = ((n, policy.spec.action.size), (n, *policy.hidden_shape))
     for name, value, shape in zip(("action", "hidden"), first, expected, strict=True):
@@ -110,27 +112,28 @@ def proven(policy: BlockPolicy, where: str) -> BlockPolicy:
         )
     one_by_one = False
     for row in rng.choice(n, min(n, 8), replace=False):
-        everywhere = (np.repeat(x[row : row + 1], n, 0) for x in (state, image, hidden))
-        wanted = tuple(np.repeat(x[row : row + 1], n, 0) for x in first)
+        repeated = (np.repeat(x[row : row + 1], n, 0) for x in (state, image, hidden))
+        reference = tuple(np.repeat(x[row : row + 1], n, 0) for x in first)
         among_zeros = (np.where(np.arange(n).reshape(-1, *[1] * (x.ndim - 1)) == row, x, 0)
                        for x in (state, image, hidden))  # fmt: skip
-        alone = tuple(x[row : row + 1] for x in policy.model(*among_zeros))
-        for found in (policy.model(*everywhere), alone):
-            _refuse_batch_dependence(tuple(x[: len(found[0])] for x in wanted), found, where)
-            one_by_one |= not _same(tuple(x[: len(found[0])] for x in wanted), found)
+        single = tuple(x[row : row + 1] for x in policy.model(*among_zeros))
+        for outputs in (policy.model(*repeated), single):
+            expected = tuple(x[: len(outputs[0])] for x in reference)
+            _refuse_batch_dependence(expected, outputs, where)
+            one_by_one |= not _same(expected, outputs)
     return dataclasses.replace(policy, rows=1) if one_by_one else policy
 
 
 def _refuse_batch_dependence(
-    wanted: tuple[np.ndarray, ...], found: tuple[np.ndarray, ...], where: str
+    expected: tuple[np.ndarray, ...], outputs: tuple[np.ndarray, ...], where: str
 ) -> None:
     """Refuse outputs that depend on the other rows by more than rounding, as with BatchNorm."""
-    for expected, value in zip(wanted, found, strict=True):
-        size = max(1.0, float(np.abs(expected).max(initial=0.0)))
-        apart = float(np.abs(value - expected).max(initial=0.0))
-        if apart > ROUNDING * size:
+    for reference, value in zip(expected, outputs, strict=True):
+        scale = max(1.0, float(np.abs(reference).max(initial=0.0)))
+        difference = float(np.abs(value - reference).max(initial=0.0))
+        if difference > ROUNDING * scale:
             raise PolicyError(
-                f"{where}: a row's output changes by {apart:.2g} with the other rows of its batch; "
+                f"{where}: a row's output changes by {difference:.2g} with its batch; "
                 "a layer takes statistics over the batch (BatchNorm in training mode): call "
                 "module.eval() before the export"
             )
@@ -142,21 +145,21 @@ def for_one_row(policy: BlockPolicy) -> BlockPolicy:
     The policy is returned unchanged where its model refuses one row or gives different outputs.
     Rounding differs from that in a block, so the judge does not use this.
     """
-    inputs = _drawn(policy, np.random.default_rng(0))
-    wanted = policy.model(*inputs)
+    inputs = _random_block(policy, np.random.default_rng(0))
+    in_block = policy.model(*inputs)
     try:
-        found = policy.model(*(x[:1] for x in inputs))
+        single = policy.model(*(x[:1] for x in inputs))
     except NoAnswer:
         return policy
-    same = all(
+    equal = all(
         value.shape == block[:1].shape
         and np.allclose(value, block[:1], 0.0, ROUNDING * max(1.0, np.abs(block).max(initial=0.0)))
-        for value, block in zip(found, wanted, strict=True)
+        for value, block in zip(single, in_block, strict=True)
     )
-    return dataclasses.replace(policy, block=1, rows=1) if same else policy
+    return dataclasses.replace(policy, block=1, rows=1) if equal else policy
 
 
-def _drawn(
+def _random_block(
     policy: BlockPolicy, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a block of random (state, image, hidden)."""
@@ -169,11 +172,12 @@ def _drawn(
 
 def _nan_if_overflowed(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the outputs, with NaN actions in rows whose recurrent state is not finite."""
-    lost = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
-    if lost.any():
-        action = np.where(lost[:, None], np.float32(np.nan), action)
+    overflowed = ~np.asarray(np.isfinite(hidden).all(axis=tuple(range(1, hidden.ndim))))
+    if overflowed.any():
+        action = np.where(overflowed[:, None], np.float32(np.nan), action)
     return action, hidden
 
 
-def _same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
-    return all(a.tobytes() == b.tobytes() for a, b in zip(one, other, strict=True))
+def _same(first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]) -> bool:
+    """Return whether two outputs are equal to the bit."""
+    return all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))

@@ -1,7 +1,8 @@
-"""The contract of a policy: names, units, frames and scales of inputs and outputs, and a digest.
+"""The contract of a policy: names, units, frames and scales of its inputs and outputs, as JSON.
 
-The contract is one JSON object. It is made from a `PolicySpec` and stored in policy files,
-checkpoints and environments. The judge reads it and refuses inputs that it cannot provide.
+The contract is made from a `PolicySpec` and stored in policy files, checkpoints and environments.
+The judge (the part of the suite that flies and scores policies) reads it, and refuses a policy
+whose inputs it cannot provide. A digest (SHA-256) identifies a contract.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Entry:
     unit: str
     frame: str
     scale: float = 1.0
-    """Factor from the policy's input to `unit`."""
+    """The policy's input times this is in `unit`."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Image:
     shape: tuple[int, ...]
     encoding: str
     dtype: str
-    """float32, or uint8: 0 at far_m to 255 at near_m."""
+    """float32, or uint8, whose values go from 0 at far_m to 255 at near_m."""
     scale_m: float
     near_m: float
     far_m: float
@@ -64,7 +65,7 @@ class Image:
     pitch_deg: float
     fov_deg: tuple[float, float]
     rays: int
-    """Number of rays across and down a pixel."""
+    """Rays in each direction of a pixel (n x n); the pixel is their smallest depth."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ class Contract:
         return to_json(self.to_json())
 
 
+# Kind of action -> names, units, frame and limits.
 _ACTIONS = {
     "acceleration": (("x", "y", "z"), ("m/s^2",) * 3, f"{BODY}; net, without gravity",
                      "length up to 50 m/s^2"),
@@ -121,6 +123,7 @@ _ACTIONS = {
     "motors": (("rotor_1", "rotor_2", "rotor_3", "rotor_4"), ("share of largest {}",) * 4,
                "rotors in the vehicle file's order", "0 to 1"),
 }  # fmt: skip
+# Optional part of the state -> unit and frame.
 _EXTRAS = {
     "second_gate": ("m", BODY),
     "gate_axis": ("1", BODY),
@@ -148,13 +151,13 @@ def contract_of(spec: PolicySpec, memory: tuple[int, ...] | None = None) -> Cont
     scale, offset = (_each(numbers, action.size) for numbers in (action.scale, action.offset))
     output = Action(action.kind, names, units, frame, scale, offset, action.clip, limit)
     speed = spec.speed if spec.speed_input else 1.0
-    made = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
-    # The reader converts numbers, so that 30 and 30.0 give the same digest.
-    return Table("", "", dataclasses.asdict(made)).read(Contract)
+    contract = Contract(spec.rate_hz, tuple(state), image, output, memory, speed)
+    # Reading it back converts numbers, so that 30 and 30.0 give the same digest.
+    return Table("", "", dataclasses.asdict(contract)).read(Contract)
 
 
 def spec_of(contract: Contract, where: str) -> PolicySpec:
-    """Return the spec that has this contract; `where` names its source in messages.
+    """Return the `PolicySpec` that has this contract; `where` names its source in messages.
 
     Raises:
         PolicyError: naming the first part that the suite cannot provide, and the alternatives.
@@ -170,7 +173,7 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
     names = [entry.name for entry in contract.state]
     shares = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
     memory = contract.memory or ()
-    own: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
+    hidden: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
     spec = PolicySpec(
         rate_hz=contract.rate_hz,
         camera=Camera(
@@ -186,7 +189,7 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
         ),
         speed=contract.speed,
         **{key: key in names for key in EXTRAS},
-        **own,
+        **hidden,
     )  # fmt: skip
     try:
         check_spec(spec, "")
@@ -214,27 +217,28 @@ def read_contract(text: str | bytes | Mapping[str, Any], where: str) -> Contract
         digest = data.pop("digest", None)
         if data.get("version") != VERSION:
             raise TypeError(f"version is {shown(data.get('version'))}, this suite reads {VERSION}")
-        found = Table("", "", data).read(Contract)
+        contract = Table("", "", data).read(Contract)
     except (InputError, TypeError, ValueError) as error:
         raise PolicyError(
             f"{where}: not a contract ({error}); use the text of env.unwrapped.contract"
         ) from None
-    if digest not in (None, found.digest):
+    if digest not in (None, contract.digest):
         raise PolicyError(
-            f"{where}: its digest is {shown(digest)}, but its contents give {found.digest[:12]}…; "
-            "it was changed by hand: make it from a PolicySpec or use the environment's"
+            f"{where}: its digest is {shown(digest)}, but its contents give "
+            f"{contract.digest[:12]}…; it was changed by hand: make it from a PolicySpec or use "
+            "that of the environment"
         )
-    return found
+    return contract
 
 
-def refuse_other(contract: Contract, other: Contract, where: str, whose: str) -> None:
+def refuse_differences(contract: Contract, other: Contract, where: str, whose: str) -> None:
     """Refuse a contract that differs from `other`; `whose` names the owner of `other`.
 
     Raises:
         PolicyError: naming the first part that differs.
     """
     if None in (contract.memory, other.memory):
-        contract, other = (dataclasses.replace(one, memory=None) for one in (contract, other))
+        contract, other = (dataclasses.replace(c, memory=None) for c in (contract, other))
     for name, theirs, ours in _differences(contract, other):
         raise PolicyError(
             f"{where}: its contract has {name} {shown(theirs)}, {whose} {shown(ours)}; export the "
@@ -243,7 +247,7 @@ def refuse_other(contract: Contract, other: Contract, where: str, whose: str) ->
 
 
 def summary(contract: Contract) -> str:
-    """Return the contract in one line."""
+    """Return the contract as one line of text, for people."""
     image, action = contract.image, contract.action
     levels = "" if image.dtype == "float32" else ", 0 to 255"
     size = sum(entry.size for entry in contract.state)
@@ -257,22 +261,24 @@ def summary(contract: Contract) -> str:
 
 
 def _each(numbers: tuple[float, ...], size: int) -> tuple[float, ...]:
+    """Return one number for each of `size` outputs; a single number counts for all."""
     return tuple(map(float, numbers * size if len(numbers) == 1 else numbers))
 
 
 def _short(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a single number where all are equal."""
     return numbers[:1] if len(set(numbers)) == 1 else numbers
 
 
-def _differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield (path, value, other value) for each field in which two dataclasses differ."""
-    for key in (entry.name for entry in dataclasses.fields(one)):
-        a, b, path = getattr(one, key), getattr(other, key), f"{name}{key}"
+def _differences(first: Any, second: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield (path, first value, second value) for each field in which two dataclasses differ."""
+    for key in (entry.name for entry in dataclasses.fields(first)):
+        a, b, path = getattr(first, key), getattr(second, key), f"{prefix}{key}"
         if dataclasses.is_dataclass(a):
             yield from _differences(a, b, f"{path}.")
         elif a != b and key == "state":
-            for k, (mine, yours) in enumerate(zip(a, b, strict=False)):
-                yield from _differences(mine, yours, f"state[{k}].")
-            yield path, [each.name for each in a], [each.name for each in b]
+            for k, (entry_a, entry_b) in enumerate(zip(a, b, strict=False)):
+                yield from _differences(entry_a, entry_b, f"state[{k}].")
+            yield path, [entry.name for entry in a], [entry.name for entry in b]
         elif a != b:
             yield path, a, b

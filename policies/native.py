@@ -1,4 +1,4 @@
-"""Our checkpoints as `Policy`: the CNN-GRU compiled by JAX, on whichever device JAX has."""
+"""Load the suite's checkpoints as `Policy`: the CNN-GRU, compiled by JAX on its default device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from policies.block_policy import BlockPolicy, proven
+from policies.block_policy import BlockPolicy, verify_rows
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from policies.spec import PolicySpec
@@ -22,12 +22,12 @@ def load_native(folder: Path, name: str) -> BlockPolicy:
         PolicyError: where the checkpoint is damaged or of another kind.
     """
     checkpoint = load_policy_checkpoint(folder)
-    return proven(native_policy(checkpoint.params, checkpoint.spec, name), str(folder))
+    return verify_rows(native_policy(checkpoint.params, checkpoint.spec, name), str(folder))
 
 
 def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> BlockPolicy:
-    """Return the policy that a network's parameters make."""
-    held = jax.tree.map(jax.numpy.asarray, dict(params))
+    """Return the policy of a network with the parameters `params`, unchecked."""
+    device_params = jax.tree.map(jax.numpy.asarray, dict(params))
     step = jax.jit(network.step)
 
     def model(
@@ -35,7 +35,7 @@ def native_policy(params: Mapping[str, Any], spec: PolicySpec, name: str) -> Blo
     ) -> tuple[np.ndarray, np.ndarray]:
         # Accelerators use fewer bits by default; full precision gives equal flights on all devices.
         with jax.default_matmul_precision("highest"):
-            action, after = step(held, hidden, state, image)
-        return np.asarray(action), np.asarray(after)
+            action, next_hidden = step(device_params, hidden, state, image)
+        return np.asarray(action), np.asarray(next_hidden)
 
     return BlockPolicy(name, spec, model, (spec.hidden_size,))

@@ -1,7 +1,7 @@
-"""The observation of a policy: the paper's 12 numbers (Su et al. 2026, Eq. 1), extras, an image.
+"""Assemble the observation of a policy: 12 numbers (Su et al. 2026, Eq. 1), extras, depth image.
 
-Only `observe` assembles it, for trainer, judge, simulators and environments. A further vector is a
-key in `policies.spec.EXTRAS` and a line in `EXTRA_VECTORS`.
+Training, evaluation, simulators and Gymnasium environments all use `observe`. To add a vector, add
+a key to `policies.spec.EXTRAS` and a line to `EXTRA_VECTORS`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from tracks.geometry.scene import Array, Gates
 
 
 class View(NamedTuple):
-    """The observable state of drones and their gates; arrays (..., ) of NumPy or JAX."""
+    """The observable state of drones and their gates; NumPy or JAX arrays with any batch shape."""
 
     pos_w: Any
-    """(..., 3) [m]."""
+    """(..., 3) position [m]."""
     rot_w: Any
-    """(..., 3, 3) body to world."""
+    """(..., 3, 3) attitude, body to world."""
     vel_w: Any
-    """(..., 3) [m/s]."""
+    """(..., 3) velocity [m/s]."""
     gate_w: Any
     """(..., 3) centre of the next gate [m]."""
     second_w: Any
-    """(..., 3) centre of the gate after it, at most the last gate [m]."""
+    """(..., 3) centre of the gate after it, or of the last gate [m]."""
     axis_w: Any
     """(..., 3) unit vector through the next gate, in flight direction."""
     second_axis_w: Any
@@ -52,7 +52,16 @@ class Observation(NamedTuple):
 def view_of(
     pos_w: Array, rot_w: Array, vel_w: Array, gate: Gates, after: Gates, depth_m: Array | None
 ) -> View:
-    """Return the view (N, ...) of drones that fly to `gate` and then `after`, one gate a row."""
+    """Return the view (N, ...) of N drones.
+
+    Args:
+        pos_w: (N, 3) positions [m].
+        rot_w: (N, 3, 3) attitudes, body to world.
+        vel_w: (N, 3) velocities [m/s].
+        gate: each drone's next gate, (N, ...).
+        after: the gate after it, (N, ...).
+        depth_m: (N, H, W) planar depth images [m], or None.
+    """
     axes_w = gate.rot_w[..., 0], after.rot_w[..., 0]
     return View(pos_w, rot_w, vel_w, gate.center_w, after.center_w, *axes_w, depth_m)
 
@@ -62,7 +71,7 @@ EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
     "gate_axis": lambda view: to_local(view.rot_w, view.axis_w),
     "second_axis": lambda view: to_local(view.rot_w, view.second_axis_w),
 }
-"""Key of a spec -> the three numbers, (..., 3) in body axes, that it adds to the state."""
+"""Key of a `PolicySpec` -> function that returns the vector (..., 3), in body axes, for it."""
 
 
 def observe(
@@ -71,10 +80,10 @@ def observe(
     """Return the observation of a policy with `spec`.
 
     Args:
-        spec: the policy's, with its extras and depth encoding.
+        spec: the policy's specification, with its extras and depth encoding.
         view: the observable state.
-        last_action_b: (..., spec.action.size) the previous action in SI units, in the body axes of
-            its own time.
+        last_action_b: (..., spec.action.size) the previous action in SI units, in the body axes at
+            the time of that action.
         speed: (...,) commanded speed, 0 to 1, if the spec has that input; None: the spec's value.
     """
     rot_w = view.rot_w
@@ -93,7 +102,7 @@ def observe(
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:
-    """Return the network's inverse depths for planar depths [m], of the same shape."""
+    """Return the policy's image input for planar depths [m] of the same shape (inverse depth)."""
     xp = depth_m.__array_namespace__()
     encoded = encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
     if not encoding.uint8:

@@ -1,4 +1,8 @@
-"""The `Policy` protocol of the judge, and `load_policy`, which loads one by name or file."""
+"""The `Policy` protocol, and `load_policy`, which loads a policy by name or from a file.
+
+A policy maps an observation (state vector and depth image) to an action. The judge, which flies
+policies in simulation and scores them, uses policies through this protocol only.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +24,14 @@ SUFFIXES = {
     ".pt": "TorchScript, needs trust",
     ".c": "C with policy.h in its folder, needs trust and a C compiler",
 }
-"""Kinds of policy file by suffix; a folder is one of the suite's checkpoints, or holds policy.c."""
+"""Kinds of policy file by suffix; a folder is a checkpoint of the suite, or contains policy.c."""
 
 
 class Policy(Protocol):
-    """Computes actions of n trials at once; a row's result depends only on that row, to the bit."""
+    """Computes actions for n trials (flights) at once, one a row.
+
+    The outputs of a row depend on the inputs of that row only, to the bit.
+    """
 
     @property
     def name(self) -> str:
@@ -49,11 +56,11 @@ class Policy(Protocol):
             hidden: from `start` or the last `act`.
             state: (n, spec.state_size) float32, the state of `observation.observe`.
             image: (n, height, width) float32, its image.
-            fresh: (n,) bool, rows in which a new trial starts: their hidden state is reset first.
+            fresh: (n,) bool, rows in which a new trial starts; their hidden state is reset first.
 
         Returns:
-            action_b (n, 3) float32, the wanted net acceleration in current body axes [m/s^2],
-            unchecked, and the new hidden state.
+            The actions (n, spec.action.size) float32, unchecked (by default the wanted net
+            acceleration in current body axes [m/s^2]), and the new hidden state.
         """
         ...
 
@@ -77,16 +84,16 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
 
         return load_native(shipped.folder(text), text)
     path = Path(name_or_path)
-    if path.suffix == ".c" and path.is_file() or _holds_c(path):
+    if path.suffix == ".c" and path.is_file() or _is_c_folder(path):
         from policies.formats.c.c_file import load_c
 
         return load_c(path, trust)
     if path.is_dir():
         from policies.native import load_native
 
-        own = path.resolve()
-        # Trainings write a folder policy/ each; their runs have the names.
-        return load_native(path, own.parent.name if own.name == "policy" else own.name)
+        folder = path.resolve()
+        # A training writes its policy to RUN/policy, which is named after RUN.
+        return load_native(path, folder.parent.name if folder.name == "policy" else folder.name)
     if not path.exists():
         raise _missing(text, path)
     if path.suffix == ".onnx":
@@ -102,14 +109,15 @@ def load_policy(name_or_path: str | Path, trust: bool = False) -> Policy:
 
         return load_script(path, trust)
     kinds = ", ".join(f"{suffix} ({kind})" for suffix, kind in SUFFIXES.items())
-    within = path.name in ("weights.safetensors", "config.json")
-    hint = f"give its folder instead: {path.parent}" if within else "export it (docs/policies.md)"
+    in_checkpoint = path.name in ("weights.safetensors", "config.json")
+    hint = "export it (docs/policies.md)"
+    hint = f"give its folder instead: {path.parent}" if in_checkpoint else hint
     raise PolicyError(
         f"{path}: not a policy file; allowed are a checkpoint's folder, {kinds}; {hint}"
     )
 
 
-def _holds_c(path: Path) -> bool:
+def _is_c_folder(path: Path) -> bool:
     return (path / "policy.c").is_file() and not (path / "config.json").exists()
 
 
@@ -121,5 +129,5 @@ def _missing(text: str, path: Path) -> PolicyError:
         return PolicyError(f"{error} A checkpoint's folder or a policy file is allowed as well.")
     siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = closest(path.name, siblings)
-    meant = f" Did you mean {path.parent / guess}?" if guess else ""
-    return PolicyError(f"{path}: no such file or folder.{meant}")
+    question = f" Did you mean {path.parent / guess}?" if guess else ""
+    return PolicyError(f"{path}: no such file or folder.{question}")

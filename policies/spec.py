@@ -1,8 +1,8 @@
-"""The specification of a policy: its rate, its camera and the scaling of its inputs and outputs.
+"""The specification of a policy: its rate, camera, observation, and the scaling of its action.
 
-The observation is the paper's (Su et al. 2026, Eq. 1): 12 numbers and a depth image. A policy may
-add the gate after the next one, the flight direction of either gate, and the wanted speed. This
-file also defines the errors of policies.
+The observation is that of Su et al. 2026, Eq. 1: 12 numbers and a depth image. A policy may add the
+gate after the next one, the flight direction of either gate, and the wanted speed. This file also
+defines the exceptions that loading and running policies raise.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from tracks.geometry.camera import Camera
 from tracks.input.ranges import Range, check_ranges
 
 STATE_SIZE = 12
-"""Numbers in the paper's state: v_b (3), third row of R (3), gate in body axes (3), u (3). Another
-kind of action changes the last part to its own size."""
+"""Numbers in the paper's state: velocity in body axes (3), third row of R (3), gate in body axes
+(3), last action (3). For another kind of action, the last part has its size."""
 EXTRAS = {"second_gate": 3, "gate_axis": 3, "second_axis": 3, "speed_input": 1}
 """Optional parts of the state: key of a spec -> size, in this order."""
 ACTION_SIZE = 3
@@ -29,18 +29,18 @@ ACTIONS = {"acceleration": ACTION_SIZE, "ctbr": 4, "motors": 4}
 CHANNEL_BLOCK = 32
 """Channels of the second and third convolution are multiples of this, for the C export's layout."""
 RAYS_MOST = 640 * 480
-"""Largest number of rays of an image: the pixels of usual depth cameras. 64 trials' images of this
-size, with all intermediate arrays, fit into 2 GB."""
+"""Most rays of an image: the pixels of usual depth cameras. 64 images of this size, with all
+intermediate arrays, fit into 2 GB."""
 
 
 @dataclass(frozen=True)
 class DepthEncoding:
-    """Inverse depth as the network sees it: scale / clip(depth, near, far) - offset."""
+    """Conversion of depth to the policy's image: scale / clip(depth, near, far) - offset."""
 
     scale: Annotated[float, Range(1e-6, 1e6)] = 3.0
     """Numerator of the encoding, scale / depth - offset [m]."""
     near: Annotated[float, Range(1e-3, 100.0)] = 0.3
-    """Smaller depths are set to this [m]."""
+    """Smallest depth; smaller ones are set to it [m]."""
     offset: Annotated[float, Range(-1e6, 1e6)] = 0.6
     """Subtracted in the encoding, so that distant pixels are near zero [1]."""
     channel_axis: bool = False
@@ -49,10 +49,9 @@ class DepthEncoding:
     """Whether pixels are whole numbers, 0 at the camera's range to 255 at `near` and nearer."""
 
     def bounds(self, range_m: float) -> tuple[float, float]:
-        """Return the least and the largest value of a pixel before `uint8` for a camera's range."""
-        return self.scale / max(
-            range_m, self.near
-        ) - self.offset, self.scale / self.near - self.offset
+        """Return the smallest and largest pixel before `uint8`, for a camera's range [m]."""
+        far = max(range_m, self.near)
+        return self.scale / far - self.offset, self.scale / self.near - self.offset
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class ActionSpec:
     offset: Annotated[tuple[float, ...], Range(-1e6, 1e6)] = (0.0,)
     """SI value of an output of zero: one number for all, or one for each."""
     motors: str = "thrust"
-    """For kind motors: the output is a share of the largest `thrust` or `speed`."""
+    """For kind motors: an output of 1 is the largest `thrust` or the largest `speed` of a rotor."""
     clip: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Outputs are clipped to plus and minus this before scaling; 0: no clipping."""
 
@@ -137,8 +136,8 @@ def check_spec(spec: PolicySpec, where: str = "spec.") -> None:
     """Refuse an impossible spec.
 
     Args:
-        spec: what to check.
-        where: prefix of a key in the message.
+        spec: the specification.
+        where: prefix of a key in messages.
 
     Raises:
         ValueError: naming the key, its value and what is allowed.
@@ -179,8 +178,8 @@ def check_network(spec: PolicySpec) -> None:
     """
     if spec.depth.channel_axis or spec.depth.uint8 or not spec.action.is_plain:
         raise ValueError(
-            "spec.depth.channel_axis, spec.depth.uint8 and spec.action.scale are for policies from "
-            "elsewhere; our network has none of them"
+            "spec.depth.channel_axis, spec.depth.uint8 and spec.action.scale are for other "
+            "policies; the suite's network does not support them"
         )
     first, *others = spec.channels
     if first % 2 or any(count % CHANNEL_BLOCK for count in others):
@@ -191,8 +190,8 @@ def check_network(spec: PolicySpec) -> None:
     for side, pixels in (("width", spec.camera.width), ("height", spec.camera.height)):
         if pixels % 4 or pixels < 20:
             raise ValueError(
-                f"spec.camera.{side} is {pixels}, allowed for our network are multiples of 4 from "
-                "20 on"
+                f"spec.camera.{side} is {pixels}, allowed for the suite's network are multiples of "
+                "4, from 20"
             )
 
 
@@ -200,18 +199,18 @@ class Note(NamedTuple):
     """A probable fault of a policy's interface, or an assumption about it."""
 
     fault: str
-    """Its name."""
+    """Name of the fault."""
     evidence: str
-    """The evidence, with the file or the figures."""
+    """A sentence with the evidence: the file or the figures."""
     fix: str
-    """What to do next."""
+    """The next step for the user."""
 
     def __str__(self) -> str:
         return f"{self.evidence}; {self.fix}"
 
 
 class PolicyError(ValueError):
-    """A policy or checkpoint is refused; the message names it, the fault and what to do next."""
+    """A policy or checkpoint is refused; the message names it, the fault and the next step."""
 
 
 class NeedsTrust(PolicyError):

@@ -34,7 +34,7 @@ from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.verdict.rollout_gap import gap_of
-from tracks.common.work import usable_cores, work_off
+from tracks.common.work import run_pieces, usable_cores
 from tracks.common.work.threads import one_thread_a_product
 
 OFF = 20.0
@@ -133,7 +133,7 @@ def main(count: int, seed: int) -> int:
         print(f"{number}: {one[-1]}", flush=True)
 
     cases = [[seed, number] for number in range(count)]
-    work_off(flyable, cases, usable_cores(), keep, pinned=True)
+    run_pieces(flyable, cases, usable_cores(), keep, pinned=True)
     held = [hold for inside, _, _ in found.values() for hold in inside]
     flown, false = len(found), sum(bool(wrong) for _, wrong, _ in found.values())
     print(f"intervals of a named drag that hold it: {sum(held)} of {len(held)}", end=" ")

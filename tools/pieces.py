@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from suite.common.work import Silent
-from tracks.common.work import Workers, read_workers, work_off
+from tracks.common.work import Workers, read_workers, run_pieces
 from tracks.common.work.threads import set_threads
 from tracks.common.work.travel import pack
 
@@ -93,7 +93,7 @@ def engine(count: int, args: argparse.Namespace) -> None:
                 rate = done / (time.monotonic() - started)
                 print(f"{done}: {rate:.0f} a second, {memory_mb():.0f} MB", flush=True)
 
-        work_off(partial(nothing, args.size), range(count), workers, keep)
+        run_pieces(partial(nothing, args.size), range(count), workers, keep)
         clock.say(f"{done} pieces of {args.size} bytes, of the driver", done)
         for process in psutil.Process().children(recursive=True):
             with contextlib.suppress(psutil.Error):

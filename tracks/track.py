@@ -1,4 +1,8 @@
-"""A track: a scene to race through, its origin (family, level, seed) and the start."""
+"""A track: a scene of gates and obstacles to race through, with its start position.
+
+A generated track is determined by its family (the rule that draws it), its difficulty level and its
+seed. A custom track is read from a file.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +32,9 @@ class Track:
     start_yaw: float
     """Heading at the start, about world z, 0 along world x [rad]."""
     names: tuple[str, ...]
-    """Names of the solids, in the order boxes, cylinders, capsules, spheres, meshes. The bars of a
-    gate's frame share a name ("gate 3 frame"); every other name is unique."""
+    """Names of the solids (gate frames and obstacles), in the order boxes, cylinders, capsules,
+    spheres, meshes. The bars of a gate's frame share a name ("gate 3 frame"); every other name is
+    unique."""
     mesh_sizes: tuple[int, ...] = ()
     """Triangles of each convex mesh; `scene.triangles` holds them one mesh after another."""
 
@@ -41,15 +46,16 @@ def first_gates(track: Track, count: int) -> Track:
         ValueError: unless `count` is from 1 to the number of gates.
     """
     gates = track.scene.gates
-    whole, bars = gates.opening_g.shape[:2]
-    if not 1 <= count <= whole:
-        raise ValueError(f"{count} gates of a track that has {whole}: give 1 to {whole}")
-    if count == whole:
+    total, bars = gates.opening_g.shape[:2]
+    if not 1 <= count <= total:
+        raise ValueError(f"{count} gates of a track that has {total}: give 1 to {total}")
+    if count == total:
         return track
-    stays = np.r_[: count * bars, whole * bars : len(track.scene.boxes.center_w)]
+    # The first boxes are the bars of the gates' frames, gate by gate.
+    kept = np.r_[: count * bars, total * bars : len(track.scene.boxes.center_w)]
     scene = track.scene._replace(
         gates=Gates(*(field[:count] for field in gates)),
-        boxes=Boxes(*(field[stays] for field in track.scene.boxes)),
+        boxes=Boxes(*(field[kept] for field in track.scene.boxes)),
     )
-    names = track.names[: count * bars] + track.names[whole * bars :]
+    names = track.names[: count * bars] + track.names[total * bars :]
     return replace(track, scene=scene, names=names)

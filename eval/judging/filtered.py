@@ -30,7 +30,7 @@ from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
 from policies.observation import View
-from tracks.common.masks import packed, select, take
+from tracks.common.masks import make_contiguous, select, take
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot, to_local, to_world
 from tracks.geometry.scene import Gates
@@ -155,7 +155,7 @@ class Filtered:
         )
         begun = wait(initial, self._late)
         filters = begun if self.filters is None else select(new, begun, self.filters)
-        self.filters = packed(filters)
+        self.filters = make_contiguous(filters)
         memory = {
             name: begin(values, Moment(truth, self._trial[name], self._dt, self._camera))
             if (begin := SENSORS[name].start)
@@ -184,7 +184,7 @@ class Filtered:
                 sample, memory = measure(values, memory, sample, self._sample[name], self._dt)
                 self._memory[name] = select(flew, memory, self._memory[name])
             own = sample.rate_b, sample.acc_b, dt, flew
-            self.filters = packed(step(self.filters, *own, self._settings.imu))
+            self.filters = make_contiguous(step(self.filters, *own, self._settings.imu))
         now = View(view.pos_w, view.rot_w, view.vel_w, *before[3:])
         self._truth = select(flew, now, before)
         self._steps += flew

@@ -41,7 +41,7 @@ from eval.worlds.trial import (
 )
 from policies.observation import View, observe
 from policies.policy import Policy
-from tracks.common.work import Workers, crew, usable_cores, work_off
+from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import check_family
 from tracks.track import Track
 
@@ -148,9 +148,11 @@ def fly(
     shares = [
         share
         for group in fitting(trials, tracks)
-        for share in pieces_of([(number, trials[number]) for number in group], crew(workers), most)
+        for share in pieces_of(
+            [(number, trials[number]) for number in group], worker_count(workers), most
+        )
     ]
-    work_off(partial(fly_share, task), shares, workers, keep)
+    run_pieces(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
 
 

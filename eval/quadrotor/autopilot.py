@@ -15,7 +15,7 @@ from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, unp
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
 from policies.spec import ActionSpec
-from tracks.common.masks import nowhere, packed, select
+from tracks.common.masks import make_contiguous, nowhere, select
 from tracks.geometry.scene import Array
 
 ATTITUDE_HZ = 100.0
@@ -76,7 +76,7 @@ def start_autopilot(
         # The delay stores rotor speeds instead of commands.
         past = xp.zeros_like(plant.past_commands) + plant.rotor_speed[..., None]
         plant = plant._replace(past_commands=past)
-    return packed(AutopilotState(plant, hover, level_heading(motion.rot_w)))
+    return make_contiguous(AutopilotState(plant, hover, level_heading(motion.rot_w)))
 
 
 def autopilot_step(
@@ -102,7 +102,7 @@ def autopilot_step(
     state = attitude_step(autopilot, state, motion, action_b, gate_w, step)
     inputs = Inputs(state.command, noise=noise, speed_cmd=speed_asked(autopilot, action_b))
     plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
-    return packed(state._replace(plant=plant)), wrench
+    return make_contiguous(state._replace(plant=plant)), wrench
 
 
 def attitude_step(

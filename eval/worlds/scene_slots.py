@@ -35,7 +35,7 @@ from eval.worlds.trial import (
 )
 from policies.observation import View, view_of
 from policies.spec import ActionSpec
-from tracks.common.masks import packed, select, take
+from tracks.common.masks import make_contiguous, select, take
 from tracks.formats.mujoco_scene import MESH_GROUP
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Scene, stack
@@ -146,7 +146,7 @@ class SceneSlots(ABC):
         motion = self._motion()
         noise = self._draws(np.where(started, -1, self._progress.step))
         fresh = start_autopilot(self._autopilot, motion, noise)
-        self._loops = packed(select(started, fresh, getattr(self, "_loops", fresh)))
+        self._loops = make_contiguous(select(started, fresh, getattr(self, "_loops", fresh)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
 
@@ -249,7 +249,7 @@ class SceneSlots(ABC):
             speed_before = self._loops.plant.rotor_speed
             draws = self._draws(step)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
-            self._loops = packed(select(flying, loops, self._loops))
+            self._loops = make_contiguous(select(flying, loops, self._loops))
             if record:
                 due = flying & (step % self._autopilot.attitude_every == 0)
                 rows += self._rows(due, speed_before)

@@ -1,1 +1,1 @@
-"""Policies as files: our checkpoints, ONNX, torch."""
+"""Policies as files: the suite's checkpoints, ONNX, torch and C."""

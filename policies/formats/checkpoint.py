@@ -1,7 +1,7 @@
-"""Checkpoints: a folder with arrays in weights.safetensors and their description in config.json.
+"""Write and read checkpoints: folders with weights.safetensors (arrays) and config.json.
 
-Neither file can run code when it is read. The config has the weights' SHA-256, so a file that
-was cut short, mixed up with another or changed is refused.
+Reading them cannot run code. The config has the weights' SHA-256, so a weights file that is
+incomplete, changed or of another checkpoint is refused.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Stored:
     arrays: dict[str, np.ndarray]
     """Arrays by name, with their saved shapes and types."""
     config: dict[str, Any]
-    """All of config.json: kind, provenance, weights and the caller's keys."""
+    """The object of config.json: kind, provenance, weights and the caller's keys."""
 
 
 def save_arrays(
@@ -53,13 +53,13 @@ def save_arrays(
 ) -> Path:
     """Write arrays and their description as a checkpoint, replacing an existing one.
 
-    A kill at any moment leaves the old checkpoint or the new one, whole.
+    A kill at any moment leaves the complete old checkpoint or the complete new one.
 
     Args:
         folder: the checkpoint's folder.
         arrays: numpy or JAX arrays by name, of any shape.
         kind: "policy", "delta" or "training"; loading requires the same kind.
-        seed: the seed of its training or fit; None for none.
+        seed: the seed of its training or fit, or None.
         extra: further keys of config.json (see `tracks.common.files.to_json`).
 
     Returns:
@@ -67,11 +67,11 @@ def save_arrays(
 
     Raises:
         ValueError: where `extra` has a key that the checkpoint itself writes.
-        OSError: where the disk refuses; what was there stays.
+        OSError: where the files cannot be written; an existing checkpoint is kept.
     """
     from safetensors.numpy import save
 
-    # safetensors writes a strided view's memory as it lies, so every array is made C-contiguous.
+    # safetensors ignores strides and writes memory as it is, so arrays are made C-contiguous.
     contiguous = {name: np.asarray(value, order="C") for name, value in arrays.items()}
     weights = save(contiguous, metadata={"format": "np"})
     config = {"kind": kind, **stamp(SCHEMA, seed)}
@@ -110,19 +110,19 @@ def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
         )
     path = folder / WEIGHTS
     expected = config["weights"]
-    # Before gigabytes are read: a file of another size is refused unread.
+    # The size is checked first, before gigabytes are read.
     size = path.stat().st_size if path.is_file() else expected["bytes"]
     if size != expected["bytes"]:
         raise PolicyError(
             f"{path}: {size} bytes, {CONFIG} says {expected['bytes']}; "
-            "the file is cut short or another's: copy the whole folder again"
+            "the file is incomplete or of another checkpoint: copy the whole folder again"
         )
     weights = _read(path, WEIGHTS_BYTES)
     digest = hashlib.sha256(weights).hexdigest()
     if digest != expected["sha256"]:
         raise PolicyError(
             f"{path}: sha256 is {digest[:12]}…, {CONFIG} says {expected['sha256'][:12]}…; "
-            "the file was changed or mixed up with another: copy the whole folder again"
+            "the file was changed or is of another checkpoint: copy the whole folder again"
         )
     try:
         arrays = load(weights)
@@ -136,7 +136,7 @@ def load_arrays(folder: Path, *, kind: str, finite: bool = True) -> Stored:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read and check a checkpoint's config.json alone.
+    """Read and check only the config.json of a checkpoint.
 
     Raises:
         PolicyError: where it is missing, is not JSON, or one of the keys that every checkpoint
@@ -150,12 +150,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     except InputError as error:
         raise PolicyError(f"{error}; the file is damaged: copy the whole folder again") from None
     if not isinstance(config, dict):
-        raise PolicyError(f"{path}: holds a {type(config).__name__}, expected an object")
+        raise PolicyError(f"{path}: is a {type(config).__name__}, expected an object")
     _require(path, config, "schema", int)
     if config["schema"] != SCHEMA:
         raise PolicyError(
             f"{path}: schema is {config['schema']}, this suite reads {SCHEMA}; "
-            "update the suite or export the checkpoint with the one that wrote it"
+            "update the suite, or export the checkpoint with the version that wrote it"
         )
     _require(path, config, "kind", str)
     _require(path, config, "weights", dict)
@@ -165,25 +165,25 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def check_finite(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse NaN and infinity.
+    """Refuse NaN and infinity in arrays.
 
     Raises:
         PolicyError: naming the file, the array and how many of its values are not finite.
     """
     for name, value in arrays.items():
         if np.issubdtype(value.dtype, np.inexact):
-            bad = int(value.size - np.isfinite(value).sum())
-            if bad:
+            nonfinite = int(value.size - np.isfinite(value).sum())
+            if nonfinite:
                 raise PolicyError(
-                    f"{path}: {name!r} holds {bad} of {value.size} values that are NaN or "
-                    "infinite; take an earlier checkpoint of that run"
+                    f"{path}: {name!r} has {nonfinite} of {value.size} values that are NaN or "
+                    "infinite; use an earlier checkpoint of that run"
                 )
 
 
 def check_shapes(
     path: Path, arrays: Mapping[str, np.ndarray], expected: Mapping[str, tuple[int, ...]]
 ) -> None:
-    """Refuse arrays that are not float32 of exactly the expected names and shapes.
+    """Refuse arrays whose names, shapes or type (float32) are not the expected ones.
 
     Raises:
         PolicyError: naming the file, the array, its shape and the shape expected.
@@ -192,7 +192,7 @@ def check_shapes(
     if missing or unknown:
         raise PolicyError(
             f"{path}: missing arrays {sorted(missing)}, unknown arrays {sorted(unknown)}; "
-            "the weights are another network's: use the suite's version that wrote them"
+            "the weights are of another network: use the version of the suite that wrote them"
         )
     for name, shape in expected.items():
         value = arrays[name]
@@ -204,12 +204,13 @@ def check_shapes(
 
 
 def _read(path: Path, most_bytes: int) -> bytes:
+    """Return the contents of a file of a checkpoint, with errors that name the next step."""
     try:
         return read_bytes(path, most_bytes)
     except FileNotFoundError:
-        inside = path.parent / "policy"
-        if (inside / CONFIG).is_file():
-            text = f"{path.parent}: a training's folder; its policy is {inside}"
+        policy_folder = path.parent / "policy"
+        if (policy_folder / CONFIG).is_file():
+            text = f"{path.parent}: the folder of a training; give its policy, {policy_folder}"
             raise PolicyError(text) from None
         raise PolicyError(
             f"{path}: missing; a checkpoint is a folder with {WEIGHTS} and {CONFIG}"
@@ -225,5 +226,5 @@ def _require(path: Path, table: Mapping[str, Any], key: str, kind: type) -> None
     if not isinstance(value, kind) or isinstance(value, bool):
         raise PolicyError(
             f"{path}: key {key!r} is {shown(value)}, expected a value of type {kind.__name__}; "
-            "the file is damaged or not a checkpoint's: copy the whole folder again"
+            "the file is damaged or not of a checkpoint: copy the whole folder again"
         )

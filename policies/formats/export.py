@@ -1,4 +1,4 @@
-"""Export policies: the suite's as torch program (.pt2), ONNX and C; any torch module as ONNX."""
+"""Export the suite's policies as torch program (.pt2), ONNX or C, and any torch module as ONNX."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from policies.formats.c.forward import Observed
 
 MODULE_OPSET = 17
-"""Opset of a module's graph; old enough for the runtimes of companion computers."""
+"""ONNX opset of a module's graph; old enough for the runtimes of companion computers."""
 
 
 def export_policy(
@@ -36,9 +36,9 @@ def export_policy(
 
     Args:
         name_or_folder: a shipped policy's name or a checkpoint's folder.
-        out: the folder that the files go to: NAME.pt2, NAME.onnx; for C policy.h, policy.c and what
-            checks them.
-        formats: which of `FORMATS`.
+        out: the folder for the files: NAME.pt2, NAME.onnx; for C policy.h, policy.c and a program
+            that tests them.
+        formats: names in `FORMATS`.
         dtype: type of the weights in C, "float32" or "int8".
         observed: observations of flights, which set the scales of int8 activations.
 
@@ -47,23 +47,23 @@ def export_policy(
 
     Raises:
         PolicyError: where the checkpoint cannot be used, or int8 has no observations.
-        ValueError: for an unknown format or type, or a type that the format has not.
-        OSError: where the disk refuses; no half file is left.
+        ValueError: for an unknown format or type, or a type that the format does not support.
+        OSError: where a file cannot be written; no partial file is left.
     """
-    chosen = list(formats)
-    check_formats(chosen, dtype)
+    formats = list(formats)
+    check_formats(formats, dtype)
     name, checkpoint = exported_checkpoint(name_or_folder)
     texts = labels(checkpoint.spec, name, checkpoint.seed)
     written = []
-    for wanted in chosen:
-        if wanted == "c":
+    for chosen in formats:
+        if chosen == "c":
             from policies.formats.c.project import c_project
 
             project = c_project(checkpoint, name, dtype, observed).files
             files = {file: text.encode() for file, text in project.items()}
         else:
-            _, write = _WRITERS[wanted]
-            files = {main_file(name, wanted): write(checkpoint, texts)}
+            _, write = _WRITERS[chosen]
+            files = {main_file(name, chosen): write(checkpoint, texts)}
         for file, data in files.items():
             with replacing_file(out / file) as temporary:
                 temporary.write_bytes(data)
@@ -79,13 +79,14 @@ def export_module(
 ) -> Path:
     """Export a torch module as ONNX with its contract, and load the file once as the judge does.
 
-    The module is exported in evaluation mode, with a free batch, by torch's exporter over
-    TorchScript, which needs no further package.
+    The module is exported in evaluation mode, with a free batch size, by torch's TorchScript
+    exporter, which needs no further package. The judge (the part of the suite that flies and scores
+    policies) refuses files that it cannot run, so the new file is loaded once as a test.
 
     Args:
         module: its forward takes (state, image) or (state, image, hidden), float32 with the batch
             first, and returns the action, or (action, hidden).
-        path: ends in .onnx.
+        path: of the new file; it ends in .onnx.
         trained_under: its contract (`env.unwrapped.contract`) or its spec.
         memory: shape of one row's hidden state; None without memory.
 
@@ -105,7 +106,7 @@ def export_module(
         if isinstance(trained_under, PolicySpec)
         else contract.spec_of(trained_under, str(path))
     )
-    made = contract.contract_of(spec, memory or ())
+    policy_contract = contract.contract_of(spec, memory or ())
     sizes = [(spec.state_size,), spec.image_shape, *([memory] if memory else [])]
     names = INPUTS[: len(sizes)]
     example = tuple(torch.zeros(2, *size) for size in sizes)
@@ -129,29 +130,29 @@ def export_module(
     finally:
         module.train(training)
     proto = onnx.load_model_from_string(buffer.getvalue())
-    onnx.helper.set_model_props(proto, {contract.KEY: made.text})
+    onnx.helper.set_model_props(proto, {contract.KEY: policy_contract.text})
     with replacing_file(path) as temporary:
         temporary.write_bytes(proto.SerializeToString())
     load_policy(path)
     return Path(path)
 
 
-def main_file(name: str, wanted: str) -> str:
+def main_file(name: str, format: str) -> str:
     """Return the file name of the policy `name` in one of `FORMATS`."""
-    return "policy.c" if wanted == "c" else f"{name}{_WRITERS[wanted][0]}"
+    return "policy.c" if format == "c" else f"{name}{_WRITERS[format][0]}"
 
 
 def check_formats(formats: Iterable[str], dtype: str = "float32") -> None:
     """Refuse formats and types that cannot be written.
 
     Raises:
-        ValueError: for an unknown format or type, or a type that the format has not.
+        ValueError: for an unknown format or type, or a type that the format does not support.
     """
-    for wanted in formats:
-        if wanted not in FORMATS:
-            raise unknown_name("format", wanted, FORMATS)
-        if dtype != "float32" and wanted != "c":
-            raise ValueError(f"format {wanted} is float32 alone; {dtype} goes with --format c")
+    for format in formats:
+        if format not in FORMATS:
+            raise unknown_name("format", format, FORMATS)
+        if dtype != "float32" and format != "c":
+            raise ValueError(f"format {format} supports float32 only; {dtype} needs --format c")
 
 
 def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoint]:
@@ -164,13 +165,13 @@ def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoi
     if not folder.is_dir():
         raise PolicyError(
             f"{name_or_folder}: not a shipped policy ({', '.join(shipped.names()) or 'none'}) and "
-            "not a checkpoint's folder; only policies of ours can be exported"
+            "not a checkpoint's folder; only policies of the suite can be exported"
         )
     return folder.resolve().name, load_policy_checkpoint(folder)
 
 
 def torch_program(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
-    """Return a policy as the bytes of a .pt2 file with `texts` by their keys."""
+    """Return a policy as the bytes of a .pt2 file, with `texts` as extra files by name."""
     import torch
 
     from policies.formats.torch_twin import torch_twin
@@ -193,7 +194,7 @@ def torch_program(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
 
 
 def onnx_file(checkpoint: PolicyCheckpoint, texts: dict[str, str]) -> bytes:
-    """Return a policy as the bytes of an .onnx file with `texts` by their keys."""
+    """Return a policy as the bytes of an .onnx file, with `texts` as metadata by key."""
     from policies.formats.onnx_graph import onnx_model
 
     return onnx_model(checkpoint.params, checkpoint.spec, texts).SerializeToString()
@@ -204,4 +205,4 @@ _WRITERS: dict[str, tuple[str, Callable[[PolicyCheckpoint, dict[str, str]], byte
     "onnx": (".onnx", onnx_file),
 }
 FORMATS = (*_WRITERS, "c")
-"""Names of formats."""
+"""Names of the formats."""

@@ -1,9 +1,9 @@
-"""Run a model in its own process, so that an endless loop or a crash does not affect the suite.
+"""Run a foreign model in its own process, so that its endless loop or crash does not end the suite.
 
-A model from elsewhere is a program: one ONNX node can loop 2^62 times, even while the file loads,
-TorchScript has `while`, and C has everything. So onnxruntime, torch and a compiled policy.c run in
-a process with limits of time and memory (`model_server.py`), which is killed when it exceeds them.
-This protects against errors only: torch files and C are code and can do more.
+A model made outside the suite is a program: an ONNX node can loop 2^62 times, even while the file
+loads; TorchScript and C have loops too. So onnxruntime, torch and a compiled policy.c run in a
+process with limits of time and memory (`model_server.py`), which is killed when it exceeds them.
+This protects against errors, not against attacks: torch files and C can run any code.
 """
 
 from __future__ import annotations
@@ -39,18 +39,17 @@ ANSWER_BYTES = 2**28
 PIPE_BYTES = 2**20
 """Size of the pipes; the largest that Linux allows every user."""
 GRACE_S = 5.0
-"""Time after the limit at which the process ends itself, in case its parent is gone [s]."""
+"""Time after a limit at which the process ends itself, in case its parent has ended [s]."""
 SERVER = Path(__file__).with_name("model_server.py")
-
-
+"""The program that runs in the process."""
 REMEDIES = {
     "onnxruntime": "export it for an older opset",
     "torch": "export it again with this version of torch",
     "ctypes": "it must define policy_reset and policy_step as its policy.h declares them",
 }
-"""Engine -> advice where it refuses a model."""
-CALLED = {"ctypes": "compiled C"}
-"""Module -> usual name of the engine."""
+"""Module that runs a model -> advice where it refuses one."""
+ENGINE_NAMES = {"ctypes": "compiled C"}
+"""Module that runs a model -> its name in messages, if different."""
 
 
 class Port(NamedTuple):
@@ -60,21 +59,21 @@ class Port(NamedTuple):
     kind: str
     """Type as named by onnxruntime, such as tensor(float); empty for torch."""
     shape: tuple[int | None, ...]
-    """None for a free size; empty for TorchScript, where it is unknown."""
+    """Size of each axis, None for a free one; empty for TorchScript, where it is unknown."""
 
 
 class ModelProcess:
     """A loaded model in its own process, which ends with this object.
 
-    A process without an answer is killed; the next call starts a new one.
+    A process that does not answer in time is killed; the next call starts a new one.
     """
 
     def __init__(self, model: bytes, where: str, kind: str, labels: Sequence[str] = ()) -> None:
         """Start the process and load the model there.
 
         Args:
-            model: a serialised model, or a library's path.
-            where: the file it came from, for messages.
+            model: a serialised model, or the path of a C library.
+            where: the file that it was read from, for messages.
             kind: one of `model_server.KINDS`.
             labels: names of the texts in a torch file; for a C library one name, for its JSON.
 
@@ -82,15 +81,15 @@ class ModelProcess:
             PolicyError: where the engine refuses it, or exceeds its limits.
         """
         self._where, self._model = where, model
-        self._module, self._kind, self._wanted = KINDS[kind][0], kind, list(labels)
-        self._engine = CALLED.get(self._module, self._module)
-        about = self._start()
-        self.labels: dict[str, str | bytes] = about.get("labels", {})
+        self._module, self._kind, self._labels = KINDS[kind][0], kind, list(labels)
+        self._engine = ENGINE_NAMES.get(self._module, self._module)
+        description = self._start()
+        self.labels: dict[str, str | bytes] = description.get("labels", {})
         """Texts by name; empty where there is none."""
-        self.sizes: list[int] = about.get("sizes", [])
+        self.sizes: list[int] = description.get("sizes", [])
         """For a C library: bytes of its state, then the sizes of its observation."""
         self.inputs, self.outputs = (
-            [Port(name, number, tuple(shape)) for name, number, shape in about[side]]
+            [Port(name, kind, tuple(shape)) for name, kind, shape in description[side]]
             for side in ("inputs", "outputs")
         )
 
@@ -102,7 +101,7 @@ class ModelProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             bufsize=0,
-            # Ctrl-C goes to the terminal's whole group; its end is ours to decide.
+            # Ctrl-C reaches all processes of a session; this process decides when the model ends.
             start_new_session=True,
         )
         self._end = weakref.finalize(self, _end, self._process)
@@ -115,14 +114,14 @@ class ModelProcess:
             "load_s": LOAD_S + GRACE_S,
             "answer_s": ANSWER_S + GRACE_S,
         }
-        head = {"bytes": len(self._model), "kind": self._kind, "labels": self._wanted, **limits}
-        about, _ = self._ask(head, [self._model], LOAD_S, "loaded")
-        if "error" in about:
+        header = {"bytes": len(self._model), "kind": self._kind, "labels": self._labels, **limits}
+        description, _ = self._request(header, [self._model], LOAD_S, "loaded")
+        if "error" in description:
             raise PolicyError(
-                f"{self._where}: {self._engine} {about['version']} cannot load it "
-                f"({about['error']}); {REMEDIES[self._module]}"
+                f"{self._where}: {self._engine} {description['version']} cannot load it "
+                f"({description['error']}); {REMEDIES[self._module]}"
             )
-        return about
+        return description
 
     def run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Return the model's outputs, float32, for its inputs in order.
@@ -133,32 +132,32 @@ class ModelProcess:
         if not self._end.alive:
             self._start()
         arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in feed.items()}
-        head = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
+        header = {"arrays": [[name, value.shape] for name, value in arrays.items()]}
         data = [value.reshape(-1).view(np.uint8).data for value in arrays.values() if value.size]
-        found, answer = self._ask(head, data, ANSWER_S, "answered")
-        if "error" in found:
+        answer, buffer = self._request(header, data, ANSWER_S, "answered")
+        if "error" in answer:
             raise NoAnswer(
-                f"{self._where}: fails while it runs ({found['error']}); export it again"
+                f"{self._where}: fails while it runs ({answer['error']}); export it again"
             )
-        outputs, at = [], 0
-        for _, shape in found["arrays"]:
+        outputs, offset = [], 0
+        for _, shape in answer["arrays"]:
             count = int(np.prod(shape, dtype=np.int64))
-            outputs.append(np.frombuffer(answer, np.float32, count, at).reshape(shape))
-            at += 4 * count
+            outputs.append(np.frombuffer(buffer, np.float32, count, offset).reshape(shape))
+            offset += 4 * count
         return outputs
 
-    def _ask(
-        self, head: dict[str, Any], data: list[Any], limit_s: float, done: str
+    def _request(
+        self, header: dict[str, Any], data: list[Any], limit_s: float, done: str
     ) -> tuple[dict[str, Any], bytearray]:
-        """Send a frame and return the answer's."""
+        """Send a frame (see `model_server.py`), and return header and data of the answer."""
         until = time.monotonic() + limit_s
-        text = json.dumps(head).encode()
+        text = json.dumps(header).encode()
         try:
             for part in (struct.pack("<I", len(text)) + text, *data):
                 self._write(memoryview(part), until)
             (length,) = struct.unpack("<I", self._read(4, until))
-            found = json.loads(self._read(length, until))
-            return found, self._read(data_bytes(found), until)
+            answer = json.loads(self._read(length, until))
+            return answer, self._read(data_bytes(answer), until)
         except TimeoutError:
             reason = f"it was not {done} within {limit_s:g} s"
         except (BrokenPipeError, EOFError, ValueError, MemoryError):
@@ -166,8 +165,8 @@ class ModelProcess:
         self._end()
         raise NoAnswer(
             f"{self._where}: {self._engine} does not come to an end with it "
-            f"({reason}); look for loops without an end and for sizes beyond the memory, and "
-            "export it again"
+            f"({reason}); check for endless loops and for sizes beyond the memory, and export it "
+            "again"
         )
 
     def _write(self, data: memoryview, until: float) -> None:
@@ -209,8 +208,8 @@ def _widen(handle: int) -> None:
 def _wait(handle: int, event: int, until: float) -> None:
     poll = select.poll()
     poll.register(handle, event)
-    left = until - time.monotonic()
-    if left <= 0 or not poll.poll(left * 1000):
+    remaining_s = until - time.monotonic()
+    if remaining_s <= 0 or not poll.poll(remaining_s * 1000):
         raise TimeoutError
 
 
@@ -218,7 +217,7 @@ def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
     try:
         code = process.wait(1.0)
     except subprocess.TimeoutExpired:
-        return "it answers nonsense"
+        return "its answer is not valid"
     return f"it ended by {signal.Signals(-code).name}" if code < 0 else f"it ended with {code}"
 
 

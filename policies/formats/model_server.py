@@ -1,12 +1,13 @@
 """The program that runs one foreign model: ONNX, TorchScript, a torch program or a C library.
 
-It imports nothing of the suite and is run by its path. Frames come on standard input, answers go to
-output. A frame is four bytes of length, a JSON object of that length, and the bytes of the float32
-arrays whose names and shapes it lists under "arrays" (bytes as they are under "bytes"). The first
-frame holds the model, its kind and the limits; each other one, the inputs of one call, in the
-model's order. An answer has "error" instead of arrays where the model cannot be loaded or fails.
+`model_process.py` starts it by its path, so it imports nothing of the suite. It reads frames from
+standard input and writes an answer to each to standard output. A frame has four parts: the length
+of the header (four bytes), the header (JSON), and data. The header gives the size of the data,
+either as "bytes" or as the names and shapes of float32 arrays under "arrays". The first frame has
+the model, its kind and the limits; each further frame has the inputs of one call, in the model's
+order. An answer has "error" instead of arrays where the model cannot be loaded or fails.
 
-An alarm signal ends the process where a call exceeds its limit, even without a parent.
+An alarm signal ends the process where a call exceeds its time limit, even without a parent.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from collections.abc import Callable
 from typing import IO, Any
 
 Run = Callable[[dict[str, Any]], list[Any]]
-"""Inputs by name to the outputs, float32 arrays all."""
+"""A function from inputs by name to outputs, all float32 arrays."""
 Loaded = tuple[dict[str, Any], Run]
-"""Description of a model, and its function."""
+"""Description of a model (its inputs, outputs and texts), and its function."""
 
 
-def write_frame(file: IO[bytes], head: dict[str, Any], *data: Any) -> None:
-    """Write one frame: its head, then the buffers of its data."""
-    text = json.dumps(head).encode()
+def write_frame(file: IO[bytes], header: dict[str, Any], *data: Any) -> None:
+    """Write one frame: its header, then the buffers of its data."""
+    text = json.dumps(header).encode()
     file.write(struct.pack("<I", len(text)) + text)
     for part in data:
         file.write(part)
@@ -39,29 +40,31 @@ def write_frame(file: IO[bytes], head: dict[str, Any], *data: Any) -> None:
 
 
 def read_frame(file: IO[bytes]) -> tuple[dict[str, Any], bytearray]:
-    """Return one frame's head and its data.
+    """Return the header and the data of one frame.
 
     Raises:
         EOFError: where the other side has closed the pipe.
     """
-    (length,) = struct.unpack("<I", _exactly(file, 4))
-    head = json.loads(_exactly(file, length))
-    return head, _exactly(file, data_bytes(head))
+    (length,) = struct.unpack("<I", _read(file, 4))
+    header = json.loads(_read(file, length))
+    return header, _read(file, data_bytes(header))
 
 
-def data_bytes(head: dict[str, Any]) -> int:
-    """Return how many bytes of data follow a head."""
-    return head.get("bytes", 0) + sum(4 * math.prod(shape) for _, shape in head.get("arrays", ()))
+def data_bytes(header: dict[str, Any]) -> int:
+    """Return the number of bytes of data that follow a header."""
+    arrays = header.get("arrays", ())
+    return header.get("bytes", 0) + sum(4 * math.prod(shape) for _, shape in arrays)
 
 
-def _exactly(file: IO[bytes], count: int) -> bytearray:
+def _read(file: IO[bytes], count: int) -> bytearray:
+    """Return exactly `count` bytes."""
     data = bytearray(count)
     view, done = memoryview(data), 0
     while done < count:
-        got = file.readinto(view[done:])  # type: ignore[attr-defined]
-        if not got:
+        read = file.readinto(view[done:])  # type: ignore[attr-defined]
+        if not read:
             raise EOFError
-        done += got
+        done += read
     return data
 
 
@@ -72,12 +75,12 @@ def load_onnx(onnxruntime: Any, model: bytes, labels: list[str]) -> Loaded:
     options.use_deterministic_compute = True
     options.log_severity_level = 4
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    about = {
+    description = {
         side: [[value.name, value.type, [_size(n) for n in value.shape or ()]] for value in values]
         for side, values in (("inputs", session.get_inputs()), ("outputs", session.get_outputs()))
     }
-    wanted = [name for name, _, _ in about["outputs"]]
-    return about, lambda feed: session.run(wanted, feed)
+    output_names = [name for name, _, _ in description["outputs"]]
+    return description, lambda feed: session.run(output_names, feed)
 
 
 def load_program(torch: Any, model: bytes, labels: list[str]) -> Loaded:
@@ -89,8 +92,8 @@ def load_program(torch: Any, model: bytes, labels: list[str]) -> Loaded:
     for name in map(str, program.graph_signature.user_inputs):
         shape = getattr(values.get(name), "shape", ())
         inputs.append([name, "", [_size(n) for n in shape]])
-    about = {"inputs": inputs, "outputs": [], "labels": extra}
-    return about, _torch_run(torch, program.module(check_guards=False))
+    description = {"inputs": inputs, "outputs": [], "labels": extra}
+    return description, _torch_run(torch, program.module(check_guards=False))
 
 
 def load_script(torch: Any, model: bytes, labels: list[str]) -> Loaded:
@@ -106,18 +109,19 @@ def load_script(torch: Any, model: bytes, labels: list[str]) -> Loaded:
 
 
 def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
+    """Return the function that runs a torch module on numpy arrays."""
     # Threads split sums, so a fixed number of them makes outputs reproducible.
     torch.set_num_threads(1)
 
     def run(feed: dict[str, Any]) -> list[Any]:
-        # A clone has torch's own memory alignment, independent of its place in the frame.
+        # A clone has torch's memory alignment, which does not depend on the place in the frame.
         inputs = [torch.from_numpy(value).clone() for value in feed.values()]
         with torch.inference_mode():
             try:
-                found = module(*inputs)
-            except Exception as error:  # whatever the file's own code and torch raise
+                result = module(*inputs)
+            except Exception as error:  # the code of the file may raise anything
                 raise RuntimeError(_lines(error)[-1]) from error
-        outputs = list(found) if isinstance(found, (tuple, list)) else [found]
+        outputs = list(result) if isinstance(result, (tuple, list)) else [result]
         for number, value in enumerate(outputs):
             if getattr(value, "dtype", None) is not torch.float32:
                 kind = getattr(value, "dtype", type(value).__name__)
@@ -128,9 +132,10 @@ def _torch_run(torch: Any, module: Callable[..., Any]) -> Run:
 
 
 def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
-    """Load a C policy's shared library, whose path is all that was sent.
+    """Load a C policy's shared library from its path.
 
-    Memories travel as float32 words, whatever they hold; so does the byte that says a row is fresh.
+    A frame has float32 arrays only. So a policy's memory, of any type, is sent as its bytes in
+    float32 words, and the flag that a row begins a new flight as a float32.
     """
     import numpy as np
 
@@ -138,7 +143,7 @@ def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
     library.suite_json.restype = ctypes.c_char_p
     state_bytes, *sizes = (library.suite_size(number) for number in range(4))
     text = library.suite_json().decode(errors="replace")
-    about = {
+    description = {
         "inputs": [],
         "outputs": [],
         "labels": {labels[0]: text},
@@ -153,11 +158,11 @@ def load_library(ctypes: Any, path: bytes, labels: list[str]) -> Loaded:
         action = np.empty(feed["action"].shape, np.float32)
         arrays = (memory, fresh, feed["state"], feed["image"], action)
         library.suite_rows(rows, *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
-        after = np.zeros(words.shape, np.float32)
-        after.view(np.uint8)[:, :state_bytes] = memory
-        return [action, after]
+        next_words = np.zeros(words.shape, np.float32)
+        next_words.view(np.uint8)[:, :state_bytes] = memory
+        return [action, next_words]
 
-    return about, run
+    return description, run
 
 
 KINDS: dict[str, tuple[str, Callable[[Any, bytes, list[str]], Loaded]]] = {
@@ -166,34 +171,36 @@ KINDS: dict[str, tuple[str, Callable[[Any, bytes, list[str]], Loaded]]] = {
     "script": ("torch", load_script),
     "library": ("ctypes", load_library),
 }
-"""The module that runs a kind of model, and how it is loaded."""
+"""Kind of model -> the module that runs it, and the function that loads it."""
 
 
 def serve(source: IO[bytes], answers: IO[bytes]) -> None:
     """Load the model of the first frame and answer until the parent closes the input."""
-    head, model = read_frame(source)
+    header, model = read_frame(source)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_REAL, head["load_s"])
-    name, load = KINDS[head["kind"]]
+    signal.setitimer(signal.ITIMER_REAL, header["load_s"])
+    name, load = KINDS[header["kind"]]
     engine = importlib.import_module(name)
-    # The engine's own libraries are not the model's: torch's alone may be gigabytes of addresses.
-    most, (_, allowed) = _addresses() + head["memory_bytes"], resource.getrlimit(resource.RLIMIT_AS)
+    # The limit excludes the engine's libraries: those of torch may take gigabytes of addresses.
+    most = _address_space() + header["memory_bytes"]
+    _, allowed = resource.getrlimit(resource.RLIMIT_AS)
     if allowed != resource.RLIM_INFINITY:
         most = min(most, allowed)
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     try:
-        about, run = load(engine, bytes(model), head["labels"])
-    except Exception as error:  # onnxruntime's own exceptions share no public base
+        description, run = load(engine, bytes(model), header["labels"])
+    except Exception as error:  # onnxruntime's exceptions have no common public base class
         write_frame(answers, {"error": _lines(error)[0], "version": engine.__version__})
         return
     del model
     signal.setitimer(signal.ITIMER_REAL, 0)
-    write_frame(answers, about)
-    _answer(source, answers, run, head["answer_s"])
+    write_frame(answers, description)
+    _answer(source, answers, run, header["answer_s"])
 
 
 def _answer(source: IO[bytes], answers: IO[bytes], run: Run, answer_s: float) -> None:
+    """Answer frames with inputs until the parent closes the input."""
     import numpy as np
 
     while True:
@@ -202,24 +209,24 @@ def _answer(source: IO[bytes], answers: IO[bytes], run: Run, answer_s: float) ->
         except EOFError:
             return
         signal.setitimer(signal.ITIMER_REAL, answer_s)
-        feed, at = {}, 0
+        feed, offset = {}, 0
         for name, shape in request["arrays"]:
             count = math.prod(shape)
-            feed[name] = np.frombuffer(data, np.float32, count, at).reshape(shape)
-            at += 4 * count
+            feed[name] = np.frombuffer(data, np.float32, count, offset).reshape(shape)
+            offset += 4 * count
         try:
-            found = [np.ascontiguousarray(value) for value in run(feed)]
+            outputs = [np.ascontiguousarray(value) for value in run(feed)]
         except Exception as error:
             write_frame(answers, {"error": _lines(error)[0]})
             continue
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        shapes = [[str(number), list(value.shape)] for number, value in enumerate(found)]
-        write_frame(answers, {"arrays": shapes}, *found)
+        shapes = [[str(number), list(value.shape)] for number, value in enumerate(outputs)]
+        write_frame(answers, {"arrays": shapes}, *outputs)
 
 
-def _addresses() -> int:
-    """Return the bytes of addresses that this process uses, 0 where the system does not say."""
+def _address_space() -> int:
+    """Return the size of this process's address space [bytes], 0 where the system has no /proc."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[0]) * resource.getpagesize()
@@ -237,7 +244,7 @@ def _lines(error: Exception) -> list[str]:
 
 
 if __name__ == "__main__":
-    # What native libraries print must not come between the answers.
+    # Native libraries may print; their output goes to standard error, apart from the answers.
     to_parent = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     try:

@@ -1,4 +1,7 @@
-"""ONNX files as `Policy`: standard operators only, run by onnxruntime in a process of its own."""
+"""Load an ONNX file as a `Policy`: it is checked, and run by onnxruntime in a separate process.
+
+Files with operators outside the ONNX standard, or with data outside their folder, are refused.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 import onnx
 import onnx.inliner
 
-from policies.block_policy import BlockPolicy, proven
+from policies.block_policy import BlockPolicy, verify_rows
 from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import (
     INPUTS,
@@ -23,8 +26,9 @@ from policies.spec import PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 _STANDARD = ("", "ai.onnx")
+"""Names of the standard operators' domain."""
 NODES_MOST = 100_000
-"""Largest number of operators of a graph with inlined functions."""
+"""Most operators of a graph after its functions are inlined."""
 
 
 def load_onnx(path: Path) -> BlockPolicy:
@@ -41,11 +45,11 @@ def load_onnx(path: Path) -> BlockPolicy:
     for value in (*loaded.inputs, *loaded.outputs):
         if value.kind != "tensor(float)":
             raise PolicyError(f"{path}: {value.name!r} is {value.kind}, expected tensor(float)")
-    found = {value.name: value.shape for value in loaded.inputs}
-    order = sorted(found, key=(*INPUTS, *found).index)
-    block, hidden_shape = check_inputs({name: found[name] for name in order}, spec, str(path))
+    shapes = {value.name: value.shape for value in loaded.inputs}
+    order = sorted(shapes, key=(*INPUTS, *shapes).index)
+    block, hidden_shape = check_inputs({name: shapes[name] for name in order}, spec, str(path))
     check_memory(metadata, hidden_shape, str(path))
-    notes = (*metadata.notes, *dropped_inputs(found, str(path)))
+    notes = (*metadata.notes, *dropped_inputs(shapes, str(path)))
     outputs = [value.name for value in loaded.outputs]
     if len(outputs) != 1 + (hidden_shape != (0,)):
         raise PolicyError(
@@ -57,22 +61,22 @@ def load_onnx(path: Path) -> BlockPolicy:
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         feed = {"state": state, "image": image, "hidden": hidden}
-        action, *after = loaded.run({name: feed[name] for name in found})
-        return action, after[0] if after else hidden
+        action, *next_hidden = loaded.run({name: feed[name] for name in shapes})
+        return action, next_hidden[0] if next_hidden else hidden
 
     policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, notes)
-    return proven(policy, str(path))
+    return verify_rows(policy, str(path))
 
 
 def read_checked(path: Path) -> onnx.ModelProto:
-    """Read an ONNX file, its external data included, and check that it is harmless.
+    """Read an ONNX file with its external data, and check that it is harmless.
 
     Raises:
         PolicyError: where it is damaged, too large, not standard, or points outside its folder.
     """
     proto = _inlined(path, _graph_of(path))
     if proto.training_info:
-        raise PolicyError(f"{path}: holds training graphs; export inference alone")
+        raise PolicyError(f"{path}: has training graphs; export it for inference only")
     for graph in _graphs(proto.graph):
         for node in graph.node:
             _check_text(path, node.op_type, node.domain)
@@ -108,22 +112,23 @@ def _inlined(path: Path, proto: onnx.ModelProto) -> onnx.ModelProto:
     functions = {(f.domain, f.name): f for f in proto.functions}
     sizes: dict[tuple[str, str], int] = {}
 
-    def size(nodes: Any, above: tuple[tuple[str, str], ...] = ()) -> int:
+    def size(nodes: Any, callers: tuple[tuple[str, str], ...] = ()) -> int:
+        """Return the number of operators after inlining; `callers` are the enclosing functions."""
         total = 0
         for node in nodes:
             key = (node.domain, node.op_type)
-            if key in above or len(above) > len(functions):
+            if key in callers or len(callers) > len(functions):
                 raise PolicyError(f"{path}: function {key[1]!r} calls itself; export it again")
             if key in functions and key not in sizes:
-                sizes[key] = size(functions[key].node, (*above, key))
+                sizes[key] = size(functions[key].node, (*callers, key))
             total += sizes.get(key, 1)
             for attribute in node.attribute:
                 for graph in (attribute.g, *attribute.graphs):
-                    total += size(graph.node, above)
+                    total += size(graph.node, callers)
         return total
 
     if size(proto.graph.node) > NODES_MOST:
-        raise PolicyError(f"{path}: its functions come to more than {NODES_MOST} operators")
+        raise PolicyError(f"{path}: its functions expand to more than {NODES_MOST} operators")
     try:
         return onnx.inliner.inline_local_functions(proto)
     except Exception as error:
@@ -132,7 +137,7 @@ def _inlined(path: Path, proto: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return an ONNX file and the files with its external data, by name.
+    """Return an ONNX file and the files with its external data, sorted by name.
 
     Raises:
         PolicyError: where it is damaged or points outside its folder.
@@ -142,34 +147,35 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _graph_of(path: Path) -> onnx.ModelProto:
+    """Return the model of a file, without its external data and unchecked."""
     try:
         return onnx.load_model_from_string(read_bytes(path, MODEL_BYTES))
     except OSError as error:
         raise PolicyError(f"{path}: cannot be read ({reason(error)}); check the file") from None
     except InputError as error:
         raise PolicyError(str(error)) from None
-    except Exception as error:  # protobuf's DecodeError; protobuf is no dependency of ours
+    except Exception as error:  # protobuf's DecodeError; the suite does not depend on protobuf
         raise PolicyError(
-            f"{path}: not a whole ONNX file ({_first_line(error)}); export it again"
+            f"{path}: not a complete ONNX file ({_first_line(error)}); export it again"
         ) from None
 
 
 def _external_bytes(path: Path, tensors: list[Any]) -> int:
-    """Return the bytes of external data: the files', or all tensors' where they are more."""
-    sizes, held = {}, 0
+    """Return the size of external data: of the files, or of all tensors where that is more."""
+    sizes, in_memory = {}, 0
     for tensor in tensors:
         file = _data_file(path, tensor)
         sizes[file] = file.stat().st_size
         # Tensors may share a file's bytes, but each is read into memory separately.
-        held += _held_bytes(_external(tensor), sizes[file])
-    return max(sum(sizes.values()), held)
+        in_memory += _tensor_bytes(_external(tensor), sizes[file])
+    return max(sum(sizes.values()), in_memory)
 
 
-def _held_bytes(entries: dict[str, Any], size: int) -> int:
-    """Return the bytes of a tensor in a file of `size`; all of it where unspecified."""
+def _tensor_bytes(entries: dict[str, Any], size: int) -> int:
+    """Return the bytes of a tensor in a file of `size` bytes; `size` where unspecified."""
     try:
-        rest = size - int(entries.get("offset", 0))
-        return max(0, min(int(entries.get("length", rest)), rest))
+        available = size - int(entries.get("offset", 0))
+        return max(0, min(int(entries.get("length", available)), available))
     except ValueError:
         return size
 
@@ -187,11 +193,11 @@ def _data_file(path: Path, tensor: onnx.TensorProto) -> Path:
     file = (folder / location).resolve()
     if not location or Path(location).is_absolute() or not file.is_relative_to(folder):
         raise PolicyError(
-            f"{path}: tensor {tensor.name!r} is kept in {location!r}, outside the file's folder; "
-            "export with the data inside"
+            f"{path}: tensor {tensor.name!r} is in {location!r}, outside the file's folder; export "
+            "with the data inside"
         )
     if not file.is_file():
-        raise PolicyError(f"{path}: tensor {tensor.name!r} is kept in {file}, which is missing")
+        raise PolicyError(f"{path}: tensor {tensor.name!r} is in {file}, which is missing")
     return file
 
 

@@ -1,9 +1,9 @@
-"""Our network as an ONNX graph of standard operators, built node by node.
+"""Build the policy network as an ONNX graph of standard operators, node by node.
 
-Opset 17 and IR version 8 (2022) are old enough for the runtimes on companion computers. Torch's own
-exporters (2.13) cannot give this graph of `torch_twin`: the one over TorchScript (`dynamo=False`)
-takes the GRU apart into fifteen operators and warns that it will be removed; the one over
-`torch.export` does so too, writes IR version 10 and needs the package onnxscript.
+Opset 17 and IR version 8 (2022) are old enough for the runtimes on companion computers. The
+exporters of torch (2.13) cannot produce this graph from `torch_twin`. The TorchScript exporter
+(`dynamo=False`) splits the GRU into fifteen operators and is deprecated. The exporter based on
+`torch.export` splits it too, writes IR version 10 and needs the package onnxscript.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ IR_VERSION = 8
 def onnx_model(
     params: Mapping[str, np.ndarray], spec: PolicySpec, metadata: Mapping[str, str]
 ) -> onnx.ModelProto:
-    """Return the network: state, image, hidden to action, hidden_next, the batch free.
+    """Return the network from (state, image, hidden) to (action, hidden_next), for any batch size.
 
     Args:
         params: the network's parameters.
-        spec: what they were made for.
-        metadata: texts that the file carries, by key.
+        spec: the specification that they were trained for.
+        metadata: texts for the file, by key.
     """
     camera, width = spec.camera, spec.hidden_size
     inputs = [
@@ -55,6 +55,7 @@ def onnx_model(
 
 
 def _initializers(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np.ndarray]:
+    """Return the graph's constants, weights in ONNX's layouts."""
     width = spec.hidden_size
     biases = [_gates(params[f"gru.bias_{side}"], width) for side in ("input", "hidden")]
     return {
@@ -72,12 +73,13 @@ def _initializers(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[st
 
 
 def _gates(rows: np.ndarray, width: int) -> np.ndarray:
-    """Return torch's order of gates (reset, update, new) as ONNX's (update, reset, new)."""
+    """Return rows in the suite's gate order (reset, update, new) as ONNX's (update, reset, new)."""
     rows = np.asarray(rows)
     return np.concatenate([rows[width : 2 * width], rows[:width], rows[2 * width :]])
 
 
 def _nodes(width: int) -> list[onnx.NodeProto]:
+    """Return the operators in order of execution, with the names of their inputs and outputs."""
     node = helper.make_node
     return [
         node("Unsqueeze", ["image", "channel_axis"], ["picture"]),
@@ -89,9 +91,9 @@ def _nodes(width: int) -> list[onnx.NodeProto]:
         node("Conv", ["a2", "conv3.weight"], ["c3"], kernel_shape=[3, 3]),
         node("LeakyRelu", ["c3"], ["a3"], alpha=LEAK),
         node("Flatten", ["a3"], ["features"], axis=1),
-        node("Gemm", ["features", "image.weight"], ["seen"], transB=1),
-        node("Gemm", ["state", "state.weight", "state.bias"], ["felt"], transB=1),
-        node("Add", ["seen", "felt"], ["sum"]),
+        node("Gemm", ["features", "image.weight"], ["image_embedding"], transB=1),
+        node("Gemm", ["state", "state.weight", "state.bias"], ["state_embedding"], transB=1),
+        node("Add", ["image_embedding", "state_embedding"], ["sum"]),
         node("LeakyRelu", ["sum"], ["embedding"], alpha=LEAK),
         node("Unsqueeze", ["embedding", "time_axis"], ["sequence"]),
         node("Unsqueeze", ["hidden", "time_axis"], ["before"]),
@@ -100,7 +102,7 @@ def _nodes(width: int) -> list[onnx.NodeProto]:
             ["sequence", "gru.input", "gru.hidden", "gru.bias", "", "before"],
             ["", "after"],
             hidden_size=width,
-            # The recurrent bias of the new gate is inside the reset's product, as in torch.
+            # The reset gate multiplies the recurrent bias of the new gate too, as in torch.
             linear_before_reset=1,
         ),
         node("Squeeze", ["after", "time_axis"], ["hidden_next"]),

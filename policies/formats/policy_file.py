@@ -1,4 +1,8 @@
-"""Checkpoints of the suite's networks: a policy with its `PolicySpec`, and a Delta Action Model."""
+"""Save and load checkpoints of the suite's networks: policies and Delta Action Models.
+
+A Delta Action Model is a network that adds a correction to the action, so that simulated flights
+match measured ones. A policy is stored with its `PolicySpec` (rate, camera, scaling) and contract.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +27,15 @@ class PolicyCheckpoint:
     """A policy as it was stored."""
 
     params: dict[str, np.ndarray]
-    """The network's parameters, float32, as `network.init` names and shapes them."""
+    """The network's parameters, float32, with the names and shapes of `network.init`."""
     spec: PolicySpec
-    """The rate, camera and scaling it was made for."""
+    """The rate, camera and scaling that it was trained for."""
     config: dict[str, Any]
-    """The whole of config.json, "training" among it."""
+    """The object of config.json; "training" has the training's configuration."""
 
     @property
     def seed(self) -> int | None:
-        """The seed of its training; None where unknown."""
+        """Seed of its training; None where unknown."""
         return self.config.get("seed")
 
 
@@ -48,7 +52,7 @@ def save_policy(
     Args:
         folder: the checkpoint's folder.
         params: the network's parameters.
-        spec: what the policy expects of the world.
+        spec: the rate, camera and scaling that the policy expects.
         seed: the training's seed.
         training: the resolved training configuration.
 
@@ -56,7 +60,7 @@ def save_policy(
         `folder`.
 
     Raises:
-        OSError: where the disk refuses; what was there stays.
+        OSError: where the files cannot be written; an existing checkpoint is kept.
     """
     stored_contract = contract.contract_of(spec, (spec.hidden_size,)).to_json()
     extra = {
@@ -80,9 +84,9 @@ def load_policy_checkpoint(folder: Path) -> PolicyCheckpoint:
     spec = spec_from_json(stored.config["spec"], f"{folder / CONFIG}: spec")
     check_shapes(folder / WEIGHTS, stored.arrays, expected_shapes(spec, str(folder / CONFIG)))
     if contract.KEY in stored.config:
-        where, own = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
+        where, expected = f"{folder / CONFIG}: {contract.KEY}", contract.contract_of(spec)
         stored_contract = contract.read_contract(stored.config[contract.KEY], where)
-        contract.refuse_other(stored_contract, own, where, "the spec in the same file")
+        contract.refuse_differences(stored_contract, expected, where, "the spec in the same file")
     return PolicyCheckpoint(stored.arrays, spec, stored.config)
 
 
@@ -109,9 +113,9 @@ class DeltaCheckpoint:
     """A Delta Action network as it was stored."""
 
     params: dict[str, np.ndarray]
-    """The network's parameters, float32, as `delta_network.init` names and shapes them."""
+    """The network's parameters, float32, with the names and shapes of `delta_network.init`."""
     config: dict[str, Any]
-    """The whole of config.json, "fit" among it."""
+    """The object of config.json; "fit" has the fit's configuration and results."""
 
 
 def save_delta(
@@ -133,7 +137,7 @@ def save_delta(
         `folder`.
 
     Raises:
-        OSError: where the disk refuses; what was there stays.
+        OSError: where the files cannot be written; an existing checkpoint is kept.
     """
     return save_arrays(folder, params, kind=DELTA, seed=seed, extra={"fit": dict(fit or {})})
 
@@ -143,7 +147,7 @@ def load_delta(folder: Path) -> DeltaCheckpoint:
 
     Raises:
         PolicyError: where the checkpoint is damaged, of another kind, not finite, or its arrays
-            are not the network's.
+            do not have the names and shapes of the network's.
     """
     import jax
 

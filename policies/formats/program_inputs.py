@@ -1,4 +1,4 @@
-"""Checks of the inputs of a foreign policy, for all formats."""
+"""Check the inputs of a policy file made outside the suite: names, shapes, memory, any format."""
 
 from __future__ import annotations
 
@@ -11,24 +11,22 @@ from policies.formats.spec_json import KEY, PolicyMetadata
 from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
 
 INPUTS = ("state", "image", "hidden")
-"""Names of a program's inputs, in order; a policy without memory leaves the last out."""
-
-
+"""Names of a program's inputs, in order; a policy without memory omits the last."""
 BLOCK_MOST = 4096
-"""Largest batch of a model with a fixed batch."""
+"""Largest batch size of a model with a fixed one."""
 HIDDEN_MOST = 2**16
-"""Largest recurrent state of one row."""
+"""Most numbers in the recurrent state of one row."""
 
 
 def check_inputs(
     shapes: dict[str, tuple[Any, ...]], spec: PolicySpec, where: str
 ) -> tuple[int, tuple[int, ...]]:
-    """Return (rows a block, shape of a row's hidden state) from a program's inputs.
+    """Return the rows of a block, and the shape of a row's hidden state, from a program's inputs.
 
     Args:
-        shapes: by input name, in order; sizes that are not ints are free.
-        spec: the file's spec.
-        where: the file, for the message.
+        shapes: shapes by input name, in order; sizes that are not ints are free.
+        spec: the file's specification.
+        where: the file, for messages.
 
     Raises:
         PolicyError: where names, ranks or sizes are not those of an observation.
@@ -40,8 +38,8 @@ def check_inputs(
     hidden = shapes.get("hidden", (None, 0))[1:]
     if rows or not hidden or not all(isinstance(size, int) for size in hidden):
         raise PolicyError(
-            f"{where}: inputs have shapes {shapes}; all need the batch as first axis, and the "
-            "other axes of 'hidden' must be fixed"
+            f"{where}: inputs have shapes {shapes}; the first axis of each must be the batch, and "
+            "the other axes of 'hidden' must have fixed sizes"
         )
     if not 1 <= block <= BLOCK_MOST or not 0 <= math.prod(hidden) <= HIDDEN_MOST:
         raise PolicyError(
@@ -51,25 +49,25 @@ def check_inputs(
     for name, expected in (("state", (spec.state_size,)), ("image", spec.image_shape)):
         if name not in shapes:
             continue
-        found = shapes[name][1:]
-        free = len(found) == len(expected) and all(
-            size == want or not isinstance(size, int)
-            for size, want in zip(found, expected, strict=True)
+        shape = shapes[name][1:]
+        fits = len(shape) == len(expected) and all(
+            size == required or not isinstance(size, int)
+            for size, required in zip(shape, expected, strict=True)
         )
-        if not free:
+        if not fits:
             raise PolicyError(
                 f"{where}: input {name!r} has shape {shapes[name]}, expected (batch, "
-                f"{', '.join(map(str, expected))}); the camera's size, {', '.join(EXTRAS)} "
-                f"and the kind of action stand in {KEY} or in its contract"
+                f"{', '.join(map(str, expected))}); set the camera's size, {', '.join(EXTRAS)} "
+                f"and the kind of action in {KEY} or in its contract"
             )
     return block, tuple(hidden)
 
 
 def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where: str) -> None:
-    """Refuse a memory of another shape than the contract's.
+    """Refuse a hidden state whose shape is not the contract's.
 
     Raises:
-        PolicyError: naming both.
+        PolicyError: naming both shapes.
     """
     shape = metadata.contract.memory if metadata.contract else None
     if shape is not None and tuple(shape) != (hidden_shape if hidden_shape != (0,) else ()):
@@ -80,12 +78,12 @@ def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where:
 
 
 def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
-    """Return notes on inputs that an exporter has dropped because nothing uses them."""
+    """Return notes on inputs that an exporter has dropped because the program does not use them."""
     missing = [name for name in INPUTS[:2] if name not in names]
     return tuple(
         Note(
             "dropped_input",
-            f"{where}: has no input {name!r}: exporters drop unused inputs, and it flies without",
+            f"{where}: has no input {name!r}: exporters drop unused inputs; it is flown without it",
             f"if it should use it, use {name} in forward() and export again",
         )
         for name in missing
@@ -93,7 +91,7 @@ def dropped_inputs(names: Iterable[str], where: str) -> tuple[Note, ...]:
 
 
 def inputs_message(where: str, names: tuple[str, ...]) -> str:
-    """Return the error's message for a program whose inputs have other names."""
+    """Return the error message for a program whose inputs have other names."""
     return (
         f"{where}: inputs are {', '.join(names) or 'none'}; expected {', '.join(INPUTS)} in this "
         "order (hidden may be left out); name forward()'s arguments so, or give input_names to "

@@ -1,6 +1,7 @@
-"""A `PolicySpec` as JSON, and the metadata of policy files.
+"""Convert a `PolicySpec` to JSON and back, and read the metadata of policy files.
 
-A torch, ONNX or C file has an object under the key `policy.json`, a contract, both or neither.
+A torch, ONNX or C file may have a JSON object under the key `policy.json`, and a contract (names,
+units, frames and scales of its inputs and outputs; see `policies.contract`).
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ def spec_to_json(spec: PolicySpec) -> dict[str, Any]:
 
 
 def spec_from_json(data: Any, where: str) -> PolicySpec:
-    """Return the spec that `data` holds; keys that are left out take the default.
+    """Return the spec that `data` describes; missing keys take their defaults.
 
     Args:
-        data: what `spec_to_json` gave, after JSON.
-        where: the file and key it came from, for the message.
+        data: the result of `spec_to_json`, read from JSON.
+        where: its file and key, for messages.
 
     Raises:
         PolicyError: for an unknown key, a wrong type or a value out of range.
@@ -47,6 +48,7 @@ def spec_from_json(data: Any, where: str) -> PolicySpec:
 KEY = "policy.json"
 """Name of the extra file in a torch archive, and of the metadata entry in ONNX."""
 SCHEMA = 1
+"""Version of the object's layout."""
 KEYS = ("schema", "suite_version", "git_commit", "seed", "name", "spec", contract.KEY)
 """Keys of the object; `spec` and `contract` describe the policy."""
 
@@ -55,23 +57,26 @@ class PolicyMetadata(NamedTuple):
     """The metadata of a policy file."""
 
     spec: PolicySpec
-    """The default spec where the file has none."""
+    """The file's spec; the default where it has none."""
     contract: contract.Contract | None
-    """The file's own contract; None for none."""
+    """The file's contract, if it has one."""
     notes: tuple[Note, ...]
-    """Assumptions."""
+    """Assumptions that were made where the file says nothing."""
 
 
 def labels(spec: PolicySpec, name: str, seed: int | None) -> dict[str, str]:
-    """Return the texts that go into a policy's file, by their keys."""
+    """Return the metadata texts for a policy's file, by their keys."""
     return {KEY: embed(spec, name, seed), contract.KEY: contract.contract_of(spec).text}
 
 
 def embed(spec: PolicySpec, name: str, seed: int | None) -> str:
-    """Return the text that goes under `KEY`."""
-    known = contract.contract_of(spec).to_json()
-    about = {"name": name, "spec": spec_to_json(spec), contract.KEY: known}
-    return to_json({**stamp(SCHEMA, seed), **about})
+    """Return the JSON text for the key `KEY`: provenance, name, spec and contract."""
+    entries = {
+        "name": name,
+        "spec": spec_to_json(spec),
+        contract.KEY: contract.contract_of(spec).to_json(),
+    }
+    return to_json({**stamp(SCHEMA, seed), **entries})
 
 
 def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetadata:
@@ -79,36 +84,39 @@ def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetada
 
     Args:
         texts: the file's texts under `KEY` and `contract.KEY`, if present.
-        where: the file, for the message.
+        where: the file, for messages.
 
     Raises:
-        PolicyError: where a text is not JSON, of a newer schema or no spec, or two contradict.
+        PolicyError: where a text is not JSON, is of a newer schema or not a spec, or where two
+            texts contradict each other.
     """
-    about = _object(texts.get(KEY), f"{where}: {KEY}")
-    found = [(texts.get(contract.KEY), f"{where}: {contract.KEY}"),
-             (about.get(contract.KEY), f"{where}: {KEY}: {contract.KEY}")]  # fmt: skip
-    read = [(contract.read_contract(text, place), place) for text, place in found if text]
-    if "spec" in about:
-        spec = spec_from_json(about["spec"], f"{where}: {KEY}: spec")
-        own = contract.contract_of(spec)
-        for one, place in read:
-            contract.refuse_other(one, own, place, f"the spec in {KEY}")
-        return PolicyMetadata(spec, read[0][0] if read else None, ())
-    if read:
-        for one, place in read[1:]:
-            contract.refuse_other(one, read[0][0], place, f"the entry {contract.KEY}")
-        return PolicyMetadata(contract.spec_of(*read[0]), read[0][0], ())
+    entries = _object(texts.get(KEY), f"{where}: {KEY}")
+    sources = [(texts.get(contract.KEY), f"{where}: {contract.KEY}"),
+               (entries.get(contract.KEY), f"{where}: {KEY}: {contract.KEY}")]  # fmt: skip
+    contracts = [(contract.read_contract(text, place), place) for text, place in sources if text]
+    if "spec" in entries:
+        spec = spec_from_json(entries["spec"], f"{where}: {KEY}: spec")
+        expected = contract.contract_of(spec)
+        for each, place in contracts:
+            contract.refuse_differences(each, expected, place, f"the spec in {KEY}")
+        return PolicyMetadata(spec, contracts[0][0] if contracts else None, ())
+    if contracts:
+        first = contracts[0][0]
+        for each, place in contracts[1:]:
+            contract.refuse_differences(each, first, place, f"the entry {contract.KEY}")
+        return PolicyMetadata(contract.spec_of(*contracts[0]), first, ())
     spec = spec_from_json({}, where)
     assumed = contract.summary(contract.contract_of(spec))
-    doubt = Note(
+    note = Note(
         "no_contract",
         f"{where}: no contract in it; assumed: {assumed}",
-        "where it was trained otherwise, export it with env.unwrapped.contract",
+        "if this is wrong, export it with env.unwrapped.contract",
     )
-    return PolicyMetadata(spec, None, (doubt,))
+    return PolicyMetadata(spec, None, (note,))
 
 
 def _object(text: str | bytes | None, where: str) -> dict[str, Any]:
+    """Return the object under `KEY`; refuse other schemas and unknown keys."""
     if not text:
         return {}
     try:

@@ -1,9 +1,10 @@
-"""Torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, run in their own process.
+"""Load torch exported programs (.pt2) and TorchScript (.pt) as `Policy`, run in a separate process.
 
-Neither is loaded without trust: `torch.jit.load` runs what a file says by design, and
-`torch.export.load` unpickles sample inputs and some weights, resolves operators by dotted paths and
-evaluates expressions, all from the file; torch has no safe mode for it. The process of their own
-(`model_process.py`) keeps a module that hangs or aborts from taking the suite along, no more.
+Neither is loaded unless the user trusts the file, because loading can run any code:
+`torch.jit.load` runs code of the file by design. `torch.export.load` unpickles sample inputs and
+some weights, resolves operators by dotted paths and evaluates expressions, all from the file; torch
+has no safe mode for it. The separate process (`model_process.py`) only protects the suite from a
+module that hangs or crashes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from policies import contract
-from policies.block_policy import BlockPolicy, Model, proven
+from policies.block_policy import BlockPolicy, Model, verify_rows
 from policies.formats.model_process import ModelProcess
 from policies.formats.program_inputs import INPUTS, check_inputs, check_memory, inputs_message
 from policies.formats.spec_json import KEY, extract
@@ -38,15 +39,15 @@ def load_program(path: Path, trust: bool = False) -> BlockPolicy:
     check_memory(metadata, hidden_shape, str(path))
     model = _as_model(loaded, path, hidden_shape)
     policy = BlockPolicy(path.name, spec, model, hidden_shape, block, block, metadata.notes)
-    return proven(policy, str(path))
+    return verify_rows(policy, str(path))
 
 
 def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     """Return the policy of a TorchScript file.
 
     Raises:
-        PolicyError: without trust, or where it is no TorchScript or its inputs and outputs do not
-            fit.
+        PolicyError: without trust, or where the file is not TorchScript or its inputs and outputs
+            do not fit.
     """
     loaded = _loaded(path, "script", "TorchScript", trust)
     metadata = extract(loaded.labels, str(path))
@@ -54,17 +55,18 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
     _check_names(path, names)
     hidden_shape = (spec.hidden_size,) if names == INPUTS else (0,)
     model = _as_model(loaded, path, hidden_shape)
-    return proven(
+    return verify_rows(
         BlockPolicy(path.name, spec, model, hidden_shape, notes=metadata.notes), str(path)
     )
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
+    """Return a process that has loaded the file; `words` names its kind in messages."""
     if not trust:
         raise NeedsTrust(
-            f"{path}: {words} can run any code of its maker's while torch loads it; if you trust "
-            "who made the file, pass --trust; a policy to be shared needs none as .onnx "
-            "(torch.onnx.export; suite export for one of ours)"
+            f"{path}: {words} can run any code of its author while torch loads it; if you trust "
+            "the author, pass --trust; as .onnx, a policy can be shared without trust "
+            "(torch.onnx.export; suite export for a policy of the suite)"
         )
     try:
         data = read_bytes(path, MODEL_BYTES)
@@ -75,7 +77,7 @@ def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
     if kind == "script" and _is_weights(data):
         raise PolicyError(
             f"{path}: this file contains weights without a program (a state_dict or a pickled "
-            "module); load them into the module and export it: examples/sb3_race.py"
+            "module); load them into the module and export that, as in examples/sb3_race.py"
         )
     return ModelProcess(data, str(path), kind, (KEY, contract.KEY))
 
@@ -96,6 +98,7 @@ def _is_weights(data: bytes) -> bool:
 
 
 def _as_model(loaded: ModelProcess, path: Path, hidden_shape: tuple[int, ...]) -> Model:
+    """Return the function that runs the process's model; it checks the number of outputs."""
     memory = hidden_shape != (0,)
 
     def model(
@@ -108,7 +111,7 @@ def _as_model(loaded: ModelProcess, path: Path, hidden_shape: tuple[int, ...]) -
                 f"{path}: gives {len(outputs)} outputs, expected the tensors action"
                 f"{' and hidden' if memory else ''}; see docs/policies.md"
             )
-        action, *after = outputs
-        return action, after[0] if memory else hidden
+        action, *next_hidden = outputs
+        return action, next_hidden[0] if memory else hidden
 
     return model

@@ -1,4 +1,4 @@
-"""The policy network as a torch module, for export and for deployment with torch."""
+"""The policy network as a torch module with the same outputs, for export and deployment."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from policies.spec import PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")
 LINEAR = ("state", "action")
+"""Layers whose weights need only another layout."""
 
 
 class TorchTwin(nn.Module):

@@ -1,1 +1,1 @@
-"""The neural networks, and the layers they are made of."""
+"""The neural networks (policy and Delta Action Model), their layers and parameters."""

@@ -1,7 +1,8 @@
-"""The Delta Action network: MLP + GRU of 32 (Su et al. 2026, Sec. III-D and III-E).
+"""The Delta Action network: it corrects the action so that the simulation matches real flights.
 
-From velocity in body axes, attitude and the current action it gives a correction of the action,
-so that the point mass under the corrected action moves as the recorded vehicle did.
+Inputs are the velocity in body axes, the attitude and the current action; the output is added to
+the action. The point mass under the corrected action then moves as the recorded vehicle did. The
+network is an MLP and a GRU of 32 units (Su et al. 2026, Sec. III-D and III-E).
 """
 
 from __future__ import annotations
@@ -14,22 +15,18 @@ from policies.networks.network import leaky_relu
 from policies.spec import ACTION_SIZE
 
 Params = dict[str, jax.Array]
-
+"""Parameters by name."""
 HIDDEN = 32
 """Width of the features and of the recurrent state."""
 INPUTS = 9
-"""Velocity in body axes (3), third row of R (3) and the action (3)."""
+"""Numbers in the input: velocity in body axes (3), third row of R (3) and the action (3)."""
 INPUT_SCALE = (0.2, 0.2, 0.2, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
-"""Brings metres a second and m/s^2 to order one."""
-
-
-def init(key: jax.Array) -> Params:
-    """Return fresh parameters; the output starts at zero, so the model starts as no correction."""
-    return _drawn(key)
+"""Factors that bring the inputs in m/s and m/s^2 to order one."""
 
 
 @jax.jit
-def _drawn(key: jax.Array) -> Params:
+def init(key: jax.Array) -> Params:
+    """Return random initial parameters; the output layer is zero, so there is no correction."""
     shapes = {
         "input.weight": (INPUTS, HIDDEN),
         "input.bias": (HIDDEN,),
@@ -41,9 +38,9 @@ def _drawn(key: jax.Array) -> Params:
         "output.bias": (ACTION_SIZE,),
     }
     params = {}
-    for name, drawn in uniform(key, shapes).items():
+    for name, number in uniform(key, shapes).items():
         bound = (INPUTS if name == "input.weight" else HIDDEN) ** -0.5
-        params[name] = drawn * (2 * bound) - bound
+        params[name] = number * (2 * bound) - bound
     params["output.weight"] *= 0.0
     params["output.bias"] *= 0.0
     return params
@@ -57,11 +54,11 @@ def start(n: int) -> jax.Array:
 def step(
     params: Params, hidden: jax.Array, vel_b: jax.Array, row3: jax.Array, action_b: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return (correction_b (..., 3) [m/s^2], hidden' (..., 32)).
+    """Return the correction (..., 3) [m/s^2, body axes] and the new hidden state (..., 32).
 
     Args:
         params: from `init` or a checkpoint.
-        hidden: (..., 32).
+        hidden: (..., 32) recurrent state.
         vel_b: (..., 3) velocity in body axes [m/s].
         row3: (..., 3) third row of R, world z in body axes.
         action_b: (..., 3) the action being corrected [m/s^2].
@@ -69,7 +66,7 @@ def step(
     x = jnp.concatenate([vel_b, row3, action_b], axis=-1) * jnp.asarray(INPUT_SCALE)
     x = leaky_relu(x @ params["input.weight"] + params["input.bias"])
     gates_x = x @ params["gru.weight_input"] + params["gru.bias"]
-    # A gate's two biases are equivalent, except in the new gate, where the reset is between them.
+    # Only the new gate needs a second bias, which the reset gate multiplies.
     bias_h = jnp.pad(params["gru.bias_new"], (2 * HIDDEN, 0))
     hidden = gru_update(gates_x, hidden @ params["gru.weight_hidden"] + bias_h, hidden)
     return hidden @ params["output.weight"] + params["output.bias"], hidden

@@ -1,13 +1,13 @@
-"""The layers of our networks: convolutions, the gated recurrent unit, and fresh weights.
+"""Layers of the networks: convolutions with fast CPU gradients, the GRU, and initial weights.
 
-The gradients of these convolutions are matrix products that XLA's CPU runs fast, and alike.
-XLA's CPU gradients of small convolutions run at a tenth of the machine's matrix-product rate or
-less. Here a row of pixels, all its channels side by side, is one vector: a kernel row maps it to an
-output row by a banded matrix, so both gradients are products of matrices some hundreds wide. Two
-to three times the arithmetic of the convolution, at many times its speed.
+On the CPU, XLA computes gradients of small convolutions at a tenth of the speed of its matrix
+products, or less. Here they are matrix products. A row of pixels with all its channels is one
+vector, and a kernel row maps it to an output row by a banded matrix, so both gradients are products
+of matrices some hundreds wide. They take two to three times the arithmetic of the convolution, but
+run many times as fast.
 
-A product of two long and narrow matrices is cut along its sums by as many threads as there are,
-so its last bits would depend on the machine's cores. `patch_product` cuts it itself.
+XLA divides the sums of a product of two long and narrow matrices among all threads, so its last
+bits would depend on the number of cores. `patch_product` divides the sums itself.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ import jax
 import jax.numpy as jnp
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
+"""Order of axes of the image, the kernel and the result."""
 PIECE = 8
-"""Images in one product of `patch_product`'s gradient, too few to split among threads."""
+"""Images in one product of `patch_product`'s gradient, too few for XLA to split among threads."""
 
 
 @jax.custom_vjp
 def patch_product(x: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return x (N, ..., C) @ weight (C, D); its gradient has the same bits on any cores."""
+    """Return x (N, ..., C) @ weight (C, D); the number of cores does not change the gradient."""
     return x @ weight
 
 
@@ -39,6 +40,7 @@ def _patch_forward(
 def _patch_backward(
     saved: tuple[jax.Array, jax.Array], grad: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
+    """Return the gradients for x and weight; the latter is summed piece by piece."""
     x, weight = saved
     pieces = len(x) // max(size for size in range(1, PIECE + 1) if len(x) % size == 0)
     rows, grad_rows = (part.reshape(pieces, -1, part.shape[-1]) for part in (x, grad))
@@ -75,7 +77,7 @@ def _fold(banded: jax.Array, taps: int, inputs: int, outputs: int) -> jax.Array:
     width = banded.shape[0] // inputs
     places = width - taps + 1
     split = banded.reshape(width, inputs, places, outputs)
-    return functools.reduce(jnp.add, (split[at : at + taps, :, at] for at in range(places)))
+    return functools.reduce(jnp.add, (split[k : k + taps, :, k] for k in range(places)))
 
 
 def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -83,19 +85,20 @@ def _forward(x: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Arra
 
 
 def _backward(saved: tuple[jax.Array, jax.Array], grad: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the gradients for the images and the kernel, one kernel row after another."""
     x, kernel = saved
     count, height, width, inputs = x.shape
-    reach, taps, _, outputs = kernel.shape
-    rows_out = height - reach + 1
+    kernel_rows, taps, _, outputs = kernel.shape
+    rows_out = height - kernel_rows + 1
     x_rows, grad_rows = _as_rows(x), _as_rows(grad)
     flat_grad = grad_rows.reshape(rows_out * count, -1)
     kernel_grad, x_grad = [], jnp.zeros_like(x_rows)
-    for row in range(reach):
-        seen = x_rows[row : row + rows_out].reshape(rows_out * count, -1)
-        kernel_grad.append(_fold(seen.T @ flat_grad, taps, inputs, outputs))
+    for row in range(kernel_rows):
+        inputs_of_row = x_rows[row : row + rows_out].reshape(rows_out * count, -1)
+        kernel_grad.append(_fold(inputs_of_row.T @ flat_grad, taps, inputs, outputs))
         back = flat_grad @ _banded(kernel[row], width).T
         back = back.reshape(rows_out, count, -1)
-        x_grad = x_grad + jnp.pad(back, ((row, reach - 1 - row), (0, 0), (0, 0)))
+        x_grad = x_grad + jnp.pad(back, ((row, kernel_rows - 1 - row), (0, 0), (0, 0)))
     x_grad = x_grad.reshape(height, count, width, inputs).transpose(1, 0, 2, 3)
     return x_grad, jnp.stack(kernel_grad)
 
@@ -104,12 +107,12 @@ conv_valid.defvjp(_forward, _backward)
 
 
 def gru_update(from_input: jax.Array, from_hidden: jax.Array, hidden: jax.Array) -> jax.Array:
-    """Return the next hidden state (..., H).
+    """Return the next hidden state (..., H) of a GRU (Cho et al. 2014, in torch's convention).
 
     Args:
-        from_input: (..., 3 H) the input's part of the gates reset, update and new.
-        from_hidden: (..., 3 H) the hidden state's part of the same.
-        hidden: (..., H).
+        from_input: (..., 3 H) the input's contribution to the gates reset, update and new.
+        from_hidden: (..., 3 H) the hidden state's contribution to the same gates.
+        hidden: (..., H) the hidden state.
     """
     reset_x, update_x, new_x = jnp.split(from_input, 3, axis=-1)
     reset_h, update_h, new_h = jnp.split(from_hidden, 3, axis=-1)
@@ -120,14 +123,15 @@ def gru_update(from_input: jax.Array, from_hidden: jax.Array, hidden: jax.Array)
 
 
 def uniform(key: jax.Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, jax.Array]:
-    """Return numbers in [0, 1) by name, float32, each array from its own key.
+    """Return random numbers in [0, 1) by name, float32, each array from its own key.
 
-    They are those of `jax.random.uniform(key, shape)`: JAX makes a number from its place alone, so
-    a short array is the beginning of a long one. A program for each shape takes ten times as long
-    to compile as one row of the longest does.
+    They equal those of `jax.random.uniform(key, shape)`. In JAX a random number depends on the key
+    and its index only, so a short array is the beginning of a long one. All arrays are therefore
+    drawn with the longest one's length, which compiles ten times as fast as a program for each
+    shape.
     """
     longest = max(math.prod(shape) for shape in shapes.values())
-    rows = jax.vmap(lambda one: jax.random.uniform(one, (longest,), jnp.float32))(
+    rows = jax.vmap(lambda row_key: jax.random.uniform(row_key, (longest,), jnp.float32))(
         jax.random.split(key, len(shapes))
     )
     return {

@@ -1,8 +1,9 @@
-"""The policy network: CNN + GRU (Su et al. 2026, Sec. III-E; stem after Zhang et al. 2025).
+"""The policy network: CNN and GRU (Su et al. 2026, Sec. III-E; first layers as Zhang et al. 2025).
 
-The encoded inverse depth is max-pooled by 2 (near things win) before three convolutions; the
-state's embedding is added to the image's; a GRU (torch's gate convention) and a linear layer give
-the wanted net acceleration in body axes. Parameters are a flat dict of float32 arrays.
+The encoded inverse depth is max-pooled by 2, so that near objects remain, and passes three
+convolutions. The state's embedding is added to the image's. A GRU (with torch's gate convention)
+and a linear layer compute the wanted net acceleration in body axes. Parameters are a flat dict of
+float32 arrays.
 """
 
 from __future__ import annotations
@@ -28,23 +29,19 @@ def leaky_relu(x: jax.Array) -> jax.Array:
 
 
 def flat_features(spec: PolicySpec) -> int:
-    """Return how many features leave the last convolution, flattened height x width x channel."""
+    """Return the number of outputs of the last convolution: height x width x channels."""
     rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
     return rows * columns * spec.channels[2]
 
 
-def init(key: jax.Array, spec: PolicySpec) -> Params:
-    """Return fresh parameters: torch's uniform defaults, the state branch x 0.5.
-
-    Zhang et al. 2025 scale the output by 0.01 as well. Then the first gradient steps, which all ask
-    for the same climb, grow what comes before it until the memory saturates, and some seeds take a
-    thousand iterations to come back.
-    """
-    return _drawn(key, spec)
-
-
 @jax.jit(static_argnames="spec")
-def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
+def init(key: jax.Array, spec: PolicySpec) -> Params:
+    """Return random initial parameters: torch's uniform defaults, with the state's weights halved.
+
+    Zhang et al. 2025 also scale the output by 0.01. Here this is left out. With it the first
+    gradient steps, which all increase the thrust, grow the earlier layers until the memory
+    saturates, and some seeds take a thousand iterations to recover.
+    """
     hidden, (first, second, third) = spec.hidden_size, spec.channels
     fan = {
         "conv1.weight": ((2, 2, 1, first), 4),
@@ -59,48 +56,49 @@ def _drawn(key: jax.Array, spec: PolicySpec) -> Params:
         "gru.bias_hidden": ((3 * hidden,), hidden),
         "action.weight": ((hidden, spec.action.size), hidden),
     }
-    drawn = uniform(key, {name: shape for name, (shape, _) in fan.items()})
-    params = {name: (2 * drawn[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in fan.items()}
+    numbers = uniform(key, {name: shape for name, (shape, _) in fan.items()})
+    params = {name: (2 * numbers[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in fan.items()}
     params["state.weight"] *= 0.5
     return params
 
 
-def fitted(params: Params, seen: PolicySpec, spec: PolicySpec) -> Params:
-    """Return parameters of a policy that sees `seen` as parameters for `spec`.
+def adapt_params(params: Params, old: PolicySpec, new: PolicySpec) -> Params:
+    """Return the parameters of a policy with spec `old`, adapted to the spec `new`.
 
-    Numbers that `spec` adds to the state get weights of zero, so the policy acts as it did. At
-    another rate its memory keeps its pace in seconds: the update gate's bias grows by the logarithm
-    of the rates' ratio, which is exact for what is remembered over many decisions.
+    Numbers that `new` adds to the state get weights of zero, so the actions do not change. At
+    another rate the memory keeps its time constants in seconds: the update gate's bias is raised by
+    the logarithm of the ratio of the rates, which is exact in the limit of long memory.
 
     Raises:
-        ValueError: where the policy sees what `spec` does not have, or they differ in all but that.
+        ValueError: where `new` lacks a part of the state, or the specs differ in anything but the
+            state, the speed and the rate.
     """
-    for entry in dataclasses.fields(spec):
-        has, wanted = getattr(seen, entry.name), getattr(spec, entry.name)
+    for entry in dataclasses.fields(new):
+        before, after = getattr(old, entry.name), getattr(new, entry.name)
         if entry.name == "camera":  # rays change the pixels' values, but not their number
-            has = dataclasses.replace(has, rays=wanted.rays)
-        if has != wanted and entry.name not in (*EXTRAS, "speed", "rate_hz"):
+            before = dataclasses.replace(before, rays=after.rays)
+        if before != after and entry.name not in (*EXTRAS, "speed", "rate_hz"):
             raise ValueError(
-                f"the policy to start from has spec.{entry.name} {has}, and this run {wanted}; "
-                "train from nothing, or with the policy's own"
+                f"the policy to start from has spec.{entry.name} {before}, and this run {after}; "
+                "train without a start, or with the value of the policy"
             )
-    rows, first = [params["state.weight"][: spec.base_size]], spec.base_size
+    rows, first = [params["state.weight"][: new.base_size]], new.base_size
     for key, count in EXTRAS.items():
-        has, wanted = getattr(seen, key), getattr(spec, key)
-        if has and not wanted:
+        before, after = getattr(old, key), getattr(new, key)
+        if before and not after:
             raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")
-        if has:
+        if before:
             rows.append(params["state.weight"][first : first + count])
             first += count
-        elif wanted:
+        elif after:
             rows.append(jnp.zeros((count, rows[0].shape[1])))
-    keeps = slice(spec.hidden_size, 2 * spec.hidden_size)
-    bias = params["gru.bias_input"].at[keeps].add(math.log(spec.rate_hz / seen.rate_hz))
+    update_gate = slice(new.hidden_size, 2 * new.hidden_size)
+    bias = params["gru.bias_input"].at[update_gate].add(math.log(new.rate_hz / old.rate_hz))
     return {**params, "state.weight": jnp.concatenate(rows), "gru.bias_input": bias}
 
 
 def encode(params: Params, image: jax.Array) -> jax.Array:
-    """Return the embeddings of encoded images: (N, height, width) to (N, hidden)."""
+    """Return the embeddings (N, hidden) of encoded images (N, height, width)."""
     n, height, width = image.shape
     pooled = image.reshape(n, height // 2, 2, width // 2, 2).max((2, 4))
     # The 2x2 convolution of stride 2 is a matrix product on patches that do not overlap.
@@ -116,7 +114,14 @@ def encode(params: Params, image: jax.Array) -> jax.Array:
 def recur(
     params: Params, hidden: jax.Array, embedding: jax.Array, state: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return (action_b (N, 3) [m/s^2], hidden' (N, hidden)) from an image's embedding and state."""
+    """Return the actions (N, 3) [m/s^2, body axes] and the new hidden states (N, hidden).
+
+    Args:
+        params: from `init` or a checkpoint.
+        hidden: (N, hidden) recurrent state.
+        embedding: (N, hidden) the images' embeddings, from `encode`.
+        state: (N, spec.state_size) the state of `observation.observe`.
+    """
     x = leaky_relu(embedding + state @ params["state.weight"] + params["state.bias"])
     gates_x = x @ params["gru.weight_input"] + params["gru.bias_input"]
     gates_h = hidden @ params["gru.weight_hidden"] + params["gru.bias_hidden"]
@@ -127,7 +132,7 @@ def recur(
 def step(
     params: Params, hidden: jax.Array, state: jax.Array, image: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return (action_b (N, 3) [m/s^2], hidden' (N, hidden)) from one observation.
+    """Return the actions (N, 3) [m/s^2, body axes] and the new hidden states for one observation.
 
     Args:
         params: from `init` or a checkpoint.

@@ -1,6 +1,7 @@
-"""A JAX pytree (parameters, optimizer state, step, random key) as arrays by name, and back.
+"""Convert a JAX pytree (parameters, optimiser state, random key) to arrays by name, and back.
 
-Of our network's parameters also the layouts of torch and ONNX: rows are outputs, channels first.
+Also convert the policy network's weights to the layouts of torch and ONNX, in which rows are
+outputs and channels come first.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from policies.spec import PolicyError, PolicySpec
 
 
 def tree_to_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves of `tree` by their path, random keys as their data."""
+    """Return the leaves of `tree` by their path; random keys are replaced by their data."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path): np.asarray(_data(leaf)) for path, leaf in leaves}
 
 
 def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str) -> Any:
-    """Return a tree like `template` with the leaves that `tree_to_arrays` gave.
+    """Return a tree with the structure of `template` from the result of `tree_to_arrays`.
 
     Args:
         template: a tree of the same structure, shapes and types; its values are not used.
         arrays: leaves by path.
-        where: the file they came from, for the message.
+        where: the file of the arrays, for messages.
 
     Raises:
         PolicyError: where the names, a shape or a type differ from the template's.
@@ -42,11 +43,11 @@ def tree_from_arrays(template: Any, arrays: Mapping[str, np.ndarray], where: str
         )
     restored = []
     for name, (_, leaf) in zip(names, leaves, strict=True):
-        value, like = arrays[name], np.asarray(_data(leaf))
-        if value.shape != like.shape or value.dtype != like.dtype:
+        value, expected = arrays[name], np.asarray(_data(leaf))
+        if value.shape != expected.shape or value.dtype != expected.dtype:
             raise PolicyError(
-                f"{where}: {name!r} is {value.dtype} {value.shape}, expected {like.dtype} "
-                f"{like.shape}; resume with the configuration that the run was started with"
+                f"{where}: {name!r} is {value.dtype} {value.shape}, expected {expected.dtype} "
+                f"{expected.shape}; resume with the configuration that the run was started with"
             )
         array = jnp.asarray(value)
         if _is_key(leaf):
@@ -74,7 +75,7 @@ def kernel_oihw(kernel: np.ndarray) -> np.ndarray:
 
 
 def image_weight(params: Mapping[str, np.ndarray], spec: PolicySpec) -> np.ndarray:
-    """Return the image's embedding (hidden, features) for features flattened channels first."""
+    """Return the weights (hidden, features) of the image's embedding, features channels first."""
     rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
     weight = np.asarray(params["image.weight"]).reshape(rows, columns, spec.channels[2], -1)
     return rows_are_outputs(weight.transpose(2, 0, 1, 3).reshape(-1, weight.shape[-1]))

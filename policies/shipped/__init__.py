@@ -1,11 +1,11 @@
-"""The shipped policies: one folder each, with a checkpoint and a card.md."""
+"""The policies that the suite ships: one folder each, with a checkpoint and a card.md."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 DEFAULT = "race"
-"""Name of the policy that is flown when none is given."""
+"""Name of the default policy."""
 
 _HERE = Path(__file__).resolve().parent
 

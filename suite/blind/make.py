@@ -23,7 +23,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from tracks.common.files import replacing_folder, write_json
 from tracks.common.provenance import stamp
-from tracks.common.work import Workers, work_off
+from tracks.common.work import Workers, run_pieces
 from tracks.input.reading import read_json
 
 SCHEMA = 1
@@ -89,7 +89,7 @@ def make_set(
                     write_flight(temporary / f"{log.name}.parquet", log)
             update(len(cases) - len(names) + number + 1, name)
 
-        work_off(_build, [cases[name] for name in names], workers or 1, keep)
+        run_pieces(_build, [cases[name] for name in names], workers or 1, keep)
     made = [name for name in cases if name not in failed]
     manifest = Manifest(
         {

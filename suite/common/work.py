@@ -13,7 +13,7 @@ from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
 from suite.common.options import Advanced
 from suite.common.running.apart import Job, do_apart, fill, parcels
-from tracks.common.work import WorkerDied, Workers, read_workers, usable_cores, work_off
+from tracks.common.work import WorkerDied, Workers, read_workers, run_pieces, usable_cores
 from tracks.common.work.threads import share_threads
 
 Result = TypeVar("Result")
@@ -102,9 +102,9 @@ def all_done(
         try:
             if isinstance(workers, str):
                 work = partial(do_apart, partial(_silently, do))
-                work_off(work, parcels(jobs), workers, keep)
+                run_pieces(work, parcels(jobs), workers, keep)
             else:
-                work_off(partial(_yielded, do), jobs, workers, keep, pinned=True)
+                run_pieces(partial(_yielded, do), jobs, workers, keep, pinned=True)
         except WorkerDied as error:
             raise WorkFailed(
                 f"{what}: a process ended badly, what the others finished is kept; the same "

@@ -34,7 +34,7 @@ from suite.judging.collect import collect
 from suite.judging.requests import Collection
 from tracks.common.grid import Grid, table
 from tracks.common.provenance import git_commit
-from tracks.common.work import work_off
+from tracks.common.work import run_pieces
 from tracks.input.ranges import Range, Seed
 
 OWN = "flight log"
@@ -182,7 +182,7 @@ def _checked(
             show(len(done), left[number])
 
         check = partial(_check, vehicle_name=config.vehicle, seed=config.seed)
-        work_off(check, [keys[key] for key in left], place.workers or 1, keep)
+        run_pieces(check, [keys[key] for key in left], place.workers or 1, keep)
     return {c: done[key] for key, c in keys.items()}
 
 

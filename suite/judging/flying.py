@@ -20,7 +20,7 @@ from suite.judging.requests import (
     parse_tracks,
 )
 from tracks.common.files import plain
-from tracks.common.work import Workers, crew, usable_cores
+from tracks.common.work import Workers, usable_cores, worker_count
 from tracks.input.ranges import check_ranges
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def flying_needs(trials: float, workers: Workers, world: str = "mujoco") -> Esti
     Raises:
         ValueError: for a cluster that cannot be used.
     """
-    processes = crew(workers)
+    processes = worker_count(workers)
     seconds = START_SECONDS + trials * cost_of(world) * SECONDS_A_TRIAL / processes
     # Memory of this machine only.
     return Estimate(seconds, PROCESS_BYTES * (workers if isinstance(workers, int) else 1))

@@ -80,7 +80,7 @@ def started_from(policy: str, spec: PolicySpec) -> network.Params:
     from suite.judging.flying import checkpoint_folder
 
     start = load_policy_checkpoint(checkpoint_folder(policy, "--init-from"))
-    return network.fitted(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
+    return network.adapt_params(jax.tree.map(jnp.asarray, start.params), start.spec, spec)
 
 
 def train(
@@ -136,7 +136,7 @@ def _refitted(state: TrainState, seen: PolicySpec, spec: PolicySpec) -> TrainSta
     """Return the state of a policy with spec `seen`, converted for a policy with `spec`."""
     if seen == spec:
         return state
-    return state._replace(params=network.fitted(state.params, seen, spec))
+    return state._replace(params=network.adapt_params(state.params, seen, spec))
 
 
 def _digest(params: Mapping[str, Any] | None) -> str | None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from policies.block_policy import BlockPolicy, for_one_row, proven
+from policies.block_policy import BlockPolicy, for_one_row, verify_rows
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError, PolicySpec
 
@@ -73,12 +73,12 @@ def neighbour_dependent(state, image, hidden):
 
 def test_a_model_whose_rows_depend_on_each_other_is_refused():
     with pytest.raises(PolicyError, match=r"other rows of its batch; .*module.eval\(\)"):
-        proven(BlockPolicy("x", PolicySpec(), neighbour_dependent, (0,)), "x")
+        verify_rows(BlockPolicy("x", PolicySpec(), neighbour_dependent, (0,)), "x")
 
 
 @pytest.mark.parametrize("block", [64, 7])
 def test_a_model_that_rounds_by_place_is_fed_one_by_one(block):
-    policy = proven(BlockPolicy("x", PolicySpec(), place_dependent, (0,), block, block), "x")
+    policy = verify_rows(BlockPolicy("x", PolicySpec(), place_dependent, (0,), block, block), "x")
     assert (policy.rows, policy.block) == (1, block)
     _, state, image = observe(0, 20)
     none = np.zeros(20, bool)
@@ -115,7 +115,7 @@ def test_a_checkpoint_takes_one_row_and_what_answers_it_otherwise_keeps_its_bloc
 def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
     rng = np.random.default_rng(0)
     base = BlockPolicy("x", PolicySpec(), lambda s, i, h: (s[:, :3], h), (0,))
-    assert proven(base, "here") == base
+    assert verify_rows(base, "here") == base
     for model, said in [
         (lambda s, i, h: (rng.random((64, 3), np.float32), h), "two outputs"),
         (lambda s, i, h: (s[:, :4], h), r"here: output 'action' is float32 \(64, 4\)"),
@@ -123,7 +123,7 @@ def test_a_model_that_rolls_dice_or_has_wrong_outputs_is_refused():
         (lambda s, i, h: (s[:, :3], s), "output 'hidden'"),
     ]:
         with pytest.raises(PolicyError, match=said):
-            proven(dataclasses.replace(base, model=model), "here")
+            verify_rows(dataclasses.replace(base, model=model), "here")
 
 
 @pytest.mark.parametrize("n", [3, 64])

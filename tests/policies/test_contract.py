@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.contract import KEY, contract_of, read_contract, refuse_other, spec_of, summary
+from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of, summary
 from policies.formats.export import export_module
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.policy import load_policy
@@ -75,9 +75,9 @@ def test_a_contract_changed_by_hand_or_of_another_version_is_refused():
 
 def test_memories_differ_only_where_both_are_known():
     spec = PolicySpec()
-    refuse_other(contract_of(spec), contract_of(spec, (3,)), "here", "that")
+    refuse_differences(contract_of(spec), contract_of(spec, (3,)), "here", "that")
     with pytest.raises(PolicyError, match=r"memory \(3,\), that \(4,\)"):
-        refuse_other(contract_of(spec, (3,)), contract_of(spec, (4,)), "here", "that")
+        refuse_differences(contract_of(spec, (3,)), contract_of(spec, (4,)), "here", "that")
 
 
 def test_it_travels_in_checkpoint_onnx_torch_and_c(checkpoint, exported):

@@ -48,7 +48,9 @@ def test_a_missing_file_is_told_the_nearest_beside(exported):
 
 def test_a_trainings_folder_is_told_where_its_policy_is(checkpoint, tmp_path):
     shutil.copytree(checkpoint, tmp_path / "run" / "policy")
-    with pytest.raises(PolicyError, match=r"run: a training's folder; its policy is .*run/policy$"):
+    with pytest.raises(
+        PolicyError, match=r"the folder of a training; give its policy, .*run/policy$"
+    ):
         load_policy(tmp_path / "run")
 
 

@@ -73,14 +73,14 @@ class RandomNetwork:
     def __init__(self, seed=0, share=3.0):
         import jax
 
-        from policies.block_policy import proven
+        from policies.block_policy import verify_rows
         from policies.native import native_policy
         from policies.networks.network import init
 
         self.spec = PolicySpec()
         params = init(jax.random.key(seed), self.spec)
         params["action.weight"] *= 100.0
-        self._network = proven(native_policy(params, self.spec, self.name), "test")
+        self._network = verify_rows(native_policy(params, self.spec, self.name), "test")
         self._pursuit = Pursuit()
         self._share = share
 

@@ -1,7 +1,8 @@
-"""Write files and folders completely or not at all: under a temporary name first, then renamed.
+"""Write files and folders atomically: under a temporary name first, which is then renamed.
 
-A kill or a full disk never leaves a partial file under its final name. The temporary names start
-with a dot and end in ``.part``; a killed process may leave one in the same folder.
+A kill or a full disk never leaves a partial file under its final name. A temporary folder in the
+same parent folder holds what is being written. Its name starts with a dot and ends in ``.part``; a
+killed process may leave it behind.
 """
 
 from __future__ import annotations
@@ -25,27 +26,27 @@ from typing import Any
 PART = ".part"
 """Ending of a temporary folder, in use or left by a killed process."""
 PART_NAME = re.compile(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part")
-"""Pattern of its name: the final name, and the number of the writing process."""
+"""Pattern of a temporary folder's name: the final name, and the number of the writing process."""
 LONGEST_STEM = 200
-"""Most bytes of the final name in the temporary one: systems allow 255."""
+"""Most bytes of the final name within the temporary name; file systems allow 255 in all."""
 SWEPT_DEPTH = 4
 """Depth of folders that `sweep_parts` searches."""
 
 
 def user_cache(environment: Mapping[str, str] | None = None) -> Path:
-    """Return the suite's own folder in the user's cache, made if missing.
+    """Return the suite's folder in the user's cache directory, and make it if it is missing.
 
-    Without a writable home (as in some containers) it is a private folder for temporary files.
+    Without a writable home directory (as in some containers) it is a private temporary folder.
 
     Args:
-        environment: variables; None: those of this process.
+        environment: environment variables; None: those of this process.
     """
     values = os.environ if environment is None else environment
     try:
-        place = Path(values.get("XDG_CACHE_HOME", ""))
-        # A relative one is to be ignored: https://specifications.freedesktop.org/basedir
-        place = place if place.is_absolute() else Path.home() / ".cache"
-        folder = place / "diffracing-suite"
+        cache = Path(values.get("XDG_CACHE_HOME", ""))
+        # A relative path must be ignored: https://specifications.freedesktop.org/basedir
+        cache = cache if cache.is_absolute() else Path.home() / ".cache"
+        folder = cache / "diffracing-suite"
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if os.access(folder, os.W_OK):
             return folder
@@ -54,9 +55,9 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
     folder = Path(tempfile.gettempdir()) / f"diffracing-suite-{os.getuid()}"
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    found = folder.lstat()
-    # Files in it are loaded as code, so nobody else may own or write it.
-    if found.st_uid != os.getuid() or found.st_mode & 0o022 or not folder.is_dir():
+    status = folder.lstat()
+    # Files in it are loaded as code, so no other user may own or write it.
+    if status.st_uid != os.getuid() or status.st_mode & 0o022 or not folder.is_dir():
         folder = Path(tempfile.mkdtemp(prefix="diffracing-suite-"))
     return folder
 
@@ -148,20 +149,20 @@ def recover_folder(path: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def folder_while_used(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Make a folder and its parents; remove those that are still empty at the end.
+    """Make a folder and its parents; remove the new ones that are still empty at the end.
 
     Raises:
         OSError: where it cannot be made.
     """
     folder = Path(path)
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    new_folders = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        for each in made:
+        for new_folder in new_folders:
             with contextlib.suppress(OSError):
-                each.rmdir()
+                new_folder.rmdir()
 
 
 def check_place(path: str | os.PathLike[str]) -> None:
@@ -183,16 +184,16 @@ def check_no_input(
     """Refuse to overwrite an input file.
 
     Args:
-        path: of the output.
-        inputs: of the inputs; names that are not files are ignored.
-        option: the option that sets `path`.
+        path: path of the output.
+        inputs: paths of the inputs; names that are not files are ignored.
+        option: the command line option that sets `path`.
 
     Raises:
         ValueError: naming the file, and the option to change.
     """
-    for given in inputs:
-        if given and os.path.exists(given) and os.path.exists(path):
-            if os.path.samefile(given, path):
+    for input_path in inputs:
+        if input_path and os.path.exists(input_path) and os.path.exists(path):
+            if os.path.samefile(input_path, path):
                 raise ValueError(
                     f"{option}: {os.fspath(path)} is also an input and would be overwritten; give "
                     f"another {option}"
@@ -200,30 +201,31 @@ def check_no_input(
 
 
 def sweep_parts(folder: str | os.PathLike[str]) -> list[Path]:
-    """Remove the temporary folders of killed processes in a folder and below, and return them.
+    """Remove the temporary folders of killed processes in `folder` and below, and return them.
 
-    Those of running processes are kept, and replacements killed between their two renames are
-    completed. Call it only where no other process writes.
+    Temporary folders of running processes are kept. A folder replacement that was killed between
+    its two renames is completed first. Call this only where no other process writes.
     """
-    swept = []
+    removed = []
     start = os.fspath(folder)
-    for place, names, _ in os.walk(start):
-        depth = os.path.relpath(place, start).count(os.sep)
-        for name in [name for name in names if name.startswith(".") and name.endswith(PART)]:
-            names.remove(name)
+    for parent, subfolders, _ in os.walk(start):
+        depth = os.path.relpath(parent, start).count(os.sep)
+        for name in [name for name in subfolders if name.startswith(".") and name.endswith(PART)]:
+            subfolders.remove(name)
             match = PART_NAME.fullmatch(name)
             if match and not _is_being_written(name):
-                for whole in os.listdir(Path(place, name)):  # `name` may have a shortened name
-                    recover_folder(Path(place, whole))
-                shutil.rmtree(Path(place, name), ignore_errors=True)
-                swept.append(Path(place, name))
+                # The final name is read from inside, since `name` may hold a shortened one.
+                for final_name in os.listdir(Path(parent, name)):
+                    recover_folder(Path(parent, final_name))
+                shutil.rmtree(Path(parent, name), ignore_errors=True)
+                removed.append(Path(parent, name))
         if depth >= SWEPT_DEPTH:
-            names.clear()
-    return swept
+            subfolders.clear()
+    return removed
 
 
 def _prefix(final: Path) -> str:
-    # With the process number, so that others can check whether the writer is still running.
+    # The process number lets others check whether the writer is still running.
     return f".{_stem(final)}-{os.getpid()}-"
 
 
@@ -284,7 +286,7 @@ def digest_of(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` made of dicts, lists, strings, finite numbers, booleans and None only."""
+    """Return `value` converted to dicts, lists, strings, finite numbers, booleans and None."""
     if isinstance(value, type):
         return value.__qualname__
     if dataclasses.is_dataclass(value):

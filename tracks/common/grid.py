@@ -1,4 +1,4 @@
-"""Tables of text, and their output as Markdown, HTML and in a terminal."""
+"""Tables of text cells, and their output as Markdown, as HTML and in a terminal (rich)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 Row = TypeVar("Row")
 _TAG = re.compile(r"<(?=[A-Za-z/!?])")
+"""The bracket that opens an HTML tag, comment or declaration."""
 
 
 class Cell(NamedTuple):
@@ -28,12 +29,12 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Grid:
-    """A table."""
+    """A table of text, before it is written in any format."""
 
     title: str
     """Text above the table."""
     headers: Sequence[str]
-    """One for each column."""
+    """One text for each column."""
     rows: Sequence[Sequence[Cell]]
     """Each with as many cells as there are headers."""
     strong_last: bool = False
@@ -57,8 +58,14 @@ def table(
 def table_of(
     rows: Iterable[Row], *columns: tuple[str, Callable[[Row], str | Cell]], note: str = ""
 ) -> Grid:
-    """Return a table with a line for each of `rows`; a column is its header and its cells' text."""
-    lines = [[text(row) for _, text in columns] for row in rows]
+    """Return a table with a line for each of `rows`.
+
+    Args:
+        rows: objects of any kind.
+        columns: (header, function of a row that returns the cell) of each column.
+        note: text below the table.
+    """
+    lines = [[cell_of(row) for _, cell_of in columns] for row in rows]
     return table([header for header, _ in columns], lines, note=note)
 
 
@@ -71,7 +78,10 @@ def markdown(grid: Grid) -> str:
 
 
 def markdown_cell(text: str) -> str:
-    """Return a text from an untrusted source without control characters and HTML."""
+    """Return a text from an untrusted source as a Markdown cell, without HTML tags.
+
+    Control characters, opening brackets of tags and column separators are escaped.
+    """
     return _TAG.sub("&lt;", printable(text, keep="")).replace("|", "\\|")
 
 

@@ -1,6 +1,6 @@
-"""Select rows of nested arrays by a mask, for numpy and JAX.
+"""Select rows of arrays, and of nested tuples and dicts of arrays, by a mask (numpy and JAX).
 
-With numpy, work is skipped where a mask is true or false everywhere. JAX traces masks without
+With numpy, callers skip work where a mask is true or false everywhere. JAX traces masks without
 values, so a compiled program always does all the work.
 """
 
@@ -46,7 +46,7 @@ def _selected(mask: Array, new: Any, old: Any) -> Any:
     return xp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
 
 
-def packed(tree: Any) -> Any:
+def make_contiguous(tree: Any) -> Any:
     """Return nested tuples and dicts of numpy arrays with all arrays C-contiguous.
 
     numpy's order of summation depends on the memory layout, and a concatenation inherits its parts'

@@ -42,18 +42,19 @@ def printable(text: str, keep: str = "\n\t") -> str:
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> ValueError:
     """Return (not raise) the error for an unknown `name` of `kind`.
 
-    The message has the name, the closest one or those that contain it, and all allowed names.
+    The message has the name, the closest allowed name (or those that contain it), and all allowed
+    names.
     """
     allowed = list(allowed)
-    near = [guess] if (guess := closest(name, allowed)) else _holding(name, allowed)
-    meant = f" Did you mean {', '.join(map(repr, near))}?" if near else ""
-    return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{meant} Known: {', '.join(allowed)}.")
+    similar = [guess] if (guess := closest(name, allowed)) else _containing(name, allowed)
+    hint = f" Did you mean {', '.join(map(repr, similar))}?" if similar else ""
+    return ValueError(f"unknown {kind} {name[:LONGEST]!r}.{hint} Known: {', '.join(allowed)}.")
 
 
-def _holding(name: str, allowed: list[str]) -> list[str]:
-    """Return the entries of `allowed` that contain `name`, if they are few."""
-    found = [entry for entry in allowed if len(name) > 2 and name.lower() in entry.lower()]
-    return found if len(found) < 5 else []
+def _containing(name: str, allowed: list[str]) -> list[str]:
+    """Return the entries of `allowed` that contain `name`, if they are fewer than five."""
+    matches = [entry for entry in allowed if len(name) > 2 and name.lower() in entry.lower()]
+    return matches if len(matches) < 5 else []
 
 
 T = TypeVar("T")
@@ -63,11 +64,11 @@ PREFIX = "diffracing_suite."
 
 
 class Registry(Mapping[str, T]):
-    """A mapping from names to objects: the suite's own first, then added ones.
+    """A mapping from names to objects: those of the suite first, then added ones.
 
-    A package adds entries with an entry point of the registry's group. A program adds them for its
-    own process with `register`. Modules and entry points are loaded only when a name is looked up
-    or all names are listed.
+    Another package adds an entry with a Python entry point of the registry's group. A program adds
+    one for its own process with `register`. Modules and entry points are loaded only when a name is
+    looked up or all names are listed.
     """
 
     def __init__(
@@ -82,9 +83,9 @@ class Registry(Mapping[str, T]):
         Args:
             kind: name of the kind of entry, for messages.
             group: entry point group, such as `diffracing_suite.effects`.
-            own: the suite's entries in order: a value, or its place as `module` or
-                `module:attribute`.
-            check: (name, value) -> the fault of an added entry, None for none.
+            own: the suite's entries in order: each is a value, or the text `module` or
+                `module:attribute` to import it from.
+            check: function (name, value) that returns what is wrong with an added entry, or None.
         """
         self._kind, self._group, self._check = kind, group, check
         self._entries: dict[str, Any] = {
@@ -130,6 +131,7 @@ class Registry(Mapping[str, T]):
         return len(self._all())
 
     def _load(self, name: str) -> T:
+        """Return the entry `name`, imported and checked if it is an entry point."""
         entry = self._entries[name] if name in self._entries else self._all()[name]
         value = entry
         if isinstance(entry, EntryPoint):
@@ -148,6 +150,7 @@ class Registry(Mapping[str, T]):
         return value
 
     def _all(self) -> dict[str, Any]:
+        """Return all entries, with those of other packages; refuse two entries of one name."""
         if not self._complete:
             added: dict[str, EntryPoint] = {}
             for entry in sorted(_installed().select(group=self._group), key=lambda e: e.name):
@@ -163,9 +166,9 @@ class Registry(Mapping[str, T]):
         return self._entries
 
     def _checked(self, name: str, value: Any, origin: str) -> Any:
-        wrong = self._check(name, value)
-        if wrong:
-            raise ValueError(f"{self._kind} {name!r} ({origin}): {wrong}")
+        problem = self._check(name, value)
+        if problem:
+            raise ValueError(f"{self._kind} {name!r} ({origin}): {problem}")
         return value
 
 

@@ -1,6 +1,6 @@
-"""Provenance of files: the suite's version, and four keys in every file that the suite writes.
+"""Provenance of files: the suite's version, git commit and seed, which every written file holds.
 
-The build reads the version here.
+The build of the package reads `VERSION` from this file.
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+VERSION = "0.1.0"
 _ROOT = Path(__file__).resolve().parents[2]
 
 
 @functools.cache
 def git_commit() -> str | None:
-    """Return the commit of this code, and a digest of later changes.
+    """Return the git commit of this code, or None where it is unknown (a copy without history).
 
-    Where tracked files differ from the commit, "-dirty-" and 8 digits of their differences follow,
-    so that two states of the code never share a name. In a checkout git reports the commit; a wheel
-    contains the commit of its build. None where neither exists (a copy without history). A
-    repository that merely contains the installed package is ignored.
+    Where tracked files differ from the commit, "-dirty-" and 8 hex digits of a digest of the
+    differences follow, so that two states of the code never have the same name. In a checkout, git
+    reports the commit; an installed wheel contains the commit that it was built from. A repository
+    that merely contains the installed package is ignored.
     """
-    baked = Path(__file__).with_name("built_from.txt")
-    if baked.is_file():
-        return baked.read_text(encoding="utf-8").strip() or None
+    built_from = Path(__file__).with_name("built_from.txt")
+    if built_from.is_file():
+        return built_from.read_text(encoding="utf-8").strip() or None
     if not (_ROOT / ".git").exists():
         return None
     try:
@@ -36,8 +37,8 @@ def git_commit() -> str | None:
     return f"{commit}-dirty-{hashlib.sha256(changes).hexdigest()[:8]}" if changes else commit
 
 
-def _git(root: Path, *what: str) -> bytes:
-    command = ["git", "-C", str(root), *what]
+def _git(root: Path, *arguments: str) -> bytes:
+    command = ["git", "-C", str(root), *arguments]
     return subprocess.run(command, capture_output=True, timeout=10, check=True).stdout
 
 
@@ -49,6 +50,3 @@ def stamp(schema: int, seed: int | None) -> dict[str, Any]:
         "git_commit": git_commit(),
         "seed": seed,
     }
-
-
-VERSION = "0.1.0"

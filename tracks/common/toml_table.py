@@ -50,18 +50,19 @@ def load_shipped(
     parse: Callable[[dict[str, Any]], T],
     refused: type[ValueError],
 ) -> T:
-    """Return the object described by a TOML file, given by its path or a shipped name.
+    """Return the object that a TOML file describes.
 
     Args:
-        source: a path (it ends in .toml, has a folder or exists) or a shipped name.
-        folder: with the shipped files.
+        source: the file's path (it ends in .toml, has a folder or exists), or the name of a file
+            that the suite ships.
+        folder: folder of the shipped files.
         kind: name of the kind of file, for messages.
-        parse: makes the object from the file's table; raises a ValueError for a fault.
-        refused: class of the error for a faulty file.
+        parse: makes the object from the file's table; raises a ValueError for a wrong value.
+        refused: class of the error for a file that cannot be used.
 
     Raises:
         refused: naming the file.
-        ValueError: for a source that is neither.
+        ValueError: for a source that is neither a path nor a shipped name.
     """
     path = Path(source)
     if path.suffix != ".toml" and len(path.parts) == 1 and not path.is_file():
@@ -84,43 +85,49 @@ def load_shipped(
 
 
 class Table:
-    """One table of a file; every key that is read counts as known."""
+    """One table of a TOML file; it records the keys that are read, so that others are refused."""
 
     def __init__(self, source: str, place: str, values: Mapping[str, Any]) -> None:
-        """Make a reader of `values`; messages begin with `source`, unless it is empty."""
+        """Make a reader of a table.
+
+        Args:
+            source: path of the file, with which messages begin, or "".
+            place: dotted name of the table in the file; "" for the whole file.
+            values: the table.
+        """
         self._source, self._place, self.values = source, place, values
         self._known: list[str] = []
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the file."""
         return Path(self._source)
 
     def error(self, key: str, value: object, allowed: str) -> ValueError:
         """Return (not raise) the error for a value that is not allowed under `key`."""
         return self._refused(f"{self._at(key)} is {shown(value)}, allowed is {allowed}")
 
-    def read(self, cls: type[T], also: Iterable[str] = (), **held: Any) -> T:
+    def read(self, cls: type[T], also: Iterable[str] = (), **fixed: Any) -> T:
         """Return a dataclass from this table's keys; missing fields take their defaults.
 
         Args:
             cls: its fields are numbers, texts, truth values, tuples of these, or dataclasses.
             also: further allowed keys.
-            held: values of fields that are not in the table.
+            fixed: values of fields that are not in the table.
         """
-        named = {field.name: field for field in dataclasses.fields(cls) if field.name not in held}  # pyright: ignore[reportArgumentType]
-        self.expect([*named, *also])
+        fields = {field.name: field for field in dataclasses.fields(cls) if field.name not in fixed}  # pyright: ignore[reportArgumentType]
+        self.expect([*fields, *also])
         hints = get_type_hints(cls)
-        for name, field in named.items():
-            needed = field.default is field.default_factory is dataclasses.MISSING
-            if needed or self.has(name):
-                held[name] = self.value(name, hints[name])
-        return cls(**held)
+        for name, field in fields.items():
+            required = field.default is field.default_factory is dataclasses.MISSING
+            if required or self.has(name):
+                fixed[name] = self.value(name, hints[name])
+        return cls(**fixed)
 
     def value(self, key: str, kind: Any, default: Any = REQUIRED) -> Any:
         """Return the value of `key` as `kind`, one of the field types of `read`."""
-        found = self._get(key, default, _words(kind))
-        return found if key not in self.values else self._typed(key, found, kind)
+        value = self._get(key, default, _describe(kind))
+        return value if key not in self.values else self._typed(key, value, kind)
 
     def choice(self, key: str, allowed: Iterable[str]) -> str:
         """Return one of the texts `allowed`; the first where the key is absent."""
@@ -131,8 +138,9 @@ class Table:
         return value
 
     def _typed(self, key: str, value: Any, kind: Any) -> Any:
+        """Return `value` converted to the type `kind`, or refuse it."""
         parts = get_args(kind)
-        if isinstance(kind, UnionType):  # something or nothing
+        if isinstance(kind, UnionType):  # a type or None
             return None if value is None else self._typed(key, value, parts[0])
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             if not isinstance(value, Mapping):
@@ -144,15 +152,17 @@ class Table:
             return tuple(self._typed(f"{key}[{i}]", v, parts[0]) for i, v in enumerate(value))
         if get_origin(kind) is tuple:
             if not isinstance(value, list | tuple) or len(value) != len(parts):
-                raise self.error(key, value, _words(kind))
-            both = enumerate(zip(value, parts, strict=True))
-            # A nested list is named with its index in the message.
-            inner = get_origin(parts[0]) is tuple
-            return tuple(self._typed(f"{key}[{i}]" if inner else key, v, k) for i, (v, k) in both)
+                raise self.error(key, value, _describe(kind))
+            entries = enumerate(zip(value, parts, strict=True))
+            # Messages give the index of a list within a list.
+            nested = get_origin(parts[0]) is tuple
+            return tuple(
+                self._typed(f"{key}[{i}]" if nested else key, v, part) for i, (v, part) in entries
+            )
         plain: Any = kind
-        good = isinstance(value, plain) if plain in (bool, str) else is_number(value)
-        if not good or value == "" or (plain is int and value != int(value)):
-            raise self.error(key, value, _words(kind))
+        valid = isinstance(value, plain) if plain in (bool, str) else is_number(value)
+        if not valid or value == "" or (plain is int and value != int(value)):
+            raise self.error(key, value, _describe(kind))
         return plain(value)
 
     def has(self, key: str) -> bool:
@@ -206,8 +216,8 @@ class Table:
     ) -> np.ndarray:
         """Return `size` finite numbers, each from `least` to `most`."""
         value = self._get(key, default, f"{size} numbers")
-        good = isinstance(value, list | tuple) and len(value) == size
-        if not good or not all(is_number(entry) and least <= entry <= most for entry in value):
+        valid = isinstance(value, list | tuple) and len(value) == size
+        if not valid or not all(is_number(entry) and least <= entry <= most for entry in value):
             limits = _limits(-math.inf, least, most)
             raise self.error(key, value, f"a list of {size} numbers{limits and ', each' + limits}")
         return np.array(value, float)
@@ -220,10 +230,10 @@ class Table:
         def fits(entry: object) -> bool:
             return is_number(entry) and -most <= entry <= most
 
-        good = len(rows) >= least and all(
+        valid = len(rows) >= least and all(
             isinstance(row, list) and len(row) == size and all(map(fits, row)) for row in rows
         )
-        if not good:
+        if not valid:
             raise self.error(
                 key,
                 value,
@@ -262,6 +272,7 @@ class Table:
                 )
 
     def _get(self, key: str, default: Any, kind: str) -> Any:
+        """Return the value of `key` or `default`; refuse a missing key that is required."""
         if self.has(key):
             return self.values[key]
         if default is REQUIRED:
@@ -276,8 +287,8 @@ class Table:
         return ValueError(f"{self._source}: {text}" if self._source else text)
 
 
-def _words(kind: Any) -> str:
-    """Return a description of the values of `kind`."""
+def _describe(kind: Any) -> str:
+    """Return a text that describes the allowed values of the type `kind`."""
     if get_origin(kind) is not tuple:
         names = {bool: "true or false", int: "a whole number", float: "a finite number"}
         return names.get(kind, "a text that is not empty" if kind is str else "a table")
@@ -287,6 +298,7 @@ def _words(kind: Any) -> str:
 
 
 def _limits(above: float, least: float, most: float) -> str:
+    """Return the limits as a text such as " from 0 to 1"; empty where there are none."""
     low = "" if least == -math.inf else f" from {least:g}"
     low = low if above == -math.inf else f" above {above:g}"
     return low + ("" if most == math.inf else f" {'to' if low else 'up to'} {most:g}")
@@ -300,8 +312,8 @@ def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
         if not isinstance(entry, Mapping) and not _is_array(entry)
     ]
     for key, entry in table.items():
-        for one in entry if _is_array(entry) else ():
-            lines.append(f"\n[[{prefix}{key}]]\n{to_toml(one, f'{prefix}{key}.')}")
+        for subtable in entry if _is_array(entry) else ():
+            lines.append(f"\n[[{prefix}{key}]]\n{to_toml(subtable, f'{prefix}{key}.')}")
         if isinstance(entry, Mapping):
             inside = to_toml(entry, f"{prefix}{key}.")
             only_tables = entry and all(isinstance(value, Mapping) for value in entry.values())
@@ -312,10 +324,11 @@ def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
 
 def _is_array(entry: Any) -> bool:
     """Return whether this is an array of tables."""
-    return isinstance(entry, list) and bool(entry) and all(isinstance(o, Mapping) for o in entry)
+    return isinstance(entry, list) and bool(entry) and all(isinstance(t, Mapping) for t in entry)
 
 
 def _value(value: Any) -> str:
+    """Return a value that is not a table as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):

@@ -1,7 +1,8 @@
-"""Track families by name; each is a function `make(d, rng) -> Layout` with an entry here.
+"""Track families by name, and the tracks that they draw.
 
-Another package adds one with an entry point of the group `diffracing_suite.tracks`, a program for
-its own process with `FAMILIES.register(name, make)`.
+A family is a rule that draws a track: a function `make(d, rng) -> Layout` of the difficulty `d` and
+a random generator. Another package adds one with an entry point of the group
+`diffracing_suite.tracks`, a program for its own process with `FAMILIES.register(name, make)`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
 
-def _wrong(name: str, make: Any) -> str | None:
+def _problem(name: str, make: Any) -> str | None:
     return None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout"
 
 
@@ -31,14 +32,16 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
         "ellipse": judged.ellipse,
         "random": random.make,
     },
-    _wrong,
+    _problem,
 )
 JUDGED = ("zigzag", "circular", "ellipse")
-"""The families of the tables; `random` is what policies are trained on."""
+"""The families on which policies are evaluated; they are trained on `random`."""
 LEVELS = range(10)
+"""Difficulty levels, 0 (easy) to 9 (hard)."""
 MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
-"""Most solids of each kind over all families and levels: 32 frame bars, and 7 stretches with at
-most 3 plates, 3 small solids, 1 pillar and 4 ground objects, whose kinds are dealt out evenly."""
+"""Most solids of each kind over all families and levels: 32 frame bars, and 7 stretches (parts of
+the track between two gates) with at most 3 plates, 3 small solids, 1 pillar and 4 ground objects
+each. Small solids and ground objects are distributed evenly over their kinds."""
 
 
 def make_track(family: str, level: int, seed: int) -> Track:
@@ -50,8 +53,8 @@ def make_track(family: str, level: int, seed: int) -> Track:
         seed: 0 or more.
 
     Raises:
-        ValueError: where the family is unknown or returns no layout, the level is out of range or
-            the seed negative, or where the track has more solids than the simulators' scenes hold.
+        ValueError: where the family is unknown or does not return a Layout, the level is out of
+            range, the seed is negative, or the track has more solids than `MAX_COUNTS`.
     """
     check_family(family)
     if level not in LEVELS:
@@ -75,12 +78,12 @@ def make_track(family: str, level: int, seed: int) -> Track:
 def random_track(
     difficulty: float, rng: np.random.Generator, mix: random.Mix = random.MIX
 ) -> Track:
-    """Return a fresh track of the training distribution; `seed` of the result is 0.
+    """Return a new track of the training distribution; its `seed` is 0.
 
     Args:
         difficulty: d in [0, 1].
-        rng: source of randomness.
-        mix: shares of tracks with sharp turns and with obstacles.
+        rng: random generator.
+        mix: probabilities of sharp turns and of obstacles.
 
     Raises:
         ValueError: where the difficulty is outside [0, 1].
@@ -97,15 +100,16 @@ def check_family(family: str) -> None:
 
 
 def _check_size(track: Track) -> None:
+    """Refuse a track with more gates or solids than the simulators' scenes have space for."""
     gates, corners = track.scene.gates.opening_g.shape[:2]
     if gates > GATE_COUNT or corners > 4:
         raise ValueError(
             f"track family {track.family!r}: {gates} gates of {corners} corners; allowed are at "
             f"most {GATE_COUNT} of 4 (a track file may have more)"
         )
-    for kind, there, most in zip(Counts._fields, counts(track.scene), MAX_COUNTS, strict=False):
-        if there > most:
+    for kind, count, most in zip(Counts._fields, counts(track.scene), MAX_COUNTS, strict=False):
+        if count > most:
             raise ValueError(
-                f"track family {track.family!r}: {there} {kind}; allowed are at most {most} "
+                f"track family {track.family!r}: {count} {kind}; allowed are at most {most} "
                 "(a track file may have more)"
             )

@@ -1,4 +1,9 @@
-"""The three judged families (Yu et al. 2025): zigzag, circular and ellipse, with 8 gates each."""
+"""The three track families on which policies are judged: zigzag, circular and ellipse.
+
+Each is a function that draws a track of 8 gates with obstacles from a difficulty and a random
+generator, after the baseline (Yu et al. 2025). A stretch is the part of a track between two
+successive gates; obstacles stand along it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from tracks.families.layout import (
     flight_order,
     furnish,
     noisy_gates,
-    pick_stretch,
+    pick_first_gate,
     ramp,
 )
 from tracks.geometry.obstacles import straight_sites
@@ -23,15 +28,18 @@ ZIGZAG_OFFSET_M, ELLIPSE_OFFSET_M = 3.6, 2.5
 """Largest distance of obstacles from the lines between gates [m]."""
 STEP = 2 * np.pi / GATE_COUNT
 """Angle between neighbouring gates of the circle [rad]."""
-_ROOM_BEHIND_M, _ROOM_AHEAD_M = 1.0, 1.5
+_CIRCLE_MARGIN_M, _ELLIPSE_MARGIN_M = 1.0, 1.5
 """Least distance of the start from the gate behind it, on the circle and on the ellipse [m]."""
 
 
 def zigzag(d: float, rng: np.random.Generator) -> Layout:
-    """Return a 35 m line of gates along world x, from above the origin, with growing deviations."""
+    """Return a 35 m line of gates along world x, which starts above the origin.
+
+    The gates' random deviations from the line grow along it.
+    """
     t = np.arange(GATE_COUNT) / (GATE_COUNT - 1)
-    reach = t[:, None] * np.array([1.0, ramp(1, 4, d), ramp(0.1, 1, d)])
-    center_w = reach * rng.uniform(-1, 1, (GATE_COUNT, 3))
+    max_deviation = t[:, None] * np.array([1.0, ramp(1, 4, d), ramp(0.1, 1, d)])
+    center_w = max_deviation * rng.uniform(-1, 1, (GATE_COUNT, 3))
     center_w += np.array([0.0, 0.0, MID_HEIGHT_M])
     center_w[:, 0] += SPACING_M * np.arange(GATE_COUNT)
     gates = noisy_gates(rng, d, center_w, np.zeros(GATE_COUNT))
@@ -52,19 +60,19 @@ def circular(d: float, rng: np.random.Generator) -> Layout:
     center_w += ramp(0.2, 1, d) * rng.uniform(-1, 1, (GATE_COUNT, 3))
     gates = noisy_gates(rng, d, center_w, angle + turn * np.pi / 2)
 
-    first = pick_stretch(rng, gates.center_w, 2.0 + _ROOM_BEHIND_M)
+    first = pick_first_gate(rng, gates.center_w, 2.0 + _CIRCLE_MARGIN_M)
     gates = flight_order(gates, first)
     back = gates.center_w[-1] - gates.center_w[0]
     length = float(np.linalg.norm(back))
-    most = min(4.0, length - _ROOM_BEHIND_M)
+    most = min(4.0, length - _CIRCLE_MARGIN_M)
     distance = rng.uniform(min(2.0, most), most)
     start_pos_w = gates.center_w[0] + back * distance / length
 
     def site(rng: np.random.Generator, stretch: np.ndarray) -> np.ndarray:
         share = rng.random((2, len(stretch)))
-        at = turn * STEP * (first + stretch + share[0])
-        reach = radius * (0.5 + share[1])
-        return reach[:, None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
+        angle = turn * STEP * (first + stretch + share[0])
+        distance = radius * (0.5 + share[1])
+        return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     per_stretch = counts_per_stretch(rng, d, GATE_COUNT - 1, radius / 8)
     return furnish(rng, gates, start_pos_w, per_stretch, site)
@@ -83,12 +91,12 @@ def ellipse(d: float, rng: np.random.Generator) -> Layout:
     center_w += ramp(0.2, 1, d) * rng.uniform(-1, 1, (GATE_COUNT, 3))
     gates = noisy_gates(rng, d, center_w, heading, max_frame_width_m=0.22)
 
-    gates = flight_order(gates, pick_stretch(rng, gates.center_w, 2.0 + _ROOM_AHEAD_M))
+    gates = flight_order(gates, pick_first_gate(rng, gates.center_w, 2.0 + _ELLIPSE_MARGIN_M))
     ahead = gates.center_w[0] - gates.center_w[-1]
     length = float(np.linalg.norm(ahead))
-    most = min(3.0, length - _ROOM_AHEAD_M)
-    past = rng.uniform(min(2.0, most), most)
-    start_pos_w = gates.center_w[-1] + ahead * past / length
+    most = min(3.0, length - _ELLIPSE_MARGIN_M)
+    distance = rng.uniform(min(2.0, most), most)
+    start_pos_w = gates.center_w[-1] + ahead * distance / length
 
     stretches = np.arange(GATE_COUNT - 1)
     per_stretch = counts_per_stretch(rng, d, len(stretches))

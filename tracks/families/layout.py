@@ -1,4 +1,8 @@
-"""Shared functions of the track families: difficulty, gate sizes, starts, assembly."""
+"""Functions that the track families share: interpolation over difficulty, gates, obstacles.
+
+A family is a rule that draws a track; it returns a `Layout`. A stretch is the part of a track
+between two successive gates.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +15,24 @@ from tracks.geometry.obstacles import Obstacles, PerStretch, Site, keep_clear, s
 from tracks.geometry.scene import Boxes, Gates, Scene
 
 GATE_COUNT = 8
-MIN_HEIGHT_M = 0.8
-MAX_HEIGHT_M = 2.0
-MID_HEIGHT_M = 1.4
+"""Gates of a generated track."""
+MIN_HEIGHT_M, MID_HEIGHT_M, MAX_HEIGHT_M = 0.8, 1.4, 2.0
+"""Lowest, mean and highest height of a gate's centre in the baseline (Yu et al. 2025) [m]."""
 MAX_YAW_NOISE = np.deg2rad(30.0)
 """Largest yaw noise of a gate at d = 1 [rad]."""
 
 
 class Layout(NamedTuple):
-    """The result of a family: a track without its origin."""
+    """The result of a family: a track without family, level and seed."""
 
     scene: Scene
+    """Gates and obstacles."""
     start_pos_w: np.ndarray
-    """(3,) [m]."""
+    """(3,) the drone's centre at time 0 [m]."""
     start_yaw: float
-    """[rad]."""
+    """Heading at the start about world z [rad]."""
     names: tuple[str, ...]
-    """As in `Track.names`."""
+    """Names of the solids, as in `Track.names`."""
 
 
 def ramp(easy: float, hard: float, d: float) -> float:
@@ -42,14 +47,14 @@ def noisy_gates(
     heading: np.ndarray,
     max_frame_width_m: float = 0.25,
 ) -> Gates:
-    """Return the baseline's square gates at the given poses: sizes and yaw noise follow d.
+    """Return the baseline's square gates, whose sizes and yaw noise depend on the difficulty.
 
     Args:
-        rng: source of randomness.
+        rng: random generator.
         d: difficulty in [0, 1).
         center_w: (G, 3) [m]; heights are clipped to the baseline's range.
         heading: (G,) flight directions without noise [rad].
-        max_frame_width_m: bars are 0.15 m to this wide.
+        max_frame_width_m: largest width of the frames' bars; the smallest is 0.15 m.
     """
     n = len(center_w)
     yaw = heading + rng.uniform(-1, 1, n) * MAX_YAW_NOISE * d
@@ -61,14 +66,19 @@ def noisy_gates(
 
 
 def flight_order(gates: Gates, first: int) -> Gates:
-    """Return the gates of a closed track, rotated so that gate `first` becomes gate 0."""
+    """Return the gates of a closed track, renumbered so that gate `first` becomes gate 0."""
     return Gates(*(np.roll(field, -first, axis=0) for field in gates))
 
 
-def pick_stretch(rng: np.random.Generator, center_w: np.ndarray, min_length_m: float) -> int:
-    """Return a random gate with a long enough stretch before it for a start.
+def pick_first_gate(rng: np.random.Generator, center_w: np.ndarray, min_length_m: float) -> int:
+    """Return the number of a random gate whose stretch before it is long enough for a start.
 
-    If there is none, return the gate with the longest stretch.
+    If there is none, return the gate with the longest stretch before it.
+
+    Args:
+        rng: random generator.
+        center_w: (G, 3) gate centres of a closed track in flight order [m].
+        min_length_m: length of a long enough stretch.
     """
     length = np.linalg.norm(center_w - np.roll(center_w, 1, axis=0), axis=-1)
     fits = np.flatnonzero(length >= min_length_m)
@@ -78,10 +88,12 @@ def pick_stretch(rng: np.random.Generator, center_w: np.ndarray, min_length_m: f
 def counts_per_stretch(
     rng: np.random.Generator, d: float, stretches: int, scale: float = 1.0
 ) -> PerStretch:
-    """Return the baseline's numbers of obstacles, the same on every stretch but on the ground.
+    """Return the baseline's numbers of obstacles for each stretch.
+
+    The numbers are equal on all stretches, except those of ground objects, which are random.
 
     Args:
-        rng: source of randomness.
+        rng: random generator.
         d: difficulty in [0, 1).
         stretches: number of stretches with obstacles.
         scale: factor on the counts before truncation (radius / 8 on the circle).
@@ -121,6 +133,14 @@ def furnish(
     per_stretch: PerStretch,
     site: Site,
 ) -> Layout:
-    """Place obstacles clear of gates and start, and return the layout."""
+    """Place random obstacles at a distance from gates and start, and return the layout.
+
+    Args:
+        rng: random generator.
+        gates: G gates in flight order.
+        start_pos_w: (3,) the drone's centre at time 0 [m].
+        per_stretch: numbers of obstacles on each stretch.
+        site: draws horizontal positions of obstacles on given stretches.
+    """
     obstacles = scatter(rng, per_stretch, site, keep_clear(gates, start_pos_w))
     return build(gates, start_pos_w, obstacles)

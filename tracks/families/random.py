@@ -1,8 +1,9 @@
-"""Random: the training distribution, which covers the three judged families.
+"""The track family `random`, on which policies are trained; it covers the three judged families.
 
 A track is a random walk of 8 gates. Its mean turn (a bend of either sign or none, with up to two
 sharp turns) produces circles, U-turns and lines; random deviations of heading and spacing produce
-zigzags. Every parameter is drawn for each track; each kind of obstacle has its own density.
+zigzags. Every parameter is drawn for each track; each kind of obstacle has its own density. A
+stretch is the part of a track between two successive gates.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from tracks.geometry.obstacles import PerStretch, segment_distance, straight_sit
 from tracks.geometry.scene import Gates
 
 MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
+"""Least and largest horizontal distance between successive gates [m]."""
 PASSING_M = 1.6
-"""Least horizontal distance of a stretch from the centre of a gate that it does not join."""
+"""Least horizontal distance of a stretch from the centre of a gate that it does not join [m]."""
 MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
@@ -26,37 +28,39 @@ MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8
+"""Candidate walks of one draw."""
 _DRAWS = 12
+"""Draws before a straight track is returned."""
 
-BESIDE_M = (2.0, 4.0)
+OFFSET_M = (2.0, 4.0)
 """Range of the largest distance of a track's obstacles from the lines between gates; smaller values
-put more of them in the way [m]."""
+place more obstacles on the lines [m]."""
 
 
 class Walks(NamedTuple):
     """Several candidate walks (W of them) with the same drift."""
 
     center: np.ndarray
-    """(W, G, 2) level gate centres [m]."""
+    """(W, G, 2) horizontal positions of the gates' centres [m]."""
     yaw: np.ndarray
-    """(W, G) flight directions [rad]."""
+    """(W, G) flight directions through the gates [rad]."""
     start: np.ndarray
-    """(W, 2) level start [m]."""
+    """(W, 2) horizontal position of the start [m]."""
 
 
 class Mix(NamedTuple):
-    """Shares of hard tracks, in addition to the difficulty."""
+    """Probabilities of sharp turns, hairpins and obstacles, in addition to the difficulty."""
 
     sharp_share: float = 0.55
     """Probability that a track has one or two sharp turns."""
     density: tuple[float, float] = (0.0, 1.3)
-    """Range of the obstacles' density, as a share of the judged families'."""
+    """Range of the obstacles' density, relative to the judged families."""
     bare_share: float = 0.2
     """Probability that a track has no obstacles."""
     hairpin_share: float = 0.0
-    """Probability that a track is drawn with one or two hairpins; the crowded ones are redrawn."""
+    """Probability that a track has hairpins, one or two; walks near other gates are redrawn."""
     height_spread: float = 1.0
-    """Spread of the gates' heights, relative to the usual one."""
+    """Factor on the range of the gates' heights."""
 
 
 MIX = Mix()
@@ -65,12 +69,12 @@ MIX = Mix()
 def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     """Return a random track of difficulty `d` in [0, 1]."""
     xy, yaw, start = _walk(d, rng, mix)
-    shape = GATE_COUNT
-    side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, shape), 0.75, 1.3)
-    width = rng.uniform(0.13, 0.27, shape)
-    depth = rng.uniform(0.03, ramp(0.05, 0.08, d), shape)
-    middle, reach = rng.uniform(1.0, 1.8), mix.height_spread * ramp(0.1, 1, d) * rng.random()
-    height = middle + reach * rng.uniform(-1, 1, shape)
+    n = GATE_COUNT
+    side = np.clip(ramp(1.2, 0.85, d) + rng.uniform(-0.1, 0.1, n), 0.75, 1.3)
+    width = rng.uniform(0.13, 0.27, n)
+    depth = rng.uniform(0.03, ramp(0.05, 0.08, d), n)
+    middle, spread = rng.uniform(1.0, 1.8), mix.height_spread * ramp(0.1, 1, d) * rng.random()
+    height = middle + spread * rng.uniform(-1, 1, n)
     height = np.clip(height, np.maximum(0.8, side / 2 + width), 2.2)
     center_w = np.column_stack([xy, height])
     gates = square_gates(center_w, yaw, side, width, depth)
@@ -78,17 +82,17 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
     start_pos_w = np.array([*start, start_height])
 
     stretches = np.arange(GATE_COUNT - 1)
-    site = straight_sites(gates, stretches, rng.uniform(*BESIDE_M))
-    return furnish(rng, gates, start_pos_w, _density(d, rng, len(stretches), mix), site)
+    site = straight_sites(gates, stretches, rng.uniform(*OFFSET_M))
+    return furnish(rng, gates, start_pos_w, _obstacle_counts(d, rng, len(stretches), mix), site)
 
 
-def _density(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> PerStretch:
-    """Draw obstacle counts: none on some tracks, up to more than the baseline's on others."""
-    level = rng.uniform(*mix.density) if rng.random() < 1 - mix.bare_share else 0.0
-    kind = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
+def _obstacle_counts(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> PerStretch:
+    """Draw obstacle counts: none on some tracks, more than the baseline's on others."""
+    density = rng.uniform(*mix.density) if rng.random() < 1 - mix.bare_share else 0.0
+    kind_factor = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
     air, pillar, ground = ramp(1, 3.5, d), ramp(0.8, 1.3, d), 2.0
-    mean = level * kind * np.array([air, air, pillar, ground])
-    numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (level > 0)
+    mean = density * kind_factor * np.array([air, air, pillar, ground])
+    numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (density > 0)
     for row, most in zip(numbers, MAX_TOTALS, strict=True):
         if row.sum() > most:
             # Removed at random: otherwise the last stretches would always have fewer obstacles.
@@ -100,7 +104,7 @@ def _walk(
     d: float, rng: np.random.Generator, mix: Mix
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first free walk."""
-    # No draw without hairpins, so that such mixes keep their tracks for each seed.
+    # A mix without hairpins draws no number here, so that each seed keeps its track.
     hairpins = mix.hairpin_share > 0 and rng.random() < mix.hairpin_share
     for _ in range(_DRAWS):
         turn = _drift_turns(d, rng, mix.sharp_share)
@@ -113,7 +117,7 @@ def _walk(
 
 
 def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.ndarray:
-    """Return the mean turn at each gate, (G,) [rad]."""
+    """Draw the mean turn at each gate, (G,) [rad]."""
     sign = rng.choice([-1.0, 1.0])
     bend = np.deg2rad(rng.uniform(0, 52)) if rng.random() < 0.6 else 0.0
     turn = sign * bend + rng.normal(size=GATE_COUNT) * np.deg2rad(rng.uniform(0, 12))
@@ -125,7 +129,7 @@ def _drift_turns(d: float, rng: np.random.Generator, sharp_share: float) -> np.n
 
 
 def _with_hairpins(turn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the turns (G,) with one or two hairpins [rad]."""
+    """Return the turns (G,) reduced to 30 %, with one or two random hairpins [rad]."""
     turn = 0.3 * turn
     first = rng.integers(0, GATE_COUNT - 1)
     second = first + rng.integers(3, 5)
@@ -135,10 +139,11 @@ def _with_hairpins(turn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
+    """Draw candidate walks with the mean turns (G,) [rad]."""
     shape = (_WALKS, GATE_COUNT)
     drift = rng.uniform(-np.pi, np.pi) + np.cumsum(turn) - turn
-    stray = rng.uniform(-1, 1, shape) * np.deg2rad(rng.uniform(0, ramp(15, 50, d)))
-    heading = drift + stray
+    deviation = rng.uniform(-1, 1, shape) * np.deg2rad(rng.uniform(0, ramp(15, 50, d)))
+    heading = drift + deviation
     spacing = rng.uniform(3.3, 6.0) + rng.uniform(-1, 1, shape) * rng.uniform(0, ramp(0.5, 2, d))
     spacing = np.clip(spacing, MIN_SPACING_M, MAX_SPACING_M)
     spacing[:, 0] = rng.uniform(2, 4, _WALKS)
@@ -149,20 +154,20 @@ def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
 
 
 def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
-    """Return which walks avoid their own gates and approach each gate from its front, (W,)."""
+    """Return which walks avoid their other gates and pass each gate in its direction, (W,)."""
     point = np.concatenate([walks.start[:, None], walks.center], axis=1)
-    way = np.diff(point, axis=1)
+    step = np.diff(point, axis=1)
     normal = np.stack([np.cos(walks.yaw), np.sin(walks.yaw)], axis=-1)
-    length = np.linalg.norm(way, axis=-1)
+    length = np.linalg.norm(step, axis=-1)
     least = np.cos(max_approach) * length
-    meets = np.all(np.sum(way * normal, -1) > least, axis=1)
-    leaves = np.all(np.sum(way[:, 1:] * normal[:, :-1], -1) > least[:, 1:], axis=1)
+    approaches = np.all(np.sum(step * normal, -1) > least, axis=1)
+    leaves = np.all(np.sum(step[:, 1:] * normal[:, :-1], -1) > least[:, 1:], axis=1)
 
     distance = segment_distance(walks.center[:, None], point[:, :-1, None], point[:, 1:, None])
     stretch, gate = np.arange(GATE_COUNT)[:, None], np.arange(GATE_COUNT)
     joined = (gate == stretch) | (gate == stretch - 1)
-    passes = np.all((distance > PASSING_M) | joined, axis=(1, 2))
-    return meets & leaves & passes
+    avoids_others = np.all((distance > PASSING_M) | joined, axis=(1, 2))
+    return approaches & leaves & avoids_others
 
 
 def is_free(gates: Gates, start_pos_w: np.ndarray) -> bool:

@@ -1,1 +1,1 @@
-"""Scenes in other formats: track files, meshes, MuJoCo."""
+"""Tracks from TOML files and mesh files, and scenes as meshes and as MuJoCo models."""

@@ -1,7 +1,7 @@
-"""Tracks from TOML files: gates of any convex shape, every kind of solid, meshes, a start.
+"""Read a custom track from a TOML file: gates of any convex shape, solids, meshes, the start.
 
-`examples/` in this folder has one with every key. Positions are in the world frame in metres,
-angles in degrees; relative paths of mesh files start at the TOML file's folder.
+`tracks/examples/yard.toml` has every key. Positions are in the world frame in metres, angles in
+degrees; relative paths of mesh files start at the TOML file's folder.
 """
 
 from __future__ import annotations
@@ -26,27 +26,29 @@ if TYPE_CHECKING:
     import trimesh
 
 _START_BEHIND_M = 2.5
+"""Default distance of the start before gate 0 [m]."""
 FARTHEST_M = 1e5
 """Largest coordinate, as in a flight log [m]."""
 LEAST_M, MOST_M = 1e-3, 1e5
-"""Of a length."""
+"""Smallest and largest length [m]."""
 MOST_TABLES = 1000
-"""Gates, and solids of each kind, of a track: a second of reading."""
+"""Most gates, and most solids of each kind; so many are read in about a second."""
 _RESERVED = (
     *("ground", "parked", "quadrotor box"),
     *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
 )
-"""Names of geoms that MuJoCo's models have of their own."""
+"""Names that geoms of the suite's MuJoCo models already have."""
 _ROUNDING = 0.01
-"""Of a mesh's thickness, as a share."""
+"""Share by which a mesh may be thinner than `LEAST_M`, for rounding."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
+"""Singular of the keys that do not end in a plain s."""
 
 
 def load_track(path: str | os.PathLike[str]) -> Track:
     """Return the track of a TOML file; its family is the file's `name`, level and seed are 0.
 
     Raises:
-        ValueError: naming the file, the key, its value and what is allowed, where something is
+        ValueError: naming the file, the key, its value and what is allowed, where a key is
             missing, unknown, of the wrong shape or impossible (a gate below the ground, an
             opening or a mesh that is not convex, a start inside a solid).
     """
@@ -55,7 +57,7 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     name = top.text("name", top.path.stem)
     gate_tables = _tables(top, "gates")
     if not gate_tables:
-        raise ValueError(f"{top.path}: holds no gate; add at least one [[gates]]")
+        raise ValueError(f"{top.path}: has no gate; add at least one [[gates]]")
     gates = _gates(gate_tables)
     start_pos_w, start_yaw = _start(top, gates)
 
@@ -90,25 +92,28 @@ def load_track(path: str | os.PathLike[str]) -> Track:
 class _Names:
     """Gives every solid a unique name and refuses duplicates."""
 
-    def __init__(self, taken: list[str]) -> None:
-        self._taken = set(taken)
+    def __init__(self, used: list[str]) -> None:
+        self._used = set(used)
 
     def __call__(self, table: Table, kind: str, number: int) -> str:
+        """Return the name of solid `number` of a kind: the table's, or one made of the kind."""
         name = table.text("name", f"{_SINGULAR.get(kind, kind[:-1])} {number}")
-        if name in self._taken or name in _RESERVED or "/" in name or not name.isprintable():
-            taken = ", ".join(map(repr, _RESERVED))
+        if name in self._used or name in _RESERVED or "/" in name or not name.isprintable():
+            reserved = ", ".join(map(repr, _RESERVED))
             raise table.error(
-                "name", name, f"a printable name no other solid has, without '/', none of {taken}"
+                "name",
+                name,
+                f"a printable name no other solid has, without '/', none of {reserved}",
             )
-        self._taken.add(name)
+        self._used.add(name)
         return name
 
     def part(self, table: Table, name: str, part: int) -> str:
         """Return the name of a part of the solid `name`."""
         label = f"{name} part {part}"
-        if label in self._taken:
-            raise table.error("name", name, f"one whose parts are not named as others: {label!r}")
-        self._taken.add(label)
+        if label in self._used:
+            raise table.error("name", name, f"another name: a solid is called {label!r} already")
+        self._used.add(label)
         return label
 
 
@@ -122,6 +127,7 @@ def _tables(top: Table, kind: str) -> list[Table]:
 def _read(
     top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
 ) -> tuple[list[tuple], list[str]]:
+    """Return the values and the names of all solids of a kind; `read` reads one table."""
     rows, labels = [], []
     for number, table in enumerate(_tables(top, kind)):
         rows.append(read(table))
@@ -131,12 +137,14 @@ def _read(
 
 
 def _columns(rows: list[tuple], shapes: list[tuple[int, ...]]) -> list[np.ndarray]:
+    """Return an array for each column of `rows`; without rows, empty ones of the given shapes."""
     if not rows:
         return [np.zeros((0, *shape)) for shape in shapes]
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def _gates(tables: list[Table]) -> Gates:
+    """Return the gates of the tables [[gates]]; all openings get the same number of corners."""
     rows, openings = [], []
     for table in tables:
         center, rot = _place(table, "center"), rotation(table)
@@ -158,52 +166,55 @@ def _gates(tables: list[Table]) -> Gates:
 
 def _opening(table: Table) -> np.ndarray:
     """Return the corners (V, 2) of one of: width and height; corners and radius; polygon."""
-    given = [key for key in ("width", "radius", "polygon") if table.has(key)]
-    if len(given) != 1:
+    keys = [key for key in ("width", "radius", "polygon") if table.has(key)]
+    if len(keys) != 1:
         raise table.error(
             "opening",
-            given,
+            keys,
             "one of: width and height; radius with corners (of a regular polygon); polygon",
         )
-    if given == ["width"]:
+    if keys == ["width"]:
         return rectangle(_length(table, "width"), _length(table, "height"))
-    if given == ["radius"]:
+    if keys == ["radius"]:
         corners = table.whole("corners", 12, least=3, most=64)
         return regular_polygon(corners, _length(table, "radius"))
     return _convex(table, table.points("polygon", 2, least=3, most=MOST_M))
 
 
 def _convex(table: Table, polygon: np.ndarray) -> np.ndarray:
-    """Return the polygon counter-clockwise; refuse one that is not convex or crosses itself."""
+    """Return the corners (V, 2) counter-clockwise; refuse them if not convex or self-crossing."""
     side = np.roll(polygon, -1, axis=0) - polygon
-    after = np.roll(side, -1, axis=0)
-    turn = np.arctan2(
-        side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0], np.sum(side * after, axis=-1)
-    )
+    next_side = np.roll(side, -1, axis=0)
+    turn = np.arctan2(_cross(side, next_side), np.sum(side * next_side, axis=-1))
     if np.linalg.norm(side, axis=-1).min() < LEAST_M:
         allowed = f"sides of {LEAST_M:g} m at least"
         raise table.error("polygon", polygon.tolist(), allowed)
-    same_way = (turn > 1e-6).all() or (turn < -1e-6).all()
-    if not same_way or not np.isclose(abs(turn.sum()), 2 * np.pi):
+    one_direction = (turn > 1e-6).all() or (turn < -1e-6).all()
+    if not one_direction or not np.isclose(abs(turn.sum()), 2 * np.pi):
         allowed = "the corners [y, z] of a convex polygon in order, no three of them in line"
         raise table.error("polygon", polygon.tolist(), allowed)
     if turn[0] < 0:
         polygon = polygon[::-1]
-    after = np.roll(polygon, -1, axis=0)
-    if (polygon[:, 0] * after[:, 1] - polygon[:, 1] * after[:, 0] <= 0).any():
+    if (_cross(polygon, np.roll(polygon, -1, axis=0)) <= 0).any():
         raise table.error("polygon", polygon.tolist(), "corners around [0, 0], the gate's centre")
     return polygon
 
 
-def rotation(table: Table) -> np.ndarray:
-    """Return the rotation (3, 3) of a table: `quat_wxyz`, or yaw, then pitch, then roll [deg].
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products (V,) of vectors (V, 2) in a plane."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
-    Pitch is positive nose up, roll positive right side down, body axes forward-left-up.
+
+def rotation(table: Table) -> np.ndarray:
+    """Return the rotation (3, 3), local to world, that a table gives.
+
+    Its keys are `quat_wxyz`, or `yaw_deg`, `pitch_deg` and `roll_deg`, applied in this order. Pitch
+    is positive nose up, roll positive right side down, body axes forward-left-up.
     """
     if table.has("quat_wxyz"):
         return quat_to_rot(_unit(table, "quat_wxyz", table.vector("quat_wxyz", 4)))
-    turned = np.deg2rad([table.number(f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
-    (cy, cp, cr), (sy, sp, sr) = np.cos(turned), np.sin(turned)
+    angles = np.deg2rad([table.number(f"{angle}_deg", 0.0) for angle in ("yaw", "pitch", "roll")])
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     pitch = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
     roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -226,6 +237,7 @@ def _unit(table: Table, key: str, vector: np.ndarray) -> np.ndarray:
 
 
 def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
+    """Return the start's position (3,) [m] and heading [rad]: the file's, or before gate 0."""
     ahead = gates.rot_w[0, :, 0] * [1.0, 1.0, 0.0]
     level = np.linalg.norm(ahead)
     pos_w = gates.center_w[0] - _START_BEHIND_M * ahead / max(level, 1e-9)
@@ -242,31 +254,31 @@ def _start(top: Table, gates: Gates) -> tuple[np.ndarray, float]:
 
 
 def _refuse_inside(top: Table, track: Track, frame_names: list[str]) -> None:
-    """Refuse a start, and an opening with all of its corners, that a solid holds."""
-    # Here, so that only those who read a track pay for the import of trimesh.
+    """Refuse a start inside a solid, and a gate whose whole opening is inside a solid."""
+    # Imported here, because trimesh takes long to import and only custom tracks need it.
     from tracks.formats.meshes import solid_meshes
 
     gates, frames = track.scene.gates, set(frame_names)
     corners_w = gates.center_w[:, None] + gates.opening_g @ np.swapaxes(gates.rot_w[:, :, 1:], 1, 2)
     for name, mesh in solid_meshes(track):
-        if _holds(mesh, track.start_pos_w):
+        if _is_inside(mesh, track.start_pos_w):
             allowed = f"a position outside of every solid; this one is inside {name!r}"
             raise top.error("start.position", track.start_pos_w.tolist(), allowed)
         if name in frames:
             continue
-        # A solid is convex: with the corners of an opening it holds all of it.
-        shut = _holds(mesh, corners_w).all(axis=-1)
-        if shut.any():
-            gate = int(np.argmax(shut))
+        # A solid is convex: if it contains an opening's corners, it contains the opening.
+        blocked = _is_inside(mesh, corners_w).all(axis=-1)
+        if blocked.any():
+            gate = int(np.argmax(blocked))
             allowed = f"a place outside of every solid; the opening is inside {name!r}"
             raise top.error(f"gates[{gate}].center", gates.center_w[gate].tolist(), allowed)
 
 
-def _holds(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Return which points (..., 3) a convex mesh holds."""
+def _is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Return which points (..., 3) are inside a convex mesh."""
     origin = np.asarray(mesh.triangles)[:, 0]
     side = np.sum((points[..., None, :] - origin) * mesh.face_normals, axis=-1)
-    # Inside is on one side of every face, whichever way they are wound.
+    # A point inside is on the same side of every face; the sign depends on the winding.
     return np.all(side < 0, axis=-1) | np.all(side > 0, axis=-1)
 
 
@@ -289,6 +301,7 @@ def _sphere(table: Table) -> tuple:
 
 
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
+    """Return the triangles (M, 3, 3) in the world and the name of each mesh's convex parts."""
     placed = []
     for number, table in enumerate(_tables(top, "meshes")):
         file = top.path.parent / table.text("file")
@@ -308,12 +321,12 @@ def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
 
 
 def _check_mesh(table: Table, scale: float, part: int, mesh: np.ndarray) -> None:
-    """Refuse a part (M, 3, 3) in the world that MuJoCo, which stores singles, finds no body."""
+    """Refuse a part (M, 3, 3) that is too far away or, in MuJoCo's float32, too thin."""
     reach_m = float(np.abs(mesh).max())
     if not reach_m <= FARTHEST_M:
         allowed = f"one that leaves every part within {FARTHEST_M:g} m of the origin on each axis"
         raise table.error("scale", scale, f"{allowed}; part {part} reaches {reach_m:.3g}")
     thick_m = thickness(mesh.astype(np.float32).astype(float))
     if thick_m < (1.0 - _ROUNDING) * LEAST_M:
-        allowed = f"one that makes every part at least {LEAST_M:g} m thick where it stands"
+        allowed = f"one that makes every part at least {LEAST_M:g} m thick at its position"
         raise table.error("scale", scale, f"{allowed}; part {part} has {thick_m:.2g}")

@@ -1,8 +1,8 @@
-"""Read untrusted mesh files in a separate process with limits, which can be killed.
+"""Read untrusted mesh files in a separate process with limits of time and memory.
 
-A mesh of few bytes may refer to files that never end, or unpack to more than the memory. The
-process answers with numbers alone. It is kept for the next track, and ends by itself when it was
-not needed for a while.
+A small mesh file may refer to files that never end, or unpack to more than the memory. The process
+returns only the triangles' coordinates. It is kept for the next track, and ends by itself when it
+was not used for a while.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ import numpy as np
 from tracks.input.reading import MESH_BYTES, check_file
 
 KINDS = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
-"""Endings of the files that are read; archives are not."""
+"""Allowed endings of file names; archives are not read."""
 READ_S = 60.0
-"""All files of a track are read within this time [s]."""
+"""Time limit for all files of a track [s]."""
 IDLE_S = 30.0
-"""The process waits so long for another track [s]."""
+"""Time after which the unused process ends [s]."""
 MEMORY_BYTES = 3 * 2**30
-"""Addresses that the process may use, libraries included."""
+"""Size of the process's address space, libraries included."""
 _PROGRAM = (
     "import sys; sys.path.append(sys.argv[1]); "
     "from tracks.formats.mesh_reader import serve; serve()"
@@ -43,8 +43,8 @@ def load_convex_parts(paths: Sequence[Path]) -> list[list[np.ndarray]]:
     """Return the result of `convex_parts.convex_parts` for each mesh file.
 
     Raises:
-        ValueError: where a file cannot be read, or a part is open or not convex, naming both;
-            where reading takes too long or too much memory.
+        ValueError: where a file cannot be read, a part is open or not convex, or reading takes too
+            long or too much memory; the message names the file.
     """
     for path in paths:
         if path.suffix.lower() not in KINDS:
@@ -56,12 +56,13 @@ def load_convex_parts(paths: Sequence[Path]) -> list[list[np.ndarray]]:
         return []
     names = ", ".join(map(str, paths[:3])) + (", ..." if len(paths) > 3 else "")
     with _one_at_a_time:
-        found, data = _ask([os.fspath(path.absolute()) for path in paths], names)
-    if "error" in found:
-        raise ValueError(found["error"])
+        header, data = _request([os.fspath(path.absolute()) for path in paths], names)
+    if "error" in header:
+        raise ValueError(header["error"])
     triangles = np.frombuffer(data).reshape(-1, 3, 3)
-    parts = iter(np.split(triangles, np.cumsum([n for each in found["sizes"] for n in each])))
-    return [[next(parts) for _ in each] for each in found["sizes"]]
+    sizes = header["sizes"]  # triangles of each part, for each file
+    parts = iter(np.split(triangles, np.cumsum([n for file_sizes in sizes for n in file_sizes])))
+    return [[next(parts) for _ in file_sizes] for file_sizes in sizes]
 
 
 _one_at_a_time = threading.Lock()
@@ -69,13 +70,13 @@ _one_at_a_time = threading.Lock()
 
 @functools.cache
 def _process() -> subprocess.Popen[bytes]:
-    """Start the process that reads, once."""
+    """Start the reading process, once, and return it."""
     process = subprocess.Popen(
         [sys.executable, "-P", "-c", _PROGRAM, str(Path(__file__).resolve().parents[2])],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C is for us
+        start_new_session=True,  # Ctrl-C must reach only this process
     )
     atexit.register(_end, process)
     return process
@@ -90,52 +91,56 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _ask(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
-    """Return the head and the data of the answer.
+def _request(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
+    """Send paths to the reading process; return the header and the data of its answer.
 
     Raises:
-        ValueError: where there is none.
+        ValueError: where it does not answer in time, or ends.
     """
     if _process().poll() is not None:
         _end(_process())
         _process.cache_clear()
     process = _process()
-    late = threading.Timer(READ_S, process.kill)
-    late.start()
+    timer = threading.Timer(READ_S, process.kill)
+    timer.start()
     try:
-        return _answer_of(process, paths)
+        return _exchange(process, paths)
     except (EOFError, BrokenPipeError):
-        late_s = f"within {READ_S:g} s" if late.finished.is_set() else ""
-    except BaseException:  # Ctrl-C: a later answer would be read as the next one
+        late = f"within {READ_S:g} s" if timer.finished.is_set() else ""
+    except BaseException:  # Ctrl-C: a late answer would be read as that of the next request
         process.kill()
         raise
     finally:
-        late.cancel()
-    if process.wait() == -signal.SIGALRM:  # it stopped waiting for us at this moment
-        return _ask(paths, names)
-    how = late_s or f"to the end, its reader ended with {process.returncode}"
+        timer.cancel()
+    if process.wait() == -signal.SIGALRM:  # its idle time ended at this moment
+        return _request(paths, names)
+    how = late or f"to the end, its reader ended with {process.returncode}"
     raise ValueError(f"{names}: cannot be read as a mesh {how}; use a simpler one")
 
 
-def _answer_of(process: subprocess.Popen[bytes], paths: list[str]) -> tuple[dict[str, Any], bytes]:
+def _exchange(process: subprocess.Popen[bytes], paths: list[str]) -> tuple[dict[str, Any], bytes]:
+    """Write a request to the process, and return the header and the data that it writes."""
     assert process.stdin is not None and process.stdout is not None
     process.stdin.write(json.dumps(paths).encode() + b"\n")
     process.stdin.flush()
     line = process.stdout.readline()
-    found = json.loads(line) if line.endswith(b"\n") else {"bytes": -1}
-    data = process.stdout.read(max(found["bytes"], 0))
-    if len(data) != found["bytes"]:
+    header = json.loads(line) if line.endswith(b"\n") else {"bytes": -1}
+    data = process.stdout.read(max(header["bytes"], 0))
+    if len(data) != header["bytes"]:
         process.kill()
         raise EOFError
-    return found, data
+    return header, data
 
 
 def serve() -> None:
-    """Be the process that reads: lines of paths on the input, frames of triangles on the output."""
-    # What libraries print must not come into the answers.
+    """Run the reading process: each input line is a JSON list of paths, each output an answer.
+
+    An answer is a line with a JSON header, followed by the corners of the triangles as float64.
+    """
+    # Libraries may print; their output goes to standard error, so that it cannot mix with answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    import trimesh  # noqa: F401  # before the limit, not once a file
+    import trimesh  # noqa: F401  # imported before the memory limit is set
 
     from tracks.formats.convex_parts import convex_parts
 
@@ -143,7 +148,7 @@ def serve() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     while line := sys.stdin.readline():
-        signal.setitimer(signal.ITIMER_REAL, READ_S + 5.0)  # in case the parent is gone
+        signal.setitimer(signal.ITIMER_REAL, READ_S + 5.0)  # in case the parent has ended
         parts, path = [], ""
         try:
             for path in json.loads(line):
@@ -154,12 +159,12 @@ def serve() -> None:
             most = f"{MEMORY_BYTES / 2**30:g} GB of memory"
             _answer(answers, {"error": f"{path}: takes more than {most}; use a simpler mesh"}, [])
         else:
-            sizes = [[len(part) for part in each] for each in parts]
-            _answer(answers, {"sizes": sizes}, [part for each in parts for part in each])
+            sizes = [[len(part) for part in file_parts] for file_parts in parts]
+            _answer(answers, {"sizes": sizes}, [p for file_parts in parts for p in file_parts])
         signal.setitimer(signal.ITIMER_REAL, IDLE_S)
 
 
-def _answer(file: IO[bytes], head: dict[str, Any], parts: list[np.ndarray]) -> None:
+def _answer(file: IO[bytes], header: dict[str, Any], parts: list[np.ndarray]) -> None:
     data = b"".join(np.ascontiguousarray(part, float).tobytes() for part in parts)
-    file.write(json.dumps(head | {"bytes": len(data)}).encode() + b"\n" + data)
+    file.write(json.dumps(header | {"bytes": len(data)}).encode() + b"\n" + data)
     file.flush()

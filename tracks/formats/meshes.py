@@ -1,4 +1,4 @@
-"""A track's solids as triangle meshes, for pictures and for checks of the geometry."""
+"""Convert a track's solids to triangle meshes (trimesh), for pictures and geometric checks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _SECTIONS = 24
 def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
     """Return (name, mesh) of every solid in the order of `Track.names`, in the world frame.
 
-    Parked bars (of openings with fewer corners than the track's most) are left out; the ground,
-    the plane z = 0, has no mesh. Round solids are approximated by inscribed polyhedra.
+    Padding bars far below the ground (of openings with fewer corners than others) are left out. The
+    ground, the plane z = 0, has no mesh. Round solids are approximated by inscribed polyhedra.
     """
     scene = track.scene
     first = np.cumsum((0, *track.mesh_sizes))
@@ -72,7 +72,7 @@ def _cylinder(radius: float, half_length: float) -> trimesh.Trimesh:
 
 def _capsule(radius: float, half_length: float) -> trimesh.Trimesh:
     mesh = trimesh.creation.capsule(radius=radius, height=2 * half_length, count=[_SECTIONS] * 2)
-    # Centred, independent of the library's origin.
+    # Centre the capsule, whatever origin the library chose.
     return mesh.apply_translation(-mesh.bounds.mean(axis=0))
 
 

@@ -1,9 +1,9 @@
-"""A scene as MuJoCo geoms in the world body.
+"""Add a scene (gates, obstacles and the ground) to a MuJoCo model, as geoms of its world body.
 
 Solids have MuJoCo's default contact bits, so a drone collides with them; geoms of the world body
 never collide with one another. Rays ignore contact bits and hit every solid, unless they select a
-geom group. Geoms come kind by kind in the order of `Track.names`, the ground last. Each kind is
-followed by its padding: solids far below the ground that only fill up their number.
+geom group. The order is that of `Track.names`, with the ground last. Each kind of solid is followed
+by its padding: solids far below the ground, which make the number of geoms equal in all models.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ import numpy as np
 from tracks.geometry.scene import Counts, Scene, pad
 
 GROUND = "ground"
+"""Name of the ground's geom."""
 PARKED = "parked"
+"""Name of padding geoms."""
 MESH_GROUP = 1
 """Geom group of meshes, for rays that should hit meshes only."""
-_BAR = "/"
+_SEPARATOR = "/"
+"""Between the name of a solid and the number of its geom."""
 
 
 def solid_name(geom_name: str) -> str:
-    """Return the solid's name ("gate 3 frame") of a geom's name ("gate 3 frame/2")."""
-    return geom_name.split(_BAR)[0]
+    """Return the name of the solid ("gate 3 frame") of the geom `geom_name` ("gate 3 frame/2")."""
+    return geom_name.split(_SEPARATOR)[0]
 
 
 def add_scene(
@@ -41,14 +44,14 @@ def add_scene(
     to models of the same sizes, as `mujoco.batch.Batch.set_models` requires.
 
     Args:
-        spec: is changed in place.
+        spec: the model; it is changed in place.
         scene: not batched.
         names: as `Track.names`; solids are named by kind and number where it is empty.
         mesh_sizes: as `Track.mesh_sizes`.
         pad_to: numbers of primitive solids to pad to; meshes are never padded.
 
     Raises:
-        ValueError: where the scene holds more solids of a kind than `pad_to`, or names and solids
+        ValueError: where the scene has more solids of a kind than `pad_to`, or names and solids
             do not match in number.
     """
     solid_counts = [
@@ -87,14 +90,14 @@ def add_scene(
         size = np.stack([rods.radius, rods.half_length, 0 * rods.radius], axis=-1)
         add(kind, shape, rods.center_w, _axis_quats(rods.axis_w), size)
     size = np.stack([spheres.radius, 0 * spheres.radius, 0 * spheres.radius], axis=-1)
-    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(size), 1))
-    add(3, geom.mjGEOM_SPHERE, spheres.center_w, still, size)
+    no_rotation = np.tile([1.0, 0.0, 0.0, 0.0], (len(size), 1))
+    add(3, geom.mjGEOM_SPHERE, spheres.center_w, no_rotation, size)
     _add_meshes(spec, scene.triangles, mesh_sizes, give_name)
     world.add_geom(name=GROUND, type=geom.mjGEOM_PLANE, size=[0, 0, 1])
 
 
 class _Names:
-    """Returns unique geom names, solid by solid."""
+    """Returns a unique geom name for each solid of a kind, called in order."""
 
     def __init__(self, names: tuple[str, ...], solid_counts: list[int]) -> None:
         self._names = names
@@ -107,20 +110,21 @@ class _Names:
         if kind == len(self._counts) or number < self._counts[kind]:
             fallback = f"{Scene._fields[kind + 1]} {number}"
             name = self._names[self._first[kind] + number] if self._names else fallback
-        seen = self._used.get(name, 0)
-        self._used[name] = seen + 1
-        return name if seen == 0 else f"{name}{_BAR}{seen}"
+        uses = self._used.get(name, 0)
+        self._used[name] = uses + 1
+        return name if uses == 0 else f"{name}{_SEPARATOR}{uses}"
 
 
 def _add_meshes(
     spec: mujoco.MjSpec, triangles: np.ndarray, mesh_sizes: tuple[int, ...], give_name: _Names
 ) -> None:
+    """Add each convex mesh as a geom of the world body."""
     first = 0
     for number, size in enumerate(mesh_sizes):
         corners = np.asarray(triangles[first : first + size], float).reshape(-1, 3)
         first += size
         name = give_name(4, number)
-        # Only the vertices: MuJoCo collides and casts rays against their convex hull.
+        # MuJoCo collides and casts rays against the convex hull, so the vertices are enough.
         vertices = np.unique(corners, axis=0)
         spec.add_mesh(name=name, uservert=vertices.ravel().tolist())
         kind = mujoco.mjtGeom.mjGEOM_MESH

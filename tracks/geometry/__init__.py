@@ -1,1 +1,1 @@
-"""Geometry on a scene: depth, clearance, the attractive field, crossings."""
+"""Geometry of a scene: depth images, distances to obstacles, the field of a gate, crossings."""

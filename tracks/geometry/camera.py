@@ -1,4 +1,4 @@
-"""The depth camera: a pinhole, 32 x 24 pixels, pitched up in the body's x-z plane."""
+"""The drone's depth camera: a pinhole model with 32 x 24 pixels, pitched up, and its rays."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ class Camera:
     fov_deg: Annotated[tuple[float, float], Range(1.0, 179.0)] = (78.4, 63.8)
     """Horizontal and vertical field of view, edge to edge [deg]."""
     range_m: Annotated[float, Range(0.1, 1000.0)] = 10.0
-    """Larger depths are set to this [m]."""
+    """Largest depth; larger ones are set to it [m]."""
     width: Annotated[int, Range(1, 1024)] = 32
-    """Pixels across."""
+    """Columns of the image [pixels]."""
     height: Annotated[int, Range(1, 1024)] = 24
-    """Pixels down."""
+    """Rows of the image [pixels]."""
     rays: Annotated[int, Range(1, 8)] = 1
-    """Rays across and down a pixel, whose value is the nearest; more rays find thinner objects."""
+    """Rays in each direction of a pixel (n x n); the pixel is their smallest depth. More rays find
+    thinner objects."""
 
 
 def pixel_rays_b(camera: Camera) -> np.ndarray:
     """Return the rays through the pixel centres in body axes, (height * width, 3).
 
-    Row-major from the top left, as the image is stored. Each ray's component along the optical
-    axis is 1, so the ray parameter at a hit is the planar depth itself.
+    The order is that of the image: row by row from the top left. Each ray's component along the
+    optical axis is 1, so the ray parameter at a hit is the planar depth itself.
     """
     half_u, half_v = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2)
     left = half_u * (1 - (2 * np.arange(camera.width) + 1) / camera.width)
@@ -47,14 +48,15 @@ def pixel_rays_b(camera: Camera) -> np.ndarray:
 
 
 def cast_rays_b(camera: Camera) -> np.ndarray:
-    """Return all rays of an image, (rays^2 * height * width, 3), for `nearest`.
+    """Return all rays of an image in body axes, (rays^2 * height * width, 3), for `nearest`.
 
     Each pixel is split evenly into rays x rays parts, and a ray goes through the centre of each.
-    All pixels' first parts come first, so that the nearest is taken over a leading axis.
+    The first parts of all pixels come first, so that `nearest` takes the minimum over a leading
+    axis.
     """
     n, height, width = camera.rays, camera.height, camera.width
-    finer = replace(camera, width=n * width, height=n * height)
-    rays = pixel_rays_b(finer).reshape(height, n, width, n, 3)
+    supersampled = replace(camera, width=n * width, height=n * height)
+    rays = pixel_rays_b(supersampled).reshape(height, n, width, n, 3)
     return rays.transpose(1, 3, 0, 2, 4).reshape(-1, 3)
 
 

@@ -1,7 +1,7 @@
-"""The nearest point on any solid or the ground, and signed distance to it (JAX, batched).
+"""Signed distance from points to the solids of a scene and the ground, and directions away (JAX).
 
-Inside a solid the distance is negative and the nearest point lies on the surface in the direction
-out of the solid, so that a repulsive gradient always points to free space.
+Inside a solid the distance is negative and the direction points to the nearest surface, so that a
+repulsive gradient always points to free space. The training's collision loss uses it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from tracks.geometry.cull import nearest_solids
 from tracks.geometry.scene import Array, Boxes, Counts, Rods, Scene, Spheres
 
 _TINY = 1e-9
+"""Shortest length of a vector that has a direction [m]."""
 
 
 def _norm(vector: Array) -> Array:
@@ -27,16 +28,17 @@ def _direction(vector: Array, length: Array) -> Array:
 def _box(boxes: Boxes, point_w: Array) -> tuple[Array, Array]:
     local = (point_w[..., None, :] - boxes.center_w)[..., None, :] @ boxes.rot_w
     local = local[..., 0, :]
-    beyond = jnp.abs(local) - boxes.half_size
-    outside = jnp.maximum(beyond, 0.0)
-    deepest = beyond.max(-1)
-    is_inside = deepest < 0
-    push = jnp.where(beyond >= deepest[..., None], 1.0, 0.0)
+    # Signed distance to the faces of each axis, negative inside; the largest is that of the box.
+    face_distance = jnp.abs(local) - boxes.half_size
+    outside = jnp.maximum(face_distance, 0.0)
+    inside_distance = face_distance.max(-1)
+    is_inside = inside_distance < 0
+    nearest_face = jnp.where(face_distance >= inside_distance[..., None], 1.0, 0.0)
     length = _norm(outside)
-    away = jnp.where(is_inside[..., None], push, _direction(outside, length))
+    away = jnp.where(is_inside[..., None], nearest_face, _direction(outside, length))
     away = away * jnp.where(local < 0, -1.0, 1.0)
     normal = (boxes.rot_w @ away[..., None])[..., 0]
-    return jnp.where(is_inside, deepest, length), _direction(normal, _norm(normal))
+    return jnp.where(is_inside, inside_distance, length), _direction(normal, _norm(normal))
 
 
 def _sphere(spheres: Spheres, point_w: Array) -> tuple[Array, Array]:
@@ -54,17 +56,18 @@ def _capsule(rods: Rods, point_w: Array) -> tuple[Array, Array]:
 
 
 def to_cylinders(rods: Rods, point_w: Array) -> tuple[Array, Array]:
-    """Return signed distances to flat-ended rods and directions away from them (`distances`)."""
+    """Return signed distances to rods with flat ends, and directions away (see `distances`)."""
     away = point_w[..., None, :] - rods.center_w
     along = (away * rods.axis_w).sum(-1)
     radial = away - along[..., None] * rods.axis_w
     radius = _norm(radial)
+    # Signed distances to the curved side and to the plane of the nearer end, negative inside.
     side, end = radius - rods.radius, jnp.abs(along) - rods.half_length
     outward = _direction(radial, radius)
     endward = rods.axis_w * jnp.where(along < 0, -1.0, 1.0)[..., None]
-    out_side, out_end = jnp.maximum(side, 0.0), jnp.maximum(end, 0.0)
-    length = jnp.hypot(out_side, out_end)
-    corner = out_side[..., None] * outward + out_end[..., None] * endward
+    beyond_side, beyond_end = jnp.maximum(side, 0.0), jnp.maximum(end, 0.0)
+    length = jnp.hypot(beyond_side, beyond_end)
+    corner = beyond_side[..., None] * outward + beyond_end[..., None] * endward
     inside = jnp.where((side > end)[..., None], outward, endward)
     is_inside = (side < 0) & (end < 0)
     normal = jnp.where(is_inside[..., None], inside, _direction(corner, length))
@@ -72,7 +75,10 @@ def to_cylinders(rods: Rods, point_w: Array) -> tuple[Array, Array]:
 
 
 def _triangle(corners: Array, point_w: Array) -> tuple[Array, Array]:
-    """Distance to a triangle (unsigned): Ericson 2005, Real-Time Collision Detection, 5.1.5."""
+    """Return unsigned distances to triangles (..., 3, 3), and directions away from them.
+
+    Source: Ericson 2005, Real-Time Collision Detection, 5.1.5.
+    """
     a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
     p = point_w[..., None, :]
     normal = jnp.cross(b - a, c - a)
@@ -88,11 +94,11 @@ def _triangle(corners: Array, point_w: Array) -> tuple[Array, Array]:
         share = jnp.clip(((p - start) * edge).sum(-1) / square, 0, 1)
         return start + share[..., None] * edge
 
-    nearest = jnp.stack([on_edge(a, b), on_edge(b, c), on_edge(c, a)])
-    gap = _norm(p - nearest)
-    best = jnp.take_along_axis(nearest, gap.argmin(0)[None, ..., None], axis=0)[0]
-    over = on_left(a, b) & on_left(b, c) & on_left(c, a)
-    away = p - jnp.where(over[..., None], plane, best)
+    edge_points = jnp.stack([on_edge(a, b), on_edge(b, c), on_edge(c, a)])
+    index = _norm(p - edge_points).argmin(0)[None, ..., None]
+    nearest = jnp.take_along_axis(edge_points, index, axis=0)[0]
+    projects_inside = on_left(a, b) & on_left(b, c) & on_left(c, a)
+    away = p - jnp.where(projects_inside[..., None], plane, nearest)
     length = _norm(away)
     return length, _direction(away, length)
 
@@ -115,27 +121,27 @@ def distances(scene: Scene, point_w: Array) -> tuple[Array, Array]:
         (_sphere, scene.spheres, scene.spheres.center_w),
         (_triangle, scene.triangles, scene.triangles[..., 0]),
     ]
-    found = [f(solids, point_w) for f, solids, rows in kinds if rows.shape[-2] > 0]
+    by_kind = [f(solids, point_w) for f, solids, rows in kinds if rows.shape[-2] > 0]
     ground = point_w[..., None, 2]
     up = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (*ground.shape, 3))
-    distance = jnp.concatenate([d for d, _ in found] + [ground], axis=-1)
-    return distance, jnp.concatenate([n for _, n in found] + [up], axis=-2)
+    distance = jnp.concatenate([d for d, _ in by_kind] + [ground], axis=-1)
+    return distance, jnp.concatenate([n for _, n in by_kind] + [up], axis=-2)
 
 
 def nearest_obstacle(
     scene: Scene, point_w: Array, limits: Counts | None = None
 ) -> tuple[Array, Array]:
-    """Return the signed distance (B, S) [m] to the nearest solid and its direction (B, S, 3).
+    """Return the signed distance to the nearest solid or the ground, and the direction away.
 
     Args:
         scene: batched, (B, ...).
-        point_w: (B, S, 3) points of a short stretch of path in each world [m].
-        limits: look only at this many solids of each kind, those whose bounding spheres are
-            nearest to the middle of the stretch; None looks at all, which is exact.
+        point_w: (B, S, 3) points on a short piece of path in each scene [m].
+        limits: use only this many solids of each kind, those whose bounding spheres are nearest
+            to the middle point; None uses all, which is exact.
 
     Returns:
-        distance and the unit vectors along which it grows; the nearest surface point is
-        point - distance * away.
+        distance (B, S) [m]; away (B, S, 3), the unit vectors along which it grows. The nearest
+        surface point is point - distance * away.
     """
     if limits is not None:
         scene = nearest_solids(scene, point_w[:, point_w.shape[1] // 2], limits)
@@ -147,6 +153,7 @@ def nearest_obstacle(
 
 
 def _with_points_axis(part: Array) -> Array:
+    """Insert an axis of length 1 for the points after the batch axis."""
     if isinstance(part, tuple):
         return type(part)(*(array[:, None] for array in part))
     return part[:, None]

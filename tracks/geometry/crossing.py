@@ -1,4 +1,7 @@
-"""Gate crossing: the gate's plane is crossed inside the opening, in flight direction."""
+"""Detect gate crossings: the gate's plane is crossed inside the opening, in flight direction.
+
+The functions take numpy and JAX arrays.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +20,15 @@ def is_inside(opening_g: Array, point_g: Array) -> Array:
 
 
 def sides(opening_g: Array, point_g: Array) -> tuple[Array, Array]:
-    """Return the sides of an opening, and the signed distance of a point to each.
+    """Return the sides of an opening, and on which side of each a point lies.
 
     Args:
         opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
         point_g: (..., 2) [m].
 
     Returns:
-        edge (..., V, 2) from corner to corner [m]; turn (..., V), the distance inside of an edge
-        times its length [m^2].
+        edge (..., V, 2) from corner to corner [m]; turn (..., V), the signed distance of the point
+        from an edge, positive inside, times the edge's length [m^2].
     """
     xp = point_g.__array_namespace__()
     edge = xp.roll(opening_g, -1, axis=-2) - opening_g
@@ -36,7 +39,7 @@ def sides(opening_g: Array, point_g: Array) -> tuple[Array, Array]:
 def crossing(
     center_w: Array, rot_w: Array, opening_g: Array, before_w: Array, after_w: Array
 ) -> tuple[Array, Array]:
-    """Return (passed, missed), each (...) bool, for a straight step from before_w to after_w.
+    """Return whether a straight step passes or misses a gate, each (...) bool.
 
     Args:
         center_w: (..., 3) opening's centre [m].
@@ -46,14 +49,14 @@ def crossing(
         after_w: (..., 3) its end [m].
 
     Returns:
-        passed: the plane was crossed in flight direction inside the opening; missed: it was
-        crossed in flight direction outside of it.
+        passed: the step crosses the gate's plane in flight direction inside the opening; missed:
+        it crosses the plane in flight direction outside of it.
     """
     xp = before_w.__array_namespace__()
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
     if nowhere(crosses):
-        return crosses, crosses  # most steps cross no plane
+        return crosses, crosses  # the usual case: saves the rest of the work
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)
     point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]

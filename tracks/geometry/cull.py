@@ -1,7 +1,8 @@
-"""Select the relevant solids of a scene: the nearest, or the visible ones.
+"""Select the relevant solids of a scene: the nearest, or those in the camera's view (JAX).
 
-Scenes are batched, (B, ...), with static shapes: the K best solids of each kind are gathered, where
-K is the caller's `Counts`. A kind with at most K solids is returned whole.
+Scenes are batched, (B, ...), and array shapes must not depend on values. So the K best solids of
+each kind are gathered, where K is set by the caller's `Counts`. A kind with at most K solids is
+returned unchanged.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from tracks.geometry.scene import Array, Counts, Scene
+
+_INVISIBLE = 1e6
+"""Added to the score of a solid out of view, so that every visible one comes first [m]."""
 
 
 class Bounds(NamedTuple):
@@ -58,7 +62,7 @@ def _gather(solids: Any, index: Array) -> Any:
 
 
 def keep_best(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
-    """Keep the solids of each kind with the least scores (B, N), at most `limits` of them."""
+    """Return the scene with the solids of the least scores (B, N), at most `limits` a kind."""
     kept = {}
     for name, score in scores.items():
         limit = getattr(limits, name)
@@ -68,7 +72,7 @@ def keep_best(scene: Scene, scores: dict[str, Array], limits: Counts) -> Scene:
 
 
 def nearest_solids(scene: Scene, pos_w: Array, limits: Counts) -> Scene:
-    """Keep the solids whose bounding spheres are nearest to pos_w (B, 3)."""
+    """Return the scene with the solids whose bounding spheres are nearest to pos_w (B, 3) [m]."""
     scores = {}
     for name, ball in bounds(scene):
         away = ball.center_w - pos_w[:, None]
@@ -79,13 +83,13 @@ def nearest_solids(scene: Scene, pos_w: Array, limits: Counts) -> Scene:
 def visible_solids(
     scene: Scene, pos_w: Array, rot_w: Array, rays_b: Array, range_m: float, limits: Counts
 ) -> Scene:
-    """Keep the nearest solids whose bounding spheres reach into the cone around the rays.
+    """Return the scene with the nearest solids whose bounding spheres reach into the view cone.
 
     Args:
         scene: batched, (B, ...).
         pos_w: (B, 3) camera positions [m].
         rot_w: (B, 3, 3) body to world.
-        rays_b: (R, 3) rays in body axes; the cone around their mean holds them all.
+        rays_b: (R, 3) rays in body axes; the view cone around their mean contains them all.
         range_m: largest planar depth [m].
         limits: how many of each kind to keep.
     """
@@ -103,6 +107,6 @@ def visible_solids(
         across = jnp.sqrt(jnp.maximum(squared - along * along, 0.0))
         outside_cone = across * cosine - along * sine > ball.radius
         distance = jnp.sqrt(squared) - ball.radius
-        unseen = (outside_cone & (distance > 0)) | (distance > reach)
-        scores[name] = jnp.where(unseen, 1e6 + distance, distance)
+        invisible = (outside_cone & (distance > 0)) | (distance > reach)
+        scores[name] = jnp.where(invisible, _INVISIBLE + distance, distance)
     return keep_best(scene, scores, limits)

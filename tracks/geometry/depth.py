@@ -1,8 +1,10 @@
-"""Planar depth images by analytic ray casting, batched over worlds (JAX).
+"""Render planar depth images by analytic ray casting, batched over scenes (JAX, for training).
 
-Every solid is convex or a union of convex parts. A ray is inside a convex part on an interval
-[enter, leave] of the ray parameter, and intervals of intersected sets are intersected. With rays
-whose component along the optical axis is 1 the parameter is the planar depth.
+Planar depth is the distance along the optical axis. Every solid is convex or a union of convex
+parts. A ray is inside a convex part on an interval [enter, leave] of the ray parameter; the
+interval of an intersection of sets is the intersection of their intervals. Rays have a component
+of 1 along the optical axis, so the ray parameter is the planar depth. Shapes: B scenes with one
+camera each, R rays, K solids of a kind; a solid's function gets one solid of each scene.
 """
 
 from __future__ import annotations
@@ -16,27 +18,29 @@ from tracks.geometry.cull import visible_solids
 from tracks.geometry.scene import Array, Counts, Rods, Scene
 
 _FAR = 1e9
+"""Depth of a ray without a hit [m]."""
 _TINY = 1e-12
+"""Avoids division by zero."""
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Return the dot product over the last axis, written out so that it fuses."""
+    """Return the dot product over the last axis, written out so that XLA fuses it."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def _entry(enter: Array, leave: Array) -> Array:
-    """Return the start of an interval: 0 from inside, far if it is empty or behind the camera."""
+    """Return the start of an interval: 0 from inside, _FAR if it is empty or behind the camera."""
     return jnp.where((enter <= leave) & (leave > 0), jnp.maximum(enter, 0.0), _FAR)
 
 
-def _safe(x: Array) -> Array:
-    """Return x kept away from zero, so that its reciprocal is finite."""
+def _nonzero(x: Array) -> Array:
+    """Return x, or a tiny number where it is about zero, so that its reciprocal is finite."""
     return jnp.where(jnp.abs(x) < _TINY, _TINY, x)
 
 
 def _slab(origin: Array, speed: Array, half: Array) -> tuple[Array, Array]:
     """Return the interval in which |origin + t speed| <= half."""
-    inverse = 1.0 / _safe(speed)
+    inverse = 1.0 / _nonzero(speed)
     middle, spread = -origin * inverse, half * jnp.abs(inverse)
     return middle - spread, middle + spread
 
@@ -51,7 +55,8 @@ def _ball(square: Array, cross: Array, excess: Array) -> tuple[Array, Array]:
 
 
 def _box(solid: tuple[Array, ...], rays: Array) -> Array:
-    origin, axes, half = solid  # (B, 3), (B, 3, 3) rows are the box's axes in body, (B, 3)
+    # The camera in box axes (B, 3); the box's axes in the body frame as rows (B, 3, 3); (B, 3).
+    origin, axes, half = solid
     enter, leave = -_FAR, _FAR
     for i in range(3):
         speed = _dot(axes[:, None, i], rays)
@@ -92,11 +97,11 @@ def _capsule(solid: tuple[Array, ...], rays: Array) -> Array:
 
 
 def _triangle(solid: tuple[Array, ...], rays: Array) -> Array:
-    """Moeller & Trumbore 1997, both sides."""
-    corner, edge1, edge2 = solid  # (B, 3) each, corner relative to the eye
+    """Return the depths of hits on either side of triangles (Moeller & Trumbore 1997)."""
+    corner, edge1, edge2 = solid  # (B, 3) each, in body axes, the corner relative to the camera
     across = jnp.cross(rays, edge2[:, None])
     determinant = _dot(edge1[:, None], across)
-    inverse = 1.0 / _safe(determinant)
+    inverse = 1.0 / _nonzero(determinant)
     u = _dot(-corner[:, None], across) * inverse
     normal = jnp.cross(-corner, edge1)
     v = _dot(rays, normal[:, None]) * inverse
@@ -108,10 +113,10 @@ def _triangle(solid: tuple[Array, ...], rays: Array) -> Array:
 def _closest(
     depth: Array, cast: Callable[..., Array], solids: tuple[Array, ...], rays: Array
 ) -> Array:
-    """Lower `depth` (B, R) to the hits on solids whose arrays are (B, K, ...), one K at a time.
+    """Return the minimum of `depth` (B, R) and the depths of hits on solids (B, K, ...).
 
-    A loop over solids with all rays of all worlds inside keeps the running minimum in the cache
-    and the arithmetic in vector registers, which one (B, K, R) reduction does not on a CPU.
+    The loop goes over the K solids. It keeps the running minimum in the CPU's cache and the
+    arithmetic in vector registers, which one reduction of (B, K, R) does not.
     """
     count = solids[0].shape[1]
     if count == 0:
@@ -125,6 +130,7 @@ def _closest(
 
 
 def _rods_b(rods: Rods, pos_w: Array, rot_w: Array) -> tuple[Array, ...]:
+    """Return rods relative to the camera in body axes, for `_cylinder` and `_capsule`."""
     origin = (pos_w[:, None] - rods.center_w) @ rot_w
     return origin, rods.axis_w @ rot_w, rods.radius, rods.half_length
 
@@ -145,7 +151,7 @@ def depth_image(
         rot_w: (B, 3, 3) body to world.
         rays_b: (R, 3) from `camera.pixel_rays_b`.
         range_m: largest depth [m].
-        limits: keep only this many solids of each kind, the nearest visible ones; None keeps all,
+        limits: use only this many solids of each kind, the nearest visible ones; None uses all,
             which is exact.
     """
     if limits is not None:

@@ -1,7 +1,8 @@
-"""The attractive vector field of a gate (Su et al. 2026, Sec. III-C2).
+"""The attractive vector field of a gate, which guides a policy in training (Su et al. 2026).
 
-A gate is a closed loop of current along its opening's edge; the magnetic field threads the opening
-in flight direction. Any polygon serves; a round gate is a polygon of many edges.
+The edge of a gate's opening is taken as a closed loop of electric current (Sec. III-C2). Its
+magnetic field passes through the opening in flight direction. The opening may be any polygon; a
+round gate is a polygon of many edges.
 """
 
 from __future__ import annotations
@@ -10,16 +11,18 @@ from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array
 
 CURRENT = 2e-5
-"""C_I, as the paper has it [m]."""
+"""The paper's constant C_I, by which the field is scaled [m]."""
 _TINY = 1e-9
+_WIRE_SQUARED_M2 = 1e-12
+"""Least squared distance from the loop: at the loop itself the field is infinite [m^2]."""
 
 
 def _norm(vector: Array) -> Array:
     xp = vector.__array_namespace__()
     square = (vector * vector).sum(-1)
     # At zero the root's slope is infinite, and its gradient would be NaN.
-    some = square > 0.0
-    return xp.where(some, xp.sqrt(xp.where(some, square, 1.0)), 0.0)
+    nonzero = square > 0.0
+    return xp.where(nonzero, xp.sqrt(xp.where(nonzero, square, 1.0)), 0.0)
 
 
 def _unit(vector: Array) -> Array:
@@ -30,18 +33,18 @@ def _unit(vector: Array) -> Array:
 def magnetic_field(
     center_w: Array, rot_w: Array, opening_g: Array, point_w: Array, current: float = CURRENT
 ) -> Array:
-    """Return the field B (..., 3) at point_w in the world frame (Eq. mag_segment, mag_total).
+    """Return the field B (..., 3) at point_w in world axes: the sum over the opening's sides.
 
     The paper's "shortest vector to the wire segment" is taken as the perpendicular to the line
-    through it: only then does the sum satisfy Biot and Savart and have no divergence.
+    through the segment. Only then does the sum satisfy the Biot-Savart law and have no divergence.
 
     Args:
         center_w: (..., 3) opening's centre [m].
         rot_w: (..., 3, 3) gate to world.
-        opening_g: (..., V, 2) corners (y, z), counter-clockwise seen along -x; repeated corners
+        opening_g: (..., V, 2) corners (y, z), counter-clockwise seen along -x [m]; repeated corners
             add nothing.
         point_w: (..., 3) [m].
-        current: C_I; the field scales with it [m].
+        current: the paper's C_I, by which the field is scaled [m].
     """
     xp = point_w.__array_namespace__()
     point_g = to_local(rot_w, point_w - center_w)
@@ -51,8 +54,7 @@ def magnetic_field(
     unit = _unit(end - start)
     ends = _unit(start) - _unit(end)
     perpendicular = start - (start * unit).sum(-1)[..., None] * unit
-    # On the wire itself the field is undefined; a distance of a micrometre keeps it finite.
-    square = xp.maximum((perpendicular * perpendicular).sum(-1), 1e-12)
+    square = xp.maximum((perpendicular * perpendicular).sum(-1), _WIRE_SQUARED_M2)
     strength = current * (unit * ends).sum(-1) / square
     field_g = (strength[..., None] * xp.linalg.cross(unit, perpendicular)).sum(-2)
     return to_world(rot_w, field_g)
@@ -61,13 +63,16 @@ def magnetic_field(
 def attractive_field(
     field_w: Array, vel_w: Array, decay: float = 0.3, epsilon: float = 1e-5
 ) -> Array:
-    """Return u_A (..., 3) from the magnetic field and the velocity (Eq. u_a_cal).
+    """Return the attractive field u_A (..., 3) in world axes (Su et al. 2026, Sec. III-C2).
+
+    It has the direction of B. Its magnitude is 0 where the velocity is aligned with B, and largest
+    where it is opposite.
 
     Args:
-        field_w: (..., 3) from `magnetic_field`.
-        vel_w: (..., 3) [m/s].
-        decay: lambda_A in (0, 1): how far |B| is flattened.
-        epsilon: keeps the alignment finite at rest.
+        field_w: (..., 3) B from `magnetic_field`.
+        vel_w: (..., 3) velocity [m/s].
+        decay: lambda_A in (0, 1): |B| is raised to the power 1 - decay.
+        epsilon: added to the denominator of the alignment, which is 0 at rest.
     """
     xp = field_w.__array_namespace__()
     size = _norm(field_w)

@@ -1,4 +1,8 @@
-"""Gates: openings as convex polygons, and their frames with one box for each side."""
+"""Make gates: openings as convex polygons, and their frames with one box for each side.
+
+G gates have V corners each. A gate's frame of reference has x in flight direction; the opening lies
+in its y-z plane.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +33,7 @@ def regular_polygon(corners: int, radius: float) -> np.ndarray:
 
     Args:
         corners: number of corners, at least 3; the first side is level and at the bottom.
-        radius: of the inscribed circle [m], so that a circular gate's clear width is kept.
+        radius: radius of the inscribed circle, that is, the clear width of a round gate [m].
     """
     angle = 2 * np.pi * (np.arange(corners) - 0.5) / corners - np.pi / 2
     circumradius = radius / np.cos(np.pi / corners)
@@ -59,7 +63,8 @@ def frame_boxes(gates: Gates) -> Boxes:
     """Return the frames' bars, one box for each side of an opening, gate by gate, (G * V) boxes.
 
     A bar lies outside its side of the opening and is lengthened so that neighbours close the
-    corner between them. Where corners repeat (openings padded to V corners), the bar is parked.
+    corner between them. Where corners repeat (openings padded to V corners), the bar is parked far
+    below the ground.
     """
     corner = np.asarray(gates.opening_g, float)
     side = np.roll(corner, -1, axis=-2) - corner
@@ -69,6 +74,7 @@ def frame_boxes(gates: Gates) -> Boxes:
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     width = np.asarray(gates.frame_width, float)[:, None]
     end, start = _corner_extensions(along, real, width)
+    # A bar's centre (y, z): half of its length along the side, half of its width outwards.
     middle = (
         corner + along * ((length + end - start) / 2)[..., None] + outward * width[..., None] / 2
     )
@@ -98,20 +104,28 @@ def _corner_extensions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the extensions of each bar at its end and at its start, (G, V) each [m].
 
-    `width * tan(turn / 2)` brings the outer edges of neighbours together; sharper corners than a
-    right angle are capped at one width, so that no spike sticks out.
+    `width * tan(turn / 2)` brings the outer edges of neighbours together. The factor is at most 1
+    (reached at a right angle), so that sharp corners have no spikes.
+
+    Args:
+        along: (G, V, 2) unit vectors along the sides.
+        real: (G, V) whether a side has a length, which a repeated corner has not.
+        width: (G, 1) widths of the bars [m].
     """
-    gates, corners = real.shape
-    end = np.zeros((gates, corners))
-    start = np.zeros((gates, corners))
+
+    def tan_half_turn(side: np.ndarray, next_side: np.ndarray) -> np.ndarray:
+        cosine = np.sum(side * next_side, axis=-1)
+        return np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
+
     if real.all():
-        cosine = np.sum(along * np.roll(along, -1, axis=1), axis=-1)
-        end = width * np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
+        end = width * tan_half_turn(along, np.roll(along, -1, axis=1))
         return end, np.roll(end, 1, axis=1)
-    for gate in range(gates):
+    end, start = np.zeros(real.shape), np.zeros(real.shape)
+    for gate in range(len(real)):
         sides = np.flatnonzero(real[gate])
-        cosine = np.sum(along[gate, sides] * along[gate, np.roll(sides, -1)], axis=-1)
-        ratio = np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
-        end[gate, sides] = width[gate, 0] * ratio
-        start[gate, np.roll(sides, -1)] = end[gate, sides]
+        next_sides = np.roll(sides, -1)
+        end[gate, sides] = width[gate, 0] * tan_half_turn(
+            along[gate, sides], along[gate, next_sides]
+        )
+        start[gate, next_sides] = end[gate, sides]
     return end, start

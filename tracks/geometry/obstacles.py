@@ -1,7 +1,8 @@
-"""Random obstacles: plates, small solids, pillars and objects on the ground.
+"""Place random obstacles on a track: plates, small solids, pillars and objects on the ground.
 
-Sizes are the baseline's (Yu et al. 2025). Kinds of solids are distributed evenly over a track (by
-permutation instead of independent draws), which bounds the number of each kind.
+Sizes are the baseline's (Yu et al. 2025). A stretch is the part of a track between two successive
+gates. Kinds of solids (box, cylinder, ...) are distributed evenly over a track, by permutation
+instead of independent draws, which bounds the number of each kind.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ from tracks.geometry.scene import Boxes, Gates, Rods, Spheres
 BOX, CYLINDER, CAPSULE, SPHERE = range(4)
 KIND_NAMES = ("box", "cylinder", "capsule", "sphere")
 GATE_DISTANCE_M = 1.5
-"""Least level distance of an obstacle's centre from a gate's centre [m]."""
+"""Least horizontal distance of an obstacle's centre from a gate's centre [m]."""
 CORRIDOR_HALF_LENGTH_M = 1.5
 """Distance before and behind a gate over which its axis is kept free [m]."""
 CORRIDOR_CLEARANCE_M = 0.4
-"""Least level distance between an obstacle and a gate's axis [m]."""
+"""Least horizontal distance between an obstacle and a gate's axis [m]."""
 START_CLEARANCE_M = 0.6
-"""Least level distance between an obstacle and the line from the start to gate 0 [m]."""
+"""Least horizontal distance between an obstacle and the line from the start to gate 0 [m]."""
 _TRIES = 24
+"""Positions that are drawn for an obstacle before it is left out."""
 
 Site = Callable[[np.random.Generator, np.ndarray], np.ndarray]
-"""Draws level positions (n, 2) for obstacles of the given stretches (n,)."""
+"""A function that draws horizontal positions (n, 2) [m] of n obstacles on given stretches (n,)."""
 
 
 class PerStretch(NamedTuple):
@@ -48,11 +50,11 @@ class KeepClear(NamedTuple):
     """Horizontal lines that obstacles must avoid, and the gates' centres."""
 
     begin: np.ndarray
-    """(K, 2) [m]."""
+    """(K, 2) first ends of the lines [m]."""
     end: np.ndarray
-    """(K, 2) [m]."""
+    """(K, 2) their other ends [m]."""
     clearance_m: np.ndarray
-    """(K,) between a line and an obstacle's surface."""
+    """(K,) least distances between a line and an obstacle's surface."""
     center: np.ndarray
     """(G, 2) gate centres [m]."""
 
@@ -69,7 +71,12 @@ class Obstacles(NamedTuple):
 
 
 def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
-    """Return the lines to keep free: each gate's axis, and the line from the start to gate 0."""
+    """Return the lines to keep free: each gate's axis, and the line from the start to gate 0.
+
+    Args:
+        gates: G gates.
+        start_pos_w: (3,) [m].
+    """
     center = gates.center_w[:, :2]
     reach = CORRIDOR_HALF_LENGTH_M * gates.rot_w[:, :2, 0]
     clearance = np.full(len(center) + 1, CORRIDOR_CLEARANCE_M)
@@ -83,35 +90,35 @@ def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
 
 
 def segment_distance(point: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return distances from points to line segments, any dimension D on the last axis.
+    """Return the distances (...) from points to line segments of D dimensions [m].
 
     Args:
         point: (..., D) [m].
         begin: (..., D) [m], broadcast against `point`.
         end: (..., D) [m], broadcast against `point`.
     """
-    way = end - begin
-    share = np.sum((point - begin) * way, -1) / np.maximum(np.sum(way * way, -1), 1e-12)
-    nearest = begin + np.clip(share, 0.0, 1.0)[..., None] * way
+    along = end - begin
+    share = np.sum((point - begin) * along, -1) / np.maximum(np.sum(along * along, -1), 1e-12)
+    nearest = begin + np.clip(share, 0.0, 1.0)[..., None] * along
     return np.sqrt(np.sum((point - nearest) ** 2, -1))
 
 
 def straight_sites(gates: Gates, first: np.ndarray, offset_m: float) -> Site:
-    """Return a site within `offset_m` of the line from gate `first[s]` to the next.
+    """Return a `Site` that draws positions within `offset_m` of the lines between gates.
 
     Args:
         gates: the gates in flight order; the last is followed by gate 0.
-        first: (S,) index of the gate that each stretch leaves.
-        offset_m: largest level distance from the line [m].
+        first: (S,) number of the gate at which each stretch begins.
+        offset_m: largest horizontal distance from the line [m].
     """
     begin = gates.center_w[first, :2]
-    way = gates.center_w[(first + 1) % len(gates.center_w), :2] - begin
-    side = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=-1)[:, None]
+    along = gates.center_w[(first + 1) % len(gates.center_w), :2] - begin
+    side = np.stack([-along[:, 1], along[:, 0]], -1) / np.linalg.norm(along, axis=-1)[:, None]
 
     def site(rng: np.random.Generator, stretch: np.ndarray) -> np.ndarray:
         share = rng.random((len(stretch), 2))
         offset = offset_m * (2 * share[:, 1:] - 1)
-        return begin[stretch] + share[:, :1] * way[stretch] + offset * side[stretch]
+        return begin[stretch] + share[:, :1] * along[stretch] + offset * side[stretch]
 
     return site
 
@@ -121,7 +128,13 @@ def scatter(
 ) -> Obstacles:
     """Return random obstacles that keep the lines of `clear` free.
 
-    An obstacle without a free place after 24 draws is left out.
+    An obstacle for which no free position is found is left out.
+
+    Args:
+        rng: random generator.
+        per_stretch: numbers of obstacles on each stretch.
+        site: draws their positions.
+        clear: lines to keep free.
     """
     numbers = [int(n.sum()) for n in per_stretch]
     plates, small, pillars, ground = numbers
@@ -136,8 +149,8 @@ def scatter(
         ]
     )
     in_air = np.arange(total) < plates + small
-    standing = ~in_air
-    is_pillar = standing & (np.arange(total) < plates + small + pillars)
+    on_ground = ~in_air
+    is_pillar = on_ground & (np.arange(total) < plates + small + pillars)
 
     # `size` is a box's half sizes; for the other kinds (radius, unused, half length).
     size = rng.uniform(0.1, 0.3, (total, 3))
@@ -150,21 +163,19 @@ def scatter(
 
     rot_w = yaw_rotation(rng.uniform(-np.pi, np.pi, total))
     rot_w[in_air] = _random_rotations(rng, plates + small)
-    lying = (kind == CAPSULE) & standing
+    # A capsule on the ground lies: its axis (the third column) becomes horizontal.
+    lying = (kind == CAPSULE) & on_ground
     rot_w[lying] = rot_w[lying][:, :, [1, 2, 0]]
 
     height = rng.uniform(0.5, 3.0, total)
-    round_low = (kind == SPHERE) | (kind == CAPSULE)
-    height[standing] = np.where(round_low, size[:, 0], size[:, 2])[standing]
+    rests_on_radius = (kind == SPHERE) | (kind == CAPSULE)
+    height[on_ground] = np.where(rests_on_radius, size[:, 0], size[:, 2])[on_ground]
 
-    xy, kept = _place(rng, stretch, _level_radius(kind, size, is_pillar), site, clear)
+    xy, placed = _place(rng, stretch, _horizontal_radius(kind, size, is_pillar), site, clear)
     center_w = np.concatenate([xy, height[:, None]], axis=-1)
     labels = _labels(numbers, kind)
-
-    def of(wanted: int) -> np.ndarray:
-        return np.flatnonzero(kept & (kind == wanted))
-
-    b, c, p, s = (of(wanted) for wanted in range(4))
+    # Indices of the placed boxes, cylinders, capsules and spheres.
+    b, c, p, s = (np.flatnonzero(placed & (kind == each)) for each in range(4))
     return Obstacles(
         Boxes(center_w[b], rot_w[b], size[b]),
         Rods(center_w[c], rot_w[c][:, :, 2], size[c, 0], size[c, 2]),
@@ -175,6 +186,7 @@ def scatter(
 
 
 def _labels(numbers: list[int], kind: np.ndarray) -> list[str]:
+    """Return the obstacles' names, such as "small sphere 2", from their numbers and kinds."""
     plates, small, pillars, ground = numbers
     names = [KIND_NAMES[k] for k in kind[plates:]]
     return [
@@ -185,8 +197,8 @@ def _labels(numbers: list[int], kind: np.ndarray) -> list[str]:
     ]
 
 
-def _level_radius(kind: np.ndarray, size: np.ndarray, is_pillar: np.ndarray) -> np.ndarray:
-    """Return the largest horizontal reach of each obstacle from its centre, (n,) [m]."""
+def _horizontal_radius(kind: np.ndarray, size: np.ndarray, is_pillar: np.ndarray) -> np.ndarray:
+    """Return each obstacle's largest horizontal extent from its centre, (n,) [m]."""
     across = np.where(kind == BOX, np.hypot(size[:, 0], size[:, 1]), size[:, 0])
     bounding = np.hypot(across, size[:, 2])
     bounding = np.where(kind == CAPSULE, size[:, 0] + size[:, 2], bounding)
@@ -197,20 +209,21 @@ def _level_radius(kind: np.ndarray, size: np.ndarray, is_pillar: np.ndarray) -> 
 def _place(
     rng: np.random.Generator, stretch: np.ndarray, radius: np.ndarray, site: Site, clear: KeepClear
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return horizontal positions (n, 2) [m], and whether a free one was found (n,)."""
     xy = np.zeros((len(stretch), 2))
-    todo = np.arange(len(stretch))
+    pending = np.arange(len(stretch))
     for _ in range(_TRIES):
-        if not len(todo):
+        if not len(pending):
             break
-        xy[todo] = site(rng, stretch[todo])
-        point = xy[todo, None]
+        xy[pending] = site(rng, stretch[pending])
+        point = xy[pending, None]
         distance = segment_distance(point, clear.begin, clear.end)
-        blocks = np.any(distance < clear.clearance_m + radius[todo, None], axis=-1)
-        gap = np.sum((point - clear.center) ** 2, axis=-1)
-        todo = todo[blocks | np.any(gap < GATE_DISTANCE_M**2, axis=-1)]
-    kept = np.ones(len(stretch), bool)
-    kept[todo] = False
-    return xy, kept
+        blocks_line = np.any(distance < clear.clearance_m + radius[pending, None], axis=-1)
+        squared = np.sum((point - clear.center) ** 2, axis=-1)
+        pending = pending[blocks_line | np.any(squared < GATE_DISTANCE_M**2, axis=-1)]
+    placed = np.ones(len(stretch), bool)
+    placed[pending] = False
+    return xy, placed
 
 
 def _random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Rotations: vectors, quaternions, matrices and the exponential map (numpy and JAX).
+"""Rotate vectors, and convert quaternions, matrices and rotation vectors (numpy and JAX).
 
-Products are written out and summed over the last axes. A matrix product may round a row differently
-for another batch size, and a trial's outcome must not depend on other trials.
+Products are written out as sums over the last axes. A matrix product may round a row differently in
+another batch size, and the outcome of a trial (one judged flight) must not depend on other trials.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def to_local(rot_w: Array, vector_w: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a x b (..., 3); numpy's own is several times slower on small arrays."""
+    """Return a x b (..., 3); `numpy.cross` is several times slower on small arrays."""
     xp = a.__array_namespace__()
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
@@ -82,7 +82,7 @@ def exp_rot(vector: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues)."""
     xp = vector.__array_namespace__()
     squared = xp.sum(vector**2, axis=-1)[..., None, None]
-    # Below this the series is exact to rounding, and the root has no finite slope at zero.
+    # For small angles the series is exact to rounding; the root has an infinite slope at zero.
     small = squared < 1e-8
     angle = xp.sqrt(xp.where(small, 1.0, squared))
     first = xp.where(small, 1.0 - squared / 6.0, xp.sin(angle) / angle)

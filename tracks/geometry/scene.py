@@ -1,7 +1,8 @@
 """A scene as plain arrays: the gates in flight order, and all solids; the ground is z = 0.
 
-The classes are named tuples, so they are immutable, and pytrees for JAX without importing it.
-All positions are in the world frame (z up) in metres; rotation matrices map local to world.
+The classes are named tuples: immutable, and accepted by JAX as pytrees without importing it. All
+positions are in the world frame (z up) in metres; rotation matrices map local to world. Solids are
+padded by parked ones, far below the ground, so that scenes of different size can be stacked.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Gates(NamedTuple):
     """(G, 3, 3) gate to world; column 0 is the flight direction."""
     opening_g: Array
     """(G, V, 2) corners (y, z) of the convex opening [m], counter-clockwise in the y-z plane
-    (y to z), which is how the flying drone's field of currents threads it along +x. Openings
-    with fewer corners repeat the last one."""
+    (from y to z), so that the attractive field passes through it along +x. Openings with fewer
+    corners repeat the last one."""
     frame_width: Array
     """(G,) width of the frame's bars around the opening [m]."""
     frame_depth: Array
@@ -49,7 +50,7 @@ class Boxes(NamedTuple):
 
 
 class Rods(NamedTuple):
-    """Cylinders (flat ends) or capsules (round ends); the field of the scene decides."""
+    """Cylinders (flat ends) or capsules (round ends), depending on the field of `Scene`."""
 
     center_w: Array
     """(N, 3) [m]."""
@@ -58,7 +59,7 @@ class Rods(NamedTuple):
     radius: Array
     """(N,) [m]."""
     half_length: Array
-    """(N,) half of the straight part, a capsule's caps not counted [m]."""
+    """(N,) half lengths of the straight part, without a capsule's caps [m]."""
 
 
 class Spheres(NamedTuple):
@@ -75,7 +76,7 @@ class Scene(NamedTuple):
 
     gates: Gates
     boxes: Boxes
-    """Gate frame bars come first (V a gate, gate by gate), then the obstacles."""
+    """The bars of the gates' frames (V for each gate, gate by gate), then the obstacles."""
     cylinders: Rods
     capsules: Rods
     spheres: Spheres
@@ -129,24 +130,24 @@ def pad(scene: Scene, to: Counts) -> Scene:
     Raises:
         ValueError: where the scene has more than `to` of a kind, naming both numbers.
     """
-    have = counts(scene)
-    for kind, n, limit in zip(Counts._fields, have, to, strict=True):
+    present = counts(scene)
+    for kind, n, limit in zip(Counts._fields, present, to, strict=True):
         if n > limit:
             raise ValueError(
                 f"scene has {n} {kind}, more than the {limit} it is padded to; pad to more"
             )
-    more = to.boxes - have.boxes
+    more = to.boxes - present.boxes
     boxes = Boxes(
         np.concatenate([scene.boxes.center_w, _parked(more)]),
         np.concatenate([scene.boxes.rot_w, np.tile(np.eye(3), (more, 1, 1))]),
         np.concatenate([scene.boxes.half_size, np.full((more, 3), 1e-3)]),
     )
-    more = to.spheres - have.spheres
+    more = to.spheres - present.spheres
     spheres = Spheres(
         np.concatenate([scene.spheres.center_w, _parked(more)]),
         np.concatenate([scene.spheres.radius, np.full(more, 1e-3)]),
     )
-    more = to.triangles - have.triangles
+    more = to.triangles - present.triangles
     corner = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]]) + _parked(1)
     triangles = np.concatenate([scene.triangles, np.tile(corner, (more, 1, 1))])
     return Scene(

@@ -1,10 +1,10 @@
-"""Planar depth images of many cameras at once (numpy): equal to MuJoCo's ray casting, but faster.
+"""Render planar depth images of many cameras at once (numpy), faster than MuJoCo's ray casting.
 
-The image is divided into tiles of a few rays, and a ray is tested only against the solids visible
-in its tile. The planes between tiles pass through the camera, so the extent of a solid along their
-normals gives its tiles. Depths agree with MuJoCo's to rounding (1e-9 m), except for rays that graze
-an edge. All operations are elementwise in double precision, so an image depends only on its own
-camera and scene.
+Planar depth is the distance along the optical axis. The image is divided into tiles of a few rays,
+and a ray is tested only against the solids visible in its tile. The planes between tiles pass
+through the camera, so the extent of a solid along their normals gives its tiles. Depths agree with
+MuJoCo's to rounding (1e-9 m), except for rays that graze an edge. All operations are elementwise in
+double precision, so an image depends only on its own camera and scene.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Boxes, Rods, Scene
 
 TILE = 6
-"""Most rays across and down a tile; a pixel with more rays is a tile of its own."""
+"""Most rays across and down a tile; a pixel with more rays is one tile."""
 PAIRS_AT_ONCE = 1024
-"""Most pairs of solid and tile that are processed together, so that they fit the CPU cache."""
+"""Most pairs of solid and tile that are processed together, so that they fit the CPU's cache."""
 RAYS_AT_ONCE = 1 << 20
 """Most rays of the images that are processed together, to limit memory."""
 _TINY, _FAR = 1e-200, 1e290
-"""Offset that avoids division by zero, and a depth larger than any other."""
+"""Offset that avoids division by zero, and the depth of a ray without a hit [m]."""
 
 
 class Tiles(NamedTuple):
@@ -104,31 +104,33 @@ def depth_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
 
 
 def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+    """Return the images of `depth_images` of so few cameras that they fit the memory limit."""
     camera, side = tiles.camera, len(tiles.up)
     rows, columns = tiles.up.shape[1], tiles.left.shape[1]
-    # Axes of each camera in the world, (N, 3, 3); why no matmul: `tracks.geometry.rotation`.
+    # Axes of each camera in the world, (N, 3, 3); `tracks.geometry.rotation` says why no matmul.
     axes_w = (rot_w[:, :, :, None] * tiles.axes_b).sum(-2)
     depth = np.full((len(pos_w) * rows * columns, side * side), camera.range_m)
     for (name, ball), cast in zip(bounds(scene), (_box, _cylinder, _capsule, _sphere), strict=True):
         frame, number, rank = _in_view(tiles, ball, pos_w, axes_w)
         solids = take(getattr(scene, name), (frame, number))
         shape = _shape(solids, pos_w[frame], axes_w[frame])
-        across, down = _tiles_met(tiles, shape, flat=name == "cylinders")
-        which, row, column = np.nonzero(down[:, :, None] & across[:, None, :])
-        tile = (frame[which] * rows + row) * columns + column
+        in_column, in_row = _overlapped_tiles(tiles, shape, flat=name == "cylinders")
+        # Pairs of a solid (an index of `shape`) and a tile.
+        solid, row, column = np.nonzero(in_row[:, :, None] & in_column[:, None, :])
+        tile = (frame[solid] * rows + row) * columns + column
         # Solids of one rank belong to different images, so a tile occurs once between two stops.
-        stops = np.flatnonzero(np.diff(rank[which], append=-1)) + 1
-        for low in range(0, len(which), PAIRS_AT_ONCE):
-            high = min(low + PAIRS_AT_ONCE, len(which))
+        stops = np.flatnonzero(np.diff(rank[solid], append=-1)) + 1
+        for low in range(0, len(solid), PAIRS_AT_ONCE):
+            high = min(low + PAIRS_AT_ONCE, len(solid))
             pairs = slice(low, high)
-            found = _first(
-                *cast(shape.take(which[pairs]), *_products(tiles, row[pairs], column[pairs]))
+            hit = _first_hit(
+                *cast(shape.take(solid[pairs]), *_products(tiles, row[pairs], column[pairs]))
             )
-            found = np.ascontiguousarray(found.reshape(side * side, -1).T)
+            hit = np.ascontiguousarray(hit.reshape(side * side, -1).T)
             inner = stops[(stops > low) & (stops < high)].tolist()
             for start, end in zip([low, *inner], [*inner, high], strict=True):
-                met = tile[start:end]
-                depth[met] = np.minimum(depth.take(met, axis=0), found[start - low : end - low])
+                part = tile[start:end]
+                depth[part] = np.minimum(depth.take(part, axis=0), hit[start - low : end - low])
     depth = depth.reshape(len(pos_w), rows, columns, side, side).transpose(0, 1, 3, 2, 4)
     depth = depth.reshape(len(pos_w), rows * side, columns * side)
     np.minimum(depth, _ground(tiles, pos_w, axes_w), out=depth)
@@ -150,19 +152,19 @@ def _ground(tiles: Tiles, pos_w: np.ndarray, axes_w: np.ndarray) -> np.ndarray:
 def _in_view(
     tiles: Tiles, ball: Bounds, pos_w: np.ndarray, axes_w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return image, number and rank (V,) of the solids whose bounding `ball` is in view.
+    """Return image, number and rank, (V,) each, of the solids whose bounding sphere is in view.
 
     The rank counts the visible solids of an image from 0; the arrays are sorted by rank.
     """
     away = ball.center_w - pos_w[:, None]
     depth, left, up = np.moveaxis(to_local(axes_w[:, None], away), -1, 0)
     radius = ball.radius
-    seen = (depth + radius > 0) & (depth - radius < tiles.camera.range_m)
+    visible = (depth + radius > 0) & (depth - radius < tiles.camera.range_m)
     for offset, edges in ((left, tiles.left_edges), (up, tiles.up_edges)):
         most, least = edges[0], edges[-1]
-        seen &= offset - most * depth < radius * np.sqrt(1 + most * most)
-        seen &= offset - least * depth > -radius * np.sqrt(1 + least * least)
-    frame, number = np.nonzero(seen)
+        visible &= offset - most * depth < radius * np.sqrt(1 + most * most)
+        visible &= offset - least * depth > -radius * np.sqrt(1 + least * least)
+    frame, number = np.nonzero(visible)
     rank = np.arange(len(frame)) - np.searchsorted(frame, frame)
     order = np.argsort(rank, kind="stable")
     return frame[order], number[order], rank[order]
@@ -171,24 +173,24 @@ def _in_view(
 def _shape(solids: Any, pos_w: np.ndarray, axes_w: np.ndarray) -> _Shape:
     """Return V solids in the axes (V, 3, 3) of the cameras at pos_w (V, 3)."""
 
-    def turned(vector_w: np.ndarray) -> np.ndarray:
+    def to_camera(vector_w: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(to_local(axes_w, vector_w).T)
 
-    center = turned(solids.center_w - pos_w)
+    center = to_camera(solids.center_w - pos_w)
     if isinstance(solids, Boxes):
-        axes = tuple(turned(solids.rot_w[:, :, i]) for i in range(3))
+        axes = tuple(to_camera(solids.rot_w[:, :, i]) for i in range(3))
         return _Shape(center, axes, tuple(solids.half_size.T), np.zeros(len(pos_w)))
     if isinstance(solids, Rods):
-        return _Shape(center, (turned(solids.axis_w),), (solids.half_length,), solids.radius)
+        return _Shape(center, (to_camera(solids.axis_w),), (solids.half_length,), solids.radius)
     return _Shape(center, (), (), solids.radius)
 
 
-def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return which columns (V, columns) and rows (V, rows) of tiles each solid reaches.
+def _overlapped_tiles(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return which columns (V, columns) and rows (V, rows) of tiles each solid overlaps.
 
-    `flat` solids are cylinders: their ends are flat, so the radius acts only across the axis.
+    `flat` is true for cylinders: their ends are flat, so the radius acts only across the axis.
     """
-    met = []
+    overlaps = []
     for side, edges in ((1, tiles.left_edges), (2, tiles.up_edges)):
 
         def along(vector: np.ndarray, side: int = side, edges: np.ndarray = edges) -> np.ndarray:
@@ -203,8 +205,8 @@ def _tiles_met(tiles: Tiles, shape: _Shape, flat: bool) -> tuple[np.ndarray, np.
         for axis, half in zip(shape.axes, shape.halves, strict=True):
             reach = reach + np.abs(along(axis)) * half[:, None]
         middle = along(shape.center)
-        met.append((middle - reach <= 0)[:, :-1] & (middle + reach >= 0)[:, 1:])
-    return met[0], met[1]
+        overlaps.append((middle - reach <= 0)[:, :-1] & (middle + reach >= 0)[:, 1:])
+    return overlaps[0], overlaps[1]
 
 
 def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear, np.ndarray]:
@@ -218,7 +220,7 @@ def _products(tiles: Tiles, row: np.ndarray, column: np.ndarray) -> tuple[Linear
     return linear, (1 + left * left) + (up * up)[:, None]
 
 
-def _first(enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
+def _first_hit(enter: np.ndarray, leave: np.ndarray) -> np.ndarray:
     """Return the depth of the first hit: 0 from inside a solid, `_FAR` or more without a hit."""
     missed = enter > leave
     missed |= leave <= 0
@@ -230,7 +232,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _slab(center: np.ndarray, half: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval in which |t rate - center| <= half."""
+    """Return the interval of t in which |t rate - center| <= half; overwrites `rate`."""
     rate += _TINY
     inverse = np.divide(1.0, rate, out=rate)
     middle = center * inverse
@@ -242,7 +244,7 @@ def _slab(center: np.ndarray, half: np.ndarray, rate: np.ndarray) -> tuple[np.nd
 def _ball(
     square: np.ndarray, half: np.ndarray, excess: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval in which square t^2 - 2 half t + excess <= 0; reversed if empty."""
+    """Return the interval of t in which square t^2 - 2 half t + excess <= 0; reversed if empty."""
     discriminant = half * half
     discriminant -= square * excess
     missed = (discriminant < 0) * _FAR
@@ -276,7 +278,7 @@ def _cylinder(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.nda
 
 
 def _capsule(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join a cylinder and two spheres, which overlap: from the first entry to the last exit."""
+    """Return the union of a cylinder and two spheres: from the first entry to the last exit."""
     (axis,), (half,) = shape.axes, shape.halves
     parts = [_cylinder(shape, linear, square)]
     parts += [

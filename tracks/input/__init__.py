@@ -1,1 +1,1 @@
-"""Ranges of settings, and safe readers of untrusted files."""
+"""Allowed ranges of settings, and safe readers of untrusted JSON and TOML files."""

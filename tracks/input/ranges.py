@@ -1,11 +1,11 @@
-"""Ranges of settings, declared in each field's annotation and checked in one call.
+"""Declare the allowed range of each setting in its annotation, and check a whole configuration.
 
-A field of a configuration has its range in its annotation:
+A field of a configuration dataclass has its range in its annotation:
 
     rate: Annotated[float, Range(0.0, 10.0)] = 2e-3
 
-`check_ranges` checks a dataclass and all nested dataclasses. If an annotation has its own name (as
-an option of the command line may have), messages use that name.
+`check_ranges` checks a dataclass and all nested dataclasses. If an annotation contains a name (that
+of a command line option, for example), messages use that name instead of the field's.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 @dataclass(frozen=True)
 class Range:
-    """Allowed numbers; for a tuple, of each of its numbers."""
+    """The allowed interval of a number, or of each number of a tuple."""
 
     low: float
-    """Lower bound, itself allowed unless `above`."""
+    """Lower bound; it is allowed unless `above` is true."""
     high: float
-    """Upper bound, itself allowed unless `below`; infinity is allowed only if this is infinite."""
+    """Upper bound; it is allowed unless `below` is true. If it is infinite, infinity is allowed."""
     above: bool = False
-    """Whether `low` itself is refused."""
+    """Whether values must be greater than `low`."""
     below: bool = False
-    """Whether `high` itself is refused."""
+    """Whether values must be less than `high`."""
     ordered: bool = False
     """Whether a tuple's numbers must not decrease, as in a range from low to high."""
 
     def holds(self, value: float) -> bool:
-        """Return whether `value` is allowed; NaN never is."""
-        over = self.low < value if self.above else self.low <= value
-        return over and (value < self.high if self.below else value <= self.high)
+        """Return whether `value` is allowed; NaN is not."""
+        above_low = self.low < value if self.above else self.low <= value
+        return above_low and (value < self.high if self.below else value <= self.high)
 
     def __str__(self) -> str:
         first = f"above {_number(self.low)}" if self.above else _number(self.low)
@@ -47,7 +47,7 @@ class Range:
 
 SEED_MOST = 2**32 - 1
 Seed = Annotated[int, Range(0, SEED_MOST)]
-"""A seed."""
+"""A seed of a random generator."""
 Share = Annotated[float, Range(0.0, 1.0)]
 """A fraction from 0 to 1."""
 Iterations = Annotated[int, Range(1, 10**9)]
@@ -62,7 +62,8 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
     Args:
         config: a dataclass; nested dataclasses are checked as well.
         where: prefix of a field's path in the message.
-        options: fields are options of the command line, `deadline_s` being `--deadline-s`.
+        options: whether messages name fields as command line options (`--deadline-s` for
+            `deadline_s`).
 
     Raises:
         ValueError: naming the field, its value and what is allowed.
@@ -78,12 +79,12 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
 
 def ranged(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Range]]:
     """Yield (path, value, range) of every number with a range, also in nested dataclasses."""
-    for name, called, allowed in _fields(type(config)):
+    for name, display_name, allowed in _fields(type(config)):
         value = getattr(config, name)
         if dataclasses.is_dataclass(value):
-            yield from ranged(value, (*path, called))
+            yield from ranged(value, (*path, display_name))
         elif allowed is not None and value is not None:
-            yield (*path, called), value, allowed
+            yield (*path, display_name), value, allowed
 
 
 def is_finite(value: float) -> bool:
@@ -103,7 +104,7 @@ def shown(value: object) -> str:
     """Return a value for a message; a long one is shortened."""
     try:
         text = repr(value)
-    except ValueError:  # Python prints no number of more than 4300 digits
+    except ValueError:  # Python refuses to print numbers of more than 4300 digits
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:40]}… ({len(text)} characters)"
 
@@ -112,21 +113,21 @@ def shown(value: object) -> str:
 def _fields(cls: type) -> tuple[tuple[str, str, Range | None], ...]:
     """Return (name, name in messages, range) of the fields of a dataclass."""
     hints = get_type_hints(cls, include_extras=True)
-    found = []
+    fields = []
     for field in dataclasses.fields(cls):
-        notes = list(_notes(hints[field.name]))
-        allowed = next((note for note in notes if isinstance(note, Range)), None)
-        names = (getattr(note, "name", None) for note in notes)
-        called = next((name for name in names if isinstance(name, str)), field.name)
-        found.append((field.name, called, allowed))
-    return tuple(found)
+        metadata = list(_metadata(hints[field.name]))
+        allowed = next((entry for entry in metadata if isinstance(entry, Range)), None)
+        names = (getattr(entry, "name", None) for entry in metadata)
+        display_name = next((name for name in names if isinstance(name, str)), field.name)
+        fields.append((field.name, display_name, allowed))
+    return tuple(fields)
 
 
-def _notes(hint: Any) -> Iterator[Any]:
-    """Yield all annotations of a type and of its parts."""
+def _metadata(hint: Any) -> Iterator[Any]:
+    """Yield the `Annotated` metadata of a type and of its parts."""
     yield from getattr(hint, "__metadata__", ())
     for part in get_args(hint):
-        yield from _notes(part)
+        yield from _metadata(part)
 
 
 def _number(value: float) -> str:

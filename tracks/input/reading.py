@@ -1,7 +1,7 @@
-"""Safe readers of untrusted files: kind and size are checked before JSON or TOML is parsed.
+"""Read untrusted files safely: kind and size are checked before JSON or TOML is parsed.
 
-These raise an `InputError` that names the file: a pipe or device, which may never end; a file that
-would fill the memory; numbers with thousands of digits; and tables that are nested too deeply.
+The readers raise an `InputError` that names the file for: a pipe or device, which may never end; a
+file that would fill the memory; a number with thousands of digits; tables nested too deeply.
 """
 
 from __future__ import annotations
@@ -26,23 +26,22 @@ MESH_BYTES = 256 * 2**20
 DEPTH = 64
 """Deepest nesting of tables and lists in a JSON or TOML file."""
 
-_KINDS = {
+_FILE_TYPES = {
     stat.S_IFIFO: "a named pipe",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
     stat.S_IFDIR: "a folder",
 }
-
-
-_OTHER_KINDS = {
+"""Files that are not regular, with their names in messages."""
+_WRONG_FORMATS = {
     b"\x1f\x8b": "compressed by gzip; unpack it",
     b"pk\3\4": "a zip archive or an Excel workbook; unpack it, or save it as CSV in UTF-8",
     b"version https://git-lfs": "a pointer of Git LFS, not the file itself; run git lfs pull",
     b"<!doctype html": "a web page; download the file itself",
     b"<html": "a web page; download the file itself",
 }
-"""First bytes, in small letters, of what is given for a table or a log by mistake."""
+"""First bytes, in small letters, of files that people pass by mistake, and what to do instead."""
 
 
 class InputError(ValueError):
@@ -85,7 +84,7 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
     """Return the object of a JSON file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         keys: required keys, with the types of their values.
 
     Raises:
@@ -94,7 +93,7 @@ def read_json(path: str | os.PathLike[str], **keys: type) -> dict[str, Any]:
     """
     value = parse_json(read_bytes(path), os.fspath(path))
     if not isinstance(value, dict):
-        raise InputError(f"{os.fspath(path)}: holds a {type(value).__name__}, expected an object")
+        raise InputError(f"{os.fspath(path)}: is a {type(value).__name__}, expected an object")
     for key, kind in keys.items():
         if not isinstance(value.get(key), kind):
             raise InputError(
@@ -112,6 +111,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
     """
     try:
         value = json.loads(text)
+        # An escaped surrogate without its partner is valid JSON, but cannot be encoded.
         if b"\\ud" in (text if isinstance(text, bytes) else text.encode()).lower():
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
@@ -152,13 +152,14 @@ def refuse_other_kinds(head: bytes, where: str) -> None:
     Raises:
         InputError: with what it is and what to do.
     """
-    for start, advice in _OTHER_KINDS.items():
+    for start, advice in _WRONG_FORMATS.items():
         if head[: len(start)].lower() == start:
             raise InputError(f"{where}: {advice}")
-    marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    has_mark = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    # Without a byte order mark: in English text, every second byte is zero.
     begin = head[:64]
-    halves = sorted(begin[k::2].count(b"\0") for k in (0, 1))
-    if marked or (len(begin) >= 8 and halves == [0, len(begin) // 2] and begin.isascii()):
+    zeros = sorted(begin[k::2].count(b"\0") for k in (0, 1))
+    if has_mark or (len(begin) >= 8 and zeros == [0, len(begin) // 2] and begin.isascii()):
         raise InputError(
             f"{where}: text in UTF-16, as Excel and PowerShell save it; save it as UTF-8 (Excel: "
             "CSV UTF-8; PowerShell: -Encoding utf8)"
@@ -170,12 +171,12 @@ def reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _check(path: str, found: os.stat_result, most_bytes: int) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "of an unknown kind")
+def _check(path: str, status: os.stat_result, most_bytes: int) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = _FILE_TYPES.get(stat.S_IFMT(status.st_mode), "of an unknown kind")
         raise InputError(f"{path}: cannot be read: it is {kind}, not a regular file")
-    if found.st_size > most_bytes:
-        raise _too_large(path, str(found.st_size), most_bytes)
+    if status.st_size > most_bytes:
+        raise _too_large(path, str(status.st_size), most_bytes)
 
 
 def _too_large(path: str, size: str, most_bytes: int) -> InputError:
@@ -187,13 +188,14 @@ def _too_deep(where: str) -> InputError:
 
 
 def _check_depth(value: Any, where: str) -> None:
+    """Refuse tables and lists that are nested too deeply, level by level."""
     level = [value]
     for _ in range(DEPTH):
-        inside = [each for each in level if isinstance(each, dict | list)]
+        containers = [entry for entry in level if isinstance(entry, dict | list)]
         level = [
-            below
-            for each in inside
-            for below in (each.values() if isinstance(each, dict) else each)
+            entry
+            for container in containers
+            for entry in (container.values() if isinstance(container, dict) else container)
         ]
         if not level:
             return

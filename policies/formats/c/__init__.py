@@ -1,1 +1,1 @@
-"""Our policies as C99: written, compiled, loaded and checked."""
+"""The suite's policies as C99 source: written, quantised, compiled and loaded."""

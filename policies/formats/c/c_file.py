@@ -1,4 +1,7 @@
-"""policy.c as `Policy`: compiled, and called row by row in its own process."""
+"""Load a policy.c as a `Policy`: it is compiled, and called row by row in its own process.
+
+A row is the observation of one trial (one judged flight).
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ from policies.formats.spec_json import KEY, extract
 from policies.spec import NeedsTrust, Note, PolicyError, PolicySpec
 
 _STATE_MOST = 2**26
-"""Bytes of one flight's `policy_state`."""
+"""Largest size of the C struct `policy_state`, the memory of one flight [bytes]."""
 _WORD = 4
-"""Bytes; memories travel in whole ones."""
+"""Size of a float32; states are sent to the process as arrays of them [bytes]."""
 
 
 @final
@@ -26,17 +29,17 @@ class CPolicy:
     """A `Policy` around the two functions of policy.h."""
 
     name: str
-    """Its label in tables."""
+    """Name in tables."""
     spec: PolicySpec
-    """The rate, camera and scaling it expects of the world."""
+    """The rate, camera and scaling that it expects."""
     library: Path
     """The shared library."""
     loaded: ModelProcess
-    """It, in its process."""
+    """The process that has loaded the library."""
     state_bytes: int
     """Size of `policy_state`."""
     notes: tuple[Note, ...] = ()
-    """Assumptions about it, as sentences."""
+    """Assumptions that were made where its file says nothing."""
 
     def start(self, n: int) -> np.ndarray:
         """Return the `policy_state` of n trials, reset: its bytes as (n, k) float32 words."""
@@ -45,7 +48,7 @@ class CPolicy:
     def act(
         self, hidden: np.ndarray, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (action (n, spec.action.size), hidden'); see `policies.policy.Policy.act`."""
+        """Return the actions (n, spec.action.size) and the new state; see `Policy.act`."""
         actions = np.empty((len(hidden), self.spec.action.size), np.float32)
         after = np.empty_like(hidden)
         most = max(1, ANSWER_BYTES // 2 // max(1, hidden[:1].nbytes))
@@ -58,17 +61,17 @@ class CPolicy:
 
 
 def load_c(path: Path, trust: bool = False) -> CPolicy:
-    """Return the policy of a policy.c, or of a folder with one and its policy.h.
+    """Return the policy of a policy.c, or of a folder with policy.c and policy.h.
 
     Raises:
         PolicyError: without trust, without a compiler, or where it does not compile, its sizes do
-            not fit, the same inputs give two answers, or it does not come to an end.
+            not fit, the same inputs give different outputs, or a call does not end in time.
     """
     file = path / "policy.c" if path.is_dir() else path
     if not trust:
         raise NeedsTrust(
-            f"{file}: C is compiled and run on this machine and can do anything; if you trust who "
-            "made the file, pass --trust; a policy to be shared needs none as .onnx"
+            f"{file}: C is compiled and run on this machine and can do anything; if you trust its "
+            "author, pass --trust; as .onnx, a policy can be shared without trust"
         )
     library = compiled_library(file)
     loaded = ModelProcess(str(library).encode(), str(file), "library", (KEY,))
@@ -82,13 +85,14 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
             f"and a state has {state_bytes} bytes; expected by its POLICY_JSON are {expected} and "
             f"up to {_STATE_MOST} bytes; export it again"
         )
-    named = json.loads(text).get("name") if text else None
-    policy = CPolicy(f"{named or file.stem}.c", spec, library, loaded, state_bytes, metadata.notes)
-    return _proven(policy, file)
+    name = (json.loads(text).get("name") if text else None) or file.stem
+    policy = CPolicy(f"{name}.c", spec, library, loaded, state_bytes, metadata.notes)
+    _refuse_global_state(policy, file)
+    return policy
 
 
-def _proven(policy: CPolicy, file: Path) -> CPolicy:
-    """Refuse code with global state: equal inputs must give equal outputs."""
+def _refuse_global_state(policy: CPolicy, file: Path) -> None:
+    """Refuse code for which equal inputs in several rows give different outputs."""
     rng = np.random.default_rng(0)
     spec, n = policy.spec, 3
     hidden, fresh = policy.start(n), np.ones(n, bool)
@@ -98,8 +102,7 @@ def _proven(policy: CPolicy, file: Path) -> CPolicy:
         action, hidden = policy.act(hidden, state, image, fresh)
         if any(row.tobytes() != action[0].tobytes() for row in action):
             raise PolicyError(
-                f"{file}: the same inputs gave two answers; all that a policy remembers belongs "
-                "into policy_state"
+                f"{file}: the same inputs gave two answers; keep all memory of the policy in "
+                "policy_state"
             )
         fresh = np.zeros(n, bool)
-    return policy

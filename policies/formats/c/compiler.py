@@ -1,4 +1,4 @@
-"""policy.c as a shared library, compiled for this machine and kept in the user's cache."""
+"""Compile a policy.c to a shared library for this machine, and keep it in the user's cache."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from tracks.common.files import replacing_file, user_cache
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=fast", "-fPIC", "-shared")
-HERE = ("-march=native",)
+"""Compiler options that every machine supports."""
+NATIVE_FLAGS = ("-march=native",)
 """Options for this machine's processor, left out where the compiler does not support them."""
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 """Options under which the suite's policy.c compiles without warnings."""
-TROUBLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
-"""Parts of compiler messages about the machine, not about the file."""
+MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
+"""Errors of the operating system that the machine causes and not the file."""
 COMPILE_S = 600.0
 """Time limit of the compiler [s]."""
 
@@ -32,15 +33,15 @@ def find_compiler() -> list[str] | None:
     """Return the C compiler's command: the variable CC, or cc; None where there is none.
 
     Raises:
-        PolicyError: where CC is no command line.
+        PolicyError: where CC is not a valid command line.
     """
     command = os.environ.get("CC", "cc")
     try:
         words = shlex.split(command) or ["cc"]
     except ValueError as error:
         raise PolicyError(
-            f"CC is {command!r} in the environment, no command line ({error}); set it to one "
-            "such as gcc, or unset it"
+            f"CC is {command!r} in the environment, which is not a command line ({error}); set it "
+            "to one such as gcc, or unset it"
         ) from None
     return words if shutil.which(words[0]) else None
 
@@ -62,10 +63,10 @@ def source_files(policy_c: Path) -> list[Path]:
 
 
 def compiled_library(policy_c: Path) -> Path:
-    """Return the shared library of a policy.c, compiled now or found in the cache.
+    """Return the shared library of a policy.c, compiled now or earlier.
 
-    The cache is keyed by these two files: a change of another header that they include is not
-    detected.
+    Its name in the cache is a digest of policy.c and policy.h: a change of another header that they
+    include is not detected.
 
     Raises:
         PolicyError: where there is no compiler, or it refuses the file.
@@ -82,7 +83,7 @@ def compiled_library(policy_c: Path) -> Path:
         texts = [read_bytes(file, MODEL_BYTES) for file in files]
     except InputError as error:
         raise PolicyError(str(error)) from None
-    key = hashlib.sha256(repr((compiler, FLAGS, HERE, platform.machine())).encode())
+    key = hashlib.sha256(repr((compiler, FLAGS, NATIVE_FLAGS, platform.machine())).encode())
     for text in texts:
         key.update(hashlib.sha256(text).digest())
     library = _cache() / f"{key.hexdigest()}.so"
@@ -93,22 +94,23 @@ def compiled_library(policy_c: Path) -> Path:
 
 
 def _cache() -> Path:
-    # Machines may share a home, but not compiled code: processors differ.
+    # Machines may share a home directory, but not compiled code, since processors differ.
     folder = user_cache() / "c" / (platform.node() or "here")
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     return folder
 
 
 def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
+    """Compile the files (policy.c, policy.h, library.c) to the shared library `out`."""
     policy_c, _, library_c = files
-    # Not resolved: where policy.c is a link, policy.h may be in the link's folder only.
+    # A link is not resolved, since policy.h may be only in the folder of the link.
     source = policy_c.absolute()
-    ends = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
+    arguments = [f"-I{source.parent}", str(source), str(library_c), "-o", str(out), "-lm"]
     message = ""
-    for flags in ((*FLAGS, *HERE), FLAGS):
+    for flags in ((*FLAGS, *NATIVE_FLAGS), FLAGS):
         try:
             done = subprocess.run(
-                [*compiler, *flags, *ends],
+                [*compiler, *flags, *arguments],
                 capture_output=True,
                 timeout=COMPILE_S,
                 stdin=subprocess.DEVNULL,
@@ -123,12 +125,12 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
         if done.returncode == 0:
             return
         message = message or done.stderr.decode(errors="replace").strip()
-        for number in TROUBLE:
+        for number in MACHINE_ERRORS:
             if os.strerror(number) in message:
-                place = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)
-                raise OSError(number, os.strerror(number), place[1] if place else str(out))
+                path = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)
+                raise OSError(number, os.strerror(number), path[1] if path else str(out))
     first = next((line for line in message.splitlines() if "error" in line), message[:300])
     raise PolicyError(
         f"{policy_c}: {compiler[0]} refuses it ({first[:300]}); export it again, or compile it by "
-        "hand to see all it says"
+        "hand to see all messages"
     )

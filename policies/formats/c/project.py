@@ -1,4 +1,8 @@
-"""A policy as a folder of C files: policy.h, policy.c, and a test program for the target."""
+"""Export a policy as a folder of C files: policy.h, policy.c, and a test program.
+
+The test program runs on the target processor and compares the policy's outputs with those that were
+recorded at the export (vectors.h).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,8 @@ import numpy as np
 
 from policies.formats.c.arrays import float_text
 from policies.formats.c.forward import Observed
-from policies.formats.c.quantised import Quantised, answers, quantise
+from policies.formats.c.quantised import Quantised, quantise
+from policies.formats.c.quantised import actions as quantised_actions
 from policies.formats.c.source import TEMPLATES, sources
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.formats.spec_json import embed
@@ -20,20 +25,21 @@ from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import printable, unknown_name
 
 DTYPES = ("float32", "int8")
+"""Types of the weights."""
 VECTORS = 12
-"""Steps in vectors.h, with memory."""
+"""Successive steps in vectors.h, in which the policy keeps its memory."""
 TOLERANCE = {"float32": 1e-4, "int8": 0.05}
-"""How far an answer may be from the one it was exported with [m/s^2]. A rounding that falls the
-other way moves a byte by one, and with 8 bits that is a hundredth of an action."""
+"""Largest allowed difference of an action from the recorded one [m/s^2]. If a value rounds to the
+neighbouring byte, the action changes by about a hundredth."""
 
 
 class Project(NamedTuple):
-    """An export in C."""
+    """A policy exported as C."""
 
     files: dict[str, str]
-    """Text by file name."""
+    """Text of each file, by name."""
     layers: dict[str, Quantised] | None
-    """The large layers of 8 bits; None for float32."""
+    """The quantised large layers; None for float32."""
 
 
 def c_project(
@@ -46,9 +52,9 @@ def c_project(
 
     Args:
         checkpoint: the policy.
-        name: what it is called.
-        dtype: "float32" or "int8".
-        observed: what it was given in flights; int8 needs them.
+        name: its name.
+        dtype: type of the weights, "float32" or "int8".
+        observed: its inputs in recorded flights; required for int8.
 
     Raises:
         ValueError: for an unknown type.
@@ -61,37 +67,37 @@ def c_project(
     if dtype == "int8":
         if observed is None or not len(observed.state):
             raise PolicyError(
-                f"{name}: int8 needs observations of flights, by which activations are scaled; "
-                "suite export flies them, export_policy takes them as `observed`"
+                f"{name}: int8 needs observations of flights to scale the activations; suite "
+                "export flies them, export_policy takes them as `observed`"
             )
         layers = quantise(params, spec, observed)
         name = f"{name}-int8"
     name = printable(name, keep="")  # it is written into comments
     label = embed(spec, name, checkpoint.seed)
-    part = Observed(*(x[:VECTORS] for x in observed or drawn(spec, VECTORS)))
-    part = part._replace(fresh=np.arange(len(part.state)) == 0)
+    vectors = Observed(*(x[:VECTORS] for x in observed or random_observations(spec, VECTORS)))
+    vectors = vectors._replace(fresh=np.arange(len(vectors.state)) == 0)
     if layers is None:
-        actions = native_answers(params, spec, part)
+        actions = native_actions(params, spec, vectors)
     else:
-        actions = answers(params, spec, layers, part)
+        actions = quantised_actions(params, spec, layers, vectors)
     files = {
         **sources(checkpoint, name, label, layers),
-        "vectors.h": _vectors(part, actions, TOLERANCE[dtype]),
-        **{each: (TEMPLATES / each).read_text(encoding="utf-8") for each in _AS_THEY_ARE},
+        "vectors.h": _vectors(vectors, actions, TOLERANCE[dtype]),
+        **{file: (TEMPLATES / file).read_text(encoding="utf-8") for file in _COPIED},
     }
     return Project(files, layers)
 
 
-def native_answers(
+def native_actions(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> np.ndarray:
-    """Return the JAX policy's actions (T, 3) for observations in turn."""
-    one = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
-    return answers_of(one, observed)
+    """Return the actions (T, 3) of the policy in JAX for T observations."""
+    policy = dataclasses.replace(native_policy(params, spec, "policy"), block=1, rows=1)
+    return actions_of(policy, observed)
 
 
-def answers_of(policy: Policy, observed: Observed) -> np.ndarray:
-    """Return a policy's actions (T, 3), its memory cleared where an observation is fresh."""
+def actions_of(policy: Policy, observed: Observed) -> np.ndarray:
+    """Return a policy's actions (T, 3); its memory is cleared where a flight begins."""
     hidden, actions = policy.start(1), []
     for state, image, fresh in zip(*observed, strict=True):
         action, hidden = policy.act(hidden, state[None], image[None], np.array([fresh]))
@@ -99,25 +105,27 @@ def answers_of(policy: Policy, observed: Observed) -> np.ndarray:
     return np.array(actions, np.float32)
 
 
-def drawn(spec: PolicySpec, steps: int, seed: int = 0) -> Observed:
-    """Return observations drawn at random, of the size that racing has; one flight."""
+def random_observations(spec: PolicySpec, steps: int, seed: int = 0) -> Observed:
+    """Return one flight of random observations, whose magnitudes are as in racing."""
     rng = np.random.default_rng(seed)
     camera, depth = spec.camera, spec.depth
-    size = (steps, camera.height, camera.width)
-    metres = np.exp(rng.uniform(np.log(depth.near), np.log(camera.range_m), size))
+    shape = (steps, camera.height, camera.width)
+    depth_m = np.exp(rng.uniform(np.log(depth.near), np.log(camera.range_m), shape))
     return Observed(
         rng.normal(0.0, 2.0, (steps, spec.state_size)).astype(np.float32),
-        (depth.scale / metres - depth.offset).astype(np.float32),
+        (depth.scale / depth_m - depth.offset).astype(np.float32),
         np.arange(steps) == 0,
     )
 
 
-_AS_THEY_ARE = ("main.c", "CMakeLists.txt")
+_COPIED = ("main.c", "CMakeLists.txt")
+"""Templates that are copied without changes."""
 
 
 def _vectors(observed: Observed, actions: np.ndarray, tolerance: float) -> str:
+    """Return the text of vectors.h: observations, actions and their tolerance."""
     head = (
-        "/* Observations in turn, from policy_reset on, and the actions that were exported. */\n"
+        "/* Successive observations after policy_reset, and the actions that were exported. */\n"
         f"enum {{ VECTORS = {len(actions)} }};\n#define TOLERANCE {float_text(tolerance)}\n\n"
     )
     tables = (
@@ -125,7 +133,7 @@ def _vectors(observed: Observed, actions: np.ndarray, tolerance: float) -> str:
         ("images", "POLICY_IMAGE_HEIGHT * POLICY_IMAGE_WIDTH", observed.image),
         ("actions", "POLICY_ACTION_SIZE", actions),
     )
-    return head + "\n".join(_table(*each) for each in tables)
+    return head + "\n".join(_table(*table) for table in tables)
 
 
 def _table(name: str, size: str, values: np.ndarray) -> str:

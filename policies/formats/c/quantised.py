@@ -1,9 +1,9 @@
-"""The network with weights and activations of 8 bits.
+"""Quantise the policy network: weights and activations of its large layers get 8 bits.
 
-Weights have a scale for each output (symmetric), activations one for each layer with a zero point,
-so that their smallest and largest values measured on flights are the smallest and largest bytes.
-After Jacob et al. 2018, "Quantization and Training of Neural Networks for Efficient
-Integer-Arithmetic-Only Inference"; all operations between the layers use floats.
+Weights have one scale for each output and no zero point. Activations have one scale and zero point
+for each layer: the smallest and largest values in recorded flights become the smallest and largest
+bytes. The method is that of Jacob et al. 2018, "Quantization and Training of Neural Networks for
+Efficient Integer-Arithmetic-Only Inference", but the operations between layers use floats.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ SUM_MOST = 2**31 - 1
 
 
 class Quantised(NamedTuple):
-    """A layer of 8 bits: out = (bytes(x) @ weight) * scale + offset."""
+    """A layer of 8 bits: out = (round(x * inverse + zero) @ weight) * scale + offset."""
 
     weight: np.ndarray
-    """(inputs, outputs) int8, at least -127."""
+    """(inputs, outputs) int8, -127 to 127."""
     scale: np.ndarray
-    """(outputs,) float32, value of one unit of the integer sum."""
+    """(outputs,) float32, output per unit of the integer sum."""
     offset: np.ndarray
-    """(outputs,) float32, correction for the inputs' zero point."""
+    """(outputs,) float32, which cancels the contribution of the inputs' zero point."""
     inverse: float
-    """Bytes in one unit of the input."""
+    """Inverse of the inputs' scale: steps of a byte per unit of the input."""
     zero: int
-    """The byte for an input of 0."""
+    """Zero point: the byte that represents an input of 0."""
 
 
 def quantise(
@@ -43,7 +43,7 @@ def quantise(
     """Return each of `arrays.LAYERS` with 8 bits, scaled by its inputs for `observed`.
 
     Raises:
-        PolicyError: where a sum of products may leave 32 bits.
+        PolicyError: where a sum of products may exceed 32 bits.
     """
     ranges = input_ranges(params, spec, observed)
     layers = {
@@ -58,25 +58,25 @@ def check_sums(name: str, weight: np.ndarray) -> None:
     """Refuse a layer whose integer sums may exceed 32 bits, as for a large image.
 
     Args:
-        name: of the layer.
+        name: name of the layer.
         weight: (inputs, outputs) int8.
 
     Raises:
         PolicyError: naming the layer, its inputs and what to do.
     """
-    # The sum of the sizes bounds every partial sum as well; a byte of an input is -128 at most.
+    # The sum of magnitudes bounds every partial sum as well; an input byte is -128 at the least.
     largest = 128 * int(np.abs(weight.astype(np.int64)).sum(0).max())
     if largest > SUM_MOST:
         raise PolicyError(
-            f"layer {name!r}: the sum over its {len(weight)} inputs may reach {largest}, and int8 "
-            f"adds up to {SUM_MOST} at most; export it as float32, or train with a smaller image"
+            f"layer {name!r}: the sum over its {len(weight)} inputs may reach {largest}, allowed "
+            f"for int8 is up to {SUM_MOST}; export it as float32, or train with a smaller image"
         )
 
 
 def input_ranges(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> dict[str, tuple[float, float]]:
-    """Return the smallest and largest input of each large layer over observations."""
+    """Return (smallest, largest) input of each large layer over the observations."""
     weights = matrices(params, spec)
     ranges: dict[str, tuple[float, float]] = dict.fromkeys(LAYERS, (0.0, 0.0))
 
@@ -91,35 +91,37 @@ def input_ranges(
 
 
 def _quantised(weight: np.ndarray, low: float, high: float) -> Quantised:
+    """Return a layer with float weights (inputs, outputs) and inputs from `low` to `high`."""
     largest = np.abs(weight).max(0)
-    steps = np.where(largest > 0, largest, 1.0).astype(np.float32) / np.float32(127)
-    whole = np.rint(weight / steps).clip(-127, 127).astype(np.int8)
+    step = np.where(largest > 0, largest, 1.0).astype(np.float32) / np.float32(127)
+    weight_int8 = np.rint(weight / step).clip(-127, 127).astype(np.int8)
     inverse = float(np.float32(255.0 / max(high - low, 1e-6)))
     zero = int(np.clip(np.rint(-128.0 - low * inverse), -128, 127))
-    scale = (steps / np.float32(inverse)).astype(np.float32)
-    offset = (-zero * whole.sum(0, dtype=np.int64) * scale.astype(np.float64)).astype(np.float32)
-    return Quantised(whole, scale, offset, inverse, zero)
+    scale = (step / np.float32(inverse)).astype(np.float32)
+    column_sum = weight_int8.sum(0, dtype=np.int64)
+    offset = (-zero * column_sum * scale.astype(np.float64)).astype(np.float32)
+    return Quantised(weight_int8, scale, offset, inverse, zero)
 
 
-def answers(
+def actions(
     params: Mapping[str, np.ndarray],
     spec: PolicySpec,
     layers: Mapping[str, Quantised],
     observed: Observed,
 ) -> np.ndarray:
-    """Return the actions (T, 3) of the quantised network."""
+    """Return the actions (T, 3) of the quantised network for T observations."""
     small = small_arrays(params, spec)
 
     def layer(name: str, x: np.ndarray) -> np.ndarray:
-        return products(layers[name], x)
+        return layer_outputs(layers[name], x)
 
     return forward.actions(small, spec, layer, observed)
 
 
-def products(layer: Quantised, x: np.ndarray) -> np.ndarray:
+def layer_outputs(layer: Quantised, x: np.ndarray) -> np.ndarray:
     """Return a quantised layer's outputs (..., O) for inputs (..., I)."""
     scaled = (x.astype(np.float32) * np.float32(layer.inverse) + layer.zero).clip(-128, 127)
-    whole = np.trunc(scaled + np.copysign(0.5, scaled))
-    # Exact in doubles, and many times as fast as numpy's product of integers.
-    sums = whole.astype(np.float64) @ layer.weight.astype(np.float64)
+    rounded = np.trunc(scaled + np.copysign(0.5, scaled))
+    # A product of float64 is exact here, and many times as fast as numpy's product of integers.
+    sums = rounded.astype(np.float64) @ layer.weight.astype(np.float64)
     return sums.astype(np.float32) * layer.scale + layer.offset

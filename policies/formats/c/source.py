@@ -1,4 +1,4 @@
-"""The text of policy.h and policy.c for one of the suite's policies."""
+"""Write the text of policy.h and policy.c for one of the suite's policies, from C templates."""
 
 from __future__ import annotations
 
@@ -20,28 +20,29 @@ from policies.spec import EXTRAS, PolicySpec
 from tracks.common.provenance import VERSION
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
+"""Folder of the C templates."""
 TANH_TERMS = 12
-"""Terms of the continued fraction; with inputs clipped to 8, the error to tanh is below 4e-7."""
+"""Terms of tanh's continued fraction; for inputs up to 8 the error is below 4e-7."""
 _OBSERVATION = (
     ("velocity in body axes", "m/s"),
     ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
     ("from the drone to the centre of the next gate, in body axes", "m"),
 )
 _ACTIONS = {
-    "acceleration": """the wanted net acceleration in current body axes [m/s^2], gravity
- *   already taken care of: zeros keep the velocity. Of it comes the wanted specific force
+    "acceleration": """the wanted net acceleration in current body axes [m/s^2]. Gravity is
+ *   compensated: an action of zeros keeps the velocity. The wanted specific force is
  *   f = R action + (0, 0, 9.81); the wanted body z axis is along f, the collective thrust over the
  *   mass is max(0, f . body z), the heading follows the direction to the gate, and the body rates
  *   are attitude gain times attitude error.""",
     "ctbr": """collective thrust per nominal mass along body z [m/s^2], then the
- *   body rates about x, y and z [rad/s]; the vehicle's own rate loop follows them.""",
+ *   body rates about x, y and z [rad/s], which the vehicle's rate loop follows.""",
     "motors": "the four rotors' shares of their largest $WHAT, 0 to 1.",
 }
 _EXTRA = {
     "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
     "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
-    "second_axis": ("that of the gate after it (or of the last)", "1"),
-    "speed_input": ("how fast to fly, 0 (careful) to 1", "1"),
+    "second_axis": ("the flight direction of the gate after it (or of the last)", "1"),
+    "speed_input": ("commanded speed, 0 (careful) to 1", "1"),
 }
 
 
@@ -52,9 +53,9 @@ def sources(
 
     Args:
         checkpoint: the policy.
-        name: what it is called.
-        label: JSON that says where it comes from and what it expects (`spec_json.embed`).
-        layers: the large layers of 8 bits; None for float32.
+        name: its name.
+        label: JSON with its provenance, spec and contract, from `spec_json.embed`.
+        layers: the quantised large layers; None for float32.
     """
     definitions = _definitions(checkpoint, layers)
     values = _values(checkpoint, name, label, layers, constant_bytes(checkpoint, layers))
@@ -68,19 +69,19 @@ def constants(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of policy.c by name, float32 and int8."""
     params, spec = checkpoint.params, checkpoint.spec
-    found = small = arrays.small_arrays(params, spec)
+    constants = arrays.small_arrays(params, spec)
     if layers is None:
         large = arrays.matrices(params, spec)
-        found = {f"{name}_weight": blocked(weight) for name, weight in large.items()}
-        return {**small, **found, "zeros": np.zeros(16, np.float32)}
+        constants |= {f"{name}_weight": blocked(weight) for name, weight in large.items()}
+        return {**constants, "zeros": np.zeros(16, np.float32)}
     for name, layer in layers.items():
-        found[f"{name}_weight"] = blocked(layer.weight)
-        found[f"{name}_scale"], found[f"{name}_offset"] = layer.scale, layer.offset
-    return found
+        constants[f"{name}_weight"] = blocked(layer.weight)
+        constants[f"{name}_scale"], constants[f"{name}_offset"] = layer.scale, layer.offset
+    return constants
 
 
 def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
-    """Return the floats of the two working arrays, and the length of the third (int8 alone)."""
+    """Return the lengths of the C code's two float arrays, and of its int8 array (int8 only)."""
     rows, columns = spec.camera.height // 4, spec.camera.width // 4
     first = rows * columns * spec.channels[0]
     second = (rows - 2) * (columns - 2) * spec.channels[1]
@@ -93,18 +94,19 @@ def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
 
 
 def memory_bytes(spec: PolicySpec, quantised: bool) -> int:
-    """Return the size of `policy_state`."""
+    """Return the size of the C struct `policy_state` [bytes]."""
     first, second, third = work_sizes(spec)
     floats = padded(spec.hidden_size) + padded(3 * spec.hidden_size) + first + second
     return 4 * (floats + 1) + 2 * (third + third % 2) * quantised
 
 
 def constant_bytes(checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] | None) -> int:
-    """Return the bytes of policy.c's constants."""
+    """Return the size of all constants in policy.c [bytes]."""
     return sum(value.nbytes for value in constants(checkpoint, layers).values())
 
 
 def _definitions(checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] | None) -> str:
+    """Return the C definitions of all constants."""
     texts = [array_text(name, value) for name, value in constants(checkpoint, layers).items()]
     for name, layer in (layers or {}).items():
         inverse = float_text(float(np.float32(layer.inverse)))
@@ -124,6 +126,7 @@ def _values(
     layers: Mapping[str, Quantised] | None,
     constant_bytes: int,
 ) -> dict[str, Any]:
+    """Return the values of the templates' placeholders."""
     spec = checkpoint.spec
     camera, depth = spec.camera, spec.depth
     first, second, third = work_sizes(spec)
@@ -169,22 +172,23 @@ def _values(
 
 
 def _observation(spec: PolicySpec) -> str:
+    """Return the comment's lines on the parts of the state, with indices and units."""
     rows = [(3, *row) for row in _OBSERVATION]
     last, unit = "the last action as it was flown (SI units, limited)", "as the action"
     rows.append((spec.action.size, last, unit))
     rows += [(EXTRAS[key], *_EXTRA[key]) for key in EXTRAS if getattr(spec, key)]
     lines, first = [], 0
-    for count, what, unit in rows:
-        places = f"{first}..{first + count - 1}" if count > 1 else str(first)
-        lines.append(f" *     {places}: {what} [{unit}]")
+    for count, meaning, unit in rows:
+        indices = f"{first}..{first + count - 1}" if count > 1 else str(first)
+        lines.append(f" *     {indices}: {meaning} [{unit}]")
         first += count
     return "\n".join(lines)
 
 
 def _string(text: str) -> str:
-    """Return text as C string literals, one a line, joined by backslashes as a macro has them."""
+    """Return a text as C string literals, one a line; lines of a macro end in a backslash."""
     plain = text.encode("ascii", "backslashreplace").decode().replace("\\", "\\\\")
-    # A ? as well: two of them and a third sign are one other sign in C99 (trigraphs).
+    # Question marks are escaped: two of them can begin a trigraph of C99, which is replaced.
     plain = plain.replace('"', '\\"').replace("?", "\\?")
     pieces, piece = [], ""
     for word in plain.split(" "):
@@ -199,21 +203,23 @@ def _string(text: str) -> str:
 def tanh_polynomials(terms: int = TANH_TERMS) -> tuple[list[float], list[float]]:
     """Return p and q, lowest power first, of tanh(x) = x p(x^2) / q(x^2).
 
-    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms`.
+    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms`. From the
+    innermost fraction outwards, with s = x^2, (2k + 1) + s / (v / p) = ((2k + 1) v + s p) / v.
     """
-    value, below = [Fraction(2 * terms - 1)], [Fraction(1)]
+    value, previous = [Fraction(2 * terms - 1)], [Fraction(1)]
     for k in range(terms - 2, -1, -1):
-        shifted = [Fraction(0), *below]
+        shifted = [Fraction(0), *previous]
         size = max(len(value), len(shifted))
         padded_value = [*value, *[Fraction(0)] * (size - len(value))]
         shifted = [*shifted, *[Fraction(0)] * (size - len(shifted))]
         added = [(2 * k + 1) * v + s for v, s in zip(padded_value, shifted, strict=True)]
-        value, below = added, value
-    return [float(p / value[0]) for p in below], [float(q / value[0]) for q in value]
+        value, previous = added, value
+    return [float(p / value[0]) for p in previous], [float(q / value[0]) for q in value]
 
 
 def _horner(coefficients: list[float]) -> str:
+    """Return a polynomial in `s`, lowest power first, as a C expression (Horner's scheme)."""
     *lower, text = map(float_text, coefficients)
-    for each in reversed(lower):
-        text = f"{each} + s * ({text})"
+    for coefficient in reversed(lower):
+        text = f"{coefficient} + s * ({text})"
     return text

@@ -88,11 +88,11 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
 def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the steps of both C exports, and their quantised layers, by engine."""
     from policies.formats.c.c_file import load_c
-    from policies.formats.c.project import c_project, drawn
+    from policies.formats.c.project import c_project, random_observations
     from suite.judging.deploy.latency import c_step
 
     # The time of a step does not depend on the scales, so no flights are needed for them.
-    observed, steps, layers = drawn(checkpoint.spec, 50), {}, {}
+    observed, steps, layers = random_observations(checkpoint.spec, 50), {}, {}
     for dtype in ("float32", "int8"):
         engine, place = f"C {dtype}", folder / dtype
         project = c_project(checkpoint, name, dtype, observed)

@@ -34,7 +34,7 @@ from suite.judging.flying import (
     trial_list,
 )
 from suite.judging.requests import parse_levels
-from tracks.common.work import Workers, crew, usable_cores, work_off
+from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
@@ -112,8 +112,8 @@ def flown(
                     update(next(numbers))
 
                 loaders = _loaders(policies, workers)
-                pieces = _pieces(list(setups.values()), missing, crew(workers))
-                work_off(partial(_fly_piece, loaders), pieces, workers, keep)
+                pieces = _pieces(list(setups.values()), missing, worker_count(workers))
+                run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
     return {
         key: [journals[names[key]].done[trial] for trial in order.trials]
         for key, order in orders.items()

@@ -16,7 +16,7 @@ from eval.worlds.trial import TrialSpec
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.forward import Observed
-from policies.formats.c.project import answers_of, drawn, native_answers
+from policies.formats.c.project import actions_of, native_actions, random_observations
 from policies.formats.policy_file import PolicyCheckpoint
 from policies.policy import Hidden, Policy
 from policies.spec import PolicyError, PolicySpec
@@ -65,10 +65,11 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
     given = "on flights" if observed else "inputs drawn at random"
     if find_compiler() is None:
         return Parity(0, given, np.nan, np.nan, None)
-    part = Observed(*(x[:STEPS] for x in observed or drawn(checkpoint.spec, STEPS, seed=1)))
+    inputs = observed or random_observations(checkpoint.spec, STEPS, seed=1)
+    part = Observed(*(x[:STEPS] for x in inputs))
     policy = load_c(folder, trust=True)
     apart = np.abs(
-        answers_of(policy, part) - native_answers(checkpoint.params, checkpoint.spec, part)
+        actions_of(policy, part) - native_actions(checkpoint.params, checkpoint.spec, part)
     )
     if not np.isfinite(apart).all():
         raise PolicyError(f"{folder}: the compiled policy gives numbers that are not finite")

@@ -14,7 +14,7 @@ from suite.common.errors import WorkFailed
 from suite.judging.link.messages import Wire
 from suite.judging.link.simulated import SimulatedVehicle
 from suite.judging.link.udp import UdpLink
-from tracks.common.work.travel import let_views_travel
+from tracks.common.work.travel import register_dict_views
 from tracks.geometry.camera import Camera
 from tracks.track import Track
 
@@ -52,7 +52,7 @@ class VehicleProcess:
 
     def __init__(self) -> None:
         """Start the process."""
-        let_views_travel()
+        register_dict_views()
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=serve, args=(other,), daemon=True)

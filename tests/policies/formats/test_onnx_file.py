@@ -201,7 +201,7 @@ def test_a_model_that_breaks_the_standard_is_refused(tmp_path):
     broken = helper.make_node("MatMul", ["state", "nowhere"], ["action"])
     refused(write_raw(tmp_path / "it.onnx", model([broken])), "breaks the ONNX standard")
     (tmp_path / "it.onnx").write_bytes(b"\xff" * 100)
-    refused(tmp_path / "it.onnx", "not a whole ONNX file")
+    refused(tmp_path / "it.onnx", "not a complete ONNX file")
     (tmp_path / "it.onnx").write_bytes(b"")
     refused(tmp_path / "it.onnx", "it.onnx")
 
@@ -227,7 +227,7 @@ def test_rows_and_memory_are_told_by_the_shapes(shapes, found):
     [
         ({}, "inputs are none; expected state, image, hidden in this order"),
         ({"state": STATE, "picture": IMAGE}, "inputs are state, picture; expected state, image"),
-        ({"state": (2, 12), "image": (3, 24, 32)}, "all need the batch as first axis"),
+        ({"state": (2, 12), "image": (3, 24, 32)}, "the first axis of each must be the batch"),
         ({"state": STATE, "image": IMAGE, "hidden": ("batch", "n")}, "must be fixed"),
         ({"state": STATE, "image": IMAGE, "hidden": ("batch",)}, "must be fixed"),
         ({"state": ("batch", 15), "image": IMAGE}, r"'state' .* expected \(batch, 12\)"),

@@ -91,7 +91,7 @@ def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
     """It acts as before, whatever the new numbers are."""
     rng = np.random.default_rng(0)
     params = fresh(5, seen)
-    wide = network.fitted(params, seen, spec)
+    wide = network.adapt_params(params, seen, spec)
     state, image, hidden = (
         jnp.asarray(rng.normal(size=(4, *s)), jnp.float32)
         for s in ((spec.state_size,), (24, 32), (64,))
@@ -108,7 +108,7 @@ def test_a_policy_goes_on_as_one_that_sees_more(seen, spec, columns):
 def test_a_policy_that_sees_more_is_refused(seen, spec, key):
     params = fresh(5, seen)
     with pytest.raises(ValueError, match=rf"has spec\.{key}; set spec\.{key}=True"):
-        network.fitted(params, seen, spec)
+        network.adapt_params(params, seen, spec)
 
 
 def test_at_twice_the_rate_a_memory_lasts_as_long():
@@ -117,7 +117,7 @@ def test_at_twice_the_rate_a_memory_lasts_as_long():
     # With an update gate of 0.9 whatever is seen, and nothing new, states only fade.
     params = {name: jnp.zeros_like(value) for name, value in params.items()}
     params["gru.bias_input"] = params["gru.bias_input"].at[64:128].set(np.log(0.9 / 0.1))
-    often = network.fitted(params, SMALL, replace(SMALL, rate_hz=2 * SMALL.rate_hz))
+    often = network.adapt_params(params, SMALL, replace(SMALL, rate_hz=2 * SMALL.rate_hz))
     seen = jnp.zeros((1, SMALL.state_size)), jnp.zeros((1, 24, 32))
     _, once = step(params, jnp.ones((1, 64)), *seen)
     _, half = step(often, jnp.ones((1, 64)), *seen)
@@ -129,7 +129,7 @@ def test_at_twice_the_rate_a_memory_lasts_as_long():
 def test_more_rays_a_pixel_leave_the_weights_as_they_are():
     params = fresh(5, SMALL)
     finer = replace(SMALL, camera=replace(SMALL.camera, rays=2))
-    for name, value in network.fitted(params, SMALL, finer).items():
+    for name, value in network.adapt_params(params, SMALL, finer).items():
         np.testing.assert_array_equal(value, params[name])
 
 
@@ -142,7 +142,7 @@ def test_a_policy_of_another_size_is_refused():
     }
     for words, changed in other.items():
         with pytest.raises(ValueError, match=words):
-            network.fitted(params, SMALL, replace(SMALL, **changed))
+            network.adapt_params(params, SMALL, replace(SMALL, **changed))
 
 
 HIDDEN = delta_network.HIDDEN

@@ -99,7 +99,7 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
 @pytest.mark.parametrize(
     ("summary", "said"),
     [
-        ("[1]", "holds a list"),
+        ("[1]", "is a list"),
         ('{"judged": [1]}', "'judged' is missing or not a dict"),
         ("{", "not JSON"),
     ],

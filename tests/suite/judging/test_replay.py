@@ -104,7 +104,7 @@ def test_a_run_does_not_say_itself_that_it_is_to_be_trusted(tmp_path, capsys):
     (out / "run.json").write_text(json.dumps(record))
     capsys.readouterr()
     assert cli.main(["view", str(out), "--out", str(tmp_path / "seen")]) == 2
-    assert "if you trust who made the file, pass --trust" in capsys.readouterr().err
+    assert "if you trust its author, pass --trust" in capsys.readouterr().err
     assert cli.main(["view", str(out), "--out", str(tmp_path / "seen"), "--trust"]) == 2
     assert "pass --trust" not in capsys.readouterr().err
 

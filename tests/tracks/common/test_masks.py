@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tracks.common.masks import everywhere, nowhere, packed, select
+from tracks.common.masks import everywhere, make_contiguous, nowhere, select
 
 
 def test_a_numpy_mask_is_looked_at():
@@ -46,6 +46,6 @@ def test_rows_are_chosen_through_tuples_and_dicts(xp):
 
 def test_packed_lays_rows_one_after_another():
     across = np.arange(6.0).reshape(2, 3).T
-    (again,) = packed((across,))
+    (again,) = make_contiguous((across,))
     np.testing.assert_array_equal(again, across)
     assert again.flags.c_contiguous and not across.flags.c_contiguous

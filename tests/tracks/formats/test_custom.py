@@ -74,7 +74,7 @@ def with_polygon(corners):
 
 
 BAD = [
-    ("schema = 1\n", "holds no gate"),
+    ("schema = 1\n", "has no gate"),
     ("gates = [\n", "is not TOML"),
     ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
     (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
@@ -237,7 +237,7 @@ def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
     ("size", "keys", "said"),
     [
         ((1, 1, 1e-7), "", "0.001 m thick .*; part 0 has "),
-        ((1, 1, 1), "scale = 0.002\nposition = [9e4, 9e4, 9e4]", "thick where it stands; part 0"),
+        ((1, 1, 1), "scale = 0.002\nposition = [9e4, 9e4, 9e4]", "thick at its position; part 0"),
         ((1, 1, 1), "scale = 1e6", r"within 100000 m .*; part 0 reaches 5e\+05"),
     ],
 )

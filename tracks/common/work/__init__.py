@@ -1,8 +1,8 @@
 """Run independent pieces of work in this process, in several processes or on a cluster.
 
-`work(piece)` is a function of its piece alone, and pieces are small and are sent by value. So the
-place of execution does not change a result. The caller gives only the number of processes or the
-address of a cluster.
+A piece is a small value that is sent to the process, such as the trials of one batch. `work(piece)`
+depends on its piece alone, so where it runs does not change a result. The caller gives only the
+number of processes, or the address of a cluster.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from tracks.common.work.threads import core_shares, usable_cores
 from tracks.common.work.travel import WorkerDied
 
 __all__ = [
-    "MOST", "WorkerDied", "Workers", "core_shares", "crew", "read_workers", "usable_cores",
-    "work_off",
+    "MOST", "WorkerDied", "Workers", "core_shares", "worker_count", "read_workers", "usable_cores",
+    "run_pieces",
 ]  # fmt: skip
 
 Piece = TypeVar("Piece")
@@ -26,6 +26,7 @@ Workers = int | str
 MOST = 256
 """Most processes of this machine."""
 _PROTOCOLS = ("tcp", "tls", "ws", "wss")
+"""Protocols of a cluster's address."""
 
 
 def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
@@ -38,18 +39,18 @@ def read_workers(text: str | None, option: str = "--workers") -> Workers | None:
         return None
     if text.isascii() and text.isdigit() and 1 <= int(text[:6]) <= MOST:
         return int(text)
-    protocol, apart, rest = text.rpartition("://")
-    host, _, port = rest.rpartition(":")
-    known = protocol in _PROTOCOLS if apart else True
+    protocol, separator, location = text.rpartition("://")
+    host, _, port = location.rpartition(":")
+    known = protocol in _PROTOCOLS if separator else True
     if known and host and port.isascii() and port.isdigit():
-        return f"{protocol or 'tcp'}://{rest}"
+        return f"{protocol or 'tcp'}://{location}"
     raise ValueError(
         f"{option} is {text[:80]!r}; allowed is 1 to {MOST}, processes of this machine, or the "
         "address of a cluster's scheduler such as tcp://10.0.0.1:8786"
     )
 
 
-def crew(workers: Workers) -> int:
+def worker_count(workers: Workers) -> int:
     """Return the number of processes.
 
     Raises:
@@ -62,7 +63,7 @@ def crew(workers: Workers) -> int:
     return cluster.size(workers)
 
 
-def work_off(
+def run_pieces(
     work: Callable[[Piece], Iterable[Result]],
     pieces: Iterable[Piece],
     workers: Workers,
@@ -72,16 +73,17 @@ def work_off(
     """Call `keep(number, result)` with every result of piece `number`, in order of completion.
 
     One worker means this process. More workers are separate processes, which end with this call and
-    with this process. Each takes the next piece when it has finished one, and returns results while
-    it works; on a cluster results return at the end of a piece. The piece of a worker that died is
-    repeated, once on this machine and three times on a cluster; `keep` may then get a result twice.
+    with this process. A worker takes the next piece when it has finished one. On this machine it
+    returns results while it works, on a cluster at the end of a piece. If a worker dies, its piece
+    is repeated, once on this machine and up to three times on a cluster; `keep` may then be called
+    twice with the same result.
 
     Args:
         work: a module-level function, or a `functools.partial` of one.
-        pieces: taken whenever a worker is free.
+        pieces: the next is taken when a worker is free.
         workers: number of processes of this machine, or the cluster's address.
-        keep: called in this process; an exception of it ends the work.
-        pinned: give each process of this machine an equal number of cores of its own.
+        keep: called in this process; an exception that it raises ends the work.
+        pinned: whether each process of this machine runs on its own, equal share of the cores.
 
     Raises:
         ValueError: where `work` or a piece cannot be pickled, or there is no usable cluster.
@@ -95,8 +97,8 @@ def work_off(
     elif isinstance(workers, int):
         from tracks.common.work import processes
 
-        processes.share_out(work, pieces, workers, keep, pinned)
+        processes.run_in_processes(work, pieces, workers, keep, pinned)
     else:
         from tracks.common.work import cluster
 
-        cluster.share_out(work, pieces, workers, keep)
+        cluster.run_on_cluster(work, pieces, workers, keep)

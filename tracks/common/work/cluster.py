@@ -1,11 +1,11 @@
 """Run pieces of work on a Dask cluster, whose scheduler distributes them.
 
-Work and pieces are sent as bytes, so a machine needs the same version of the suite but no files.
-The work itself is the result of a task, which every machine fetches once. If a machine dies, the
-scheduler repeats its tasks.
+Work (the function) and pieces (its arguments) are sent as bytes, so a machine needs the same
+version of the suite but no files. The function is sent as the result of a task of its own, which
+every machine fetches once. If a machine dies, the scheduler repeats its tasks.
 
-Dask's own messages contain pickles, which its client unpacks: the scheduler and the workers can run
-any code in this process. Results are therefore sent as pickles as well.
+Security: Dask's messages contain pickles, which its client unpacks, so the scheduler and the
+workers can run any code in this process. Sending results as pickles adds no further risk.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tracks.common.work.travel import (
     differences,
     failure,
     pack,
-    raised,
+    remote_error,
     software,
     unpack,
 )
@@ -41,15 +41,15 @@ Result = TypeVar("Result")
 ANSWER_S = 10.0
 """Time limit for an answer of the scheduler [s]."""
 GRACE_S = 1.0
-"""Extra time before this process stops waiting itself [s]."""
-ALONE_S = 60.0
-"""Longest time without workers [s]."""
-AHEAD = 4
-"""Pieces at the scheduler for each worker: one runs, the others wait."""
-LEAST = 64
-"""Least pieces at the scheduler, so that workers need not wait for small pieces."""
+"""Extra time after it before this process gives up waiting, should Dask exceed its limit [s]."""
+NO_WORKER_S = 60.0
+"""Longest time without workers before the work ends with an error [s]."""
+QUEUED_PER_WORKER = 4
+"""Pieces that are submitted for each worker: one runs, the others wait."""
+QUEUED_LEAST = 64
+"""Fewest pieces that are submitted, so that workers do not wait for small pieces."""
 COUNT_S = 5.0
-"""Time between counts of the workers [s]."""
+"""Time between two counts of the workers [s]."""
 ADVICE = (
     "on a machine with the suite and its extra `cluster`, `dask scheduler` starts one and "
     "`dask worker ADDRESS --nworkers N --nthreads 1` gives it N processes"
@@ -75,27 +75,27 @@ def size(address: str) -> int:
         return len(client.nthreads())
 
 
-def share_out(
+def run_on_cluster(
     work: Callable[[Piece], Iterable[Result]],
     pieces: Iterable[Piece],
     address: str,
     keep: Callable[[int, Result], None],
 ) -> None:
-    """Run `tracks.common.work.work_off` on the cluster at `address`."""
+    """Run `tracks.common.work.run_pieces` on the cluster at `address`."""
     with _connected(address) as client:
         run, waiting = uuid.uuid4().hex, iter(enumerate(pieces))
         body = client.submit(_body, pack((software(), work)), key=f"suite-{run}-work")
         # With one copy, the scheduler would give most pieces to the machine that has it.
         client.replicate([body])
-        in_air: dict[Any, int] = {}
+        submitted: dict[Any, int] = {}
         ended: SimpleQueue[Any] = SimpleQueue()
         workers = _Count(client)
 
-        def fill() -> None:
-            window = max(AHEAD * workers(), LEAST)
-            # Submitting many at once costs little more than one.
-            room = window - len(in_air) if len(in_air) <= window // 2 else 0
-            batch = list(islice(waiting, room))
+        def submit_more() -> None:
+            most = max(QUEUED_PER_WORKER * workers(), QUEUED_LEAST)
+            # Submitting many at once takes little more time than one.
+            free = most - len(submitted) if len(submitted) <= most // 2 else 0
+            batch = list(islice(waiting, free))
             if not batch:
                 return
             numbers, packed = zip(*((n, pack(piece)) for n, piece in batch), strict=True)
@@ -106,22 +106,24 @@ def share_out(
                 warnings.simplefilter("ignore")
                 futures = client.map(_work_on, packed, work=body, key=keys)
             for number, future in zip(numbers, futures, strict=True):
-                in_air[future] = number
+                submitted[future] = number
                 future.add_done_callback(ended.put)
 
-        fill()
-        while in_air:
-            futures = _next(ended, client, address)
-            results = client.gather([f for f in futures if f.status == "finished"], errors="skip")
-            _check(futures, address, in_air)
-            numbers = [in_air.pop(future) for future in futures]
-            del futures
-            fill()
-            for number, packed in zip(numbers, results, strict=True):
-                found = unpack(packed)
-                if isinstance(found, Failure):
-                    raise raised(found)
-                for result in found:
+        submit_more()
+        while submitted:
+            futures = _next_ended(ended, client, address)
+            packed_results = client.gather(
+                [f for f in futures if f.status == "finished"], errors="skip"
+            )
+            _check(futures, address, submitted)
+            numbers = [submitted.pop(future) for future in futures]
+            del futures  # the cluster keeps a result while a future refers to it
+            submit_more()
+            for number, packed in zip(numbers, packed_results, strict=True):
+                results = unpack(packed)
+                if isinstance(results, Failure):
+                    raise remote_error(results)
+                for result in results:
                     keep(number, result)
 
 
@@ -148,63 +150,63 @@ def _connected(address: str) -> Iterator[Any]:
             f"--workers {address}: a cluster needs the package {error.name!r}: "
             "pip install 'diffracing-suite[cluster]'"
         ) from error
-    # Errors are raised; the log of problems that Dask repairs itself is suppressed.
+    # Errors are remote_error; the log of problems that Dask repairs itself is suppressed.
     logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
     logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
-    met: SimpleQueue[Any] = SimpleQueue()
+    answers: SimpleQueue[Any] = SimpleQueue()
 
     def connect() -> None:
         try:
             client: Any = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
-            met.put((client, client.nthreads()))
-        except Exception as error:  # any kind, depending on the other side
-            met.put(error)
+            answers.put((client, client.nthreads()))
+        except Exception as error:  # its class depends on what answers at the address
+            answers.put(error)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # In a separate thread, because it may exceed its timeout on a silent port.
         threading.Thread(target=connect, daemon=True).start()
         try:
-            found = met.get(timeout=ANSWER_S + GRACE_S)
+            answer = answers.get(timeout=ANSWER_S + GRACE_S)
         except Empty:
-            found = TimeoutError()
-    if isinstance(found, Exception):
+            answer = TimeoutError()
+    if isinstance(answer, Exception):
         advice = TLS_ADVICE if address.startswith(("tls:", "wss:")) else ADVICE
         raise UnusableCluster(
             f"--workers {address}: no scheduler of a Dask cluster answers there; {advice}"
-        ) from found
-    client, threads = found
+        ) from answer
+    client, threads = answer
     try:
         if not threads:
             raise UnusableCluster(f"--workers {address}: the cluster has no workers; {ADVICE}")
         if max(threads.values()) > 1:
             raise UnusableCluster(
                 f"--workers {address}: its workers have up to {max(threads.values())} threads, and "
-                "our pieces want a process each; start them with --nthreads 1"
+                "each piece needs its own process; start them with --nthreads 1"
             )
         yield client
     finally:
         client.close(timeout=ANSWER_S)
 
 
-def _next(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]:
-    """Wait for ended pieces, and return them."""
+def _next_ended(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]:
+    """Wait for ended pieces, and return their futures."""
     while True:
         try:
-            futures = [ended.get(timeout=ALONE_S)]
+            futures = [ended.get(timeout=NO_WORKER_S)]
             break
         except Empty:
             if client.status != "running" or not client.nthreads():
                 raise WorkerDied(
-                    f"the cluster at {address} has had no worker for {ALONE_S:.0f} s; what was "
-                    "finished is kept, the same command continues"
+                    f"the cluster at {address} has had no worker for {NO_WORKER_S:.0f} s; finished "
+                    "work is kept, the same command continues"
                 ) from None
     while not ended.empty():
         futures.append(ended.get())
     return futures
 
 
-def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
+def _check(futures: list[Any], address: str, submitted: dict[Any, int]) -> None:
     """Raise an error for pieces that the cluster gave up."""
     for future in futures:
         if future.status == "finished":
@@ -212,18 +214,18 @@ def _check(futures: list[Any], address: str, in_air: dict[Any, int]) -> None:
         error = future.exception() if future.status == "error" else None
         if isinstance(error, (ImportError, AttributeError)):
             raise UnusableCluster(
-                f"--workers {address}: a worker cannot find what it should do ({error}); install "
-                "the same version of the suite there, and the packages that it was extended by"
+                f"--workers {address}: a worker cannot import the work ({error}); install the same "
+                "version of the suite there, and the packages that extend it"
             )
-        why = f": {error}" if error else ", or its scheduler is gone"
+        why = f": {error}" if error else ", or its scheduler has ended"
         raise WorkerDied(
-            f"the cluster at {address} gave up piece {in_air[future]}{why}; what was finished is "
+            f"the cluster at {address} gave up piece {submitted[future]}{why}; finished work is "
             "kept, the same command continues"
         )
 
 
 def _body(packed: bytes) -> bytes:
-    """Return the work; the task that all others depend on."""
+    """Return the packed function; this is the task that all others depend on."""
     return packed
 
 
@@ -248,8 +250,8 @@ def _unpacked(packed: bytes) -> Callable[[Any], Iterable[Any]]:
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     set_threads()
-    wanted, work = unpack(packed)
-    if why := differences(software(), wanted):
+    required, work = unpack(packed)
+    if why := differences(software(), required):
         raise UnusableCluster(
             f"a worker on {os.uname().nodename} would compute other numbers ({why}); install the "
             "same versions there"

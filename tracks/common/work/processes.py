@@ -1,7 +1,7 @@
 """Run pieces of work in several processes of this machine.
 
-It uses `concurrent.futures` with one pool for each process: a pool can be pinned to cores, ended at
-once, and restarted when its process has died.
+It uses `concurrent.futures` with one pool for each process. Such a pool can be bound to cores,
+ended at once, and restarted when its process has died.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from tracks.common.work.travel import (
     Failure,
     WorkerDied,
     failure,
-    let_views_travel,
     pack,
-    raised,
+    register_dict_views,
+    remote_error,
     unpack,
 )
 
@@ -33,14 +33,14 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 REPORT_S = 0.2
-"""Time between reports of results [s]; a round trip costs a millisecond."""
+"""Time between two returns of results [s]; each takes about a millisecond."""
 TRIES = 2
-"""Number of attempts for a piece whose process died."""
+"""Number of attempts at a piece whose process died."""
 
 
 @dataclass
 class _Pending:
-    """A piece that is being processed."""
+    """A piece that a process works on."""
 
     number: int
     packed: bytes
@@ -71,14 +71,14 @@ class _Process:
         return ", ".join(map(str, sorted(codes))) or "unknown"
 
 
-def share_out(
+def run_in_processes(
     work: Callable[[Piece], Iterable[Result]],
     pieces: Iterable[Piece],
     count: int,
     keep: Callable[[int, Result], None],
     pinned: bool,
 ) -> None:
-    """Run `tracks.common.work.work_off` in `count` processes of this machine."""
+    """Run `tracks.common.work.run_pieces` in `count` processes of this machine."""
     processes: list[_Process] = []
     try:
         for cores in core_shares(count) if pinned else [[]] * count:
@@ -99,48 +99,48 @@ def _collect(
     waiting = iter(enumerate(pieces))
     pending: dict[Future[tuple[bytes, bool]], tuple[_Process, _Pending]] = {}
 
-    def begin(process: _Process) -> None:
+    def start_next(process: _Process) -> None:
         for number, piece in waiting:
-            submit(process, _Pending(number, pack((work, piece))), anew=True)
+            submit(process, _Pending(number, pack((work, piece))), is_new=True)
             return
 
-    def submit(process: _Process, entry: _Pending, anew: bool) -> None:
+    def submit(process: _Process, entry: _Pending, is_new: bool) -> None:
         try:
-            future = process.pool.submit(_work_on, *([entry.packed] if anew else []))
+            future = process.pool.submit(_work_on, *([entry.packed] if is_new else []))
         except BrokenProcessPool:
-            again(process, entry)
+            repeat(process, entry)
         else:
             pending[future] = process, entry
 
-    def again(process: _Process, entry: _Pending) -> None:
+    def repeat(process: _Process, entry: _Pending) -> None:
         code = process.end()
         if entry.tries == TRIES:
             raise WorkerDied(
-                f"a process died (exit code {code}), and so did the one that did its piece again; "
-                "out of memory? Work with fewer processes."
+                f"a process died (exit code {code}), and so did the process that repeated its "
+                "piece; out of memory? Work with fewer processes."
             )
         process.begin()
         entry.tries += 1
-        submit(process, entry, anew=True)
+        submit(process, entry, is_new=True)
 
     for process in processes:
-        begin(process)
+        start_next(process)
     while pending:
         for future in wait(pending, return_when=FIRST_COMPLETED).done:
             process, entry = pending.pop(future)
             try:
-                results, more = future.result()
+                packed, more = future.result()
             except BrokenProcessPool:
-                again(process, entry)
+                repeat(process, entry)
                 continue
-            found = unpack(results)
-            if isinstance(found, Failure):
-                raise raised(found)
+            results = unpack(packed)
+            if isinstance(results, Failure):
+                raise remote_error(results)
             if more:
-                submit(process, entry, anew=False)
+                submit(process, entry, is_new=False)
             else:
-                begin(process)
-            for result in found:
+                start_next(process)
+            for result in results:
                 keep(entry.number, result)
 
 
@@ -149,33 +149,36 @@ _results: Iterator[Any] = iter(())
 
 
 def _work_on(packed: bytes | None = None) -> tuple[bytes, bool]:
-    """Return the next results of the current or a given new piece, and whether more follow.
+    """Return the next results (packed), and whether more follow.
 
-    Errors are returned: one that cannot be pickled would end this process.
+    Errors are returned as results, since an error that cannot be pickled would end this process.
+
+    Args:
+        packed: the work and a new piece; None: go on with the current piece.
     """
     global _results
     try:
         if packed is not None:
             work, piece = unpack(packed)
             _results = iter(work(piece))
-        found, until = [], time.monotonic() + REPORT_S
+        results, until = [], time.monotonic() + REPORT_S
         for result in _results:
-            found.append(result)
+            results.append(result)
             if time.monotonic() > until:
-                return pack(found), True
-        return pack(found), False
+                return pack(results), True
+        return pack(results), False
     except Exception as error:
         return pack(failure(error)), False
 
 
 def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecutor:
-    """Return processes that leave keyboard interrupts to this one and end with it.
+    """Return a pool of processes that ignore keyboard interrupts and end with this process.
 
     Args:
-        processes: how many.
-        cores: which each may use; none: all.
+        processes: number of processes.
+        cores: numbers of the cores that each may use; empty: all.
     """
-    let_views_travel()
+    register_dict_views()
     # Spawned, as threads of JAX and MuJoCo do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with naming("/dev/shm"):  # holds the locks between processes
@@ -183,7 +186,7 @@ def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecuto
 
 
 def _become_worker(cores: Sequence[int]) -> None:
-    """Make this process a worker."""
+    """Prepare this process, a worker: interrupts, cores, and its end with the parent."""
     # A keyboard interrupt reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if cores:

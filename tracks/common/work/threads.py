@@ -1,11 +1,10 @@
-"""The number of cores, and of threads in XLA and in numpy's matrix products.
+"""Set the numbers of threads of XLA (JAX's compiler) and numpy, and count the usable cores.
 
-XLA gets a thread for each core, and at least two. With one thread its matrix products (Eigen's) use
-other blocks than with several, and sum in another order. With at least two threads, a training
-gives the same bits on any number of cores; on a single core it is about a tenth slower. Products
-that threads would split along their sums are split by `policies/networks/layers.py`.
-
-This file also counts the cores that this process may use, and divides them among processes.
+XLA gets a thread for each core, and at least two. With one thread its matrix products (the Eigen
+library's) are divided into other blocks than with several, and are summed in another order. With at
+least two threads, a training gives the same bits on any number of cores; on a single core it is
+about a tenth slower. `policies/networks/layers.py` splits those products whose sums XLA would
+divide among threads.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from collections.abc import MutableMapping
 VARIABLE = "NPROC"
 """Environment variable that XLA reads when JAX first lists its devices."""
 LEAST, MOST = 2, 4096
+"""Fewest threads that the suite sets, and most that the variable may have."""
 
 
 def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
@@ -28,7 +28,7 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
         ValueError: where the variable is set to an invalid value.
     """
     values = os.environ if environment is None else environment
-    setting = values.setdefault(VARIABLE, str(_wanted()))
+    setting = values.setdefault(VARIABLE, str(_default_threads()))
     # XLA would end the process without a useful message.
     if not (setting.isascii() and setting.isdigit() and 1 <= int(setting[:5]) <= MOST):
         raise ValueError(
@@ -40,7 +40,7 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
 def share_threads(environment: MutableMapping[str, str] | None = None) -> None:
     """Limit the threads to this process's share of the cores, after `set_threads`."""
     values = os.environ if environment is None else environment
-    values[VARIABLE] = str(min(threads(values), _wanted()))
+    values[VARIABLE] = str(min(threads(values), _default_threads()))
 
 
 def threads(environment: MutableMapping[str, str] | None = None) -> int:
@@ -52,9 +52,9 @@ def threads(environment: MutableMapping[str, str] | None = None) -> int:
 def one_thread_a_product(environment: MutableMapping[str, str] | None = None) -> None:
     """Set numpy's and scipy's matrix products to one thread, unless a variable is set.
 
-    The suite's products are many and small. Threads gain nothing on free cores, and on a busy core
-    they wait for each other ten to a hundred times as long as the product takes. Call this before
-    importing numpy, which reads the setting then.
+    The suite computes many small products. Threads make them no faster on free cores. On a busy
+    core they wait for each other ten to a hundred times as long as the product takes. Call this
+    before numpy is imported, which reads the setting then.
 
     Args:
         environment: changed in place; that of this process if not given.
@@ -64,7 +64,7 @@ def one_thread_a_product(environment: MutableMapping[str, str] | None = None) ->
         values["OPENBLAS_NUM_THREADS"] = "1"
 
 
-def _wanted() -> int:
+def _default_threads() -> int:
     return max(LEAST, usable_cores())
 
 
@@ -76,7 +76,10 @@ def usable_cores() -> int:
 
 
 def core_shares(workers: int) -> list[list[int]]:
-    """Return the cores of each of `workers` processes; empty lists where a system cannot pin."""
+    """Return the core numbers for each of `workers` processes, in equal shares.
+
+    The lists are empty on systems that cannot bind a process to cores.
+    """
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(workers)]
     cores = sorted(os.sched_getaffinity(0))

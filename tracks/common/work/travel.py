@@ -1,6 +1,6 @@
-"""Serialise work, pieces and results for other processes and machines.
+"""Serialise work, its pieces, results and errors for other processes and machines (with pickle).
 
-`software` lists what must be equal on two machines for equal results to the bit.
+`software` lists the versions that must be equal on two machines for results equal to the bit.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ class Failure(NamedTuple):
 
     error: Exception
     """The exception."""
-    lines: str
-    """Its traceback."""
+    traceback: str
+    """Its traceback as text."""
     root: str
-    """Folder of the code there."""
+    """Folder of the code in the other process."""
 
 
 class _RemoteTraceback(Exception):
     """The traceback of an error in another process."""
 
-    def __init__(self, lines: str) -> None:
-        super().__init__(lines)
-        self.lines = lines
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.text = text
 
     def __str__(self) -> str:
-        return f'\n"""\n{self.lines}"""'
+        return f'\n"""\n{self.text}"""'
 
 
 def pack(value: Any) -> bytes:
     """Return `value` as bytes.
 
     Raises:
-        ValueError: where it cannot travel.
+        ValueError: where it cannot be pickled.
     """
-    let_views_travel()
+    register_dict_views()
     try:
         return pickle.dumps(value, protocol=5)
     except Exception as error:
@@ -66,32 +66,32 @@ def pack(value: Any) -> bytes:
         ) from error
 
 
-def let_views_travel() -> None:
-    """Make read-only dict views picklable, such as a vehicle's effects."""
+def register_dict_views() -> None:
+    """Make read-only views of dicts picklable, such as the effects of a vehicle."""
     copyreg.pickle(MappingProxyType, _reduce_view)
 
 
 unpack: Callable[[bytes], Any] = pickle.loads
-"""Return the value of bytes from `pack`. Their sender can run any code here: the suite's own
-processes, and the machines of a cluster given by `--workers`."""
+"""Return the value of bytes from `pack`. The sender of the bytes can run any code here; senders are
+the suite's own processes, and the machines of a cluster given by `--workers`."""
 
 
 def failure(error: Exception) -> Failure:
     """Return an error for sending; one that cannot be pickled is replaced by its text."""
-    lines = "".join(traceback.format_exception(error))
+    text = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
         kind = ValueError if isinstance(error, ValueError) else RuntimeError
         error = kind(f"{type(error).__name__}: {error}")
     error.__traceback__ = None
-    return Failure(error, lines, str(ROOT))
+    return Failure(error, text, str(ROOT))
 
 
-def raised(there: Failure) -> Exception:
+def remote_error(failed: Failure) -> Exception:
     """Return the error to raise here, with the remote traceback as its cause."""
-    there.error.__cause__ = _RemoteTraceback(there.lines.replace(there.root, str(ROOT)))
-    return there.error
+    failed.error.__cause__ = _RemoteTraceback(failed.traceback.replace(failed.root, str(ROOT)))
+    return failed.error
 
 
 def _view(entries: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -102,26 +102,30 @@ def _reduce_view(view: MappingProxyType[Any, Any]) -> tuple[Any, ...]:
     return _view, (dict(view),)
 
 
-ROOMS = ("tracks", "policies", "eval", "suite")
+OWN_PACKAGES = ("tracks", "policies", "eval", "suite")
 PACKAGES = ("numpy", "scipy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "onnxruntime")
+"""Other packages that influence the numbers."""
 
 
 @functools.cache
 def software() -> dict[str, str]:
-    """Return the versions of all relevant packages, and 16 hex digits of the suite's own code."""
-    sums = hashlib.sha256()
-    for path in sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py")):
-        sums.update(f"{path.relative_to(ROOT).as_posix()}\0".encode() + path.read_bytes())
+    """Return the version of each relevant package, and a digest of the suite's own code.
+
+    The digest is the first 16 hex digits of the SHA-256 of all Python files and their paths.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(path for name in OWN_PACKAGES for path in (ROOT / name).rglob("*.py")):
+        digest.update(f"{path.relative_to(ROOT).as_posix()}\0".encode() + path.read_bytes())
     return {
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "diffracing-suite": VERSION,
         **{name: _version(name) for name in PACKAGES},
-        "the suite's code": sums.hexdigest()[:16],
+        "the suite's code": digest.hexdigest()[:16],
     }
 
 
 def differences(theirs: Mapping[str, str], ours: Mapping[str, str]) -> str:
-    """Return the differences as text; "" for none."""
+    """Return the differences of two results of `software` as text; "" for none."""
     names = [name for name in ours if theirs.get(name) != ours[name]]
     return ", ".join(f"{name} {theirs.get(name)} there, {ours[name]} here" for name in names)
 

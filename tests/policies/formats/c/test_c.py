@@ -12,7 +12,7 @@ from policies.formats.c import arrays, quantised, source
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import STRICT, find_compiler
 from policies.formats.c.forward import Observed
-from policies.formats.c.project import c_project, drawn, native_answers
+from policies.formats.c.project import c_project, native_actions, random_observations
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
 
@@ -74,10 +74,10 @@ def test_the_vectors_find_one_wrong_weight(exports, tmp_path):
 @pytest.mark.parametrize(("name", "steps"), [("float32", 1000), ("odd", 100)])
 def test_parity_with_jax_over_a_thousand_steps_with_memory(exports, name, steps):
     export = exports[name]
-    observed = drawn(export.checkpoint.spec, steps, seed=9)
+    observed = random_observations(export.checkpoint.spec, steps, seed=9)
     policy = load_policy(export.folder, trust=True)
     assert policy.spec == export.checkpoint.spec
-    wanted = native_answers(export.checkpoint.params, policy.spec, observed)
+    wanted = native_actions(export.checkpoint.params, policy.spec, observed)
     assert np.abs(wanted).std() > 0.5
     np.testing.assert_allclose(answers(policy, observed), wanted, atol=1e-4, rtol=0)
 
@@ -86,11 +86,11 @@ def test_parity_with_jax_over_a_thousand_steps_with_memory(exports, name, steps)
 def test_int8_answers_as_worked_out_and_near_the_policy(exports, name):
     export = exports[name]
     params, spec = export.checkpoint.params, export.checkpoint.spec
-    observed = drawn(spec, 60, seed=5)
+    observed = random_observations(spec, 60, seed=5)
     found = answers(load_c(export.folder, trust=True), observed)
-    wanted = quantised.answers(params, spec, export.project.layers, observed)
+    wanted = quantised.actions(params, spec, export.project.layers, observed)
     np.testing.assert_allclose(found, wanted, atol=0.05, rtol=0)
-    native = native_answers(params, spec, observed)
+    native = native_actions(params, spec, observed)
     assert np.abs(found - native).max() < 0.1 * np.abs(native).max()
 
 
@@ -103,12 +103,12 @@ def test_sums_that_32_bits_do_not_hold_are_refused(exports, monkeypatch):
     stored = exports["odd"].checkpoint
     monkeypatch.setattr(quantised, "SUM_MOST", 1000)
     with pytest.raises(PolicyError, match="adds up to 1000 at most; export it as float32"):
-        c_project(stored, "odd", "int8", drawn(stored.spec, 2))
+        c_project(stored, "odd", "int8", random_observations(stored.spec, 2))
 
 
 def test_a_row_stands_alone_and_a_fresh_one_has_no_memory(exports):
     policy = load_c(exports["odd"].folder, trust=True)
-    observed = drawn(policy.spec, 6, seed=2)
+    observed = random_observations(policy.spec, 6, seed=2)
     alone = answers(policy, observed)
     hidden = policy.start(3)
     for k, (state, image, _) in enumerate(zip(*observed, strict=True)):
@@ -121,7 +121,7 @@ def test_a_row_stands_alone_and_a_fresh_one_has_no_memory(exports):
 
 def test_what_is_not_finite_is_answered_with_nan_and_forgotten(exports):
     policy = load_c(exports["odd"].folder, trust=True)
-    state, image, _ = drawn(policy.spec, 2)
+    state, image, _ = random_observations(policy.spec, 2)
     before, none = policy.start(1), np.zeros(1, bool)
     for bad in (np.nan, np.inf):
         for which in (0, 1):
@@ -156,7 +156,7 @@ def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monke
     with pytest.raises(PolicyError, match="no C compiler"):
         load_c(exports["odd"].folder, trust=True)
     monkeypatch.setenv("CC", "gcc '-O2")
-    with pytest.raises(PolicyError, match="CC is .* no command line .No closing quotation"):
+    with pytest.raises(PolicyError, match="not a command line .No closing quotation"):
         load_c(exports["odd"].folder, trust=True)
 
 

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import pytest
 
 from tests.support.cluster import cluster
-from tracks.common.work import WorkerDied, crew, read_workers, work_off
+from tracks.common.work import WorkerDied, read_workers, run_pieces, worker_count
 from tracks.common.work.cluster import UnusableCluster
 from tracks.common.work.travel import software
 
@@ -52,11 +52,15 @@ def lived(folder, piece):
 def test_results_of_all_pieces_come_with_their_numbers_from_both_nodes(two_nodes):
     found, pieces = [], [[k, k + 1] for k in range(40)] + [[]]
     work = partial(tens, MappingProxyType({0: 10}))
-    work_off(work, iter(pieces), two_nodes.address, lambda *entry: found.append(entry))
+    run_pieces(work, iter(pieces), two_nodes.address, lambda *entry: found.append(entry))
     assert sorted((n, item, ten) for n, (item, ten, _) in found) == [
         (n, item, 10 * item) for n, piece in enumerate(pieces) for item in piece
     ]
-    assert len({pid for _, (_, _, pid) in found} - {os.getpid()}) == 2 == crew(two_nodes.address)
+    assert (
+        len({pid for _, (_, _, pid) in found} - {os.getpid()})
+        == 2
+        == worker_count(two_nodes.address)
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +69,7 @@ def test_results_of_all_pieces_come_with_their_numbers_from_both_nodes(two_nodes
 )
 def test_what_goes_wrong_there_is_said_here(two_nodes, how, error, text):
     with pytest.raises(error, match=text) as caught:
-        work_off(partial(gone_wrong, how), [1, 2, 3], two_nodes.address, lambda *_: None)
+        run_pieces(partial(gone_wrong, how), [1, 2, 3], two_nodes.address, lambda *_: None)
     assert "in gone_wrong" in str(caught.value.__cause__)
 
 
@@ -73,10 +77,10 @@ def test_a_refusal_there_is_a_message_to_the_user_and_a_bug_is_none(two_nodes):
     from suite.common.errors import explain
 
     with pytest.raises(ValueError) as caught:
-        work_off(partial(gone_wrong, "refuse"), [1], two_nodes.address, lambda *_: None)
+        run_pieces(partial(gone_wrong, "refuse"), [1], two_nodes.address, lambda *_: None)
     assert explain(caught.value) is None, "a test's own error is not the suite's"
     with pytest.raises(ValueError) as caught:
-        work_off(load, ["no-such-policy"], two_nodes.address, lambda *_: None)
+        run_pieces(load, ["no-such-policy"], two_nodes.address, lambda *_: None)
     told = explain(caught.value)
     assert told is not None
     code, message = told
@@ -93,13 +97,13 @@ def test_a_machine_that_would_come_to_other_numbers_is_refused(two_nodes, monkey
     wanted = {**software(), "mujoco": "2.0"}
     monkeypatch.setattr("tracks.common.work.cluster.software", lambda: wanted)
     with pytest.raises(UnusableCluster, match=r"mujoco 3\S+ there, 2\.0 here.*same versions"):
-        work_off(load, ["race"], two_nodes.address, lambda *_: None)
+        run_pieces(load, ["race"], two_nodes.address, lambda *_: None)
 
 
 def test_an_address_that_does_not_answer_says_what_to_do(two_nodes, monkeypatch):
     monkeypatch.setattr("tracks.common.work.cluster.ANSWER_S", 0.5)
     with pytest.raises(UnusableCluster, match=r"--workers tcp://127\.0\.0\.1:9: .*dask scheduler"):
-        crew("tcp://127.0.0.1:9")
+        worker_count("tcp://127.0.0.1:9")
 
 
 BEHAVIOURS = {
@@ -115,7 +119,7 @@ def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised(how):
     pytest.importorskip("distributed")
     code = textwrap.dedent(f"""
         import os, socket, threading, time
-        from tracks.common.work import cluster, crew
+        from tracks.common.work import cluster, worker_count
         def serve():
             while True:
                 c, _ = port.accept()
@@ -127,7 +131,7 @@ def test_a_port_of_something_else_is_refused_in_the_time_that_is_promised(how):
         import distributed
         cluster.ANSWER_S, began = 1.0, time.monotonic()
         try:
-            crew(f"tcp://127.0.0.1:{{port.getsockname()[1]}}")
+            worker_count(f"tcp://127.0.0.1:{{port.getsockname()[1]}}")
         except cluster.UnusableCluster as error:
             print(error, flush=True)
         os._exit(time.monotonic() - began > 10.0)
@@ -166,14 +170,14 @@ def test_messages_are_encrypted_where_the_address_says_so(tmp_path, monkeypatch)
     names = {"CA_FILE": "ca-file", "CLIENT__CERT": "client.cert", "CLIENT__KEY": "client.key"}
     options = {f"distributed.comm.tls.{names[k]}": str(v) for k, v in where.items()}
     with pytest.raises(UnusableCluster, match="DASK_DISTRIBUTED__COMM__TLS__CA_FILE"):
-        crew("tls://127.0.0.1:9")
+        worker_count("tls://127.0.0.1:9")
     with dask.config.set(options), cluster(tmp_path, nodes=1, tls=tls) as found:
         results = []
-        work_off(partial(tens, {0: 10}), [[1, 2]], found.address, lambda n, r: results.append(r))
+        run_pieces(partial(tens, {0: 10}), [[1, 2]], found.address, lambda n, r: results.append(r))
         assert [ten for _, ten, _ in results] == [10, 20] and found.address.startswith("tls://")
         with dask.config.set({"distributed.comm.tls.ca-file": None}):
             with pytest.raises(UnusableCluster):
-                crew(found.address)
+                worker_count(found.address)
 
 
 def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
@@ -184,7 +188,7 @@ def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        work_off(partial(tens, {0: 1}), [[k] for k in range(200)], two_nodes.address, keep)
+        run_pieces(partial(tens, {0: 1}), [[k] for k in range(200)], two_nodes.address, keep)
     assert len(found) == 1
 
 
@@ -200,10 +204,10 @@ def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_
         if len(results) == 10:
             threading.Thread(target=found.kill, args=[0]).start()
 
-    work_off(partial(lived, str(tmp_path)), range(30), found.address, keep)
+    run_pieces(partial(lived, str(tmp_path)), range(30), found.address, keep)
     assert results == {k: k * k for k in range(30)}
     begun = [len((tmp_path / f"{k}.begun").read_text().split()) for k in range(30)]
     # What it was at, and what it had done and not handed over yet.
-    assert sum(begun) - 30 <= 3 and max(begun) <= 2 and crew(found.address) == 1
+    assert sum(begun) - 30 <= 3 and max(begun) <= 2 and worker_count(found.address) == 1
     with pytest.raises(WorkerDied, match="gave up piece 0.*same command continues"):
-        work_off(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)
+        run_pieces(partial(gone_wrong, "kill"), [1], found.address, lambda *_: None)

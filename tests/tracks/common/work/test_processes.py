@@ -13,7 +13,7 @@ from types import MappingProxyType
 import pytest
 
 from eval.logs.columns import FlightLogError
-from tracks.common.work import WorkerDied, core_shares, work_off
+from tracks.common.work import WorkerDied, core_shares, run_pieces
 
 CORES = sorted(os.sched_getaffinity(0))
 
@@ -67,7 +67,7 @@ def slow(piece):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_every_result_comes_with_the_number_of_its_piece(workers):
     found, pieces = [], [[0, 1, 2], [], [3], [4, 5]]
-    work_off(tens, pieces, workers, lambda number, result: found.append((number, result)))
+    run_pieces(tens, pieces, workers, lambda number, result: found.append((number, result)))
     assert sorted((n, item, ten) for n, (item, ten, _) in found) == [
         (0, 0, 0), (0, 1, 10), (0, 2, 20), (2, 3, 30), (3, 4, 40), (3, 5, 50),
     ]  # fmt: skip
@@ -89,14 +89,14 @@ def test_every_result_comes_with_the_number_of_its_piece(workers):
 )
 def test_what_goes_wrong_there_is_said_here(how, error, text):
     with pytest.raises(error, match=text):
-        work_off(partial(gone_wrong, how), [1, 2, 3], 2, lambda *_: None)
+        run_pieces(partial(gone_wrong, how), [1, 2, 3], 2, lambda *_: None)
     assert multiprocessing.active_children() == []
 
 
 def test_a_piece_whose_process_died_is_done_again(tmp_path):
     found = []
     pieces = range(4)
-    work_off(partial(dies_once, str(tmp_path)), pieces, 2, lambda *entry: found.append(entry))
+    run_pieces(partial(dies_once, str(tmp_path)), pieces, 2, lambda *entry: found.append(entry))
     assert set(found) == {(n, (n, k)) for n in pieces for k in (0, 1)}
     assert found.count((1, (1, 0))) == 2 and len(found) == 9
     assert multiprocessing.active_children() == []
@@ -111,20 +111,20 @@ def test_an_interrupt_ends_all_at_once_and_keeps_what_came():
 
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        work_off(slow, [1, 2], 2, keep)
+        run_pieces(slow, [1, 2], 2, keep)
     assert found == [0] and multiprocessing.active_children() == []
     assert time.monotonic() - started < 100, "the pieces take 300 s"
 
 
 def test_what_cannot_travel_is_refused_with_what_to_do():
     with pytest.raises(ValueError, match=r"functools\.partial"):
-        work_off(lambda piece: [piece], [1, 2], 2, print)
+        run_pieces(lambda piece: [piece], [1, 2], 2, print)
 
 
 def test_a_read_only_table_travels():
     found = []
     pieces = [MappingProxyType({1: 2})]
-    work_off(where, pieces, 2, lambda number, result: found.append(result[0]))
+    run_pieces(where, pieces, 2, lambda number, result: found.append(result[0]))
     assert found == pieces
 
 
@@ -137,7 +137,7 @@ def test_no_core_is_in_two_shares(monkeypatch):
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_pinned_processes_share_no_core():
     found = {}
-    work_off(where, range(6), 2, lambda _, result: found.update([result]), pinned=True)
+    run_pieces(where, range(6), 2, lambda _, result: found.update([result]), pinned=True)
     assert set(found.values()) <= set(map(tuple, core_shares(2)))
 
 
@@ -145,11 +145,11 @@ def test_processes_end_with_the_one_they_work_for(tmp_path, root):
     code = (
         "import os, signal\n"
         "from tests.tracks.common.work.test_processes import slow\n"
-        "from tracks.common.work import work_off\n"
+        "from tracks.common.work import run_pieces\n"
         "def keep(number, result):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
         "if __name__ == '__main__':\n"
-        "    work_off(slow, [1, 2], 2, keep)\n"
+        "    run_pieces(slow, [1, 2], 2, keep)\n"
     )
     program = tmp_path / "program.py"
     program.write_text(code)

@@ -10,14 +10,22 @@ import pytest
 
 from suite.cli import main
 from suite.common.errors import explain
-from tracks.common.work import MOST, core_shares, crew, processes, read_workers, threads
+from tracks.common.work import MOST, core_shares, processes, read_workers, threads, worker_count
 from tracks.common.work.threads import (
     one_thread_a_product,
     set_threads,
     share_threads,
     usable_cores,
 )
-from tracks.common.work.travel import PACKAGES, differences, failure, pack, raised, software, unpack
+from tracks.common.work.travel import (
+    PACKAGES,
+    differences,
+    failure,
+    pack,
+    remote_error,
+    software,
+    unpack,
+)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +53,7 @@ def test_others_are_refused_with_what_is_allowed(text):
 
 
 def test_a_number_is_its_own_crew_and_shares_no_core():
-    assert crew(3) == 3
+    assert worker_count(3) == 3
     assert len(core_shares(1)[0]) == usable_cores()
 
 
@@ -67,11 +75,11 @@ def test_an_error_travels_with_where_it_came_up():
         find_effect("linear_dragg")
     there = unpack(pack(failure(caught.value)))
     elsewhere = there._replace(
-        root="/opt/suite", lines=there.lines.replace(there.root, "/opt/suite")
+        root="/opt/suite", traceback=there.traceback.replace(there.root, "/opt/suite")
     )
-    found = raised(elsewhere)
+    found = remote_error(elsewhere)
     assert explain(found) == (2, str(found)) and "linear_drag" in str(found)
-    assert str(raised(failure(Stubborn("so")))) == "Stubborn: so"
+    assert str(remote_error(failure(Stubborn("so")))) == "Stubborn: so"
 
 
 @pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
