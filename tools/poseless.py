@@ -23,7 +23,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from eval.effects import EFFECTS
-from eval.effects.interface import at
+from eval.effects.interface import bound_value
 from eval.flights.follow import FlightFailed
 from eval.flights.simulate import Sensors, fly, log_of
 from eval.flights.trajectory import ordinary_flights
@@ -58,7 +58,7 @@ def hidden_values(name: str, vehicle: Vehicle, rng: np.random.Generator) -> Any:
         if p.one_at_a_time:
             away = np.roll(away, rng.integers(len(away)))
         known = vehicle.effects.get(name)
-        each = (at(p.neutral, vehicle) if known is None else np.asarray(known[k])) + away
+        each = (bound_value(p.neutral, vehicle) if known is None else np.asarray(known[k])) + away
         values.append(tuple(map(float, each)) if p.size else float(each[0]))
     return effect.values(*values)
 

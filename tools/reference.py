@@ -17,7 +17,7 @@ from typing import Any
 
 import suite
 from eval.effects import EFFECTS
-from eval.effects.interface import at
+from eval.effects.interface import bound_value
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
 from eval.sensors.measured_state import Axis, MeasuredState
@@ -159,7 +159,7 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
         parts.append(f"## {entry.name}\n\n{entry.summary}.{stage}\n\n    {equation}\n")
         rows = dict[str, str]()
         for parameter in entry.parameters:
-            low, high = (at(end, vehicle) for end in (parameter.low, parameter.high))
+            low, high = (bound_value(end, vehicle) for end in (parameter.low, parameter.high))
             usual = " to ".join(f"{end:g}" for end in parameter.typical)
             about = cell(_meaning(entry, parameter.name))
             # The nine axes of `measured_state` differ in their names only.

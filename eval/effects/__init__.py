@@ -1,8 +1,8 @@
-"""The catalogue of physical effects; the files of this folder group them by physical cause.
+"""The catalogue of effects: physical causes of a mismatch between a vehicle and its nominal model.
 
-To add an effect, write its `Effect` and list it here. Another package adds one with an entry point
-of the group `diffracing_suite.effects`; a program adds one for its own process with
-`EFFECTS.register(effect.name, effect)`.
+The files of this folder group the effects by cause. To add one, write its `Effect` and list it
+here. Another package adds one with an entry point of the group `diffracing_suite.effects`, a
+program for its own process with `EFFECTS.register(effect.name, effect)`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
 
 
-def _wrong(name: str, effect: Any) -> str | None:
-    """Return why `effect` cannot be registered under `name`; None where it can."""
+def _problem(name: str, effect: Any) -> str | None:
+    """Return why `effect` cannot be registered under `name`, or None."""
     if not isinstance(effect, Effect):
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
     if effect.name != name:
@@ -77,11 +77,13 @@ _OWN = (
     measurement.CLOCK_OFFSET,
     slung_load.SLUNG_LOAD,
 )
-"""In the order in which they act: an effect that scales a thrust follows those that add to it, and
-random wind follows the steady wind that it is relative to. Effects of other packages act last."""
+"""The suite's effects in the order in which they act: an effect that scales a thrust follows those
+that add to it, and random wind follows the steady wind that it is relative to. Effects of other
+packages act last."""
 EFFECTS: Registry[Effect] = Registry(
-    "effect", "diffracing_suite.effects", {effect.name: effect for effect in _OWN}, _wrong
+    "effect", "diffracing_suite.effects", {effect.name: effect for effect in _OWN}, _problem
 )
+"""All effects by name, those of other packages included."""
 
 
 def find_effect(name: str) -> Effect:
@@ -99,9 +101,9 @@ def nameable_effects() -> list[str]:
 
 
 def all_values(vehicle: Vehicle) -> dict[str, Any]:
-    """Return values of every effect by name: the vehicle's own, and neutral ones for the others.
+    """Return values of every effect by name: the vehicle's, and neutral ones for other effects.
 
-    The result is a pytree of numpy arrays: one model with it holds the whole catalogue.
+    The result is a pytree of numpy arrays, with which one model contains the whole catalogue.
     """
     return {
         name: as_arrays(vehicle.effects.get(name, neutral(effect, vehicle)))

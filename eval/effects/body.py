@@ -1,4 +1,4 @@
-"""Mass, inertia and centre of mass that differ from the nominal ones; a constant torque."""
+"""Effects of the body: mass, inertia or centre of mass differ from nominal; a constant torque."""
 
 from __future__ import annotations
 
@@ -44,13 +44,14 @@ class ComOffset(NamedTuple):
     """Values of `com_offset`."""
 
     offset: Array
-    """(..., 3) true centre of mass from the nominal one, body axes [m]."""
+    """(..., 3) true centre of mass minus nominal one, body axes [m]."""
 
 
 def com_offset_constants(values: ComOffset, constants: Constants) -> Constants:
-    """Return the constants with the rotors measured from the true centre of mass.
+    """Return the constants with rotor positions relative to the true centre of mass.
 
-    Positions in logs and in the world refer to the true centre of mass, and so does the inertia.
+    Positions in logs and in the simulation refer to the true centre of mass, and so does the
+    inertia.
     """
     return constants._replace(
         com_offset_b=constants.com_offset_b + values.offset,

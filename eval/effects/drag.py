@@ -1,4 +1,7 @@
-"""Drag of airframe and rotors: forces against the airspeed, and a torque against turning."""
+"""Effects of drag on airframe and rotors: forces against the airspeed, a torque against rotation.
+
+In each, v_b is the velocity relative to the air in body axes.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ def quadratic_drag_force(values: QuadraticDrag, flow: Flow) -> Array:
     """Return -m C |v_b| v_b (..., 3) [N], with the true mass."""
     xp = flow.air_vel_b.__array_namespace__()
     squared = xp.sum(flow.air_vel_b**2, axis=-1, keepdims=True)
-    # The root's slope is infinite at rest, where the force and its slope are zero.
+    # At rest the root has an infinite slope, although the force and its slope are zero.
     moving = squared > 0.0
     speed = xp.where(moving, xp.sqrt(xp.where(moving, squared, 1.0)), 0.0)
     return -per_axis(flow.constants.mass) * values.coefficient * speed * flow.air_vel_b
@@ -104,7 +107,7 @@ def angular_damping_torque(values: AngularDamping, flow: Flow) -> Array:
 
 ANGULAR_DAMPING = Effect(
     name="angular_damping",
-    summary="The air resists turning",
+    summary="The air resists rotation",
     equation="tau_b += -J d w",
     source="Faessler, Franchi and Scaramuzza 2018",
     values=AngularDamping,

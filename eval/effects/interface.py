@@ -1,8 +1,9 @@
-"""The `Effect` dataclass: its parameters, and the hooks by which it acts on the nominal quadrotor.
+"""The `Effect` dataclass: a physical cause of a mismatch, its parameters and its equations.
 
-Each effect is written once, for numpy and JAX arrays of any leading batch shape. The MuJoCo judge,
-the MJX simulator and the differentiable quadrotor all use it. With its neutral values it changes
-nothing, so a model may hold every effect at once and fit any of them.
+An effect changes the nominal quadrotor (the vehicle file's) through functions called hooks, such as
+`force`. They take numpy and JAX arrays of any leading batch shape, so the judge in MuJoCo, the MJX
+simulator and the differentiable quadrotor all use the same code. With neutral values an effect
+changes nothing, so a model may contain all effects at once and fit any of them.
 """
 
 from __future__ import annotations
@@ -29,25 +30,25 @@ class Constants(NamedTuple):
     mass: Array
     """(...,) [kg]."""
     inertia: Array
-    """(..., 3) principal, body axes, about the centre of mass [kg m^2]."""
+    """(..., 3) principal moments, body axes, about the centre of mass [kg m^2]."""
     gravity_w: Array
     """(..., 3) [m/s^2]."""
     com_offset_b: Array
-    """(..., 3) true centre of mass, measured from the nominal one [m]."""
+    """(..., 3) true centre of mass minus nominal one [m]."""
     rotor_position_b: Array
-    """(..., 4, 3) from the true centre of mass [m]."""
+    """(..., 4, 3) rotor hubs relative to the true centre of mass [m]."""
     thrust_coefficient: Array
     """(..., 4) k_T of each rotor [N/(rad/s)^2]."""
     torque_coefficient: Array
     """(..., 4) k_Q of each rotor [N m/(rad/s)^2]."""
     thrust_axis_b: Array
-    """(..., 3) unit vector along which the total thrust pushes."""
+    """(..., 3) unit vector along the total thrust."""
     time_constant: Array
-    """(...,) of the rotors [s]."""
+    """(...,) time constant of the rotors' lag [s]."""
     rate_gain: Array
-    """(..., 3) of the rate loop [1/s]."""
+    """(..., 3) gain of the rate loop [1/s]."""
     delay: Array
-    """(...,) by which commands act late [s]."""
+    """(...,) delay of the commands [s]."""
 
 
 class Flow(NamedTuple):
@@ -69,25 +70,25 @@ class Flow(NamedTuple):
     time_s: Array
     """(...,) since the start of the flight (the first row of its log) [s]."""
     voltage_drop: Array | None
-    """(...,) battery voltage at the start minus now [V]; None where there is no voltage."""
+    """(...,) battery voltage at the start minus now [V]; None where the voltage is unknown."""
     rotor_acc: Array | None = None
-    """(..., 4) mean change of the rotor speeds over the step [rad/s^2]; given only where an effect
-    sets `rotor_acc`, and None where it is unknown."""
+    """(..., 4) mean rate of change of the rotor speeds over the step [rad/s^2]; only where an
+    effect sets `rotor_acc`, and None where it is unknown."""
     memory: Any = None
-    """This effect's own state before the step; None for one without `start` and `carry`."""
+    """State of this effect before the step; None for one without `start` and `carry`."""
     dt: Any = None
-    """Length of the step [s]; given only to an effect with a state."""
+    """Length of the step [s]; only for an effect with a state."""
 
 
 class Gust(NamedTuple):
     """Inputs of the `wind` hook in one physics step."""
 
     velocity_w: Array
-    """(..., 3) of this effect's wind in the step before [m/s]."""
+    """(..., 3) wind of this effect in the previous step [m/s]."""
     air_vel_w: Array
     """(..., 3) velocity of the centre of mass relative to the mean wind [m/s]."""
     noise: Array | None
-    """(..., 3) standard normal draws of this step; None for no turbulence."""
+    """(..., 3) standard normal random numbers of this step; None for no turbulence."""
     dt: Array
     """Length of the step [s]."""
 
@@ -101,47 +102,50 @@ class Parameter:
     """One parameter of an effect: its bounds and its usual size."""
 
     name: str
-    """As in a vehicle file and in a diagnosis."""
+    """Name in vehicle files and diagnoses."""
     unit: str
-    """SI."""
+    """SI unit."""
     neutral: Bound
-    """The value with which the effect is absent (of each component)."""
+    """Value of each component with which the effect is absent."""
     low: Bound
-    """Smallest physical value (of each component)."""
+    """Smallest physical value of each component."""
     high: Bound
-    """Largest physical value (of each component)."""
+    """Largest physical value of each component."""
     typical: tuple[float, float]
-    """Usual magnitudes on a racing quadrotor of 0.5 to 1 kg (differences from neutral)."""
+    """Range of usual differences from neutral on a racing quadrotor of 0.5 to 1 kg."""
     size: int = 0
-    """Components; 0 for a plain number."""
+    """Number of components; 0 for a plain number."""
     required: bool = True
     """Whether a vehicle file must contain it; otherwise its default is the neutral value."""
     fitted: bool = True
-    """Whether it is identifiable from flights; otherwise a given constant of the vehicle."""
+    """Whether it is identifiable from flights; if not, it is a known constant of the vehicle."""
     unseen: tuple[int, ...] = ()
     """Components that are not identifiable from flights; a diagnosis reports them as null."""
     voltage: bool | None = None
-    """True: acts only with a voltage in the log; False: only without; None: in both cases."""
+    """True: acts only if the log has a voltage; False: only if it has none; None: in both cases."""
     one_at_a_time: bool = False
-    """Each component is a separate fault, and a vehicle usually has only one of them."""
+    """Whether each component is a separate fault, of which a vehicle usually has only one."""
     whole: bool = False
-    """Usual magnitudes are absolute values instead of differences from neutral."""
+    """Whether `typical` is a range of values instead of differences from neutral."""
     signs: tuple[int, ...] = (1,)
-    """Usual signs of the difference from neutral, mirror images left out."""
+    """Usual signs of the difference from neutral; one sign where both are equivalent."""
     direction: tuple[float, ...] = ()
-    """Unit vector that splits the usual size among the components; (): each has all of it."""
+    """Unit vector that divides the usual size among the components; (): each has the full size."""
 
     def upwards(self, vehicle: Vehicle) -> bool:
-        """Return whether its lower bound is the value with which nothing acts."""
-        return at(self.low, vehicle) >= (0.0 if self.whole else at(self.neutral, vehicle))
+        """Return whether its lower bound is the value with which the effect is absent."""
+        absent = 0.0 if self.whole else bound_value(self.neutral, vehicle)
+        return bound_value(self.low, vehicle) >= absent
 
 
-Values = Any  # the effect's own NamedTuple of floats, tuples or arrays
-Memory = Any  # arrays (..., K), or nested tuples and dicts of them
+Values = Any
+"""The values of an effect: its NamedTuple class, with floats, tuples or arrays as fields."""
+Memory = Any
+"""The state of an effect: arrays (..., K), or nested tuples and dicts of them."""
 
 
 class Sample(NamedTuple):
-    """Logged signals at one or many times; a fault of the log changes them."""
+    """Signals of a flight log at one or many times, which a fault of the log (a bias) changes."""
 
     pos_w: Array
     """(..., 3) [m]."""
@@ -157,12 +161,12 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Effect:
-    """A physical effect; every hook may be left out."""
+    """A physical effect, or a fault of the log; every hook (the functions below) is optional."""
 
     name: str
-    """As in a vehicle file and in a diagnosis."""
+    """Name in vehicle files and diagnoses."""
     summary: str
-    """One sentence for people."""
+    """A short description for people."""
     equation: str
     """The change to the nominal quadrotor's equations."""
     source: str
@@ -175,38 +179,39 @@ class Effect:
     wind: Callable[[Values, Gust], Array] | None = None
     """Returns this effect's wind velocity in the world (..., 3) [m/s]."""
     gust: Callable[[Values, Array], Array] | None = None
-    """For wind that changes at random: the wind at the start from normal draws (..., 3)."""
+    """For random wind: returns the wind at the start from normal random numbers (..., 3)."""
     thrust: Callable[[Values, Flow, Array], Array] | None = None
     """Takes and returns the rotors' thrusts (..., 4) [N]."""
     force: Callable[[Values, Flow], Array] | None = None
-    """Returns an added force on the centre of mass in body axes (..., 3) [N]."""
+    """Returns an additional force on the centre of mass in body axes (..., 3) [N]."""
     torque: Callable[[Values, Flow], Array] | None = None
-    """Returns an added torque in body axes (..., 3) [N m]."""
+    """Returns an additional torque in body axes (..., 3) [N m]."""
     start: Callable[[Values, Flow], Memory] | None = None
-    """For an effect with its own state, such as a swinging load; needs `carry` as well. Returns the
-    state of a vehicle that hovered until now. The other hooks read it as `Flow.memory`."""
+    """For an effect with a state, such as a swinging load; it needs `carry` too. Returns the state
+    for a vehicle that hovered until now. The other hooks read the state as `Flow.memory`."""
     carry: Callable[[Values, Flow, Array], Memory] | None = None
     """Returns the state after the step, from the acceleration of the centre of mass during the step
     in the world (..., 3) [m/s^2]."""
     measure: Callable[[Values, Sample], Sample] | None = None
-    """A fault of the log: returns the logged sample for the true one. Values mirrored about neutral
-    undo it, at least to first order."""
+    """For a fault of the log: returns the logged sample for the true one. Values mirrored about
+    neutral must undo it, at least to first order."""
     late: Callable[[Values], Array] | None = None
-    """A fault of the log: delay with which poses and velocities are logged [s]."""
+    """For a fault of the log: returns the delay with which poses and velocities are logged [s]."""
     of_log: bool = False
-    """Belongs to the log instead of the vehicle, even where it acts in flight (a tilted frame)."""
+    """Whether it belongs to the log instead of the vehicle, even if it acts in flight (a tilted
+    frame)."""
     needs: tuple[str, ...] = ()
-    """Signals that a log needs to show it: `acc_b`, or `command` for an effect between commands and
-    rotor speeds."""
+    """Signals that a log must contain to identify it: `acc_b`, or `command` for an effect between
+    commands and rotor speeds."""
     rotor_acc: bool = False
-    """Uses `Flow.rotor_acc`."""
+    """Whether it uses `Flow.rotor_acc`."""
     slow: bool = False
-    """Visible over minutes of flight, hardly within seconds."""
+    """Whether it develops over minutes of flight, so that it is hardly visible within seconds."""
     with_voltage: Callable[[Values, float], Values] | None = None
-    """For parameters that depend on the voltage: returns the values that have the same effect by a
-    voltage that falls at the given rate [V/s] as these have by time."""
+    """For parameters that depend on the voltage: converts values that act by time to values that
+    act by voltage, for a voltage that falls at the given rate [V/s]."""
     read: Callable[[Mapping[str, Any]], Values] | None = None
-    """Reads a vehicle file's table whose keys differ from the parameters."""
+    """Reads a vehicle file's table, where its keys are not the parameters' names."""
     write: Callable[[Values], dict[str, Any]] | None = None
     """The inverse of `read`."""
 
@@ -217,12 +222,12 @@ class Effect:
 
     @property
     def random(self) -> bool:
-        """Whether it draws random numbers, so that no rollout repeats it."""
+        """Whether it uses random numbers, so that a rollout does not reproduce it."""
         return self.gust is not None
 
     @property
     def by_state(self) -> bool:
-        """Whether the vehicle's state alone sets it, so that a rollout may start at any row."""
+        """Whether it depends on the vehicle's state only, so that a rollout may start anywhere."""
         return not self.random and self.start is None
 
     @property
@@ -233,7 +238,7 @@ class Effect:
     def identifiable(self, voltage: bool) -> tuple[Parameter, ...]:
         """Return the parameters that are identifiable from logs with a voltage, or without one.
 
-        An effect with its own state has none, since a log does not contain that state.
+        An effect with a state has none, since a log does not contain that state.
         """
         if self.start is not None:
             return ()
@@ -249,8 +254,8 @@ class Effect:
         )
 
 
-def at(bound: Bound, vehicle: Vehicle) -> float:
-    """Return `bound` as a number for `vehicle`."""
+def bound_value(bound: Bound, vehicle: Vehicle) -> float:
+    """Return `bound`, a number or a function of the vehicle, as a number for `vehicle`."""
     return float(bound(vehicle) if callable(bound) else bound)
 
 
@@ -258,7 +263,7 @@ def neutral(effect: Effect, vehicle: Vehicle) -> Values:
     """Return the values with which `effect` changes nothing on `vehicle`."""
 
     def value(parameter: Parameter) -> Any:
-        number = at(parameter.neutral, vehicle)
+        number = bound_value(parameter.neutral, vehicle)
         return (number,) * parameter.size if parameter.size else number
 
     return effect.values(*(value(parameter) for parameter in effect.parameters))

@@ -1,4 +1,4 @@
-"""Faults of the log: biased sensors, a tilted frame, clocks that differ."""
+"""Effects that are faults of the log: biased sensors, a tilted frame, clocks that differ."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ class GyroBias(NamedTuple):
     """Values of `gyro_bias`."""
 
     bias: Array
-    """(3,) added to the true value, body axes [rad/s]."""
+    """(3,) logged minus true rates, body axes [rad/s]."""
 
 
 def gyro_bias_measured(values: GyroBias, sample: Sample) -> Sample:
-    """Return the sample with the bias on its `rate_b`."""
+    """Return the sample with the bias added to `rate_b`."""
     return sample._replace(rate_b=sample.rate_b + values.bias)
 
 
@@ -37,11 +37,11 @@ class AccelerometerBias(NamedTuple):
     """Values of `accelerometer_bias`."""
 
     bias: Array
-    """(3,) added to the true value, body axes [m/s^2]."""
+    """(3,) logged minus true specific force, body axes [m/s^2]."""
 
 
 def accelerometer_bias_measured(values: AccelerometerBias, sample: Sample) -> Sample:
-    """Return the sample with the bias on its `acc_b`."""
+    """Return the sample with the bias added to `acc_b`."""
     return sample._replace(acc_b=sample.acc_b + values.bias)
 
 
@@ -76,7 +76,7 @@ FRAME_TILT = Effect(
     name="frame_tilt",
     summary="The log's frame is not level",
     equation="gravity = Rot(a_x, a_y, 0) (0, 0, -9.81)",
-    source="motion capture levelled badly",
+    source="motion capture that is not levelled",
     values=FrameTilt,
     parameters=(
         Parameter(
@@ -104,8 +104,8 @@ class ClockOffset(NamedTuple):
 
 CLOCK_OFFSET = Effect(
     name="clock_offset",
-    summary="Pose and velocity are logged late against rates and commands",
-    equation="row t: pose and velocity of t - offset, everything else of t",
+    summary="Pose and velocity are logged later than rates and commands",
+    equation="row t: pose and velocity of t - offset, all other signals of t",
     source="clocks of motion capture and flight controller not aligned",
     values=ClockOffset,
     parameters=(Parameter("offset", "s", neutral=0.0, low=-0.2, high=0.2, typical=(0.002, 0.02)),),

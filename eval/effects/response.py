@@ -1,4 +1,4 @@
-"""Delay, lag and gain between commands and the vehicle's response."""
+"""Effects of the response to commands: motor lag, command delay, gain of the rate loop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class MotorLag(NamedTuple):
 
 
 def motor_lag_constants(values: MotorLag, constants: Constants) -> Constants:
-    """Return the constants with this rotor time constant in place of the vehicle file's."""
+    """Return the constants with this rotor time constant instead of the vehicle file's."""
     return constants._replace(time_constant=values.time_constant)
 
 
@@ -45,7 +45,7 @@ class CommandDelay(NamedTuple):
     """Values of `command_delay`."""
 
     delay: Array
-    """(...,) how much later a command acts [s]."""
+    """(...,) additional delay of the commands [s]."""
 
 
 def command_delay_constants(values: CommandDelay, constants: Constants) -> Constants:
@@ -81,7 +81,7 @@ RATE_GAIN = Effect(
     name="rate_gain",
     summary="True rate-loop gain over nominal",
     equation="K = scale x nominal, per axis",
-    source="flight controller tuned otherwise than believed",
+    source="flight controller with other settings than assumed",
     values=RateGain,
     parameters=(
         Parameter(

@@ -1,4 +1,7 @@
-"""Rotors in moving air and close to the ground: their thrust and tilt change."""
+"""Effects of the air on the rotors: inflow, forward flight, blade flapping and ground effect.
+
+In each, v_b is the velocity relative to the air in body axes, and Omega_i a rotor's speed.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +18,14 @@ class Inflow(NamedTuple):
 
 
 def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
-    """Return the thrusts (..., 4) [N] less k Omega_i v_b . e3 each."""
+    """Return the thrusts (..., 4) [N], each reduced by k Omega_i v_b . e3."""
     climb = flow.air_vel_b[..., 2]
     return thrust - per_axis(values.coefficient * climb) * flow.rotor_speed
 
 
 INFLOW = Effect(
     name="inflow",
-    summary="Thrust lost in a climb, won in a descent",
+    summary="Thrust decreases in a climb and increases in a descent",
     equation="rotor thrust += -k Omega_i v_b.e3",
     source="blade element theory; Svacha, Mohta and Kumar 2017",
     values=Inflow,
@@ -50,7 +53,7 @@ def translational_lift_force(values: TranslationalLift, flow: Flow) -> Array:
 
 TRANSLATIONAL_LIFT = Effect(
     name="translational_lift",
-    summary="Lift won in forward flight",
+    summary="Thrust increases in forward flight",
     equation="F_b += m k (v_bx^2 + v_by^2) e3",
     source="Svacha, Mohta and Kumar 2017",
     values=TranslationalLift,
@@ -75,7 +78,7 @@ def blade_flapping_torque(values: BladeFlapping, flow: Flow) -> Array:
 
 BLADE_FLAPPING = Effect(
     name="blade_flapping",
-    summary="The rotors lean back from the wind and pitch the body up",
+    summary="The rotors tilt away from the airflow and pitch the body up",
     equation="tau_b += k (sum Omega_i) (v_b x e3)",
     source="Mahony, Kumar and Corke 2012",
     values=BladeFlapping,
@@ -88,10 +91,10 @@ BLADE_FLAPPING = Effect(
 )
 
 
-LARGEST = 1.0 / 3.0
-"""Largest g (r / 4 z)^2: caps the factor on the thrust at 1.5."""
-LOWEST = 1e-3
-"""Heights below this count as this [m]: a rotor does not fly below the ground."""
+SHARE_MOST = 1.0 / 3.0
+"""Largest g (r / 4 z)^2, with which the factor on the thrust is 1.5."""
+HEIGHT_LEAST_M = 1e-3
+"""Least height of a rotor above the ground [m]."""
 
 
 class GroundEffect(NamedTuple):
@@ -104,15 +107,15 @@ class GroundEffect(NamedTuple):
 
 
 def ground_effect_thrust(values: GroundEffect, flow: Flow, thrust: Array) -> Array:
-    """Return the thrusts (..., 4) [N] times 1 / (1 - g (r / 4 z_i)^2), the factor at most 1.5.
+    """Return the thrusts (..., 4) [N] times 1 / (1 - g (r / 4 z_i)^2), which is at most 1.5.
 
     z_i is the height of each rotor's hub above z = 0.
     """
     xp = thrust.__array_namespace__()
-    lift_w = (flow.rot_w[..., None, 2, :] * flow.constants.rotor_position_b).sum(axis=-1)
-    height = xp.maximum(flow.pos_w[..., 2, None] + lift_w, LOWEST)
+    hub_above_com = (flow.rot_w[..., None, 2, :] * flow.constants.rotor_position_b).sum(axis=-1)
+    height = xp.maximum(flow.pos_w[..., 2, None] + hub_above_com, HEIGHT_LEAST_M)
     share = per_axis(values.strength) * (per_axis(values.rotor_radius) / (4.0 * height)) ** 2
-    return thrust / (1.0 - xp.minimum(share, LARGEST))
+    return thrust / (1.0 - xp.minimum(share, SHARE_MOST))
 
 
 GROUND_EFFECT = Effect(

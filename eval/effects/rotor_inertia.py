@@ -1,4 +1,4 @@
-"""Torques of the spinning rotors' angular momentum."""
+"""Effects of the rotors' angular momentum: gyroscopic torque, and torque of spinning up."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class RotorGyroscopic(NamedTuple):
 
 
 def rotor_gyroscopic_torque(values: RotorGyroscopic, flow: Flow) -> Array:
-    """Return -J_r (sum s_i Omega_i) (w x e3) (..., 3) [N m]; the spin-up part is left out."""
+    """Return -J_r (sum s_i Omega_i) (w x e3) (..., 3) [N m], without the torque of spinning up."""
     net_spin = (flow.spin * flow.rotor_speed).sum(axis=-1)
     return -per_axis(values.rotor_inertia * net_spin) * cross_e3(flow.rate_b)
 
@@ -41,7 +41,7 @@ class RotorSpinUp(NamedTuple):
 
 
 def rotor_spin_up_torque(values: RotorSpinUp, flow: Flow) -> Array:
-    """Return -J_r (sum s_i dOmega_i/dt) e3 (..., 3) [N m]; none where the change is not known."""
+    """Return -J_r (sum s_i dOmega_i/dt) e3 (..., 3) [N m]; 0 where dOmega_i/dt is unknown."""
     if flow.rotor_acc is None:
         return 0.0 * flow.rate_b
     net = (flow.spin * flow.rotor_acc).sum(axis=-1)
@@ -50,7 +50,7 @@ def rotor_spin_up_torque(values: RotorSpinUp, flow: Flow) -> Array:
 
 ROTOR_SPIN_UP = Effect(
     name="rotor_spin_up",
-    summary="The body turns against rotors that spin up or down",
+    summary="The body is turned by rotors that spin up or down",
     equation="tau_b += -J_r (sum s_i dOmega_i/dt) e3",
     source="Mahony, Kumar and Corke 2012",
     values=RotorSpinUp,

@@ -1,4 +1,4 @@
-"""Thrust that differs from the nominal curve: its scale, its direction, the battery."""
+"""Effects on the thrust: a scale, a falling battery voltage, a tilted direction."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def thrust_scale_constants(values: ThrustScale, constants: Constants) -> Constan
 
 THRUST_SCALE = Effect(
     name="thrust_scale",
-    summary="Thrust stronger or weaker than nominal",
+    summary="Thrust larger or smaller than nominal",
     equation="k_T = scale x nominal, k_Q unchanged",
     source="thrust curve off by a factor",
     values=ThrustScale,
@@ -40,35 +40,35 @@ class BatterySag(NamedTuple):
     """Values of `battery_sag`."""
 
     rate: Array
-    """(...,) share of thrust lost a second [1/s]."""
+    """(...,) share of the thrust that is lost per second [1/s]."""
     per_volt: Array
-    """(...,) share of thrust lost a volt below the first voltage [1/V]."""
+    """(...,) share of the thrust that is lost per volt below the first voltage [1/V]."""
 
 
 def battery_sag_thrust(values: BatterySag, flow: Flow, thrust: Array) -> Array:
     """Return the thrusts (..., 4) [N] times 1 - rate t, or 1 - per_volt (V0 - V).
 
-    Where there is a voltage and `per_volt` is not zero, the voltage alone counts; a judge without
-    voltage uses `rate`.
+    V0 is the first voltage. If the voltage is known and `per_volt` is not zero, only the voltage
+    counts; otherwise `rate` is used.
     """
     xp = thrust.__array_namespace__()
     by_time = values.rate * flow.time_s
     if flow.voltage_drop is None:
         lost = by_time
     else:
-        # Both terms keep their slope at per_volt = 0, where a fit starts.
+        # Written as a sum, so that the gradient for per_volt exists at 0, where a fit starts.
         lost = values.per_volt * flow.voltage_drop + xp.where(values.per_volt == 0.0, by_time, 0.0)
     return thrust * per_axis(xp.maximum(xp.asarray(1.0 - lost), 0.0))
 
 
 def battery_sag_by_voltage(values: BatterySag, fall: float) -> BatterySag:
-    """Return the loss a volt that is `values.rate` where the voltage falls by `fall` [V/s]."""
+    """Return values per volt that equal `values.rate` for a voltage drop of `fall` [V/s]."""
     return BatterySag(0.0, values.rate / fall)
 
 
 BATTERY_SAG = Effect(
     name="battery_sag",
-    summary="Thrust falls while the battery empties",
+    summary="Thrust decreases while the battery discharges",
     equation="rotor thrust x (1 - rate t), or x (1 - per_volt (V0 - V))",
     source="convention",
     values=BatterySag,
@@ -114,7 +114,7 @@ def thrust_tilt_constants(values: ThrustTilt, constants: Constants) -> Constants
 
 THRUST_TILT = Effect(
     name="thrust_tilt",
-    summary="The total thrust is tilted; torques unchanged",
+    summary="The total thrust is tilted, with unchanged torques",
     equation="F_thrust = (sum f_i) Rot(a_x, a_y, 0) e3",
     source="body frame misaligned with the rotors",
     values=ThrustTilt,

@@ -1,4 +1,4 @@
-"""One or several rotors with less thrust and torque: worn motor, chipped propeller."""
+"""The effect of rotors with less thrust and torque: a worn motor, a damaged propeller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class WeakMotor(NamedTuple):
     """Values of `weak_motor`; the vehicle file has keys `index` (from 1) and `scale` instead."""
 
     scale: Array
-    """(..., 4) thrust and torque of each rotor, divided by nominal [1]."""
+    """(..., 4) thrust and torque of each rotor, relative to nominal [1]."""
 
 
 def constants_of(values: WeakMotor, constants: Constants) -> Constants:
@@ -37,14 +37,14 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
         if key not in table:
             raise ValueError(f"{key}: missing; needed: index (1 to 4) and scale, numbers or lists")
     index, scale = table["index"], table["scale"]
-    given = f"index = {shown(index)}, scale = {shown(scale)}"
+    entries = f"index = {shown(index)}, scale = {shown(scale)}"
     if isinstance(index, list) != isinstance(scale, list):
-        raise ValueError(f"{given}: must be both numbers or both lists")
+        raise ValueError(f"{entries}: must be both numbers or both lists")
     if not isinstance(index, list):
         index, scale = [index], [scale]
     if len(index) != len(scale) or not index:
-        raise ValueError(f"{given}: needed is one scale for each index")
-    each = [1.0] * 4
+        raise ValueError(f"{entries}: needed is one scale for each index")
+    scales = [1.0] * 4
     for number, factor in zip(index, scale, strict=True):
         if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
             raise ValueError(
@@ -52,12 +52,12 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
             )
         if not is_number(factor):
             raise ValueError(f"scale = {shown(factor)}: must be a finite number")
-        each[int(number) - 1] = float(factor)
-    return WeakMotor(tuple(each))
+        scales[int(number) - 1] = float(factor)
+    return WeakMotor(tuple(scales))
 
 
 def write(values: WeakMotor) -> dict[str, Any]:
-    """Return the vehicle file's table: the rotors whose scale is not 1."""
+    """Return the vehicle file's table with the rotors whose scale is not 1."""
     weak = [(i + 1, float(s)) for i, s in enumerate(values.scale) if s != 1.0] or [(1, 1.0)]
     if len(weak) == 1:
         return {"index": weak[0][0], "scale": weak[0][1]}

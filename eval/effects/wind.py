@@ -1,4 +1,4 @@
-"""Wind: a steady part and turbulence. Both act through the effects that use the airspeed."""
+"""Effects of wind: a constant wind and gusts. They act through effects that use the airspeed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CONSTANT_WIND = Effect(
 
 
 VERTICAL = 0.5
-"""Vertical intensity over the horizontal one [1]."""
+"""Ratio of the vertical intensity to the horizontal one [1]."""
 
 
 class Gusts(NamedTuple):
@@ -55,7 +55,10 @@ class Gusts(NamedTuple):
 
 
 def gusts_start(values: Gusts, noise: Array) -> Array:
-    """Return a stationary draw of the wind (..., 3) [m/s] from normal draws `noise` (..., 3)."""
+    """Return a random wind (..., 3) [m/s] with the stationary distribution.
+
+    `noise` (..., 3) are standard normal random numbers.
+    """
     xp = noise.__array_namespace__()
     return per_axis(values.intensity) * xp.asarray([1.0, 1.0, VERTICAL]) * noise
 
@@ -63,15 +66,16 @@ def gusts_start(values: Gusts, noise: Array) -> Array:
 def gusts_wind(values: Gusts, gust: Gust) -> Array:
     """Return the wind of this step (..., 3) [m/s], exact for a constant airspeed.
 
-    Without noise there are no gusts: the wind that was there is forgotten.
+    Without noise there are no gusts, whatever the previous wind.
     """
     xp = gust.velocity_w.__array_namespace__()
     if gust.noise is None:
         return xp.zeros_like(gust.velocity_w)
     airspeed = xp.sqrt(xp.maximum(xp.sum(gust.air_vel_w**2, axis=-1), 1.0))
-    kept = per_axis(xp.exp(-gust.dt * airspeed / values.length))
-    fresh = xp.sqrt(1.0 - kept**2)
-    return kept * gust.velocity_w + fresh * gusts_start(values, gust.noise)
+    # A first-order autoregressive process with a constant variance.
+    correlation = per_axis(xp.exp(-gust.dt * airspeed / values.length))
+    innovation = xp.sqrt(1.0 - correlation**2)
+    return correlation * gust.velocity_w + innovation * gusts_start(values, gust.noise)
 
 
 GUSTS = Effect(

@@ -1,1 +1,4 @@
-"""The judge's quadrotor and tracks as environments of dm_control and gymnasium."""
+"""The race as environments of Gymnasium, Stable-Baselines3 and dm_control.
+
+They use the vehicle, tracks and rules of the judge, which flies policies and scores them.
+"""

@@ -1,7 +1,7 @@
-"""The race as a `dm_control.rl.control.Environment`."""
+"""The race as an environment of dm_control (`dm_control.rl.control.Environment`)."""
 
 # pyright: reportIncompatibleMethodOverride=false
-# dm_control's own abstract methods are annotated as returning None.
+# The abstract methods of dm_control are annotated as returning None.
 
 from __future__ import annotations
 
@@ -23,21 +23,23 @@ from tracks.track import Track
 
 
 class RacePhysics(dm_mujoco.Physics):
-    """MuJoCo's physics with the quadrotor's plant in every step."""
+    """MuJoCo's physics, with the force and torque of the quadrotor's rotors and effects added."""
 
     race: Race
+    """The episode: course, rules and control loops."""
     reward: float
+    """Reward of the last step."""
 
     def step(self, nstep: int = 1) -> None:
         """Fly the task's action for `nstep` physics steps."""
         self.reward = self.race.advance(self.data.ptr, self.action_b, nstep)
 
     action_b: np.ndarray = np.zeros(ACTION_SIZE)
-    """(3,) set by the task before each step [m/s^2]."""
+    """(3,) current action, a wanted acceleration in body axes [m/s^2]."""
 
 
 class RaceTask(control.Task):
-    """Gates in order; reward and ends as in `eval.envs.race`."""
+    """Fly through the gates in order; rewards and endings are those of `eval.envs.race`."""
 
     def initialize_episode(self, physics: RacePhysics) -> None:
         """Put the quadrotor at the start."""
@@ -48,7 +50,7 @@ class RaceTask(control.Task):
         physics.action_b = np.asarray(action, float)
 
     def after_step(self, physics: RacePhysics) -> None:
-        """Do nothing: `Race.advance` judges every step."""
+        """Do nothing: `Race.advance` applies the rules after every physics step."""
 
     def action_spec(self, physics: RacePhysics) -> specs.BoundedArray:
         """Return the bounds of an action [m/s^2]."""
@@ -64,7 +66,7 @@ class RaceTask(control.Task):
         }
 
     def get_observation(self, physics: RacePhysics) -> dict[str, np.ndarray]:
-        """Return the observation."""
+        """Return the observation: `state` (spec.state_size,) and `image` (H, W)."""
         return physics.race.observation(physics.data.ptr)
 
     def get_reward(self, physics: RacePhysics) -> float:
@@ -92,16 +94,16 @@ def load(
     """Return the environment of one track.
 
     Args:
-        family: of the track.
-        level: 0 to 9.
-        seed: of the track.
-        track: flown instead of the family's; gusts are drawn by its name, which the judge does by
-            its file's.
-        vehicle: that flies; None: `eval/vehicles/reference.toml`.
-        spec: rate, camera and encoding of the observation; the rate is met to a whole number of
-            physics steps.
+        family: name of the track family.
+        level: difficulty level, 0 to 9.
+        seed: seed of the track.
+        track: a track that is flown instead; the random numbers of gusts depend on its name (in the
+            judge, on the name of its file).
+        vehicle: the vehicle; None: `eval/vehicles/reference.toml`.
+        spec: rate, camera and encoding of the observation; the period is rounded to whole physics
+            steps.
         rules: when an episode ends.
-        environment: passed on to `dm_control.rl.control.Environment`.
+        environment: further arguments of `dm_control.rl.control.Environment`.
     """
     track = track or make_track(family, level, seed)
     race = Race(track, vehicle or load_vehicle("reference"), spec or PolicySpec(), rules or Rules())

@@ -1,4 +1,7 @@
-"""The race as `gymnasium.Env` and `gymnasium.vector.VectorEnv`; importing this registers `ID`."""
+"""The race as environments of Gymnasium: `RaceEnv` and `RaceVectorEnv`.
+
+Importing this file registers them under `ID`, for `gymnasium.make` and `gymnasium.make_vec`.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,17 @@ if TYPE_CHECKING:
     from eval.view.chase import Scenery
 
 ID = "diffracing/Race-v0"
-"""For `gymnasium.make` and `gymnasium.make_vec`."""
+"""Name of the environment in Gymnasium's registry."""
 Observation = dict[str, np.ndarray]
+"""`state` and `image`."""
 RENDER_SIZE = 640, 360
 """Width and height of a rendered frame [pixels]."""
 INSET = 4
-"""Width of a rendered frame over that of its depth image."""
+"""Ratio of the widths of a rendered frame and the depth image within it."""
 
 
 def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
-    """Return the space of actions, -1 to 1."""
+    """Return the space of actions (spec.action.size,), -1 to 1."""
     return gymnasium.spaces.Box(-1.0, 1.0, (spec.action.size,), np.float32)
 
 
@@ -46,14 +50,15 @@ def observation_space(spec: PolicySpec) -> gymnasium.spaces.Dict:
 
 
 class RaceEnv(gymnasium.Env):
-    """Fly the gates of a track in order with the judge's quadrotor and rules.
+    """Fly through the gates of a track in order, by the rules of the judge.
 
-    Each component of an action is from -1 to 1; `contract` defines its meaning, and belongs into
-    the file of a policy that is trained here. An observation has `state`, the paper's 12 numbers
-    (more where the spec has them, SI units), and `image`, the encoded inverse depth. The reward is
-    a weighted sum of the terms `eval.envs.races.REWARDS`. `terminated` is every end except the time
-    limit, which is `truncated`; `info["ended_by"]` is the reason. A `reset` without a fixed track
-    draws a new one; `options` may contain the `track_seed`.
+    The judge is the part of the suite that flies policies and scores them. Each component of an
+    action is from -1 to 1. Its meaning is in `contract`, the description of inputs and outputs that
+    belongs into the file of a policy trained here. An observation has `state`, 12 numbers in SI
+    units (more with the spec's extras), and `image`, the encoded inverse depth. The reward is a
+    weighted sum of the terms in `eval.envs.races.REWARDS`. The time limit is `truncated`, every
+    other ending is `terminated`; `info["ended_by"]` is the reason. Unless the track is fixed,
+    `reset` draws a new one; its `options` may contain the `track_seed`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -62,8 +67,8 @@ class RaceEnv(gymnasium.Env):
         """Make the environment.
 
         Args:
-            render_mode: "rgb_array" renders the drone from behind, and in the lower right corner
-                the depth image, without a display.
+            render_mode: "rgb_array" renders the drone from behind, with the depth image in the
+                lower right corner; no display is needed.
             config: the fields of `eval.envs.races.RaceConfig`: track, level, track_seed, vehicle,
                 spec, action, channel_axis, uint8, rewards, rules.
 
@@ -86,7 +91,7 @@ class RaceEnv(gymnasium.Env):
 
     @property
     def spec_of_policy(self) -> PolicySpec:
-        """The same as a spec."""
+        """The `PolicySpec` of a policy that is trained here."""
         return self._races.spec
 
     def reset(
@@ -99,7 +104,7 @@ class RaceEnv(gymnasium.Env):
         return self._observation(), self._races.info(0)
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Fly one action for a period of the policy's rate.
+        """Fly one action (size,) for a period of the policy's rate.
 
         Raises:
             RuntimeError: before the first `reset`, and after an episode's end.
@@ -107,8 +112,8 @@ class RaceEnv(gymnasium.Env):
         if not self._started:
             raise RuntimeError("call reset() before step()")
         if self._races.ended[0] != FLYING:
-            how = self._races.ended_by(0)
-            raise RuntimeError(f"the episode has ended by {how}: call reset() before step()")
+            reason = self._races.ended_by(0)
+            raise RuntimeError(f"the episode has ended by {reason}: call reset() before step()")
         reward = self._races.step(np.reshape(action, (1, -1)))
         info = self._races.info(0)
         truncated = info["ended_by"] == "timeout"
@@ -119,7 +124,7 @@ class RaceEnv(gymnasium.Env):
         return {key: part[0] for key, part in self._races.observation().items()}
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture (360, 640, 3) uint8 from behind the drone, None without a mode.
+        """Return an image (360, 640, 3) uint8 from behind the drone; None without a render mode.
 
         Raises:
             RuntimeError: before the first `reset`.
@@ -140,15 +145,16 @@ class RaceEnv(gymnasium.Env):
         return self.__reduce__()[0](*self.__reduce__()[1])
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Return the arguments for pickling; the copy is new, before its first `reset`."""
-        return _made, (type(self), vars(self._races.config), {"render_mode": self.render_mode})
+        """Return the arguments for pickling; the copy is a new environment before `reset`."""
+        return _make, (type(self), vars(self._races.config), {"render_mode": self.render_mode})
 
 
 class RaceVectorEnv(VectorEnv):
-    """N races at once in one process, with the numbers of N `RaceEnv` to the bit.
+    """N races at once in one process; the results equal those of N `RaceEnv` to the bit.
 
     Autoreset is `SAME_STEP`: a step that ends an episode returns the first observation of the next
-    one, and the last one of the old in `info["final_obs"]`, with its info in `info["final_info"]`.
+    episode. The last observation of the ended one is in `info["final_obs"]`, its info in
+    `info["final_info"]`.
     """
 
     def __init__(
@@ -157,14 +163,14 @@ class RaceVectorEnv(VectorEnv):
         """Make the environments.
 
         Args:
-            num_envs: how many.
-            threads: for physics and images; the numbers are the same with any.
+            num_envs: number of environments.
+            threads: threads for physics and images; they do not change the results.
             render_mode: not supported here; `RaceEnv` renders.
             config: as in `RaceEnv`.
         """
         self._races = Races(RaceConfig(**config), num_envs, threads)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._made_of = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
+        self._arguments = {"num_envs": num_envs, "threads": threads, "render_mode": render_mode}
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.single_action_space = action_space(self._races.spec)
         self.single_observation_space = observation_space(self._races.spec)
@@ -183,14 +189,14 @@ class RaceVectorEnv(VectorEnv):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start all episodes; environment i draws from `seed` + i, or from the list's i-th."""
+        """Start all episodes; environment i has the seed `seed` + i, or entry i of a list."""
         seeds = seed if isinstance(seed, list) else [
             None if seed is None else seed + k for k in range(self.num_envs)
         ]  # fmt: skip
-        known = self._rngs or [None] * self.num_envs
+        existing = self._rngs or [None] * self.num_envs
         self._rngs = [
-            rng if rng is not None and each is None else seeding.np_random(each)[0]
-            for rng, each in zip(known, seeds, strict=True)
+            rng if rng is not None and new_seed is None else seeding.np_random(new_seed)[0]
+            for rng, new_seed in zip(existing, seeds, strict=True)
         ]
         slots = list(range(self.num_envs))
         self._races.start(slots, self._rngs, (options or {}).get("track_seed"))
@@ -199,7 +205,7 @@ class RaceVectorEnv(VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Fly one action each, (N, size).
+        """Fly one action in each environment, (N, size).
 
         Raises:
             RuntimeError: before the first `reset`.
@@ -207,21 +213,22 @@ class RaceVectorEnv(VectorEnv):
         if not self._rngs:
             raise RuntimeError("call reset() before step()")
         reward = self._races.step(actions)
-        how = [self._races.ended_by(slot) for slot in range(self.num_envs)]
-        truncated = np.array([each == "timeout" for each in how])
-        terminated = np.array([each not in (None, "timeout") for each in how])
-        over = np.flatnonzero(truncated | terminated).tolist()
-        seen, infos = self._races.observation(), {}
-        if over:
+        endings = [self._races.ended_by(slot) for slot in range(self.num_envs)]
+        truncated = np.array([ending == "timeout" for ending in endings])
+        terminated = np.array([ending not in (None, "timeout") for ending in endings])
+        ended = truncated | terminated
+        ended_slots = np.flatnonzero(ended).tolist()
+        observation, infos = self._races.observation(), {}
+        if ended_slots:
             final = np.full(self.num_envs, None, object)
-            for slot in over:
-                final[slot] = {key: part[slot].copy() for key, part in seen.items()}
-            ended, last = truncated | terminated, self._infos(over)
-            infos = {"final_obs": final, "_final_obs": ended, "final_info": last,
-                     "_final_info": ended}  # fmt: skip
-            self._races.start(over, [self._rngs[slot] for slot in over])
-            seen = self._races.observation()
-        return seen, reward, terminated, truncated, self._infos(list(range(self.num_envs))) | infos
+            for slot in ended_slots:
+                final[slot] = {key: part[slot].copy() for key, part in observation.items()}
+            infos = {"final_obs": final, "_final_obs": ended,
+                     "final_info": self._infos(ended_slots), "_final_info": ended}  # fmt: skip
+            self._races.start(ended_slots, [self._rngs[slot] for slot in ended_slots])
+            observation = self._races.observation()
+        infos = self._infos(list(range(self.num_envs))) | infos
+        return observation, reward, terminated, truncated, infos
 
     def _infos(self, slots: list[int]) -> dict[str, Any]:
         infos: dict[str, Any] = {}
@@ -233,14 +240,14 @@ class RaceVectorEnv(VectorEnv):
         return self.__reduce__()[0](*self.__reduce__()[1])
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        return _made, (type(self), vars(self._races.config), self._made_of)
+        return _make, (type(self), vars(self._races.config), self._arguments)
 
 
-def _made(cls: type, config: dict[str, Any], rest: dict[str, Any]) -> Any:
-    return cls(**rest, **config)
+def _make(cls: type, config: dict[str, Any], arguments: dict[str, Any]) -> Any:
+    return cls(**arguments, **config)
 
 
-# gymnasium loads no plugins: by its convention an import registers environments.
+# Gymnasium loads no plugins; by its convention, an import registers environments.
 if ID not in gymnasium.registry:
     gymnasium.register(
         id=ID,

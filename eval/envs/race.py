@@ -1,4 +1,7 @@
-"""One race on MuJoCo's C engine, action by action, for the dm_control environment."""
+"""One race in MuJoCo, flown action by action, for the dm_control environment.
+
+A race is one trial (flight) by the rules of the judge, which flies policies and scores them.
+"""
 
 from __future__ import annotations
 
@@ -39,13 +42,13 @@ ACTION_LIMIT = 20.0
 STATE_LIMIT = 1e4
 """Limit to which components of the state are clipped; flights are far below it."""
 GATE_REWARD = 5.0
-"""Reward of a passed gate; a shorter remaining way earns 1 per metre."""
+"""Reward of a passed gate; the reward of progress along the remaining path is 1 per metre."""
 CRASH_REWARD = -1.0
 """Reward of a failed episode (not of the time limit); with -5, PPO learns to hover."""
 
 
 class Race:
-    """A trial by the judge's rules; the caller owns the model's data."""
+    """A trial by the judge's rules; the caller provides MuJoCo's `MjData`."""
 
     def __init__(self, track: Track, vehicle: Vehicle, spec: PolicySpec, rules: Rules) -> None:
         """Compile the model of `vehicle` on `track`."""
@@ -55,15 +58,15 @@ class Race:
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
         self._period = 1 / (spec.rate_hz * self.autopilot.dt)
         self.steps_a_decision = max(1, round(self._period))
-        """Physics steps of a period, rounded; `steps_to_decision` keeps the rate instead."""
+        """Physics steps of a period, rounded; `steps_to_decision` keeps the mean rate instead."""
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
-        self._draws: np.ndarray | None = None
+        self._noise: np.ndarray | None = None
         if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
             steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._draws = noise_of(trial, steps + math.ceil(self._period) + 2)
+            self._noise = noise_of(trial, steps + math.ceil(self._period) + 2)
         self._eye = Eye(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
@@ -77,61 +80,66 @@ class Race:
         return None if code == FLYING else ENDINGS[code - 1]
 
     def place(self, data: mujoco.MjData) -> None:
-        """Put the quadrotor at the start, hovering; `data` has just been reset."""
+        """Put the hovering quadrotor at the start; `data` has just been reset."""
         data.qpos[:], data.qvel[:] = self._start, 0.0
         mujoco.mj_step1(self.model, data)
         motion = motion_of(data)
-        noise = None if self._draws is None else self._draws[:1]
+        noise = None if self._noise is None else self._noise[:1]
         self._loops = start_autopilot(self.autopilot, motion, noise)
         self.progress = start_progress(motion.pos_w)
         self.action_b, self._decisions = np.zeros((1, 3)), 0
         self._judge(data, bad_wrench=False)
 
     def steps_to_decision(self) -> int:
-        """Return the physics steps until the next decision, spaced as by the judge."""
+        """Return the number of physics steps until the next decision, as in the judge."""
         return max(1, int(steps_to_next(np.array(self._decisions), self._period)))
 
     def advance(self, data: mujoco.MjData, action_b: np.ndarray, steps: int) -> float:
-        """Fly `action_b` (3,) [m/s^2] for physics steps, or until the end; return the reward.
+        """Fly an action for some physics steps, or until the episode ends; return the reward.
 
-        `data` holds what `mj_step1` computes, as `place` and this leave it.
+        Args:
+            data: after `mj_step1`, as `place` and this function leave it.
+            action_b: (3,) wanted acceleration in body axes [m/s^2].
+            steps: number of physics steps.
         """
         limits = ActionLimits(size=ACTION_LIMIT * 3**0.5)
-        answer = np.asarray(action_b, float)[None]
-        guarded = guard_action(limits, answer, self.action_b, 0.0, "of the environment's user")
+        action = np.asarray(action_b, float)[None]
+        guarded = guard_action(limits, action, self.action_b, 0.0, "of the environment's user")
         self.action_b = guarded.action_b
         self._decisions += 1
-        begun, left = int(self.progress.gates[0]), self._left()
+        gates_before, path_before = int(self.progress.gates[0]), self._remaining_path()
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:
                 break
             before = self.progress
             motion, step = motion_of(data), before.step
             gate_w = next_centre(self._course, before.gates)
-            noise = None if self._draws is None else self._draws[step + 1]
+            noise = None if self._noise is None else self._noise[step + 1]
             self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
             )
-            good = bool(is_wrench(self.rules, wrench)[0])
-            if good:
+            valid = bool(is_wrench(self.rules, wrench)[0])
+            if valid:
                 data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
                 data.qfrc_applied[3:] = wrench.torque_b[0]
                 mujoco.mj_step2(self.model, data)
             self.progress = before._replace(step=step + np.int32(1))
-            if good and not has_diverged(self.rules, motion_of(data))[0]:
+            if valid and not has_diverged(self.rules, motion_of(data))[0]:
                 mujoco.mj_step1(self.model, data)
                 self._judge(data, bad_wrench=False)
             else:
                 self._judge(data, bad_wrench=True)
-        reward = left - self._left() + GATE_REWARD * (int(self.progress.gates[0]) - begun)
+        passed = int(self.progress.gates[0]) - gates_before
+        reward = path_before - self._remaining_path() + GATE_REWARD * passed
         crashed = self.ended_by not in (None, "finished", "timeout")
         return reward + CRASH_REWARD * crashed
 
-    def _left(self) -> float:
-        progress = self.progress
-        return way_left(progress.pos_w[0], self._course.gates.center_w[0], int(progress.gates[0]))
+    def _remaining_path(self) -> float:
+        progress, centres_w = self.progress, self._course.gates.center_w[0]
+        return remaining_path(progress.pos_w[0], centres_w, int(progress.gates[0]))
 
     def _judge(self, data: mujoco.MjData, bad_wrench: bool) -> None:
+        """Update the progress (gates, collision, time, ...) by the judge's rules."""
         motion = motion_of(data)
         with np.errstate(invalid="ignore", over="ignore"):
             self.progress = judge_state(
@@ -160,7 +168,13 @@ class Race:
         }
 
 
-def way_left(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
-    """Return the way from pos_w (3,) to gate number `gates` and on from centre to centre [m]."""
-    way = np.vstack([pos_w, centres_w[gates:]])
-    return float(np.sqrt((np.diff(way, axis=0) ** 2).sum(-1)).sum())
+def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
+    """Return the length of the path to the next gate, and on from centre to centre [m].
+
+    Args:
+        pos_w: (3,) the drone's position [m].
+        centres_w: (G, 3) centres of all gates [m].
+        gates: number of passed gates, that is, the number of the next gate.
+    """
+    path = np.vstack([pos_w, centres_w[gates:]])
+    return float(np.sqrt((np.diff(path, axis=0) ** 2).sum(-1)).sum())

@@ -1,7 +1,8 @@
-"""Races in the judge's simulator, decision by decision, for the gymnasium environments.
+"""Fly N races at once, decision by decision, for the Gymnasium environments.
 
-N slots fly at once, each an episode by the judge's rules. A slot's numbers do not depend on the
-other slots, to the bit, so one environment and N environments give the same results.
+Each of N slots (places in the simulator) flies one episode, by the rules of the judge, which flies
+policies and scores them. A slot's results do not depend on the other slots, to the bit, so one
+environment and N environments give the same results.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.envs.race import ACTION_LIMIT, CRASH_REWARD, GATE_REWARD, STATE_LIMIT, way_left
+from eval.envs.race import ACTION_LIMIT, CRASH_REWARD, GATE_REWARD, STATE_LIMIT, remaining_path
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import Vehicle
@@ -30,28 +31,28 @@ from tracks.formats.custom import load_track
 from tracks.track import Track
 
 SEEDS = 2**31
-"""Tracks are drawn with seeds below this."""
+"""Number of track seeds, from 0."""
 BAD_ACTION = "bad_action"
-"""End of an episode by an action that is not finite, in addition to `eval.worlds.trial.ENDINGS`."""
+"""Ending by an action that is not finite, in addition to `eval.worlds.trial.ENDINGS`."""
 
 
 class Moments(NamedTuple):
-    """Quantities of one decision of N episodes, for the reward terms."""
+    """Quantities of one decision in N episodes, from which reward terms are computed."""
 
     to_go_before: np.ndarray
-    """(N,) remaining distance from gate to gate, before the decision [m]."""
+    """(N,) length of the remaining path from gate to gate before the decision [m]."""
     to_go: np.ndarray
-    """(N,) the same after it [m]."""
+    """(N,) the same after the decision [m]."""
     gates: np.ndarray
-    """(N,) gates passed during it."""
+    """(N,) number of gates passed during the decision."""
     crashed: np.ndarray
-    """(N,) bool: ended other than by all gates or the time limit."""
+    """(N,) whether it ended for another reason than all gates or the time limit."""
     finished: np.ndarray
-    """(N,) bool."""
+    """(N,) whether it ended with all gates passed."""
     period_s: np.ndarray
     """(N,) time flown [s]."""
     action_change: np.ndarray
-    """(N,) Euclidean distance from the last action, in action-space units."""
+    """(N,) Euclidean distance between this action and the last, components from -1 to 1."""
 
 
 REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
@@ -70,18 +71,18 @@ class RaceConfig:
     """Arguments of the environments."""
 
     track: str = "random"
-    """A family, or a track file (.toml). The judge's tables use the other families."""
+    """A track family, or a track file (.toml). Policies are evaluated on the other families."""
     level: int | tuple[int, int] = 0
-    """Difficulty 0 to 9, or a range from which each episode draws."""
+    """Difficulty 0 to 9, or (lowest, highest) for a random one in each episode."""
     track_seed: int | None = None
-    """Seed of one track for all episodes; None draws one for each episode."""
+    """Seed of one track for all episodes; None: a random one for each episode."""
     vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
-    """A shipped name, a file, a vehicle, or a function that draws one for each episode, all with
-    other values of the same effects (`suite.train.recipes.race_settings` has the
-    trainer's). The judge's own is `reference`: training on it makes a comparison unfair."""
+    """A shipped name, a file, a vehicle, or a function that draws one for each episode; all drawn
+    vehicles must have the same effects (`suite.train.recipes.race_settings` has those of the
+    trainer). The judge's vehicle is `reference`; training on it makes a comparison unfair."""
     spec: PolicySpec | str | None = None
-    """Rate, camera, encoding and extras of the observation: a spec, or that of a shipped policy or
-    a checkpoint's folder."""
+    """Rate, camera, encoding and extras of the observation: a spec, or the name or folder of a
+    policy that has it."""
     action: str = "acceleration"
     """Kind of action: acceleration, ctbr or motors. Its components are -1 to 1."""
     channel_axis: bool = False
@@ -101,7 +102,7 @@ def levels_of(config: RaceConfig) -> tuple[int, int]:
 
 
 def resolved_vehicle(config: RaceConfig, rng: np.random.Generator) -> Vehicle:
-    """Return the vehicle of an episode."""
+    """Return the configured vehicle, drawn from `rng` if it is random."""
     vehicle = config.vehicle
     if isinstance(vehicle, str):
         return load_vehicle(vehicle)
@@ -134,14 +135,14 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
 
 
 class Races:
-    """Episodes of one `RaceConfig` in N slots."""
+    """Episodes of one `RaceConfig` in N slots of a simulator."""
 
     def __init__(self, config: RaceConfig, slots: int, threads: int = 1) -> None:
         """Check the configuration and make the simulator.
 
         Raises:
-            ValueError: for an unknown track, vehicle, kind of action or reward term, a level that
-                is none, or no slots.
+            ValueError: for an unknown track, vehicle, kind of action or reward term, an invalid
+                level, or no slots.
         """
         if slots < 1:
             raise ValueError(f"num_envs is {slots}, allowed is 1 or more")
@@ -152,22 +153,22 @@ class Races:
         for name in config.rewards:
             if name not in REWARDS:
                 raise unknown_name("reward term", name, REWARDS)
-        self._file: Track | None = None
+        self._file_track: Track | None = None
         if config.track.endswith(".toml"):
-            self._file = load_track(config.track)
+            self._file_track = load_track(config.track)
         else:
             check_family(config.track)
         vehicle = self._vehicle = resolved_vehicle(config, np.random.default_rng(0))
         self.spec = resolved_spec(config, vehicle)
         self.contract: Contract = contract_of(self.spec)
-        layout = layout_of([self._file] if self._file else [])
+        layout = layout_of([self._file_track] if self._file_track else [])
         self._world = MujocoWorld(
             vehicle, self.spec.camera, layout, config.rules, slots, threads, self.spec.action
         )
         self._limits = limits_of(ActionLimits(), self.spec.action, vehicle)
-        self._first = first_action(self.spec.action, vehicle)
+        self._first_action = first_action(self.spec.action, vehicle)
         self._decision = np.zeros(slots)
-        self._action = np.tile(self._first, (slots, 1))
+        self._action = np.tile(self._first_action, (slots, 1))
         self._output = np.zeros((slots, self.spec.action.size))
         self._tracks: list[Track] = []
         self._bad = np.zeros(slots, bool)
@@ -176,7 +177,13 @@ class Races:
     def start(
         self, slots: list[int], rngs: list[np.random.Generator], track_seed: int | None = None
     ) -> None:
-        """Begin an episode in each of `slots`, all that it draws coming from its generator."""
+        """Begin an episode in each of `slots`.
+
+        Args:
+            slots: numbers of the slots.
+            rngs: a random generator for each slot, for the level, the track and the vehicle.
+            track_seed: seed of the track; None: that of the configuration, or a random one.
+        """
         config = self.config
         entries: list[tuple[int, Track, TrialSpec]] = []
         for slot, rng in zip(slots, rngs, strict=True):
@@ -184,38 +191,38 @@ class Races:
             level = lowest if lowest == highest else int(rng.integers(lowest, highest + 1))
             seed = config.track_seed if track_seed is None else track_seed
             seed = int(rng.integers(SEEDS)) if seed is None else int(seed)
-            track = self._file or make_track(config.track, level, seed)
+            track = self._file_track or make_track(config.track, level, seed)
             self._tracks = self._tracks or [track] * self.slots
             self._tracks[slot] = track
             self.track_seed[slot], self.level[slot] = seed, level
-            self._decision[slot], self._action[slot], self._output[slot] = 0, self._first, 0.0
-            self._bad[slot] = False
-            name = config.track if self._file else track.family
+            self._decision[slot], self._action[slot] = 0, self._first_action
+            self._output[slot], self._bad[slot] = 0.0, False
+            name = config.track if self._file_track else track.family
             entries.append((slot, track, TrialSpec(name, level, seed)))
-        drawn = [self._drawn(rng) for rng in rngs] if callable(config.vehicle) else None
+        vehicles = [self._draw_vehicle(rng) for rng in rngs] if callable(config.vehicle) else None
         if entries:
-            self._world.load(entries, drawn)
+            self._world.load(entries, vehicles)
 
-    def _drawn(self, rng: np.random.Generator) -> Vehicle:
-        """Return the vehicle of an episode.
+    def _draw_vehicle(self, rng: np.random.Generator) -> Vehicle:
+        """Return a random vehicle for an episode.
 
         Raises:
-            ValueError: where it differs from the others in more than values of effects.
+            ValueError: where it differs from the first one in more than values of effects.
         """
-        vehicle, first = resolved_vehicle(self.config, rng), self._vehicle
+        vehicle = resolved_vehicle(self.config, rng)
         for part in fields(Vehicle):
-            ones, others = (getattr(each, part.name) for each in (vehicle, first))
+            value, first = (getattr(each, part.name) for each in (vehicle, self._vehicle))
             if part.name == "effects":
-                ones, others = sorted(ones), sorted(others)
-            if ones != others:
+                value, first = sorted(value), sorted(first)
+            if value != first:
                 raise ValueError(
-                    f"vehicle: the function drew {part.name} {ones} after {others}; draw values "
+                    f"vehicle: the function drew {part.name} {value} after {first}; draw values "
                     "of the same effects around one vehicle (`with_effects`)"
                 )
         return vehicle
 
     def track(self, slot: int) -> Track:
-        """Return the track."""
+        """Return the track in `slot`."""
         return self._tracks[slot]
 
     def view(self) -> View:
@@ -232,14 +239,18 @@ class Races:
         }
 
     def step(self, output: np.ndarray) -> np.ndarray:
-        """Fly one action (N, size), -1 to 1, for a period of the policy's rate; return rewards."""
+        """Fly one action in each slot for a period of the policy's rate; return rewards (N,).
+
+        Args:
+            output: (N, size) actions, -1 to 1.
+        """
         output = np.asarray(output, float)
-        fits = np.isfinite(output).all(-1)
+        finite = np.isfinite(output).all(-1)
         flying = self.ended == FLYING
         guarded = guard_action(self._limits, output, self._action, 0.0, "of the environment's user")
-        self._bad |= flying & ~fits
-        flying &= fits
-        before, to_go, time_s = self.gates, self.to_go, self.time_s
+        self._bad |= flying & ~finite
+        flying &= finite
+        gates_before, to_go_before, time_before_s = self.gates, self.to_go, self.time_s
         clipped = np.clip(np.nan_to_num(output), -1.0, 1.0)
         change = np.sqrt(((clipped - self._output) ** 2).sum(-1)) * flying
         self._action = np.where(flying[:, None], guarded.action_b, self._action)
@@ -248,23 +259,23 @@ class Races:
         steps = np.where(flying, np.maximum(1, steps_to_next(self._decision, period)), 0)
         self._decision += flying
         self._world.advance(self._action, steps, False)
-        ended = [self.ended_by(slot) for slot in range(self.slots)]
-        over = np.array([how not in (None, "finished", "timeout") for how in ended])
-        done = np.array([how == "finished" for how in ended])
+        endings = [self.ended_by(slot) for slot in range(self.slots)]
+        failed = np.array([ending not in (None, "finished", "timeout") for ending in endings])
+        finished = np.array([ending == "finished" for ending in endings])
         moments = Moments(
-            to_go, self.to_go, self.gates - before, over & (flying | self._bad), done & flying,
-            self.time_s - time_s, change,
+            to_go_before, self.to_go, self.gates - gates_before, failed & (flying | self._bad),
+            finished & flying, self.time_s - time_before_s, change,
         )  # fmt: skip
         reward = np.zeros(self.slots)
-        for name, (usual, term) in REWARDS.items():
-            weight = self.config.rewards.get(name, usual)
+        for name, (default, term) in REWARDS.items():
+            weight = self.config.rewards.get(name, default)
             if weight:
                 reward = reward + weight * term(moments)
         return reward
 
     @property
     def ended(self) -> np.ndarray:
-        """(N,) as `eval.worlds.trial.Progress.ended`; a bad action counts as diverged."""
+        """(N,) codes of `eval.worlds.trial.Progress.ended`; a bad action has the last code."""
         return np.where(self._bad, len(ENDINGS), self._world.progress.ended)
 
     @property
@@ -279,9 +290,11 @@ class Races:
 
     @property
     def to_go(self) -> np.ndarray:
-        """(N,) way left: to the next gate's centre and on from centre to centre [m]."""
-        parts = zip(self._world.progress.pos_w, self._tracks, self.gates, strict=True)
-        return np.array([way_left(pos, t.scene.gates.center_w, gates) for pos, t, gates in parts])
+        """(N,) length of the path to the next gate's centre, and on from centre to centre [m]."""
+        slots = zip(self._world.progress.pos_w, self._tracks, self.gates, strict=True)
+        return np.array(
+            [remaining_path(pos_w, t.scene.gates.center_w, gates) for pos_w, t, gates in slots]
+        )
 
     def ended_by(self, slot: int) -> str | None:
         """Return one of `ENDINGS`, `BAD_ACTION`, or None for a running episode."""
@@ -291,17 +304,17 @@ class Races:
         return None if code == FLYING else ENDINGS[code - 1]
 
     def info(self, slot: int) -> dict[str, Any]:
-        """Return the info of an episode, in addition to observation and reward."""
-        how = self.ended_by(slot)
+        """Return the info dict of the episode in `slot`, as Gymnasium's `step` returns it."""
+        ending = self.ended_by(slot)
         info = {
             "track_seed": int(self.track_seed[slot]),
             "level": int(self.level[slot]),
             "gates": int(self.gates[slot]),
             "time_s": float(self.time_s[slot]),
-            "ended_by": how or "",
-            "collided_with": self._world.collided_with(slot) if how == "collision" else "",
+            "ended_by": ending or "",
+            "collided_with": self._world.collided_with(slot) if ending == "collision" else "",
             "message": "",
         }
-        if how == BAD_ACTION:
+        if ending == BAD_ACTION:
             info["message"] = "the action is not finite: look for NaN in the learner's network"
         return info

@@ -1,6 +1,6 @@
-"""Races by the conventions of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`).
+"""The race as environments of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`).
 
-The library rejects images with two axes, so here the pixels are one vector, row by row; an image
+The library refuses images with two axes, so here the pixels are one vector, row by row; an image
 with `channel_axis=True` is unchanged.
 """
 
@@ -27,7 +27,7 @@ def race_env(**settings: Any) -> gymnasium.Env:
 
 
 def vector_space(space: gymnasium.Space) -> Dict:
-    """Return the space of observations whose image of two axes is one vector."""
+    """Return a space of observations with an image of two axes converted to a vector."""
     assert isinstance(space, Dict)
     image = space["image"]
     assert isinstance(image, Box)
@@ -36,20 +36,22 @@ def vector_space(space: gymnasium.Space) -> Dict:
     return Dict({"state": space["state"], "image": image})
 
 
-def as_space(space: Dict, seen: Observation, *rows: int) -> Observation:
-    """Return observations in the shapes of `space`, with a first axis of `rows` where given."""
-    return {key: part.reshape(*rows, *(space[key].shape or ())) for key, part in seen.items()}
+def as_space(space: Dict, observation: Observation, *rows: int) -> Observation:
+    """Return observations reshaped to `space`, with a first axis of size `rows`, if any."""
+    return {
+        key: part.reshape(*rows, *(space[key].shape or ())) for key, part in observation.items()
+    }
 
 
 class RaceVecEnv(VecEnv):
-    """`RaceVectorEnv` by the conventions of Stable-Baselines3: about as fast, in one process."""
+    """`RaceVectorEnv` by the conventions of Stable-Baselines3: N races in one process."""
 
     def __init__(self, num_envs: int, **settings: Any) -> None:
         """Make the environments.
 
         Args:
-            num_envs: how many.
-            settings: as of `RaceVectorEnv`.
+            num_envs: number of environments.
+            settings: arguments of `RaceVectorEnv`.
         """
         self.races = RaceVectorEnv(num_envs, **settings)
         self._actions = np.zeros(self.races.action_space.shape or (), np.float32)
@@ -57,49 +59,50 @@ class RaceVecEnv(VecEnv):
         super().__init__(num_envs, self._space, self.races.single_action_space)
 
     def reset(self) -> Observation:
-        """Start all episodes, with the seed of `seed()` where it was called."""
+        """Start all episodes, with the seeds of `seed()` if it was called."""
         seed = None if None in self._seeds else list(self._seeds)
-        seen, infos = self.races.reset(seed=seed)
+        observation, infos = self.races.reset(seed=seed)
         self._reset_seeds()
-        self.reset_infos = [_of(infos, slot) for slot in range(self.num_envs)]
-        return as_space(self._space, seen, self.num_envs)
+        self.reset_infos = [_info_of(infos, slot) for slot in range(self.num_envs)]
+        return as_space(self._space, observation, self.num_envs)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Store the actions (N, size) for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Fly the actions; as this library requires, an ended episode restarts at once."""
-        seen, reward, terminated, truncated, infos = self.races.step(self._actions)
-        over, each = terminated | truncated, []
+        """Fly the actions; an ended episode restarts at once, as the library requires."""
+        observation, reward, terminated, truncated, infos = self.races.step(self._actions)
+        ended, slot_infos = terminated | truncated, []
         for slot in range(self.num_envs):
-            info = _of(infos["final_info"] if over[slot] else infos, slot)
-            if over[slot]:
+            info = _info_of(infos["final_info"] if ended[slot] else infos, slot)
+            if ended[slot]:
                 info["terminal_observation"] = as_space(self._space, infos["final_obs"][slot])
                 info["TimeLimit.truncated"] = bool(truncated[slot])
-            each.append(info)
-        seen = as_space(self._space, seen, self.num_envs)
-        return seen, reward.astype(np.float32), over, each
+            slot_infos.append(info)
+        observation = as_space(self._space, observation, self.num_envs)
+        return observation, reward.astype(np.float32), ended, slot_infos
 
     def close(self) -> None:
-        """Do nothing: there is no other process."""
+        """Do nothing, since there is no other process."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environments, once for each."""
         return [getattr(self.races, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: environments in one simulator have nothing of their own."""
+        """Refuse, since the environments are one object."""
         raise NotImplementedError(f"{attr_name}: make new environments with other settings")
 
     def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """Refuse: environments in one simulator have nothing of their own."""
+        """Refuse, since the environments are one object."""
         raise NotImplementedError(f"{method_name}: RaceVecEnv.races has the methods of all at once")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return that none is."""
+        """Return False for each environment."""
         return [False for _ in self._get_indices(indices)]
 
 
-def _of(infos: dict[str, Any], slot: int) -> dict[str, Any]:
+def _info_of(infos: dict[str, Any], slot: int) -> dict[str, Any]:
+    """Return the info of one environment from Gymnasium's dict of arrays."""
     return {key: part[slot] for key, part in infos.items() if not key.startswith(("_", "final_"))}

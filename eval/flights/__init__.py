@@ -1,1 +1,1 @@
-"""Commanded trajectories, flown in simulation and logged with noise."""
+"""Trajectories, the controller that flies them in simulation, and noisy logs of the flights."""

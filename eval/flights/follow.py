@@ -1,6 +1,7 @@
-"""A position controller (the pilot) that flies trajectories in any simulator.
+"""A position controller, called the pilot, that flies trajectories in any simulator.
 
-Its commands are collective thrust and body rates (CTBR).
+Its commands are collective thrust and body rates (CTBR). A simulator is used through the protocol
+`Bodies`.
 """
 
 from __future__ import annotations
@@ -19,40 +20,45 @@ from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.scene import Array
 
 FURTHEST_M = 4.0
-"""A flight further off its trajectory than this has failed [m]."""
+"""Distance from its trajectory at which a flight has failed [m]."""
 LOWEST_M = 0.02
-"""A flight lower than this has failed [m]."""
+"""Height below which a flight has failed [m]."""
+SUM_MOST = 1.0
+"""Largest component of the integral of the position error [m s]."""
+LIFT_PER_FLAT, LIFT_LEAST = 0.36, 1.0
+"""Least vertical part of the wanted specific force: relative to the horizontal part, which limits
+the tilt to 70 deg, and absolute [m/s^2]."""
 
 
 class Recording(NamedTuple):
-    """One flight at every physics step, K of them, without noise."""
+    """One flight at each of K physics steps, without noise."""
 
     dt: float
-    """Of a physics step [s]."""
+    """Length of a physics step [s]."""
     period: int
-    """Physics steps for which a command is held; one row of a log each."""
+    """Physics steps for which a command is held; a log has one row for each command."""
     time_s: np.ndarray
-    """(K,) [s]."""
+    """(K,) time since the start [s]."""
     motion: Motion
-    """(K, ...) at the start of each step."""
+    """(K, ...) rigid-body state at the start of each step."""
     quat_wxyz: np.ndarray
-    """(K, 4)."""
+    """(K, 4) attitude at the start of each step."""
     rotor_speed: np.ndarray
     """(K, 4) at the start of each step [rad/s]."""
     command: Command
-    """(K, ...) of the pilot."""
+    """(K, ...) the pilot's commands."""
     acc_b: np.ndarray
-    """(K, 3) specific force in the step that has just ended [m/s^2]."""
+    """(K, 3) specific force in the previous step [m/s^2]."""
     voltage: np.ndarray
-    """(K,) [V]."""
+    """(K,) battery voltage [V]."""
     acting: Command
-    """(K, ...) what acted, before the vehicle's own delay: `command`, as an
-    `eval.flights.simulate.Extra` changed it."""
+    """(K, ...) `command` as an `eval.flights.simulate.Extra` (physics beyond the vehicle's)
+    changed it, before the vehicle's delay."""
     extra: Wrench
-    """(K, 3) force and torque that an `Extra` (physics beyond the vehicle's) added."""
+    """(K, 3) force and torque that an `Extra` added."""
     integrator: str | None = None
-    """`euler` if the simulator integrates by Euler steps of `dt`, as the flight shows; None if the
-    flight counts as continuous in time."""
+    """`euler` if the simulator integrates by Euler steps of `dt`; None if the flight counts as
+    continuous in time."""
 
 
 class FlightFailed(RuntimeError):
@@ -60,41 +66,47 @@ class FlightFailed(RuntimeError):
 
 
 class Step(NamedTuple):
-    """What N bodies had in a step that has just ended."""
+    """Quantities of N vehicles in the last physics step."""
 
     rotor_speed: np.ndarray
     """(N, 4) at its start [rad/s]."""
     voltage: np.ndarray
-    """(N,) [V]."""
+    """(N,) battery voltage [V]."""
     acting: Command
-    """(N, ...) what acted, before the vehicle's own delay."""
+    """(N, ...) commands, as `Recording.acting`."""
     extra: Wrench
-    """(N, 3) as in `Recording`."""
+    """(N, 3) added force and torque, as `Recording.extra`."""
     acc_b: np.ndarray
     """(N, 3) specific force [m/s^2]."""
 
 
 class Bodies(Protocol):
-    """N vehicles of a simulator, stepped together."""
+    """N vehicles in a simulator, stepped together."""
 
     integrator: str | None
-    """That of a `Recording`."""
+    """As `Recording.integrator`."""
 
     def motion(self) -> tuple[Motion, np.ndarray]:
-        """Return how they move now, and their attitudes (N, 4) wxyz."""
+        """Return the current rigid-body states (N, ...) and attitudes (N, 4) wxyz."""
         ...
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
-        """Go one step of physics further from `motion` at `time_s` [s], under a command each."""
+        """Simulate one physics step from `motion` at `time_s` [s] under commands (N, ...)."""
         ...
 
 
-def wanted_of(trajectories: Sequence[Trajectory], period: int, dt: float) -> Reference:
-    """Return the set points of N trajectories at every command, (commands, N, ...)."""
-    steps = round(max(way.duration_s for way in trajectories) / dt)
-    clock = np.arange(0, steps, period) * dt
-    ways = [way.reference(clock) for way in trajectories]
-    return Reference(*(np.stack(parts, axis=1) for parts in zip(*ways, strict=True)))
+def reference_of(trajectories: Sequence[Trajectory], period: int, dt: float) -> Reference:
+    """Return the set points of N trajectories at every command, (commands, N, ...).
+
+    Args:
+        trajectories: the trajectories.
+        period: physics steps between commands.
+        dt: length of a physics step [s].
+    """
+    steps = round(max(path.duration_s for path in trajectories) / dt)
+    time_s = np.arange(0, steps, period) * dt
+    references = [path.reference(time_s) for path in trajectories]
+    return Reference(*(np.stack(parts, axis=1) for parts in zip(*references, strict=True)))
 
 
 def follow(
@@ -106,22 +118,22 @@ def follow(
     dt: float,
     gains: PilotGains | None = None,
 ) -> list[Recording]:
-    """Fly `trajectories` side by side and return what happened.
+    """Fly N trajectories at once, each with its own vehicle, and return their recordings.
 
     Args:
-        bodies: N of them, where and as fast as the trajectories begin.
+        bodies: N vehicles at the start positions and velocities of the trajectories.
         nominal: the vehicle that the controller assumes.
-        trajectories: N of them.
-        wanted: their set points, by `wanted_of`.
+        trajectories: the N trajectories.
+        wanted: their set points, from `reference_of`.
         period: physics steps for which a command is held.
-        dt: of a physics step [s].
-        gains: of the pilot.
+        dt: length of a physics step [s].
+        gains: gains of the pilot; None: the defaults.
 
     Raises:
         FlightFailed: where a flight tips over, hits the ground or leaves its trajectory.
     """
     count = len(trajectories)
-    steps = [round(way.duration_s / dt) for way in trajectories]
+    steps = [round(path.duration_s / dt) for path in trajectories]
     gains, summed_w = gains or PilotGains(), np.zeros((count, 3))
     command = Command(np.zeros(count), np.zeros((count, 3)))
     acc_b = np.zeros((count, 3)) + [0.0, 0.0, GRAVITY]
@@ -131,44 +143,50 @@ def follow(
         if step % period == 0:
             now = Reference(*(part[step // period] for part in wanted))
             check_flights(motion, now, np.full(count, step * dt))
-            summed_w = np.clip(summed_w + period * dt * (now.pos_w - motion.pos_w), -1.0, 1.0)
+            summed_w = summed_w + period * dt * (now.pos_w - motion.pos_w)
+            summed_w = np.clip(summed_w, -SUM_MOST, SUM_MOST)
             command = steer(nominal, gains, now, motion, summed_w)
         speed, voltage, acting, extra, next_acc_b = bodies.step(motion, command, step * dt)
         rows.append((motion, quat, speed, command, acc_b, voltage, acting, extra))
         acc_b = next_acc_b
     time_s = np.arange(max(steps)) * dt
     return [
-        Recording(dt, period, time_s[:length], *_of(rows[:length], index))._replace(
+        Recording(dt, period, time_s[:length], *_flight_of(rows[:length], index))._replace(
             integrator=bodies.integrator
         )
         for index, length in enumerate(steps)
     ]
 
 
-def _of(rows: Sequence[Any], index: int) -> Any:
-    """Return flight `index` (K, ...) of K rows, tuples of arrays (N, ...) or of such tuples."""
+def _flight_of(rows: Sequence[Any], index: int) -> Any:
+    """Return flight `index` (K, ...) from K rows, nested tuples of arrays (N, ...)."""
     if not isinstance(rows[0], tuple):
         return np.array([row[index] for row in rows])
-    parts = (_of(field, index) for field in zip(*rows, strict=True))
+    parts = (_flight_of(field, index) for field in zip(*rows, strict=True))
     kind = type(rows[0])
     return kind(*parts) if hasattr(kind, "_fields") else tuple(parts)
 
 
 def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
-    """Check at `time_s` (N,) [s] that N flights are upright, above ground and on their way.
+    """Check that N flights are upright, above the ground and near their trajectories.
+
+    Args:
+        motion: (N, ...) states.
+        wanted: (N, ...) set points.
+        time_s: (N,) current times [s].
 
     Raises:
         FlightFailed: where one has tipped over, hit the ground or left its trajectory.
     """
-    off = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
-    # Written so that a state that is no number fails too.
+    distance = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
+    # With these comparisons, a state of NaN fails too.
     upright, high = motion.rot_w[:, 2, 2] > 0.0, motion.pos_w[:, 2] > LOWEST_M
-    sound = (off < FURTHEST_M) & upright & high
-    if not sound.all():
-        bad = int(np.flatnonzero(~sound)[0])
+    valid = (distance < FURTHEST_M) & upright & high
+    if not valid.all():
+        bad = int(np.flatnonzero(~valid)[0])
         raise FlightFailed(
-            f"flight {bad + 1} failed at {time_s[bad]:.2f} s, {off[bad]:.1f} m off its trajectory; "
-            "make the trajectory gentler or the effect weaker"
+            f"flight {bad + 1} failed at {time_s[bad]:.2f} s, {distance[bad]:.1f} m off its "
+            "trajectory; make the trajectory gentler or the effect weaker"
         )
 
 
@@ -181,7 +199,7 @@ class PilotGains:
     velocity: float = 3.5
     """Acceleration per velocity error [1/s]."""
     integral: float = 2.0
-    """Acceleration per summed position error [1/s^3]."""
+    """Acceleration per integral of the position error [1/s^3]."""
     correction: float = 8.0
     """Largest correction of each component of the acceleration [m/s^2]."""
 
@@ -193,14 +211,17 @@ def corrected(
     vel_error_w: Array,
     summed_w: Array | float = 0.0,
 ) -> Array:
-    """Return the acceleration (..., 3) [m/s^2] that also brings a vehicle back to its path.
+    """Return the acceleration of a path plus the correction of position and velocity errors.
 
     Args:
-        gains: of the position loop.
+        gains: gains of the position loop.
         acc_w: (..., 3) acceleration of the path [m/s^2].
         pos_error_w: (..., 3) path minus vehicle, position [m].
         vel_error_w: (..., 3) path minus vehicle, velocity [m/s].
         summed_w: (..., 3) integral of `pos_error_w` over time [m s].
+
+    Returns:
+        The wanted acceleration (..., 3) in world axes [m/s^2].
     """
     xp = acc_w.__array_namespace__()
     correction = (
@@ -215,18 +236,18 @@ def steer(
     """Return the command that follows `wanted`; the pilot knows the nominal vehicle only.
 
     Args:
-        vehicle: its controller's gains and limits are used.
-        gains: of the position loop.
-        wanted: of N flights at this moment.
+        vehicle: gives the attitude loop's gains and limits.
+        gains: gains of the position loop.
+        wanted: (N, ...) current set points.
         motion: (N, ...) true states.
         summed_w: (N, 3) integral of the position error over time [m s].
     """
     pos_error_w, vel_error_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
     acc_w = corrected(gains, wanted.acc_w, pos_error_w, vel_error_w, summed_w)
     force_w = acc_w + np.array([0.0, 0.0, GRAVITY])
-    # Tilt of at most 70 degrees: a commanded free fall would turn the vehicle over.
+    # The tilt is limited: a commanded free fall would turn the vehicle over.
     flat = np.sqrt((force_w[:, :2] ** 2).sum(-1))
-    force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(0.36 * flat, 1.0))
+    force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(LIFT_PER_FLAT * flat, LIFT_LEAST))
     heading_w = np.stack(
         [np.cos(wanted.yaw), np.sin(wanted.yaw), np.zeros_like(wanted.yaw)], axis=-1
     )

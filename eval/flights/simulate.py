@@ -1,4 +1,4 @@
-"""Commanded trajectories flown in MuJoCo's C engine, and what is logged of them, with noise."""
+"""Fly commanded trajectories in MuJoCo, and make logs of the flights with sensor noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from eval.effects.log_faults import apply_log_faults
-from eval.flights.follow import PilotGains, Recording, Step, follow, wanted_of
+from eval.flights.follow import PilotGains, Recording, Step, follow, reference_of
 from eval.flights.trajectory import Reference, Trajectory
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, uses_noise
@@ -19,25 +19,25 @@ from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.rotation import to_world
 
 FULL_V = 16.5
-"""Of the battery at the start [V]."""
+"""Battery voltage at the start [V]."""
 FALL_V_PER_S = 0.02
-"""Of the battery's voltage while it empties [V/s]."""
+"""Rate at which the voltage falls as the battery discharges [V/s]."""
 SAG_V = 0.35
-"""Further fall of the voltage where the rotors take twice the power of a hover [V]."""
+"""Additional voltage drop at twice the power of a hover [V]."""
 
 INTEGRATOR = "euler"
-"""MuJoCo's of our models; a command acts on whole steps of it."""
+"""MuJoCo's integrator in the suite's models; a command acts for whole steps."""
 
 
 class Extra(Protocol):
-    """Physics in addition to the vehicle's, acting on N flights at once."""
+    """Physics that the vehicle's effects do not describe, acting on N flights at once."""
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the command that acts in place of `command`, once a step."""
+        """Return the command that acts instead of `command`; called once a step."""
         ...
 
     def wrench(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> Wrench:
-        """Return the wrench (N, 3) that is added to `wrench`, once a step."""
+        """Return a force and torque (N, 3) to add to `wrench`; called once a step."""
         ...
 
 
@@ -51,20 +51,20 @@ def fly(
     has_voltage: bool = False,
     gains: PilotGains | None = None,
 ) -> list[Recording]:
-    """Fly `trajectories` side by side and return what happened.
+    """Fly N trajectories at once, each with its own vehicle, and return their recordings.
 
     Args:
         nominal: the vehicle that the position controller assumes.
         truth: the vehicle that flies: the same quadrotor with the true effects.
-        trajectories: N of them.
-        rate_hz: of commands and of log rows; the rate loop's frequency must be a multiple of it.
+        trajectories: the N trajectories.
+        rate_hz: rate of commands and log rows; the rate loop's frequency must be a multiple of it.
         extra: further physics that no effect describes.
-        rng: for random wind; none blows without it.
-        has_voltage: whether effects see the battery's voltage, as they do where it is logged.
-        gains: of the pilot.
+        rng: random generator for random wind; without it there is none.
+        has_voltage: whether effects depend on the battery's voltage, as for logs that contain it.
+        gains: gains of the position controller; None: the defaults.
 
     Raises:
-        FlightFailed: where a flight tips over, leaves the air or its trajectory.
+        FlightFailed: where a flight tips over, hits the ground or leaves its trajectory.
         ValueError: for a rate that does not divide the rate loop's frequency.
     """
     frequency = truth.controller.frequency
@@ -74,18 +74,18 @@ def fly(
             f"rate_hz = {rate_hz:g}: must divide the rate loop's frequency, {frequency:g} Hz"
         )
     dt = 1.0 / frequency
-    wanted = wanted_of(trajectories, period, dt)
+    wanted = reference_of(trajectories, period, dt)
     plant = make_plant(truth, dt)
-    draws = None
+    noise = None
     if rng is not None and uses_noise(plant):
-        steps = round(max(way.duration_s for way in trajectories) * frequency)
-        draws = rng.standard_normal((steps + 1, len(trajectories), 3))
-    bodies = _MujocoBodies(truth, plant, wanted, dt, extra, draws, has_voltage)
+        steps = round(max(path.duration_s for path in trajectories) * frequency)
+        noise = rng.standard_normal((steps + 1, len(trajectories), 3))
+    bodies = _MujocoBodies(truth, plant, wanted, dt, extra, noise, has_voltage)
     return follow(bodies, nominal, trajectories, wanted, period, dt, gains)
 
 
 class _MujocoBodies:
-    """N quadrotors, each in a model of its own."""
+    """N quadrotors in MuJoCo, each in its own simulation."""
 
     integrator: str | None = INTEGRATOR
 
@@ -96,29 +96,28 @@ class _MujocoBodies:
         wanted: Reference,
         dt: float,
         extra: Extra | None,
-        draws: np.ndarray | None,
+        noise: np.ndarray | None,
         has_voltage: bool,
     ) -> None:
         import mujoco
 
         from eval.quadrotor.model import compile_quadrotor
 
-        self._plant, self._dt, self._extra, self._draws = plant, dt, extra, draws
+        self._plant, self._dt, self._extra, self._noise = plant, dt, extra, noise
         self._has_voltage, self._steps = has_voltage, 0
         count = wanted.yaw.shape[1]
         self._model = compile_quadrotor(mujoco.MjSpec(), truth, dt)
         self._datas = [mujoco.MjData(self._model) for _ in range(count)]
-        self._first, self._second = mujoco.mj_step1, mujoco.mj_step2
+        self._step1, self._step2 = mujoco.mj_step1, mujoco.mj_step2
         for index, data in enumerate(self._datas):
             half = wanted.yaw[0, index] / 2
             data.qpos[:3] = wanted.pos_w[0, index]
             data.qpos[3:] = [np.cos(half), 0.0, 0.0, np.sin(half)]
             data.qvel[:3] = wanted.vel_w[0, index]
-            self._first(self._model, data)
-        noise = None if draws is None else draws[0]
-        self._state = hover_state(plant, (count,), noise=noise)
+            self._step1(self._model, data)
+        self._state = hover_state(plant, (count,), noise=None if noise is None else noise[0])
         self._hover = (self._state.rotor_speed**2).sum(-1)
-        self._still = Wrench(np.zeros((count, 3)), np.zeros((count, 3)))
+        self._no_wrench = Wrench(np.zeros((count, 3)), np.zeros((count, 3)))
 
     def motion(self) -> tuple[Motion, np.ndarray]:
         pose = np.array([data.qpos for data in self._datas])
@@ -127,14 +126,14 @@ class _MujocoBodies:
         return Motion(pose[:, :3], rot_w, velocity[:, :3], velocity[:, 3:]), pose[:, 3:]
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
-        speed, added = self._state.rotor_speed, self._still
+        speed, added = self._state.rotor_speed, self._no_wrench
         power = (speed**2).sum(-1) / self._hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power
         acting = command if self._extra is None else self._extra.command(command, time_s)
         self._steps += 1
         inputs = Inputs(
             acting,
-            noise=None if self._draws is None else self._draws[self._steps],
+            noise=None if self._noise is None else self._noise[self._steps],
             voltage_drop=drop if self._has_voltage else None,
         )
         now = np.full(len(self._datas), time_s)
@@ -146,36 +145,36 @@ class _MujocoBodies:
         for index, data in enumerate(self._datas):
             data.qfrc_applied[:3] = force_w[index]
             data.qfrc_applied[3:] = wrench.torque_b[index]
-            self._second(self._model, data)
-            self._first(self._model, data)
+            self._step2(self._model, data)
+            self._step1(self._model, data)
         acc_b = wrench.force_b / self._plant.constants.mass
         return Step(speed, FULL_V - drop, acting, added, acc_b)
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """Channels with the standard deviation of their white noise; 0 leaves a channel out."""
+    """Standard deviations of the white noise of a log's signals; 0: the signal is not logged."""
 
     name: str
-    """For tables."""
+    """Name in tables."""
     rate_hz: float
-    """Of the log."""
+    """Rate of the log [Hz]."""
     pos: float
-    """Each axis [m]."""
+    """Position, each axis [m]."""
     attitude: float
-    """About each body axis [rad]."""
+    """Attitude, about each body axis [rad]."""
     gyro: float
-    """Each axis [rad/s]."""
+    """Body rates, each axis [rad/s]."""
     vel: float = 0.0
-    """Each axis [m/s]."""
+    """Velocity, each axis [m/s]."""
     acc: float = 0.0
-    """Each axis [m/s^2]."""
+    """Specific force, each axis [m/s^2]."""
     rotor: float = 0.0
-    """Each rotor [rad/s]."""
+    """Speed of each rotor [rad/s]."""
     voltage: float = 0.0
-    """[V]."""
+    """Battery voltage [V]."""
     lost: float = 0.0
-    """Share of rows in which the pose is missing, in stretches of three rows."""
+    """Share of rows without a pose; each gap has three rows."""
 
 
 SENSORS: dict[str, Sensors] = {
@@ -196,7 +195,7 @@ SENSORS: dict[str, Sensors] = {
         ),
     )
 }
-"""Motion capture and a gyro; a state estimator's output; and a log of everything."""
+"""Sets of sensors by name: motion capture and a gyro; a state estimator; and all signals."""
 
 
 def log_of(
@@ -206,14 +205,14 @@ def log_of(
     rng: np.random.Generator | None,
     name: str = "flight",
 ) -> FlightLog:
-    """Return the log of a flight: the truth's faults of the log first, then noise.
+    """Return the log of a flight, with the true vehicle's log faults, then noise and gaps.
 
     Args:
-        recording: at every physics step.
-        truth: whose log faults are applied, at the physics rate.
-        sensors: what is logged; its rate must be the recording's.
-        rng: of the noise; None logs without noise and without holes (a noise-free twin).
-        name: of the flight.
+        recording: the flight at every physics step.
+        truth: the vehicle with the log faults (such as a gyro bias), applied at the physics rate.
+        sensors: the logged signals and their noise; its rate must be the recording's.
+        rng: random generator of noise and gaps; None: neither.
+        name: name of the flight.
     """
     motion = recording.motion
     true = {
@@ -224,22 +223,22 @@ def log_of(
         "rate_b": motion.rate_b,
         "acc_b": recording.acc_b,
     }
-    seen = apply_log_faults(truth.effects, true)
+    logged = apply_log_faults(truth.effects, true)
     rows = slice(None, None, recording.period)
     about: dict[str, Any] = {"source": "suite blind"}
     if recording.integrator is not None:
         about |= {"integrator": recording.integrator, "step_s": recording.dt}
 
-    def measured(values: np.ndarray, sigma: float) -> np.ndarray:
+    def noisy(values: np.ndarray, sigma: float) -> np.ndarray:
         values = np.array(values[rows])
         return values if rng is None else values + sigma * rng.standard_normal(values.shape)
 
-    pos_w, rate_b = measured(seen["pos_w"], sensors.pos), measured(seen["rate_b"], sensors.gyro)
-    quat = np.array(seen["quat_wxyz"][rows])
+    pos_w, rate_b = noisy(logged["pos_w"], sensors.pos), noisy(logged["rate_b"], sensors.gyro)
+    quat = np.array(logged["quat_wxyz"][rows])
     if rng is not None:
-        # A small turn about body axes.
-        turn = Rotation.from_rotvec(sensors.attitude * rng.standard_normal((len(quat), 3)))
-        quat = (Rotation.from_quat(quat, scalar_first=True) * turn).as_quat(scalar_first=True)
+        # The attitude's noise is a small rotation about body axes.
+        error = Rotation.from_rotvec(sensors.attitude * rng.standard_normal((len(quat), 3)))
+        quat = (Rotation.from_quat(quat, scalar_first=True) * error).as_quat(scalar_first=True)
         lost = rng.random(len(quat)) < sensors.lost / 3.0
         lost[:2] = lost[-4:] = False
         for row in np.flatnonzero(lost):
@@ -250,14 +249,14 @@ def log_of(
         time_s=recording.time_s[rows].copy(),
         pos_w=pos_w,
         quat_wxyz=quat,
-        vel_w=measured(seen["vel_w"], sensors.vel),
+        vel_w=noisy(logged["vel_w"], sensors.vel),
         rate_b=rate_b,
         thrust_cmd=recording.command.thrust[rows].copy(),
         rate_cmd_b=recording.command.rate_b[rows].copy(),
-        rotor_speed=measured(recording.rotor_speed, sensors.rotor) if sensors.rotor else None,
-        acc_b=measured(seen["acc_b"], sensors.acc) if sensors.acc else None,
-        voltage=measured(recording.voltage, sensors.voltage) if sensors.voltage else None,
+        rotor_speed=noisy(recording.rotor_speed, sensors.rotor) if sensors.rotor else None,
+        acc_b=noisy(logged["acc_b"], sensors.acc) if sensors.acc else None,
+        voltage=noisy(recording.voltage, sensors.voltage) if sensors.voltage else None,
         about=about,
-        # Not written to a file, as if it had not been measured.
+        # Without a velocity sensor, the velocity counts as derived and is not written to a file.
         velocity_derived=not sensors.vel,
     )

@@ -1,1 +1,1 @@
-"""Flies trials of a policy, judges them and computes the statistics."""
+"""The judge: it flies trials of a policy in a simulator, scores them and computes statistics."""

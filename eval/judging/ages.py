@@ -1,8 +1,9 @@
-"""The sensor model `delay` in the judge: states and images that are old at a decision.
+"""The sensor model `delay` in the judge: the policy observes states and images of an earlier time.
 
-Views are taken between decisions, at the physics step that precedes their decision by the age, and
-stored until then. With jitter, each decision has its own age from the trial's seed. At the start of
-a trial, before any view is old enough, the policy gets the first view.
+A view (the observable state, with the depth image) is taken between decisions, at the physics step
+that precedes its decision by the age, and stored until then. With jitter, each decision has its own
+random age from the trial's seed. At the start of a trial, before any view is old enough, the policy
+gets the first view. A slot is a place in the simulator, in which one trial (flight) is flown.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class Due(NamedTuple):
     """Views to take before the next decision, for one later decision."""
 
     pause: np.ndarray
-    """(N,) physics steps after the last decision."""
+    """(N,) physics steps between the last decision and the view."""
     rows: np.ndarray
     """(N,) bool: slots with such a view."""
     place: int
@@ -35,11 +36,11 @@ class Moment(NamedTuple):
     """A time between two decisions at which views are taken."""
 
     pause: np.ndarray
-    """(N,) physics steps after the last decision, never less than the moment's before."""
+    """(N,) physics steps after the last decision, at least those of the previous moment."""
     images: np.ndarray
     """(N,) bool: slots whose image is needed."""
     taken: list[tuple[Aged, Due]]
-    """Uses of the view; `Due.rows` are the slots at their pause."""
+    """Where to store the view; `Due.rows` are the slots that have this time."""
 
 
 class Aged:
@@ -48,26 +49,27 @@ class Aged:
     def __init__(
         self, age_s: float, jitter: float, slots: int, period_steps: float, dt: float
     ) -> None:
-        """Make it for an age.
+        """Make the storage of views with an age.
 
         Args:
-            age_s: the mean [s].
-            jitter: each decision's age is up to this share of the mean more or less, evenly [1].
-            slots: how many.
+            age_s: mean age [s].
+            jitter: ages are uniformly distributed between (1 - jitter) and (1 + jitter) times the
+                mean [1].
+            slots: number of slots.
             period_steps: physics steps between decisions.
-            dt: their length [s].
+            dt: length of a physics step [s].
         """
         self._mean, self._jitter, self._period = age_s / dt, jitter, period_steps
         longest = self._mean * (1.0 + jitter)
         self.ahead = math.ceil(longest / period_steps - 1e-9)
         """Largest number of decisions between taking a view and using it."""
-        self._draws = [np.random.default_rng(0)] * slots
+        self._rngs = [np.random.default_rng(0)] * slots
         self._ages = np.full((self.ahead, slots), self._mean)
-        self._kept: list[View] = []
+        self._stored: list[View] = []
 
-    def start(self, slot: int, draws: np.random.Generator) -> None:
-        """Begin in `slot` a trial whose ages come from `draws`."""
-        self._draws[slot] = draws
+    def start(self, slot: int, rng: np.random.Generator) -> None:
+        """Begin a trial in `slot`, whose random ages come from `rng`."""
+        self._rngs[slot] = rng
 
     def see(self, now: View, fresh: np.ndarray, flying: np.ndarray) -> View:
         """Return the delayed view at a decision.
@@ -80,19 +82,19 @@ class Aged:
         if not self.ahead:
             return now
         if self._jitter:
-            self._draw(fresh, flying)
-        kept = self._kept or [now] * self.ahead
-        oldest, *rest = (select(fresh, now, view) for view in kept)
-        self._kept = [*rest, now]
+            self._draw_ages(fresh, flying)
+        stored = self._stored or [now] * self.ahead
+        oldest, *newer = (select(fresh, now, view) for view in stored)
+        self._stored = [*newer, now]
         return oldest
 
-    def _draw(self, fresh: np.ndarray, flying: np.ndarray) -> None:
-        """Draw the age for the last future decision; for all of them in fresh slots."""
+    def _draw_ages(self, fresh: np.ndarray, flying: np.ndarray) -> None:
+        """Draw the age for the last future decision; in fresh slots, for all future decisions."""
         self._ages = np.roll(self._ages, -1, axis=0)
         for slot in np.flatnonzero(flying).tolist():
             count = self.ahead if fresh[slot] else 1
-            share = self._draws[slot].uniform(1.0 - self._jitter, 1.0 + self._jitter, count)
-            self._ages[-count:, slot] = self._mean * share
+            factor = self._rngs[slot].uniform(1.0 - self._jitter, 1.0 + self._jitter, count)
+            self._ages[-count:, slot] = self._mean * factor
 
     def due(self) -> Iterator[Due]:
         """Yield the views to take before the next decision."""
@@ -104,15 +106,15 @@ class Aged:
                 yield Due(np.where(rows, pause, 0), rows, place)
 
     def take(self, due: Due, view: View) -> None:
-        """Store the current view."""
-        self._kept[due.place] = select(due.rows, view, self._kept[due.place])
+        """Store the current view in the slots of `due`."""
+        self._stored[due.place] = select(due.rows, view, self._stored[due.place])
 
 
 class Delays:
-    """Ages of states and images in the slots of a judge."""
+    """Delayed states and delayed images of N slots."""
 
     def __init__(self, ages: Ages, slots: int, period_steps: float, dt: float) -> None:
-        """Make it for `ages` and the physics steps between decisions and their length [s]."""
+        """Make the storages; the other arguments are those of `Aged`."""
         self.state, self.image = (
             Aged(age_s, ages.jitter, slots, period_steps, dt)
             for age_s in (ages.state_s, ages.image_s)
@@ -130,14 +132,15 @@ class Delays:
 
     def moments(self) -> Iterator[Moment]:
         """Yield the times at which views are taken before the next decision, in order."""
-        whose = [(aged, due) for aged in (self.state, self.image) for due in aged.due()]
-        if not whose:
+        uses = [(aged, due) for aged in (self.state, self.image) for due in aged.due()]
+        if not uses:
             return
-        pauses = np.array([due.pause for _, due in whose])
-        for turn in np.argsort(pauses, axis=0, kind="stable"):
-            taken = [(aged, due._replace(rows=due.rows & (turn == number)))
-                     for number, (aged, due) in enumerate(whose)]  # fmt: skip
-            nobody = np.zeros(len(turn), bool)
+        pauses = np.array([due.pause for _, due in uses])
+        # In each slot the uses are sorted by time: `use` (N,) is the number of the next one.
+        for use in np.argsort(pauses, axis=0, kind="stable"):
+            taken = [(aged, due._replace(rows=due.rows & (use == number)))
+                     for number, (aged, due) in enumerate(uses)]  # fmt: skip
+            no_slot = np.zeros(len(use), bool)
             images = [due.rows for aged, due in taken if aged is self.image]
-            pause = np.take_along_axis(pauses, turn[None], axis=0)[0]
-            yield Moment(pause, np.any([nobody, *images], axis=0), taken)
+            pause = np.take_along_axis(pauses, use[None], axis=0)[0]
+            yield Moment(pause, np.any([no_slot, *images], axis=0), taken)

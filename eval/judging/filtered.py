@@ -1,7 +1,8 @@
-"""The state estimator in the judge: one Kalman filter per slot gives the policy its state.
+"""The state estimator in the judge: a Kalman filter for each trial gives the policy its state.
 
-After each physics step an IMU measurement is simulated. Gate corners are detected at the frame rate
-and reach the filter after a delay. All random numbers come from the trial's seed.
+After each physics step an IMU measurement is simulated. Gate corners are detected at the camera's
+frame rate and reach the filter after a delay. All random numbers come from the trial's seed. A slot
+is a place in the simulator, in which one trial (flight) is flown.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ NEAR_M = 0.2
 
 
 class Pending(NamedTuple):
-    """One frame per slot that has not reached the filter yet, with K corners."""
+    """A camera frame of each slot, with K corners, that has not reached the filter yet."""
 
     image: np.ndarray
-    """(N, K, 2) corners in the image, as tangents."""
+    """(N, K, 2) image coordinates of the corners, as tangents of angles."""
     seen: np.ndarray
     """(N, K) bool, whether a corner was detected."""
     due: np.ndarray
-    """(N,) physics step at which it arrives; -1 for none."""
+    """(N,) physics step at which it reaches the filter; -1 for none."""
 
 
 class Filtered:
@@ -61,8 +62,8 @@ class Filtered:
         Args:
             wanted: the sensors; one of them is the estimator.
             slots: number of trials that fly at once.
-            dt: length of a physics step, at which the IMU measures [s].
-            camera: the policy's; corners are detected with the same pitch and field of view.
+            dt: length of a physics step, and time between IMU measurements [s].
+            camera: the policy's camera; corners are detected with its pitch and field of view.
             corners: largest number of gate corners of a track.
 
         Raises:
@@ -71,7 +72,7 @@ class Filtered:
         if wanted.ages.state_s:
             raise ValueError(
                 f"sensors {wanted.name!r}: delay.state is {wanted.ages.state_s:g} s, but the "
-                "estimator has its own delay: leave delay.state out"
+                "estimator has a delay itself: leave delay.state out"
             )
         settings: FilterSettings = wanted.estimator
         self._settings, self._dt, self._camera = settings, dt, camera
@@ -82,7 +83,7 @@ class Filtered:
         }
         used = (SENSORS[name] for name in self._imu)
         self._trial, self._sample = blank_of_each(used, slots, camera)
-        self._late = round(settings.delay_s / dt)
+        self._delay_steps = round(settings.delay_s / dt)
         self._period = 1.0 / (settings.frame_hz * dt)
         self._half_view = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2.0)
         self._sigma = settings.corner_sigma * 2.0 * self._half_view[0] / settings.width
@@ -90,16 +91,16 @@ class Filtered:
         cos, sin = np.cos(pitch), np.sin(pitch)
         self._camera_b = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
         unused = np.random.default_rng(0)
-        self._frame_draws, self._imu_draws = [unused] * slots, [unused] * slots
+        self._frame_rngs, self._imu_rngs = [unused] * slots, [unused] * slots
         self._corner_w = np.zeros((slots, corners, 3))
-        self._real = np.zeros((slots, corners), bool)
+        self._exists = np.zeros((slots, corners), bool)  # tracks may have fewer corners
         self._steps, self._frame = np.zeros(slots, int), np.zeros(slots, int)
         self._lost = np.zeros(slots, bool)
         self._pending = [
             Pending(
                 np.zeros((slots, corners, 2)), np.zeros((slots, corners), bool), np.full(slots, -1)
             )
-            for _ in range(math.ceil(self._late / self._period) + 1)
+            for _ in range(math.ceil(self._delay_steps / self._period) + 1)
         ]
         self._error = np.zeros((slots, SIZE))
         self._memory: dict[str, Any] | None = None
@@ -109,15 +110,15 @@ class Filtered:
 
     def start(self, slot: int, trial: TrialSpec, gates: Gates) -> None:
         """Start `trial` in `slot`, on a track with these gates."""
-        own = generator_of(trial, SENSED, "gate_filter")
-        self._error[slot] = own.standard_normal(SIZE) * self._settings.start_sigma
-        self._lost[slot] = own.random() < self._settings.dropout
-        self._frame_draws[slot] = own
-        self._imu_draws[slot] = generator_of(trial, SENSED, "imu")
-        for drawn in self._trial.values():
-            draw(drawn, slot, self._imu_draws[slot])
+        rng = generator_of(trial, SENSED, "gate_filter")
+        self._error[slot] = rng.standard_normal(SIZE) * self._settings.start_sigma
+        self._lost[slot] = rng.random() < self._settings.dropout
+        self._frame_rngs[slot] = rng
+        self._imu_rngs[slot] = generator_of(trial, SENSED, "imu")
+        for numbers in self._trial.values():
+            draw(numbers, slot, self._imu_rngs[slot])
         corner_w = corners_of(gates)
-        self._real[slot] = np.arange(self._real.shape[1]) < len(corner_w)
+        self._exists[slot] = np.arange(self._exists.shape[1]) < len(corner_w)
         self._corner_w[slot, : len(corner_w)] = corner_w
         self._steps[slot] = self._frame[slot] = 0
         for pending in self._pending:
@@ -127,7 +128,7 @@ class Filtered:
         """Return `seen` with position, velocity and attitude replaced by the estimates.
 
         Args:
-            seen: the view after the other sensors.
+            seen: (N, ...) the view after the other sensor models.
             truth: (N, ...) the true view; its depth is not used.
             fresh: (N,) bool, slots whose trial starts now.
             flying: (N,) bool, slots in flight.
@@ -138,27 +139,28 @@ class Filtered:
             self._detect(new)
         assert self.filters is not None
         state = present(self.filters)
-        own = View(state.pos_w, state.rot_w, state.vel_w, *seen[3:])
-        return select(flying, own, seen)
+        estimate = View(state.pos_w, state.rot_w, state.vel_w, *seen[3:])
+        return select(flying, estimate, seen)
 
     def _begin(self, truth: View, new: np.ndarray) -> None:
+        """Start the filters and the IMU's state in the slots `new`."""
         truth = truth._replace(depth_m=None, gate_number=None)
-        kept = View(*truth[:3], *(np.zeros(len(new)),) * 4)
-        self._truth = kept if self._truth is None else select(new, kept, self._truth)
+        pose = View(*truth[:3], *(np.zeros(len(new)),) * 4)
+        self._truth = pose if self._truth is None else select(new, pose, self._truth)
         error, sigma = self._error, self._settings.start_sigma
         # Truth = estimate + error; the attitude error is in the body axes of the estimate.
         initial = start(
-            kept.pos_w - error[:, :3],
-            kept.vel_w - error[:, 3:6],
-            np.matmul(kept.rot_w, exp_rot(-error[:, 6:9])),
+            pose.pos_w - error[:, :3],
+            pose.vel_w - error[:, 3:6],
+            np.matmul(pose.rot_w, exp_rot(-error[:, 6:9])),
             sigma,
         )
-        begun = wait(initial, self._late)
-        filters = begun if self.filters is None else select(new, begun, self.filters)
+        started = wait(initial, self._delay_steps)
+        filters = started if self.filters is None else select(new, started, self.filters)
         self.filters = make_contiguous(filters)
         memory = {
-            name: begin(values, Moment(truth, self._trial[name], self._dt, self._camera))
-            if (begin := SENSORS[name].start)
+            name: start_of(values, Moment(truth, self._trial[name], self._dt, self._camera))
+            if (start_of := SENSORS[name].start)
             else ()
             for name, values in self._imu.items()
         }
@@ -173,18 +175,18 @@ class Filtered:
         """
         assert self._truth is not None and self.filters is not None and self._memory is not None
         before, dt = self._truth, np.full(len(flew), self._dt)
-        with np.errstate(invalid="ignore", over="ignore"):  # in empty slots
+        with np.errstate(invalid="ignore", over="ignore"):  # values in empty slots are undefined
             sample = inertial(before, view, self._dt)
             for name, values in self._imu.items():
                 measure = SENSORS[name].measure
                 assert measure is not None
                 for slot in np.flatnonzero(flew).tolist():
-                    draw(self._sample[name], slot, self._imu_draws[slot])
+                    draw(self._sample[name], slot, self._imu_rngs[slot])
                 memory = self._memory[name]
                 sample, memory = measure(values, memory, sample, self._sample[name], self._dt)
                 self._memory[name] = select(flew, memory, self._memory[name])
-            own = sample.rate_b, sample.acc_b, dt, flew
-            self.filters = make_contiguous(step(self.filters, *own, self._settings.imu))
+            imu = sample.rate_b, sample.acc_b, dt, flew
+            self.filters = make_contiguous(step(self.filters, *imu, self._settings.imu))
         now = View(view.pos_w, view.rot_w, view.vel_w, *before[3:])
         self._truth = select(flew, now, before)
         self._steps += flew
@@ -192,7 +194,7 @@ class Filtered:
         self._detect(flew & (self._steps == np.rint(self._frame * self._period)))
 
     def _detect(self, due: np.ndarray) -> None:
-        """Detect the corners in the slots in which a frame is `due`."""
+        """Simulate a camera frame in the slots `due`: project corners, add noise, store them."""
         rows, settings = np.flatnonzero(due), self._settings
         if not len(rows):
             return
@@ -201,22 +203,24 @@ class Filtered:
         with np.errstate(divide="ignore", invalid="ignore"):
             image, forward = project(truth[0], truth[1], self._camera_b, corner_w)
         inside = (np.abs(image) <= self._half_view).all(-1)
-        seen = self._real[rows] & inside & (forward > NEAR_M) & (forward < settings.range_m)
+        seen = self._exists[rows] & inside & (forward > NEAR_M) & (forward < settings.range_m)
         chance, noise = np.zeros(len(rows)), np.zeros(image.shape)
         for k, slot in enumerate(rows.tolist()):
-            draws, own = self._frame_draws[slot], int(self._real[slot].sum())
-            chance[k], noise[k, :own] = draws.random(), draws.standard_normal((own, 2))
+            rng, count = self._frame_rngs[slot], int(self._exists[slot].sum())
+            chance[k], noise[k, :count] = rng.random(), rng.standard_normal((count, 2))
         share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_s)
         lost = sticky(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
         self._lost[rows] = lost
-        for place in np.unique(self._frame[rows] % len(self._pending)).tolist():
-            some = self._frame[rows] % len(self._pending) == place
-            pending, to = self._pending[place], rows[some]
-            pending.image[to] = (image + self._sigma * noise)[some]
-            pending.seen[to] = (seen & ~lost[:, None])[some]
-            pending.due[to] = self._steps[to] + self._late
+        # Frames are stored in turn in the entries of `_pending`.
+        entry = self._frame[rows] % len(self._pending)
+        for number in np.unique(entry).tolist():
+            chosen = entry == number
+            pending, to = self._pending[number], rows[chosen]
+            pending.image[to] = (image + self._sigma * noise)[chosen]
+            pending.seen[to] = (seen & ~lost[:, None])[chosen]
+            pending.due[to] = self._steps[to] + self._delay_steps
         self._frame[rows] += 1
-        if not self._late:
+        if not self._delay_steps:
             self._arrive(due)
 
     def _arrive(self, flew: np.ndarray) -> None:
@@ -228,27 +232,27 @@ class Filtered:
                 continue
             corners = Corners(pending.image[rows], self._corner_w[rows], pending.seen[rows])
             state = take(self.filters.state, rows)
-            after = update_gate(state, corners, self._sigma**2, self._camera_b)
-            parts = zip(self.filters.state, after, strict=True)
-            state = FilterState(*(_with_rows(whole, rows, new) for whole, new in parts))
+            updated = update_gate(state, corners, self._sigma**2, self._camera_b)
+            parts = zip(self.filters.state, updated, strict=True)
+            state = FilterState(*(_with_rows(array, rows, new) for array, new in parts))
             self.filters = self.filters._replace(state=state)
             pending.due[rows] = -1
 
 
-def _with_rows(whole: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Return a copy of `whole` with `new` at `rows`; other states may share the original."""
-    changed = whole.copy()
+def _with_rows(array: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Return a copy of `array` with `new` at `rows`; other states may share the original."""
+    changed = array.copy()
     changed[rows] = new
     return changed
 
 
 def single_steps(steps: np.ndarray) -> list[np.ndarray]:
-    """Split the numbers of steps (N,) into single steps: 1 in slots with steps left, else 0."""
+    """Split numbers of steps (N,) into single steps: 1 in slots with remaining steps, else 0."""
     return [(steps > done).astype(int) for done in range(int(steps.max(initial=0)))]
 
 
 def corners_of(gates: Gates) -> np.ndarray:
-    """Return the corners (K, 3) of all gate openings in the world, without repeats [m]."""
+    """Return the corners (K, 3) of all gate openings in the world, each once [m]."""
     opening = np.asarray(gates.opening_g)
     corner_g = np.concatenate([np.zeros((*opening.shape[:2], 1)), opening], axis=-1)
     corner_w = gates.center_w[:, None] + to_world(gates.rot_w[:, None], corner_g)
@@ -258,10 +262,11 @@ def corners_of(gates: Gates) -> np.ndarray:
 
 
 def inertial(before: View, after: View, dt: float) -> Inertial:
-    """Return an ideal IMU's means over a step, in the body axes at its middle."""
+    """Return the measurements of an ideal IMU, means over a step, in body axes at its middle."""
+    # The axis of the rotation times the sine of its angle, and from it the rotation vector.
     sine_b = turned_by(after.rot_w, before.rot_w)
-    size = np.sqrt((sine_b**2).sum(-1))[..., None]
-    turn_b = sine_b * np.where(size > 1e-9, np.arcsin(np.minimum(size, 1.0)) / (size + 1e-300), 1.0)
+    sine = np.sqrt((sine_b**2).sum(-1))[..., None]
+    turn_b = sine_b * np.where(sine > 1e-9, np.arcsin(np.minimum(sine, 1.0)) / (sine + 1e-300), 1.0)
     acc_w = (after.vel_w - before.vel_w) / dt + [0.0, 0.0, GRAVITY]
     middle_w = np.matmul(before.rot_w, exp_rot(0.5 * turn_b))
     return Inertial(turn_b / dt, to_local(middle_w, acc_w))

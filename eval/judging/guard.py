@@ -1,4 +1,7 @@
-"""Call a policy, and check and limit its output before it is flown."""
+"""Call a policy, and check and limit its actions before they are flown.
+
+The judge (which flies policies and scores them) and the environments use it.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +19,24 @@ from policies.spec import ActionSpec, NoAnswer
 
 @dataclass(frozen=True)
 class ActionLimits:
-    """Limits of actions."""
+    """Limits of a policy's actions."""
 
     size: float = 50.0
-    """Largest |action_b| of an acceleration [m/s^2]; larger ones are reduced to it. It exceeds the
+    """Largest norm of an acceleration [m/s^2]; larger ones are scaled down to it. It exceeds the
     net acceleration of a thrust-to-weight ratio of 5, so that it affects only faulty outputs."""
     deadline_s: float | None = None
-    """Time limit of the policy's answer [s]; a late answer is not flown and ends its trials as
+    """Time limit for the policy's output [s]; a late output is not flown, and its trials end by
     timeout. None: no limit. With a limit, outcomes depend on the machine's load."""
     action: ActionSpec = field(default_factory=ActionSpec)
     """The policy's kind of action."""
     low: tuple[float, ...] = ()
-    """Smallest value of each component in SI units, for other kinds of action than acceleration."""
+    """Smallest value of each component in SI units; () for accelerations."""
     high: tuple[float, ...] = ()
     """Largest value of each component."""
 
 
 def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> ActionLimits:
-    """Return `limits` for a policy's kind of action; commands have the vehicle file's limits."""
+    """Return `limits` with those of a kind of action, which come from the vehicle file."""
     low, high = (), ()
     if action.kind == "ctbr":
         rate = vehicle.controller.rate_max
@@ -44,7 +47,7 @@ def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> Act
 
 
 def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
-    """Return the last action at the start of a trial, (size,) in SI units: hovering."""
+    """Return the action of a hover (size,) in SI units, the "last action" when a trial starts."""
     if action.kind == "acceleration":
         return np.zeros(3)
     if action.kind == "ctbr":
@@ -57,13 +60,13 @@ class Guarded(NamedTuple):
     """Checked actions, and their faults."""
 
     action_b: np.ndarray
-    """(N, size) float64, SI units; (N, 3) [m/s^2] of an acceleration."""
+    """(N, size) float64, in SI units."""
     bad: np.ndarray
-    """(N,) bool: not finite, replaced by the last good action."""
+    """(N,) whether it was not finite, and is replaced by the last valid action."""
     limited: np.ndarray
-    """(N,) bool: reduced to the limit, or a component clipped."""
+    """(N,) whether it was scaled down to the limit, or a component was clipped."""
     late: np.ndarray
-    """(N,) bool: late or missing, replaced by the last good action."""
+    """(N,) whether it was late or missing, and is replaced by the last valid action."""
     largest: np.ndarray
     """(N,) largest absolute component of the policy's raw output; NaN if bad."""
 
@@ -79,51 +82,51 @@ def call_policy(
 ) -> tuple[Guarded, Hidden]:
     """Call a policy once, and return its checked actions and the new hidden state.
 
-    A policy answers for all N trials at once, so a late or missing answer is late for all of them.
-    The hidden state is then unchanged.
+    A policy computes the actions of all N trials at once, so a late or missing output is late for
+    all of them. The hidden state is then unchanged.
 
     Args:
-        limits: of actions.
-        policy: to call; for its other arguments see `policies.policy.Policy.act`.
+        limits: limits of the actions.
+        policy: the policy; the next arguments are those of `policies.policy.Policy.act`.
         hidden: its hidden state.
-        state: (N, spec.state_size).
-        image: (N, height, width).
-        fresh: (N,) bool.
-        last_b: (N, size) the action flown last in SI units, at first `first_action`.
+        state: (N, spec.state_size) state observations.
+        image: (N, height, width) encoded depth images.
+        fresh: (N,) bool, rows in which a new trial starts.
+        last_b: (N, size) last flown actions in SI units, at the start those of `first_action`.
 
     Raises:
-        ValueError: where the answer is not an array of actions.
+        ValueError: where the output is not an array of actions.
     """
-    called = time.perf_counter()
+    start_s = time.perf_counter()
     try:
-        answer, after = policy.act(hidden, state, image, fresh)
+        output, next_hidden = policy.act(hidden, state, image, fresh)
     except NoAnswer:
-        nothing = np.zeros(len(last_b), bool)
-        return Guarded(last_b, nothing, nothing, ~nothing, np.full(len(last_b), np.nan)), hidden
-    took_s = time.perf_counter() - called
-    return guard_action(limits, answer, last_b, took_s, policy.name), after
+        none = np.zeros(len(last_b), bool)
+        return Guarded(last_b, none, none, ~none, np.full(len(last_b), np.nan)), hidden
+    took_s = time.perf_counter() - start_s
+    return guard_action(limits, output, last_b, took_s, policy.name), next_hidden
 
 
 def guard_action(
     limits: ActionLimits, action_b: object, last_b: np.ndarray, took_s: float, policy: str
 ) -> Guarded:
-    """Check and limit what a policy returned.
+    """Check and limit the actions that a policy returned.
 
     Args:
-        limits: of actions.
-        action_b: what the policy returned; should be (N, size) real numbers.
-        last_b: (N, size) the action flown last in SI units, at first `first_action`.
-        took_s: how long the answer took [s].
-        policy: its name, for the message.
+        limits: limits of the actions.
+        action_b: the policy's output, which should be (N, size) real numbers.
+        last_b: (N, size) last flown actions in SI units, at the start those of `first_action`.
+        took_s: time that the policy took [s].
+        policy: name of the policy, for messages.
 
     Raises:
-        ValueError: where the shape or kind of `action_b` is wrong.
+        ValueError: where the shape or type of `action_b` is wrong.
     """
     action = np.asarray(action_b)
     if action.shape != last_b.shape or action.dtype.kind not in "fiu":
         raise ValueError(
             f"policy {policy!r} returned actions of shape {action.shape} and type {action.dtype}; "
-            f"wanted real numbers of shape {last_b.shape}: one {limits.action.kind} for each row "
+            f"expected real numbers of shape {last_b.shape}: one {limits.action.kind} for each row "
             "of its input. Check the policy's output."
         )
     largest = np.abs(action).max(1).astype(np.float64)
@@ -133,12 +136,12 @@ def guard_action(
     bad = ~(finite & np.isfinite(action).all(1)) & ~late
     action = np.where((bad | late)[:, None], last_b, action)
     if limits.high:
-        inside = np.clip(action, limits.low, limits.high)
-        return Guarded(inside, bad, (inside != action).any(1), late, largest)
-    # Scaled before squaring, so that a huge finite action does not overflow to infinity.
-    longest = np.abs(action).max(1, keepdims=True)
-    unit = action / np.maximum(longest, 1e-30)
-    size = longest[:, 0] * np.sqrt((unit * unit).sum(1))
-    limited = size > limits.size
-    shortened = unit * (limits.size / np.sqrt(np.maximum((unit * unit).sum(1), 1e-30)))[:, None]
-    return Guarded(np.where(limited[:, None], shortened, action), bad, limited, late, largest)
+        clipped = np.clip(action, limits.low, limits.high)
+        return Guarded(clipped, bad, (clipped != action).any(1), late, largest)
+    # Scaled before squaring, so that the norm of a very large action does not overflow.
+    scale = np.abs(action).max(1, keepdims=True)
+    scaled = action / np.maximum(scale, 1e-30)
+    norm = scale[:, 0] * np.sqrt((scaled * scaled).sum(1))
+    limited = norm > limits.size
+    reduced = scaled * (limits.size / np.sqrt(np.maximum((scaled * scaled).sum(1), 1e-30)))[:, None]
+    return Guarded(np.where(limited[:, None], reduced, action), bad, limited, late, largest)

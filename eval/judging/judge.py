@@ -1,8 +1,9 @@
-"""The judge: flies many trials of one policy in one simulator.
+"""The judge: it flies many trials (flights) of one policy in one simulator, and scores them.
 
-A trial's outcome depends on (track, difficulty, seed) alone, to the bit on a machine. Policies are
-always called with the same number of rows, every row is computed separately, and trials share no
-random numbers.
+On one machine, a trial's outcome depends on (track, difficulty, seed) only, to the bit. To this
+end, policies are always called with the same number of rows, every row is computed separately, and
+trials share no random numbers. Trials are flown in slots, places of the simulator; a slot takes the
+next trial when its trial has ended.
 """
 
 from __future__ import annotations
@@ -48,22 +49,22 @@ from tracks.track import Track
 COMPILED_SLOTS = 64
 """Simulators that compile a program for their number of slots use multiples of this."""
 MOST_A_PIECE = 640
-"""Most trials of a piece, where several processes share the work."""
+"""Most trials of a piece, which one process flies at a time."""
 Trial = TypeVar("Trial")
 OnResult = Callable[[TrialResult, Flight | None], None]
-"""Called with each trial at its end, in any order; with the flight where flights are recorded."""
+"""A function that is called when a trial ends, in any order, with its flight if recorded."""
 Numbered = tuple[int, TrialSpec]
 """A trial and its index in the request."""
 Ended = tuple[int, TrialResult, Flight | None]
-"""The index of a trial, its result, and its flight where flights are recorded."""
+"""The index of a trial, its result, and its flight if recorded."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """Optional parts of recorded flights."""
+    """Which optional parts of flights are recorded."""
 
     depth: bool = False
-    """Depth images, one for each decision of the policy."""
+    """Whether depth images are recorded, one for each decision of the policy."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class JudgeOptions:
 
 @dataclass(frozen=True)
 class Task:
-    """Inputs of a process that flies a share of the trials; the fields are those of `fly`."""
+    """Arguments of a process that flies a share of the trials; the fields are those of `fly`."""
 
     policy: Any
     vehicle: Vehicle
@@ -108,22 +109,22 @@ def fly(
 ) -> list[TrialResult]:
     """Fly every trial and return the results in the order of `trials`.
 
-    An interrupt ends it at once; results passed to `on_result` before that are final.
+    An interrupt ends it at once; results that were passed to `on_result` before are final.
 
     Args:
         policy: the policy, or a function without arguments that returns it; several processes need
             one that can be pickled, such as `functools.partial(load_policy, name)`.
-        trials: to fly.
-        vehicle: that flies.
-        world: a name in `eval.worlds.WORLDS`.
+        trials: the trials to fly.
+        vehicle: the vehicle that flies.
+        world: name of the simulator, in `eval.worlds.WORLDS`.
         options: settings of the judge.
         on_result: called at the end of each trial.
-        record: what to record of the flights; None records none.
+        record: parts of the flights to record; None: flights are not recorded.
         tracks: custom tracks by their names in `trials`; other names are families.
 
     Raises:
-        ValueError: for an unknown world or track, a policy faster than the physics, or a policy
-            that returns something else than actions.
+        ValueError: for an unknown simulator or track, a policy faster than the physics, or a policy
+            whose outputs are not actions.
         WorkerDied: where a worker process died twice with the same piece.
     """
     options = options or JudgeOptions()
@@ -139,8 +140,9 @@ def fly(
 
     def keep(piece: int, ended: Ended) -> None:
         index, result, flight = ended
-        again, results[index] = index in results, result
-        if on_result and not again:
+        # A piece that was repeated, because its process died, returns some results again.
+        is_repeated, results[index] = index in results, result
+        if on_result and not is_repeated:
             on_result(result, flight)
 
     workers = _workers(task, len(trials))
@@ -164,7 +166,7 @@ def check_records(world: str) -> None:
     """
     if world == REFERENCE:
         raise ValueError(
-            f"simulator {REFERENCE!r} records no flights; record in 'mujoco', which flies alike"
+            f"simulator {REFERENCE!r} cannot record flights; use 'mujoco', whose flights are equal"
         )
 
 
@@ -173,21 +175,23 @@ def pieces_of(
 ) -> list[Sequence[Trial]]:
     """Divide trials into pieces of at most `most`, an equal number for each process.
 
-    Small pieces lose little when a process dies, but at the end of each piece slots are empty.
+    With small pieces little is lost when a process dies, but at the end of each piece some slots
+    are empty.
     """
     if processes == 1:
         return [trials] if trials else []
     pieces = min(len(trials), processes * math.ceil(len(trials) / (most * processes)))
-    # Every k-th trial, so that neighbours, which have similar costs, are in different pieces.
+    # Neighbouring trials, which take similar time, go to different pieces.
     return [trials[k::pieces] for k in range(pieces)]
 
 
 def _is_policy(policy: object) -> bool:
-    """Return whether this is a policy; False for a function or class that makes one."""
+    """Return whether this is a policy, and not a function or class that makes one."""
     return hasattr(policy, "act") and not isinstance(policy, type)
 
 
 def _workers(task: Task, trials: int) -> Workers:
+    """Return the number of processes for a number of trials, or the cluster's address."""
     requested = task.options.workers
     if isinstance(requested, int):
         return max(1, min(requested, trials))
@@ -200,7 +204,7 @@ def _workers(task: Task, trials: int) -> Workers:
 
 
 def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
-    """Fly numbered trials in this process and yield each as it ends."""
+    """Fly numbered trials in this process, and yield each one when it ends."""
     policy = task.policy if _is_policy(task.policy) else task.policy()
     options = task.options
     if task.world == REFERENCE:
@@ -212,7 +216,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
             )  # fmt: skip
             yield index, result, None
         return
-    # An empty slot costs little time, but another number of slots may need a compilation.
+    # Empty slots take little time, but another number of slots may need a compilation.
     block = COMPILED_SLOTS if compiles(task.world) else 1
     slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))
     world = world_class(task.world)(
@@ -233,7 +237,7 @@ def _check_rate(policy: Policy, vehicle: Vehicle, dt: float) -> None:
 
 
 def _stepping(world: World) -> dict[str, Any]:
-    """Return the log's entries for the integrator of `world`; {} where it has none."""
+    """Return the flight's metadata on the integrator of `world`; {} if it does not name one."""
     integrator = getattr(world, "integrator", None)
     return {} if integrator is None else {"integrator": integrator, "step_s": world.dt}
 
@@ -260,16 +264,16 @@ class _Slots:
         self._fresh = np.ones(n, bool)
         self._hidden = policy.start(n)
         self._recorder = Recorder(n, task.record.depth, self._first) if task.record else None
-        wanted, self._sensors, self._delays = task.options.sensors, None, None
+        sensors, self._sensors, self._delays = task.options.sensors, None, None
         self._filtered = None
-        if wanted.estimator:
-            room = layout_of(task.tracks.values())
-            about = world.dt, policy.spec.camera, room.gates * room.corners
-            self._filtered = Filtered(wanted, n, *about)
-        if sensing(wanted.models):
-            self._sensors = Sensors(wanted, n, rate, policy.spec.camera)
-        if wanted.is_late:
-            self._delays = Delays(wanted.ages, n, self._steps_a_decision, world.dt)
+        if sensors.estimator:
+            layout = layout_of(task.tracks.values())
+            corners = layout.gates * layout.corners
+            self._filtered = Filtered(sensors, n, world.dt, policy.spec.camera, corners)
+        if sensing(sensors.models):
+            self._sensors = Sensors(sensors, n, rate, policy.spec.camera)
+        if sensors.is_late:
+            self._delays = Delays(sensors.ages, n, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; a slot takes the next one when its trial has ended."""
@@ -277,8 +281,8 @@ class _Slots:
         while waiting or (self._index >= 0).any():
             self._fill(waiting)
             self._decide_and_fly()
-            over = (self._world.progress.ended != FLYING) | self._late
-            for slot in np.flatnonzero((self._index >= 0) & over):
+            ended = (self._world.progress.ended != FLYING) | self._late
+            for slot in np.flatnonzero((self._index >= 0) & ended):
                 index = int(self._index[slot])
                 result = self._result(int(slot))
                 flight = None
@@ -289,6 +293,7 @@ class _Slots:
                 yield index, result, flight
 
     def _fill(self, waiting: list[Numbered]) -> None:
+        """Start waiting trials in the empty slots."""
         entries = []
         for slot in np.flatnonzero(self._index < 0).tolist():
             if not waiting:
@@ -312,7 +317,7 @@ class _Slots:
             self._world.load(entries)
 
     def _decide_and_fly(self) -> None:
-        """Call the policy once and fly its actions, except late ones, until the next decision."""
+        """Call the policy once, and fly its actions, except late ones, until the next decision."""
         spec, flying = self._policy.spec, self._index >= 0
         seen = truth = self._current_view(flying)
         if self._delays:
@@ -341,7 +346,7 @@ class _Slots:
         self._fly_steps(np.where(flying, steps, 0), flying)
 
     def _fly_steps(self, steps: np.ndarray, flying: np.ndarray) -> None:
-        """Fly the actions for each slot's physics steps (N,); take views for delayed sensors."""
+        """Fly the actions for physics steps (N,), and take the views of delayed sensors."""
         done = np.zeros_like(steps)
         for moment in self._delays.moments() if self._delays else ():
             part = np.minimum(steps, moment.pause)
@@ -353,13 +358,14 @@ class _Slots:
         self._advance(steps - done)
 
     def _current_view(self, flying: np.ndarray, images: np.ndarray | None = None) -> View:
-        """Return the current view, with images of all flying slots."""
+        """Return the current true view, with images in the slots `images` (None: all flying)."""
         view = self._world.view(flying if images is None else images)
         if not self._sensors:
             return view
         return view._replace(gate_number=np.array(self._world.progress.gates))
 
     def _advance(self, steps: np.ndarray) -> None:
+        """Simulate physics steps (N,) in each slot; record them, and update the filters."""
         for part in single_steps(steps) if self._filtered else (steps,):
             for row in self._world.advance(self._action_b, part, bool(self._recorder)):
                 if self._recorder:
@@ -369,12 +375,13 @@ class _Slots:
                 self._filtered.follow(self._world.view(np.zeros(len(part), bool)), flew)
 
     def _result(self, slot: int) -> TrialResult:
+        """Return the result of the trial in `slot`, which has ended."""
         trial, task = self._trial[slot], self._task
         assert trial is not None
         progress = self._world.progress
         ended, step = int(progress.ended[slot]) or TIMEOUT, int(progress.step[slot])
-        how = ENDINGS[ended - 1]
-        judged = step + (ended != DIVERGED)  # states whose speed is in v_sum
+        ending = ENDINGS[ended - 1]
+        speeds = step + (ended != DIVERGED)  # number of speeds in v_sum
         return TrialResult(
             *trial,
             policy=self._policy.name,
@@ -382,14 +389,14 @@ class _Slots:
             world=self._world.name,
             success=ended == FINISHED,
             gates_passed=int(progress.gates[slot]),
-            ended_by=how,
-            collided_with=self._world.collided_with(slot) if how == "collision" else None,
+            ended_by=ending,
+            collided_with=self._world.collided_with(slot) if ending == "collision" else None,
             pos_x=float(progress.pos_w[slot, 0]),
             pos_y=float(progress.pos_w[slot, 1]),
             pos_z=float(progress.pos_w[slot, 2]),
             time_s=step * self._world.dt,
             v_max=float(progress.v_max[slot]),
-            v_mean=float(progress.v_sum[slot]) / max(judged, 1),
+            v_mean=float(progress.v_sum[slot]) / max(speeds, 1),
             gates_8s=int(progress.gates_8s[slot]),
             gates_035=int(progress.gates_035[slot]),
             bad_actions=int(self._faults[slot, 0]),

@@ -1,8 +1,9 @@
-"""Checks of a policy's outputs for common errors of unit, scale and frame.
+"""Check a policy's outputs for common errors of unit, scale and frame.
 
-A policy with a wrong output unit flies as badly as an untrained one. Two checks find common errors:
-the size and mean vertical component of its outputs in flight, and its outputs for a few synthetic
-observations with a gate to one side, towards which a correct policy accelerates.
+A policy with a wrong output unit flies as badly as an untrained one. Two checks find common errors.
+One uses the size and the mean vertical component of the outputs in flight. The other runs the
+policy on a few synthetic observations with a gate to one side, towards which a correct policy
+accelerates.
 """
 
 from __future__ import annotations
@@ -22,19 +23,21 @@ LIMITED_MOST = 0.05
 UNIT = 1.0 + 1e-6
 """Largest output of a policy whose action space is -1 to 1."""
 UP_MOST = 6.0
-"""A mean vertical acceleration above this shows that outputs contain gravity [m/s^2]. Decisions in
-which the vehicle does not climb enter the mean as 0: a correct policy commands upwards while a
-vehicle with too little thrust sinks."""
+"""Largest mean vertical acceleration of outputs that do not contain gravity [m/s^2]. Decisions in
+which the vehicle does not climb enter the mean as 0, since a correct policy commands upwards while
+a vehicle with too little thrust sinks."""
 
 LIFT = 3.0
-"""A vertical acceleration above this, even towards a gate below, contains gravity [m/s^2]."""
+"""A policy whose vertical acceleration is always above this, even towards a gate below, has gravity
+in its outputs [m/s^2]."""
 CLEAR = 0.5
-"""Smallest difference of an output between gates on opposite sides that counts [m/s^2]."""
+"""Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
 SCALE_FIX = (
     "export it with the contract (units, scales, frames) of its environment, or set action.scale; "
     "after a very short training this is no fault"
 )
+"""Advice for outputs of a wrong unit and a wrong scale."""
 IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
 """Factor on a test image, and the largest relative change of output that counts as no change."""
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -55,11 +58,11 @@ class Outputs:
         self._largest, self._up = np.zeros(slots), np.zeros(slots)
 
     def start(self, slot: int) -> None:
-        """Reset the statistics of `slot` for a new trial."""
+        """Reset the statistics of `slot`, a place in the simulator, for a new trial."""
         self._count[slot], self._largest[slot], self._up[slot] = 0, 0.0, 0.0
 
     def add(self, guarded: Guarded, state: np.ndarray) -> None:
-        """Add one output of every slot, for the observations `state` (N, spec.state_size)."""
+        """Add one output of every slot, with its state observation (N, spec.state_size)."""
         self._count += ~guarded.late
         self._largest = np.fmax(self._largest, guarded.largest)
         if self._is_acceleration:
@@ -77,8 +80,13 @@ class Outputs:
         }
 
 
-def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
-    """Return shares of limited and invalid actions of one policy, and warnings with a fix."""
+def action_report(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, Any]:
+    """Return the shares of limited and invalid actions of one policy, and warnings.
+
+    Args:
+        results: the policy's trials.
+        action: its kind of action and scaling.
+    """
     decisions = sum(row.decisions for row in results)
     if not decisions:
         return {"decisions": 0, "limited": None, "bad": None, "warnings": []}
@@ -92,18 +100,20 @@ def actions_of(results: Sequence[TrialResult], action: ActionSpec) -> dict[str, 
     }
 
 
-def _twice(action: ActionSpec) -> str:
+def _scale_advice(action: ActionSpec) -> str:
+    """Return advice against scaling an action twice."""
     return "" if action.is_plain else "; scale it once, by the network or by action.scale"
 
 
 def _warnings(
     results: Sequence[TrialResult], action: ActionSpec, limited: float, bad: float
 ) -> list[Note]:
+    """Return warnings about the outputs in flight."""
     found, plain = [], action.kind == "acceleration" and action.is_plain
     largest = [row.output_max for row in results]
     if limited > LIMITED_MOST:
         seen = f"{limited:.0%} of its actions were limited"
-        found.append(Note("action_limited", seen, UNIT_FIX + _twice(action)))
+        found.append(Note("action_limited", seen, UNIT_FIX + _scale_advice(action)))
     if bad:
         seen = f"{bad:.1%} of its actions were not finite; the last valid one was used"
         found.append(Note("action_not_finite", seen, "check its weights and its normalisation"))
@@ -123,10 +133,11 @@ class FromFile(Protocol):
     """A policy that was loaded from a file."""
 
     notes: tuple[Note, ...]
+    """Assumptions that were made where its file says nothing."""
 
 
 def notes_of(policy: Policy) -> tuple[Note, ...]:
-    """Return the assumptions made about a policy's file, and probable faults of its outputs."""
+    """Return the assumptions about a policy's file, and the probable faults of its outputs."""
     return (*policy.notes, *probable_faults(policy)) if isinstance(policy, FromFile) else ()
 
 
@@ -135,7 +146,7 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
     if policy.spec.action.kind != "acceleration":
         return ()
     name = policy.name
-    action, output = probed(policy)
+    action, output = probe(policy)
     left, right, above, below, _ = action
     if not np.isfinite(action).all():
         seen = f"{name}: outputs NaN or infinity in level flight towards a gate"
@@ -143,7 +154,7 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
     largest = float(np.linalg.norm(action, axis=-1).max())
     if largest > ActionLimits().size:
         seen = f"{name}: commands up to {largest:.0f} m/s^2 in level flight, more than the limit"
-        return (Note("action_limited", seen, UNIT_FIX + _twice(policy.spec.action)),)
+        return (Note("action_limited", seen, UNIT_FIX + _scale_advice(policy.spec.action)),)
     found = []
     aside, up = left[1] - right[1], above[2] - below[2]
     if aside < -CLEAR and up < -CLEAR:
@@ -177,28 +188,31 @@ def _divides_images(policy: Policy) -> bool:
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
     image = np.stack([falling, IMAGE_FACTOR * falling, np.flip(falling, -2)]).astype(np.float32)
-    answers = _answers(policy, _level(spec, np.zeros((len(image), 2))), image)[1][0]
-    scaled, flipped = np.abs(answers[1:] - answers[0]).max(-1)
+    outputs = _run(policy, _level_states(spec, np.zeros((len(image), 2))), image)[1][0]
+    scaled, flipped = np.abs(outputs[1:] - outputs[0]).max(-1)
     return bool(scaled < NO_CHANGE * flipped)
 
 
-def probed(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last actions (5, 3) [m/s^2] and all outputs (STEPS, 5, 3) that led to them.
+def probe(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Run a policy on synthetic observations of level flight towards five test gates.
 
-    The five test gates are to the left, to the right, above, below and straight ahead.
+    The gates are to the left, to the right, above, below and straight ahead.
+
+    Returns:
+        The last actions (5, 3) [m/s^2], and the outputs of all steps (STEPS, 5, 3).
     """
     spec = policy.spec
-    aside = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
+    offset = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
     far = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
-    image = np.full((len(aside), *spec.image_shape), far, np.float32)
-    return _answers(policy, _level(spec, aside), image)
+    image = np.full((len(offset), *spec.image_shape), far, np.float32)
+    return _run(policy, _level_states(spec, offset), image)
 
 
-def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
-    """Return states of level flight with a gate ahead, offset by `aside` (N, 2): left, up [m]."""
-    state = np.zeros((len(aside), spec.state_size), np.float32)
+def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
+    """Return states of level flight with a gate ahead, offset by (N, 2) to the left and up [m]."""
+    state = np.zeros((len(offset), spec.state_size), np.float32)
     state[:, VEL_B], state[:, UP_B] = (SPEED, 0, 0), (0, 0, 1)
-    state[:, GATE_B] = np.insert(aside, 0, AHEAD_M, axis=1)
+    state[:, GATE_B] = np.insert(offset, 0, AHEAD_M, axis=1)
     first = spec.base_size
     for key, numbers in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
         if getattr(spec, key):
@@ -211,8 +225,8 @@ def _level(spec: PolicySpec, aside: np.ndarray) -> np.ndarray:
     return state
 
 
-def _answers(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last actions (N, 3) [m/s^2] and all outputs (STEPS, N, 3), see `probed`."""
+def _run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Run a policy for STEPS steps; return what `probe` returns, for N rows."""
     spec = policy.spec
     hidden, outputs, action = policy.start(len(state)), [], state[:, ACTION_B]
     for step in range(STEPS):

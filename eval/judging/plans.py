@@ -1,8 +1,8 @@
-"""Planned laps of 24 tracks, and the ratio of a policy's lap times to them.
+"""Planned (near-optimal) laps of 24 tracks, and the ratios of a policy's lap times to them.
 
-A plan uses the whole track, without camera and noise. It comes from a local search over B-splines
-with the differentiable quadrotor, and this judge flew it in MuJoCo on the vehicle `reference`. Its
-lap time is an upper bound of the shortest one. The planner is in commit c6d768a
+A plan is a trajectory that was computed with knowledge of the whole track, by a local search over
+B-splines with the differentiable quadrotor. The judge then flew it in MuJoCo with the vehicle
+`reference`. Its lap time is an upper bound of the shortest one. The planner is in commit c6d768a
 (`suite reproduce laps --trials 2`), and docs/archive/laps.md describes it.
 """
 
@@ -27,14 +27,14 @@ PLANS = Path(__file__).with_name("plans.json.xz")
 
 
 class Plan(NamedTuple):
-    """A plan as flown by the judge."""
+    """A planned lap as the judge flew it."""
 
     lap_s: float
-    """Its lap time [s]."""
+    """Lap time [s]."""
     time_s: np.ndarray
-    """(T,) of the rows [s]."""
+    """(T,) times of the positions [s]."""
     pos_w: np.ndarray
-    """(T, 3) centre of mass [m], to 1 mm."""
+    """(T, 3) positions of the centre of mass, rounded to 1 mm [m]."""
 
 
 class OverPlan(NamedTuple):
@@ -42,16 +42,17 @@ class OverPlan(NamedTuple):
 
     policy: str
     ratio: Interval
-    """Lap time over planned lap time: median over tracks, 95 % bootstrap interval; NaN for none."""
+    """Lap time over planned lap time: median over tracks with its 95 % bootstrap interval; NaN if
+    no track was finished."""
     finished: int
-    """Tracks that have a plan and that the policy finished."""
+    """Number of flown tracks with a plan that the policy finished."""
     planned: int
-    """Tracks that have a plan."""
+    """Number of flown tracks with a plan."""
 
 
 @functools.cache
 def plans() -> dict[TrialSpec, Plan]:
-    """Return the plans by track: three families, levels 0, 3, 6, 9, seeds 0, 1."""
+    """Return the plans by track: three families, levels 0, 3, 6 and 9, seeds 0 and 1."""
     with lzma.open(PLANS, "rt", encoding="utf-8") as file:
         stored = json.load(file)
     return {
@@ -66,14 +67,13 @@ def over_plan(results: Sequence[TrialResult]) -> list[OverPlan]:
     """Return each policy's laps compared with the plans, for trials on planned tracks.
 
     Args:
-        results: on tracks of the families, with the vehicle `VEHICLE`.
+        results: trials on tracks of the families, with the vehicle `VEHICLE`.
     """
-    found = []
+    comparisons = []
     for policy in dict.fromkeys(row.policy for row in results):
-        mine = [row for row in results if row.policy == policy and row.trial in plans()]
-        ratios = [row.time_s / plans()[row.trial].lap_s for row in mine if row.success]
-        if mine:
-            found.append(
-                OverPlan(policy, bootstrap_median(np.array(ratios)), len(ratios), len(mine))
-            )
-    return found
+        rows = [row for row in results if row.policy == policy and row.trial in plans()]
+        ratios = [row.time_s / plans()[row.trial].lap_s for row in rows if row.success]
+        if rows:
+            ratio = bootstrap_median(np.array(ratios))
+            comparisons.append(OverPlan(policy, ratio, len(ratios), len(rows)))
+    return comparisons

@@ -1,4 +1,7 @@
-"""Recorder of flights, slot by slot, during trials."""
+"""Record the flights of trials while the judge flies them.
+
+Trials are flown in slots, places of the simulator; each slot records its own flight.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ _EMPTY = (
     np.zeros(3),  # action
     False,  # whether the action is new
 )
-"""A row that gives a flight without rows the right shapes, for a trial that ended at its start."""
+"""A row from which a flight without rows takes its shapes, for a trial that ended at its start."""
 
 
 class Recorder:
@@ -32,10 +35,10 @@ class Recorder:
         """Make a recorder.
 
         Args:
-            slots: how many trials fly at once.
-            depth: whether depth images are kept (3 kB each at 24 x 32).
-            first: (size,) action recorded before the first decision; by default a zero
-                acceleration (3,).
+            slots: number of trials that fly at once.
+            depth: whether depth images are recorded (3 kB each at 24 x 32).
+            first: (size,) action that is recorded before the first decision; None: an acceleration
+                of zero (3,).
         """
         self._depth = depth
         self._rows: list[list[tuple[Any, ...]]] = [[] for _ in range(slots)]
@@ -52,7 +55,7 @@ class Recorder:
         self._action[slot] = self._first
 
     def decided(self, slots: np.ndarray, action_b: np.ndarray, depth_m: np.ndarray) -> None:
-        """Store the policy's new actions (N, 3) and depth images for `slots` (k,)."""
+        """Store the policy's new actions and depth images, (N, ...) each, for `slots` (k,)."""
         for slot in slots:
             self._action[slot] = action_b[slot]
             self._is_new[slot] = True
@@ -70,7 +73,7 @@ class Recorder:
             self._rows[slot].append((*values, self._action[slot].copy(), new))
 
     def finish(self, slot: int, about: dict[str, Any]) -> Flight:
-        """Return the flight in `slot` with the metadata `about`."""
+        """Return the flight in `slot`, with `about` as its metadata."""
         rows = self._rows[slot] or [_EMPTY]
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         if not self._rows[slot]:

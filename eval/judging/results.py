@@ -1,7 +1,7 @@
-"""The files of an evaluation: trials.parquet, table.md, summary.json, and the journal.
+"""Write and read the files of an evaluation: trials.parquet, table.md, summary.json, the journal.
 
-The journal is a file of lines, one a finished trial, flushed as it comes: what was flown survives
-a kill, and the same command again flies the rest.
+The journal has one line for each finished trial, which is written at once. After a kill, the same
+command reads it and flies only the missing trials.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 SCHEMA = 1
 """Version of the result files."""
 MOST_TRIALS = 1_000_000
-"""Most rows of a trials.parquet: some gigabyte in memory."""
+"""Most rows of a trials.parquet; they take about a gigabyte of memory."""
 MOST_TEXT = 1000
-"""Characters of a name in a trials.parquet."""
+"""Most characters of a name in a trials.parquet."""
 JOURNAL = "trials.journal.jsonl"
 """Name of the journal in the output folder."""
 
@@ -37,13 +37,13 @@ def write_results(
     summary: dict[str, Any],
     seed: int | None,
 ) -> None:
-    """Write trials.parquet, table.md and summary.json into `folder`, each whole or not at all.
+    """Write trials.parquet, table.md and summary.json into `folder`, each completely or not at all.
 
     Args:
-        folder: made if missing.
-        results: in the order of the rows.
+        folder: the output folder, made if missing.
+        results: the trials, in the order of the rows.
         table_markdown: from `eval.judging.tables.markdown_table`.
-        summary: contents of summary.json without the stamp, from `tables.summarise`.
+        summary: contents of summary.json without the provenance, from `tables.summarise`.
         seed: the seed of the first trial, or None.
 
     Raises:
@@ -73,7 +73,7 @@ def write_trials(
 
 
 def _kinds() -> dict[str, str]:
-    """Return the type of each field as written; a named tuple wraps it in a ForwardRef."""
+    """Return the type of each field of `TrialResult` as its text; a ForwardRef is unwrapped."""
     annotations = TrialResult.__annotations__.items()
     return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
 
@@ -95,7 +95,8 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
     """Read the rows of a trials.parquet.
 
     Raises:
-        ValueError: where the file is none, lacks a column or holds another type in it.
+        ValueError: where the file is not a trials.parquet, lacks a column, or has a column of
+            another type.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -107,33 +108,34 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
             schema, rows = file.schema_arrow, file.metadata.num_rows
         if rows > MOST_TRIALS:
             raise ValueError(f"{path}: {rows:,} trials, allowed are up to {MOST_TRIALS:,}")
-        there = [name for name in kinds if name in schema.names]
-        _check_columns(path, schema, there)
-        # Texts stay dictionary-encoded: a long text in every row would not fit in memory.
-        texts = [name for name in there if kinds[name].startswith("str")]
+        present = [name for name in kinds if name in schema.names]
+        _check_columns(path, schema, present)
+        # Texts stay dictionary-encoded; a long text in every row would not fit into memory.
+        texts = [name for name in present if kinds[name].startswith("str")]
         with pq.ParquetFile(path, read_dictionary=texts) as file:
-            table = file.read(there)
-        columns = [_cells(path, name, table[name], kinds[name]) for name in there]
-    except MemoryError:  # Arrow's own is one as well
+            table = file.read(present)
+        columns = [_cells(path, name, table[name], kinds[name]) for name in present]
+    except MemoryError:  # also a subclass of ArrowException
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         first = str(error).splitlines()[0]  # Arrow's messages have several lines
         raise ValueError(
             f"{path}: not a readable Parquet file ({first}); run suite eval again"
         ) from error
-    return [TrialResult(**dict(zip(there, row, strict=True))) for row in zip(*columns, strict=True)]
+    rows = zip(*columns, strict=True)
+    return [TrialResult(**dict(zip(present, row, strict=True))) for row in rows]
 
 
-def _check_columns(path: str | os.PathLike[str], schema: Any, there: list[str]) -> None:
-    """Refuse columns that no trial has, before they are read.
+def _check_columns(path: str | os.PathLike[str], schema: Any, present: list[str]) -> None:
+    """Check the columns `present` before they are read.
 
     Raises:
-        ValueError: where one is missing, is there twice or is of another type.
+        ValueError: where a required one is missing, occurs twice or has another type.
     """
     from pyarrow import types
 
     kinds = _kinds()
-    for name in sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(there)):
+    for name in sorted(kinds.keys() - TrialResult._field_defaults.keys() - set(present)):
         raise ValueError(f"{path}: no column {name!r}; is it a trials.parquet of this suite?")
     fits = {
         "int": types.is_integer,
@@ -141,49 +143,51 @@ def _check_columns(path: str | os.PathLike[str], schema: Any, there: list[str]) 
         "bool": types.is_boolean,
         "str": lambda kind: types.is_string(kind) or types.is_large_string(kind),
     }
-    for name in there:
+    for name in present:
         if schema.names.count(name) > 1:
             raise ValueError(f"{path}: column {name!r} is there twice; run suite eval again")
-        found = kind = schema.field(name).type
-        if types.is_dictionary(found):
-            kind = found.value_type
-        wanted, *none = kinds[name].split(" | ")
-        if not fits[wanted](kind) and not (none and types.is_null(kind)):
-            raise _other_type(path, name, found)
+        column_type = kind = schema.field(name).type
+        if types.is_dictionary(column_type):
+            kind = column_type.value_type
+        required, *optional = kinds[name].split(" | ")
+        if not fits[required](kind) and not (optional and types.is_null(kind)):
+            raise _type_error(path, name, column_type)
 
 
-def _other_type(path: str | os.PathLike[str], name: str, found: Any) -> ValueError:
+def _type_error(path: str | os.PathLike[str], name: str, column_type: Any) -> ValueError:
+    """Return (not raise) the error for a column with values that a trial cannot have."""
     return ValueError(
-        f"{path}: column {name!r} holds {found}, cells without a value or texts of more than "
+        f"{path}: column {name!r} holds {column_type}, cells without a value or texts of more than "
         f"{MOST_TEXT:,} characters, where a trial has {_kinds()[name]}; is it a trials.parquet "
         "of this suite?"
     )
 
 
 def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> list[Any]:
-    """Return a column as Python's own values.
+    """Return a column as a list of Python values.
 
     Raises:
-        ValueError: where some are missing, or texts too long.
+        ValueError: where values are missing, or texts are too long.
     """
     from pyarrow import types
 
     if column.null_count and "None" not in kind:
-        raise _other_type(path, name, column.type)
+        raise _type_error(path, name, column.type)
     if not types.is_dictionary(column.type):
-        # One NaN for all, so that equal trials are equal.
+        # All NaN are one object, so that trials with NaN compare equal.
         return [math.nan if cell != cell else cell for cell in column.to_pylist()]
     coded = column.unify_dictionaries().combine_chunks()
     texts = [*coded.dictionary.to_pylist(), None]
     if any(len(text or "") > MOST_TEXT for text in texts):
-        raise _other_type(path, name, column.type)
+        raise _type_error(path, name, column.type)
     return [texts[number] for number in coded.indices.fill_null(len(texts) - 1).to_pylist()]
 
 
 class Journal:
-    """Finished trials, appended line by line; open it again to go on.
+    """A file of finished trials, one a line, to which an interrupted evaluation returns.
 
-    The first line says what was judged. A last line that a kill cut short is dropped.
+    The first line has the evaluation's settings. If a kill left an incomplete last line, it is
+    dropped.
     """
 
     def __init__(self, path: str | os.PathLike[str], about: dict[str, Any]) -> None:
@@ -191,12 +195,11 @@ class Journal:
 
         Args:
             path: the file.
-            about: everything but the trial that determines an outcome: policy with the hash of its
-                file,
-                vehicle, world, options. JSON must be able to hold it.
+            about: all settings that determine outcomes, except the trial: policy with the hash of
+                its file, vehicle, simulator, options; as JSON values.
 
         Raises:
-            ValueError: where the file there is about something else.
+            ValueError: where the existing file has other settings.
         """
         self.path = Path(path)
         self.done: dict[TrialSpec, TrialResult] = {}
@@ -214,7 +217,7 @@ class Journal:
         self._file: TextIO | None = None
 
     def _read(self, about: dict[str, Any]) -> int:
-        """Fill `done`; return how many bytes of the file are whole lines."""
+        """Fill `done`; return the number of bytes of complete lines."""
         keep = 0
         for number, line in enumerate(read_bytes(self.path, LOG_BYTES).splitlines(keepends=True)):
             if not line.endswith(b"\n"):
@@ -229,16 +232,16 @@ class Journal:
                 ) from error
             if result is not None:
                 self.done[result.trial] = result
-            elif other := _differing(entry, about):
+            elif difference := _differences(entry, about):
                 raise ValueError(
-                    f"{self.path}: holds trials flown otherwise ({other}); give another --out or "
-                    "move the file away"
+                    f"{self.path}: holds trials flown otherwise ({difference}); give another --out "
+                    "or move the file away"
                 )
             keep += len(line)
         return keep
 
     def append(self, result: TrialResult) -> None:
-        """Add a finished trial; it is with the operating system when this returns."""
+        """Add a finished trial; when this returns, it survives a kill of this process."""
         with naming(self.path):
             if self._file is None:
                 self._file = open(self.path, "a", encoding="utf-8")
@@ -247,7 +250,7 @@ class Journal:
         self.done[result.trial] = result
 
     def missing(self, trials: Iterable[TrialSpec]) -> list[TrialSpec]:
-        """Return the trials that are yet to be flown."""
+        """Return those of `trials` that are not finished."""
         return [trial for trial in trials if trial not in self.done]
 
     def others(self, trials: Iterable[TrialSpec]) -> int:
@@ -272,23 +275,24 @@ class Journal:
         self.close()
 
 
-def _differing(entry: Any, about: dict[str, Any]) -> str:
-    """Return the difference between a journal's first line and this run; empty for none."""
-    was = entry.get("about") if isinstance(entry, dict) else None
-    if not isinstance(was, dict):
+def _differences(entry: Any, about: dict[str, Any]) -> str:
+    """Return the differences between a journal's first line and these settings, or ""."""
+    old = entry.get("about") if isinstance(entry, dict) else None
+    if not isinstance(old, dict):
         return "it does not say how"
-    names = sorted(name for name in was.keys() | about.keys()
-                   if name not in was or name not in about or was[name] != about[name])  # fmt: skip
+    names = sorted(name for name in old.keys() | about.keys()
+                   if name not in old or name not in about or old[name] != about[name])  # fmt: skip
     return ", ".join(f"another {name}" for name in names)
 
 
 def _result(entry: Any) -> TrialResult:
+    """Return the trial of a journal's line."""
     if not isinstance(entry, dict) or entry.keys() != set(TrialResult._fields):
         raise ValueError("its keys are not those of a trial")
     values = dict(entry)
     for name, kind in _kinds().items():
         if kind == "float" and values[name] is None:  # JSON has no NaN
             values[name] = math.nan
-        elif isinstance(values[name], str):  # a million trials have a handful of words
+        elif isinstance(values[name], str):  # saves memory: the same texts occur in many trials
             values[name] = sys.intern(values[name])
     return TrialResult(**values)

@@ -1,9 +1,9 @@
-"""Sensor models in the judge's slots, with each trial's own draws.
+"""Apply sensor models (errors of the observed state and image) in the judge.
 
-They change only the policy's observation: the autopilot, the heading that it commands and the
-judge use the true state.
-All random numbers come from the trial's own seed, model by model and in a fixed order, so that a
-trial's outcome depends on the trial alone.
+They change only the policy's observation; the autopilot, its commanded heading and the scoring use
+the true state. All random numbers come from the trial's seed, model by model and in a fixed order,
+so a trial's outcome depends on the trial only. A slot is a place in the simulator, in which one
+trial (flight) is flown.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ class Sensors:
 
         Args:
             wanted: the sensor models.
-            slots: number of simultaneous trials.
-            rate_hz: observations a second [Hz].
-            camera: the policy's.
+            slots: number of trials that fly at once.
+            rate_hz: rate of the observations [Hz].
+            camera: the policy's camera.
         """
         self._models, self._dt_s, self._camera = sensors.sensing(wanted.models), 1 / rate_hz, camera
         used = (SENSORS[name] for name in self._models)
         self._trial, self._draws = blank_of_each(used, slots, camera)
-        idle = np.random.default_rng(0)
-        self._generators = {name: [idle] * slots for name in self._models}
+        unused = np.random.default_rng(0)
+        self._generators = {name: [unused] * slots for name in self._models}
         self._memory: dict[str, Any] | None = None
 
     def start(self, slot: int, trial: TrialSpec) -> None:
@@ -52,7 +52,7 @@ class Sensors:
         """Return the view with sensor errors; call it once for each observation.
 
         Args:
-            truth: the true view in each slot, including gate indices.
+            truth: (N, ...) the true views, with the number of the next gate.
             fresh: (N,) bool, slots whose trial begins.
             flying: (N,) bool, slots in flight; other rows are returned unchanged.
         """
@@ -62,12 +62,12 @@ class Sensors:
                 draw(self._draws[name], slot, generators[slot])
         if not len(rows):
             return truth
-        # Empty slots hold undefined values: they get a copy of a flying slot's view.
+        # Views of empty slots are undefined; they are replaced by that of a flying slot.
         filled = take(truth, np.where(flying, np.arange(len(flying)), rows[0]))
         models, timing_and_camera = self._models, (self._dt_s, self._camera)
         memory = self._memory
         if memory is None or fresh.any():
-            begun = sensors.start(models, filled, self._trial, *timing_and_camera)
-            memory = begun if memory is None else select(fresh, begun, memory)
+            started = sensors.start(models, filled, self._trial, *timing_and_camera)
+            memory = started if memory is None else select(fresh, started, memory)
         seen, self._memory = sensors.sense(models, memory, filled, self._draws, *timing_and_camera)
         return select(flying, seen, truth)

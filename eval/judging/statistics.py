@@ -1,4 +1,4 @@
-"""Confidence intervals of scores: Wilson, bootstrap, and differences on the same trials."""
+"""Confidence intervals of scores: success rates, medians, paired differences, training seeds."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import numpy as np
 
 CONFIDENCE = 0.95
 """Confidence of every interval in tables and result files."""
+NORMAL_QUANTILE = 1.959964
+"""97.5 % quantile of the standard normal distribution."""
 AT_ONCE = 10_000_000
-"""Most bootstrap draws in memory at once."""
+"""Most resampled values of a bootstrap in memory at once."""
 
 
 class Interval(NamedTuple):
@@ -41,21 +43,24 @@ class PairedDifference(NamedTuple):
 def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
     """Return the success rate with its score interval (Wilson 1927, no continuity correction).
 
-    A trial that was flown several times counts with its mean.
+    Args:
+        successes: number of successes; a trial that was flown several times counts with its mean.
+        trials: number of trials.
+        confidence: confidence of the interval.
 
     Raises:
         ValueError: unless 0 <= successes <= trials and trials >= 1.
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(
-            f"{successes} successes in {trials} trials: wanted 0 <= successes <= "
-            "trials and at least one trial"
+            f"{successes} successes in {trials} trials: expected 0 <= successes <= trials and at "
+            "least one trial"
         )
     z = NormalDist().inv_cdf((1 + confidence) / 2)
     rate = successes / trials
     middle = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * sqrt(rate * (1 - rate) / trials + (z / (2 * trials)) ** 2)
-    # Exact at the ends, where rounding would leave 1e-17 or 1 - 1e-16.
+    # Exactly 0 and 1 at the ends, without rounding errors.
     low = 0.0 if successes == 0 else middle - half
     high = 1.0 if successes == trials else middle + half
     return Interval(rate, low, high)
@@ -66,7 +71,7 @@ def bootstrap_median(
 ) -> Interval:
     """Return the median of values (n,) with its percentile bootstrap interval (Efron 1979).
 
-    NaN in all three where there is no value; the same seed gives the same interval.
+    Without values all three are NaN. The same seed gives the same interval.
     """
     return _bootstrap(np.median, values, seed, confidence, resamples)
 
@@ -76,22 +81,22 @@ def bootstrap_mean(
 ) -> Interval:
     """Return the mean of values (n,) with its percentile bootstrap interval (Efron 1979).
 
-    NaN in all three where there is no value; the same seed gives the same interval.
+    Without values all three are NaN. The same seed gives the same interval.
     """
     return _bootstrap(np.mean, values, seed, confidence, resamples)
 
 
 def expected_largest(values: np.ndarray, among: int) -> float | None:
-    """Return the mean of the largest of `among` of the values (n,), over all ways to pick them.
+    """Return the expected largest of `among` values, chosen at random from values (n,).
 
-    None where there are fewer values than that.
+    None if n is less than `among`.
     """
     count = len(values)
     if count < among:
         return None
-    # The k-th smallest (from 0) is the largest of comb(k, among - 1) of all picks.
-    picks = [comb(k, among - 1) / comb(count, among) for k in range(count)]
-    return float(np.sort(values) @ np.array(picks))
+    # The k-th smallest (from 0) is the largest in comb(k, among - 1) of all comb(n, among) choices.
+    probability = [comb(k, among - 1) / comb(count, among) for k in range(count)]
+    return float(np.sort(values) @ np.array(probability))
 
 
 def _bootstrap(
@@ -101,28 +106,29 @@ def _bootstrap(
     confidence: float,
     resamples: int,
 ) -> Interval:
+    """Return a statistic of values (n,) with its percentile interval, in batches of resamples."""
     values = np.asarray(values, float)
     if not len(values):
         return Interval(float("nan"), float("nan"), float("nan"))
     rng, rows = np.random.default_rng(seed), max(1, AT_ONCE // len(values))
-    found = np.concatenate(
+    resampled = np.concatenate(
         [
             statistic(values[rng.integers(0, len(values), (count, len(values)))], axis=1)
             for count in [rows] * (resamples // rows) + [resamples % rows]
             if count
         ]
     )
-    low, high = np.quantile(found, [(1 - confidence) / 2, (1 + confidence) / 2])
+    low, high = np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(statistic(values)), float(low), float(high))
 
 
 def paired_bootstrap(
     first: np.ndarray, second: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE
 ) -> Interval:
-    """Return the median of first - second, (n,) on the same trials, with its interval.
+    """Return the median of first - second, (n,) each on the same trials, with its interval.
 
     Raises:
-        ValueError: where the two have not the same length.
+        ValueError: where the lengths differ.
     """
     if len(first) != len(second):
         raise ValueError(f"{len(first)} values against {len(second)}: pairs need as many of each")
@@ -130,7 +136,12 @@ def paired_bootstrap(
 
 
 def mcnemar_exact(only_first: int, only_second: int) -> float:
-    """Return the two-sided exact p-value of McNemar's test from the discordant pairs."""
+    """Return the two-sided exact p-value of McNemar's test.
+
+    Args:
+        only_first: pairs in which only the first succeeded.
+        only_second: pairs in which only the second succeeded.
+    """
     n, few = only_first + only_second, min(only_first, only_second)
     tail = sum(comb(n, k) for k in range(few + 1))
     return min(1.0, 2 * tail / 2**n)
@@ -141,16 +152,16 @@ def paired_success(
 ) -> PairedDifference:
     """Return the difference of two success rates on the same trials.
 
-    The interval is Newcombe's (1998, method 10): Wilson intervals joined by square-and-add, with
-    the correlation of the pairs.
+    The interval is that of Newcombe (1998, method 10): Wilson intervals combined by the
+    square-and-add rule, with the correlation phi of the pairs.
 
     Args:
-        first: (n,) bool, in the order of the trials.
-        second: (n,) bool, the same trials in the same order.
-        confidence: of the interval.
+        first: (n,) bool, successes in the order of the trials.
+        second: (n,) bool, successes in the same trials.
+        confidence: confidence of the interval.
 
     Raises:
-        ValueError: where there is no trial, or not as many in both.
+        ValueError: where there is no trial, or the lengths differ.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     if len(first) != len(second):
@@ -158,8 +169,8 @@ def paired_success(
     n = len(first)
     both, neither = int((first & second).sum()), int((~first & ~second).sum())
     only_first, only_second = int((first & ~second).sum()), int((~first & second).sum())
-    one = wilson(both + only_first, n, confidence)
-    two = wilson(both + only_second, n, confidence)
+    rate_1 = wilson(both + only_first, n, confidence)
+    rate_2 = wilson(both + only_second, n, confidence)
     product = (
         (both + only_first)
         * (only_second + neither)
@@ -171,14 +182,14 @@ def paired_success(
         covariance = max(covariance - n / 2, 0.0)
     phi = covariance / sqrt(product) if product else 0.0
 
-    def joined(a: float, b: float) -> float:
+    def combine(a: float, b: float) -> float:
         return sqrt(max(a * a - 2 * phi * a * b + b * b, 0.0))
 
-    value = one.value - two.value
+    value = rate_1.value - rate_2.value
     return PairedDifference(
         value,
-        value - joined(one.value - one.low, two.high - two.value),
-        value + joined(one.high - one.value, two.value - two.low),
+        value - combine(rate_1.value - rate_1.low, rate_2.high - rate_2.value),
+        value + combine(rate_1.high - rate_1.value, rate_2.value - rate_2.low),
         mcnemar_exact(only_first, only_second),
         only_first,
         only_second,
@@ -190,19 +201,20 @@ def over_seeds(
 ) -> Interval:
     """Return a mean, or the difference of two, with its 95 % interval over seeds and trials.
 
-    A hierarchical bootstrap: training seeds and trials are resampled, the same trials for all
-    seeds of a draw. With few seeds that is too narrow (Owen 2007, The pigeonhole bootstrap), so its
-    deviations are scaled to the variance of a two-way layout of random effects, and to Student's t
-    with Satterthwaite's (1946) degrees of freedom.
+    It is a hierarchical bootstrap: training seeds and trials are resampled, with the same trials
+    for all seeds of a resample. With few seeds its interval is too narrow (Owen 2007, The
+    pigeonhole bootstrap). So its deviations are scaled to the variance of a two-way random effects
+    model, and to Student's t with Satterthwaite's (1946) degrees of freedom.
 
     Args:
         first: (S, T) values, such as successes, of S training seeds on T trials.
-        second: (R, T) of another method on the same trials, to be subtracted.
-        seed: of the draws.
-        draws: of the bootstrap.
+        second: (R, T) values of another method on the same trials, which are subtracted.
+        seed: seed of the random numbers.
+        draws: number of resamples.
 
     Raises:
-        ValueError: with fewer than two seeds a method, fewer than two trials, or other trials.
+        ValueError: with fewer than two seeds of a method, fewer than two trials, or different
+            numbers of trials.
     """
     from scipy.stats import t as student
 
@@ -211,32 +223,34 @@ def over_seeds(
     for group in groups:
         if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != count:
             raise ValueError(
-                f"values are {[each.shape for each in groups]}; wanted (seeds, trials), two or "
+                f"values are {[each.shape for each in groups]}; expected (seeds, trials), two or "
                 "more of each, and the same trials"
             )
     signs = (1.0, -1.0)[: len(groups)]
     value = sum(sign * group.mean() for sign, group in zip(signs, groups, strict=True))
-    of_trials = sum(sign * group.mean(0) for sign, group in zip(signs, groups, strict=True))
-    variance = (parts := [float(np.var(of_trials, ddof=1)) / count])[0]
-    freedom = [count - 1.0]
-    rng, drawn = np.random.default_rng(seed), np.zeros(draws)
+    trial_means = sum(sign * group.mean(0) for sign, group in zip(signs, groups, strict=True))
+    # Variance of the mean: between trials, plus between seeds, less the noise that both contain.
+    variance = float(np.var(trial_means, ddof=1)) / count
+    parts, freedom = [variance], [count - 1.0]
+    rng, resampled = np.random.default_rng(seed), np.zeros(draws)
     trials = rng.multinomial(count, np.full(count, 1 / count), draws) / count
     for sign, group in zip(signs, groups, strict=True):
         n = len(group)
         between = float(np.var(group.mean(1), ddof=1)) / n
-        rest = group - group.mean(1, keepdims=True) - group.mean(0) + group.mean()
-        noise = float((rest**2).sum()) / ((n - 1) * (count - 1)) / (n * count)
+        residual = group - group.mean(1, keepdims=True) - group.mean(0) + group.mean()
+        noise = float((residual**2).sum()) / ((n - 1) * (count - 1)) / (n * count)
         variance += between - noise
         parts, freedom = [*parts, between, noise], [*freedom, n - 1.0, (n - 1.0) * (count - 1.0)]
         seeds = rng.multinomial(n, np.full(n, 1 / n), draws) / n
-        drawn += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
+        resampled += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
     largest = max(variance, max(parts))
-    spread = float(drawn.std())
+    spread = float(resampled.std())
     if not largest or not spread:
         return Interval(float(value), float(value), float(value))
     degrees = largest**2 / sum(part**2 / df for part, df in zip(parts, freedom, strict=True))
-    wide = sqrt(largest) * float(student.ppf(0.975, max(1.0, degrees))) / (1.959964 * spread)
-    low, high = np.quantile(drawn, [0.025, 0.975])
+    quantile = float(student.ppf(0.975, max(1.0, degrees)))
+    factor = sqrt(largest) * quantile / (NORMAL_QUANTILE * spread)
+    low, high = np.quantile(resampled, [0.025, 0.975])
     return Interval(
-        float(value), float(value + wide * (low - value)), float(value + wide * (high - value))
+        float(value), float(value + factor * (low - value)), float(value + factor * (high - value))
     )

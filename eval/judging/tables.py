@@ -1,4 +1,7 @@
-"""Tables for people and summary.json's numbers: one cell a policy, track and level."""
+"""Compute the numbers of summary.json, and print them as tables.
+
+A cell is the set of trials of one policy on one track family at one level.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from eval.worlds.trial import ENDINGS, TrialResult
 from tracks.common.grid import Grid, markdown, table_of
 
 PRINTED_TRIALS = 10
-"""Trials of a cell in the papers' tables."""
+"""Number of trials of a cell in the tables of the papers."""
 NOTE = (
     "Success: rate with its 95 % Wilson interval. v_max, v_mean, lap: median over the cell's "
     "trials (lap: over its finished ones) with its 95 % bootstrap interval; v_max is each trial's "
@@ -31,7 +34,7 @@ PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired inte
 
 
 class Tally(NamedTuple):
-    """The results of one policy on one track at one level."""
+    """The results of one cell: a policy on one track family at one level."""
 
     policy: str
     track: str
@@ -45,17 +48,17 @@ class Tally(NamedTuple):
     v_mean: Interval
     """Median over trials [m/s]."""
     lap_s: Interval
-    """Median over finished trials [s]; NaN where there is none."""
+    """Median lap time over finished trials [s]; NaN where there is none."""
     ended_by: dict[str, int]
     """Number of trials by ending."""
     late: int = 0
-    """Number of timeouts because the policy answered late or not at all."""
+    """Number of timeouts because the policy's output was late or missing."""
     v_max_of_ten: float | None = None
-    """Mean, over picks of ten trials, of their largest v_max; None with fewer trials [m/s]."""
+    """Expected largest v_max of ten random trials; None with fewer trials [m/s]."""
 
 
 class Pairing(NamedTuple):
-    """The differences of a policy to the first one on the same trials."""
+    """The differences between a policy and the first policy on the same trials."""
 
     policy: str
     against: str
@@ -71,9 +74,10 @@ class Pairing(NamedTuple):
 
 
 def summarise(results: Sequence[TrialResult]) -> dict[str, Any]:
-    """Return the cells, and the pairings with the first policy where there are several.
+    """Return the results by cell, and the differences from the first policy.
 
-    The keys are `cells` and `paired`, lists of `Tally` and `Pairing` in order of appearance.
+    The keys of the result are `cells`, a list of `Tally`, and `paired`, a list of `Pairing` (empty
+    for one policy), both in order of appearance.
     """
     groups: dict[tuple[str, str, int], list[TrialResult]] = {}
     for result in results:
@@ -90,11 +94,12 @@ def summarise(results: Sequence[TrialResult]) -> dict[str, Any]:
 
 
 def _seed(*key: object) -> int:
-    """Return a bootstrap seed that a cell keeps whatever else is in the table."""
+    """Return the bootstrap seed of a cell, which does not depend on the other cells."""
     return zlib.crc32(repr(key).encode())
 
 
 def _cell(policy: str, track: str, difficulty: int, rows: list[TrialResult]) -> Tally:
+    """Return the results of a cell with the trials `rows`."""
     seed = _seed(track, difficulty)
 
     def median(values: list[float]) -> Interval:
@@ -124,6 +129,7 @@ def _pairing(
     rows: list[TrialResult],
     others: list[TrialResult],
 ) -> Pairing | None:
+    """Return the differences of `rows` from `others` on common trials; None if there are none."""
     by_trial = {other.trial: other for other in others}
     pairs = [(row, by_trial[row.trial]) for row in rows if row.trial in by_trial]
     if not pairs:
@@ -155,15 +161,15 @@ def with_interval(interval: Interval) -> str:
 
 
 def grids(summary: dict[str, Any]) -> list[Grid]:
-    """Return a summary of `summarise` as tables: the cells, and the pairings if any."""
-    made = [_cell_grid(summary["cells"])]
+    """Return the result of `summarise` as tables: the cells, and the differences if any."""
+    tables = [_cell_grid(summary["cells"])]
     if summary["paired"]:
-        made.append(_pair_grid(summary["paired"]))
-    return made
+        tables.append(_pair_grid(summary["paired"]))
+    return tables
 
 
 def markdown_table(summary: dict[str, Any]) -> str:
-    """Return a summary of `summarise` as Markdown."""
+    """Return the result of `summarise` as Markdown."""
     return "\n".join(map(markdown, grids(summary)))
 
 

@@ -1,1 +1,1 @@
-"""The quadrotor: controllers, mixer, rotors and body, with every effect of the vehicle."""
+"""The quadrotor's dynamics: controllers, mixer, rotors and body, with all effects of a vehicle."""

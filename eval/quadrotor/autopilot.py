@@ -1,7 +1,8 @@
-"""One physics step of the controllers: from a policy's action to force and torque on the body.
+"""One physics step of all control loops: from a policy's action to force and torque on the body.
 
-The attitude loop gives a new command every `attitude_every` steps; the plant (rate loop, mixer,
-rotors, effects) runs at every step. Pure functions, for numpy and JAX, over N vehicles at once.
+The attitude loop computes a new command every `attitude_every` steps. The plant (rate loop, mixer,
+rotors and the vehicle's effects) runs at every step. All functions are pure, take numpy and JAX
+arrays, and step N vehicles at once.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 from eval.effects.interface import GRAVITY
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading, level_heading
-from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, unpacked
+from eval.quadrotor.plant import Command, Motion, Plant, Wrench, make_plant, unpack_command
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, plant_step
 from eval.vehicles.vehicle import Controller, Vehicle
 from policies.spec import ActionSpec
@@ -19,7 +20,7 @@ from tracks.common.masks import make_contiguous, nowhere, select
 from tracks.geometry.scene import Array
 
 ATTITUDE_HZ = 100.0
-"""Frequency of the attitude loop and of flight logs, as near as whole steps allow [Hz]."""
+"""Frequency of the attitude loop and of flight logs, rounded to whole physics steps [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +34,19 @@ class Autopilot:
     attitude_every: int
     """Physics steps for which a command of the attitude loop is held."""
     action: ActionSpec = field(default_factory=ActionSpec)
-    """The policy's output: an acceleration goes through the attitude loop, body rates and thrust
-    go to the rate loop, motor commands bypass both."""
+    """The policy's output: an acceleration is the input of the attitude loop, thrust and body rates
+    of the rate loop; motor commands bypass both."""
     speed_max: float = 0.0
-    """A rotor's largest commanded speed [rad/s]."""
+    """Largest commanded speed of a rotor [rad/s]."""
 
 
 class AutopilotState(NamedTuple):
     """State of N vehicles' loops between steps."""
 
     plant: PlantState
-    """(N, ...)."""
+    """(N, ...) state of rate loop, rotors and effects."""
     command: Command
-    """Held between steps of the attitude loop."""
+    """Current output of the attitude loop."""
     heading_w: Array
     """(N, 3) wanted heading, horizontal unit vectors."""
 
@@ -65,15 +66,15 @@ def start_autopilot(
 
     Args:
         autopilot: from `make_autopilot`.
-        motion: (N, ...) at the start.
-        noise: (N, 3) normal draws for the wind at the start, or None.
+        motion: (N, ...) rigid-body state at the start.
+        noise: (N, 3) normal random numbers for the wind at the start, or None.
     """
     xp = motion.pos_w.__array_namespace__()
     n = motion.pos_w.shape[0]
     plant = hover_state(autopilot.plant, (n,), xp, noise)
     hover = Command(xp.full((n,), GRAVITY), xp.zeros((n, 3)))
     if autopilot.action.kind == "motors":
-        # The delay stores rotor speeds instead of commands.
+        # The command delay then stores rotor speeds instead of thrust and rates.
         past = xp.zeros_like(plant.past_commands) + plant.rotor_speed[..., None]
         plant = plant._replace(past_commands=past)
     return make_contiguous(AutopilotState(plant, hover, level_heading(motion.rot_w)))
@@ -93,14 +94,15 @@ def autopilot_step(
     Args:
         autopilot: from `make_autopilot`.
         state: from `start_autopilot` or the step before.
-        motion: (N, ...) at the start of the step.
-        action_b: (N, size) the policy's, within its limits; (N, 3) [m/s^2] of an acceleration.
-        gate_w: (N, 3) centre of the next gate, which the heading follows [m].
-        step: (N,) physics steps flown; the attitude loop runs at multiples of `attitude_every`.
-        noise: (N, 3) normal draws for random wind, or None.
+        motion: (N, ...) rigid-body state at the start of the step.
+        action_b: (N, size) the policy's action in SI units, within its limits.
+        gate_w: (N, 3) centre of the next gate, towards which the heading turns [m].
+        step: (N,) number of the physics step; the attitude loop runs at multiples of
+            `attitude_every`.
+        noise: (N, 3) normal random numbers for random wind, or None.
     """
     state = attitude_step(autopilot, state, motion, action_b, gate_w, step)
-    inputs = Inputs(state.command, noise=noise, speed_cmd=speed_asked(autopilot, action_b))
+    inputs = Inputs(state.command, noise=noise, speed_cmd=motor_speed_command(autopilot, action_b))
     plant, wrench = plant_step(autopilot.plant, state.plant, motion, inputs, step * autopilot.dt)
     return make_contiguous(state._replace(plant=plant)), wrench
 
@@ -113,19 +115,18 @@ def attitude_step(
     gate_w: Array,
     step: Array,
 ) -> AutopilotState:
-    """Return the state with the attitude loop's command, new or held, at a physics step.
+    """Return the state after a step of the attitude loop; between its steps the command is held.
 
-    The arguments are those of `autopilot_step`; the plant's state is unchanged. Body rates and
-    thrust act at once, at any step. Motor commands have no such command; NaN is recorded.
+    The arguments are those of `autopilot_step`; the plant's state is unchanged. An action of thrust
+    and body rates becomes the command at every step. For motor commands the command is NaN.
     """
     if autopilot.action.kind == "ctbr":
-        return state._replace(command=unpacked(action_b))
+        return state._replace(command=unpack_command(action_b))
     if autopilot.action.kind == "motors":
-        nothing = action_b * float("nan")
-        return state._replace(command=unpacked(nothing))
+        return state._replace(command=unpack_command(action_b * float("nan")))
     due = step % autopilot.attitude_every == 0
     if nowhere(due):
-        return state  # most steps only hold the command
+        return state  # at most steps the command is held
     period = autopilot.attitude_every * autopilot.dt
     heading_w = blend_heading(state.heading_w, gate_w - motion.pos_w, period)
     force_w = action_to_force(action_b, motion.rot_w)
@@ -134,7 +135,7 @@ def attitude_step(
     return AutopilotState(state.plant, command, select(due, heading_w, state.heading_w))
 
 
-def speed_asked(autopilot: Autopilot, action: Array) -> Array | None:
+def motor_speed_command(autopilot: Autopilot, action: Array) -> Array | None:
     """Return the rotor speeds (N, 4) of motor commands [rad/s]; None for other actions."""
     if autopilot.action.kind != "motors":
         return None

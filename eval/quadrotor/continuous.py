@@ -1,10 +1,10 @@
-"""The quadrotor in continuous time: steps of any length, a rate loop with its own update times.
+"""Simulate the quadrotor in continuous time: steps of any length, and updates of the rate loop.
 
-A log gives commands at the times of its rows, and the rate loop has a frequency of its own. So
-steps end where commands change, and are otherwise as long as accuracy allows. The body moves by
-the explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with aerodynamic
-forces at half a step predicted from the step before. Rotors follow their first-order lag exactly.
-For flights of MuJoCo's Euler integrator the same steps use its own rule.
+A log gives commands at the times of its rows, and the rate loop runs at another frequency. So steps
+end where commands change, and are otherwise as long as accuracy allows. The body moves by the
+explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with aerodynamic forces
+at half a step predicted from the previous step. The rotors' first-order lag is integrated exactly.
+For flights that MuJoCo's Euler integrator simulated, the body moves by that integrator's rule.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
 from eval.quadrotor.stepper import (
     Feedback,
     Inputs,
-    from_start,
     loop_update,
     mass_of,
+    prepend_start,
     rotor_wrench,
     still_thrust,
     wanted_speed,
@@ -39,7 +39,7 @@ from eval.quadrotor.stepper import (
 from tracks.geometry.rotation import exp_rot
 
 INTEGRATORS = ("continuous", "euler")
-"""How the body moves: continuous equations, or MuJoCo's Euler steps of the given length."""
+"""How the body moves: by the midpoint rule, or by MuJoCo's semi-implicit Euler rule."""
 SHORTEST_S = 1e-9
 """Steps of zero length count as this long [s]; they do not move the body."""
 
@@ -48,14 +48,14 @@ class Steps(NamedTuple):
     """T steps of flights; (T, ...) each."""
 
     length_s: Array
-    """Of the step [s]; a step of zero length leaves the body where it is."""
+    """Length of the step [s]; a step of zero length does not move the body."""
     updates: Array
-    """Bool: the rate loop updates, and the command may change, when the step begins."""
+    """Whether the rate loop updates, and the command may change, when the step begins."""
     lead_s: Array
-    """Mean delay of the loop's real updates that this one update replaces [s].
+    """Mean delay of the real updates of the loop that this update replaces [s].
 
-    Several updates of a fast loop are merged into one, which uses the rates extrapolated by this
-    time along their slope.
+    Several updates of a fast loop are merged into one, for which the rates are extrapolated
+    linearly by this time.
     """
 
 
@@ -65,19 +65,19 @@ class Carry(NamedTuple):
     rotor_speed: Array
     """(..., 4) [rad/s]."""
     wanted_speed: Array
-    """(..., 4) commanded since the loop's last update [rad/s]."""
+    """(..., 4) rotor speeds that the rate loop's last update commanded [rad/s]."""
     turn_b: Array
     """(..., 3) angular acceleration of the last step [rad/s^2]."""
     air: Wrench
-    """(..., 3) force and torque of the last step without the rotors' own thrust."""
+    """(..., 3) force and torque of the last step, less those of the rotors in still air."""
     loop: Any = ()
     """State of a firmware's rate loop."""
     since_s: Any = 0.0
-    """(...,) time since its last update [s]."""
+    """(...,) time since the last update of a firmware's loop [s]."""
 
 
 class Flight(NamedTuple):
-    """T flown steps."""
+    """T simulated steps."""
 
     motion: Motion
     """(T + 1, ...): the start and the state after each step."""
@@ -97,19 +97,17 @@ def fly(
     integrator: str = "continuous",
     feedback: Feedback | None = None,
 ) -> Flight:
-    """Fly `inputs` (T, ...) for `steps` from `motion` (...) in JAX.
-
-    The commands already contain the delay; the plant's own delay is not used.
+    """Simulate T steps from `motion` in JAX, and return the states after them.
 
     Args:
-        plant: its `dt` and `delay_weight` are not used.
-        motion: at the start.
-        steps: T of them.
-        inputs: of T steps; a command is read where the loop updates.
+        plant: its `dt` and `delay_weight` are not used: the inputs' commands are already delayed.
+        motion: (...) rigid-body state at the start.
+        steps: lengths of the T steps, and where the rate loop updates.
+        inputs: (T, ...) inputs of the steps; a command is read where the loop updates.
         rotor_speed: (..., 4) at the start [rad/s].
-        start_s: (...,) since the start of the flight [s].
+        start_s: (...,) time since the start of the flight [s].
         integrator: one of `INTEGRATORS`.
-        feedback: computes a push that replaces `inputs.push_b`.
+        feedback: computes a push (an additional acceleration) that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
@@ -121,47 +119,55 @@ def fly(
     if plant.loop is not None:
         start = start._replace(since_s=jnp.zeros(rotor_speed.shape[:-1]))
     # Aerodynamic forces at the start, so that the first step is as accurate as the others.
-    first = jax.tree.map(lambda given: given[0], inputs)._replace(push_b=None)
-    held = steady(rotor_speed)
-    whole = _wrench(plant, motion, held, first, start_s)
-    start = start._replace(air=_remainder(whole, _still(plant, held)))
+    first = jax.tree.map(lambda series: series[0], inputs)._replace(push_b=None)
+    rotors = steady(rotor_speed)
+    total = _wrench(plant, motion, rotors, first, start_s)
+    start = start._replace(air=_difference(total, _still(plant, rotors)))
 
-    def one(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
-        (now, motion, time_s, remembered), (index, span, given) = carry, row
+    def one_step(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
+        (now, motion, time_s, memory), (index, span, row_inputs) = carry, row
         if feedback is not None:
-            remembered, push_b = feedback.act(remembered, motion, given, index)
-            given = given._replace(push_b=push_b)
-        now, motion, acc_b = step(plant, now, motion, span, given, time_s, integrator)
-        carry = (now, motion, time_s + span.length_s, remembered)
+            memory, push_b = feedback.act(memory, motion, row_inputs, index)
+            row_inputs = row_inputs._replace(push_b=push_b)
+        now, motion, acc_b = step(plant, now, motion, span, row_inputs, time_s, integrator)
+        carry = (now, motion, time_s + span.length_s, memory)
         return carry, (motion, now.rotor_speed, acc_b)
 
     begin = (start, motion, start_s, None if feedback is None else feedback.start)
     rows = (jnp.arange(len(steps.length_s)), steps, inputs)
-    _, (motions, speeds, acc_b) = jax.lax.scan(one, begin, rows)
-    motions, speeds = from_start((motion, rotor_speed), (motions, speeds))
+    _, (motions, speeds, acc_b) = jax.lax.scan(one_step, begin, rows)
+    motions, speeds = prepend_start((motion, rotor_speed), (motions, speeds))
     return Flight(motions, speeds, acc_b)
 
 
 def update_loop(plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array) -> Carry:
-    """Return `carry` after the loop's update with `rate_b` (..., 3), in rows with an update."""
+    """Return `carry` after an update of the rate loop, where `span.updates` is true.
+
+    Args:
+        plant: the plant.
+        carry: the state before.
+        span: the step that begins.
+        command: (...) thrust and body rates.
+        rate_b: (..., 3) current body rates [rad/s].
+    """
     xp = rate_b.__array_namespace__()
-    ahead_b = rate_b + span.lead_s[..., None] * carry.turn_b
+    predicted_b = rate_b + span.lead_s[..., None] * carry.turn_b
     if plant.loop is not None:
-        return _update_firmware_loop(plant, carry, span, command, ahead_b)
-    wanted = wanted_speed(plant, command, ahead_b)
+        return _update_firmware_loop(plant, carry, span, command, predicted_b)
+    wanted = wanted_speed(plant, command, predicted_b)
     speed = xp.where(span.updates[..., None], wanted, carry.wanted_speed)
     return carry._replace(wanted_speed=speed)
 
 
 def _update_firmware_loop(
-    plant: Plant, carry: Carry, span: Steps, command: Command, ahead_b: Array
+    plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array
 ) -> Carry:
     """Return `carry` after an update of a firmware's loop; merged updates count as one long one."""
     import jax
 
-    xp = ahead_b.__array_namespace__()
+    xp = rate_b.__array_namespace__()
     dt = xp.maximum(carry.since_s, plant.dt)
-    memory, wanted = loop_update(plant, carry.loop, command, ahead_b, dt[..., None])
+    memory, wanted = loop_update(plant, carry.loop, command, rate_b, dt[..., None])
 
     def where(new: Array, old: Array) -> Array:
         updates = span.updates.reshape(span.updates.shape + (1,) * (new.ndim - span.updates.ndim))
@@ -175,7 +181,7 @@ def _update_firmware_loop(
 
 
 def turn_rotors(plant: Plant, carry: Carry, span: Steps) -> tuple[Carry, RotorStep]:
-    """Return `carry` and the rotors' step towards their commanded speeds."""
+    """Return `carry` after the step `span` of the rotors towards their commands, and that step."""
     xp = span.length_s.__array_namespace__()
     length_s = xp.maximum(span.length_s, SHORTEST_S)
     rotors = follow(carry.rotor_speed, carry.wanted_speed, plant.constants.time_constant, length_s)
@@ -193,7 +199,7 @@ def step(
 ) -> tuple[Carry, Motion, Array]:
     """Return carry and motion after one step, and its specific force (..., 3) [m/s^2].
 
-    The arguments are those of `fly`, of one step.
+    The arguments are those of `fly`, for one step; `time_s` is the time at its start.
     """
     before, wanted = carry.rotor_speed, None
     length = span.length_s[..., None]
@@ -210,22 +216,22 @@ def step(
         lag = plant.constants.time_constant
         rotor_acc = acceleration(before, rotors, wanted, lag, length)
     if integrator == "euler":
-        whole = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
-        acc_w, turn_b = accelerations(plant, motion, whole)
+        total = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
+        acc_w, turn_b = accelerations(plant, motion, total)
         carry = carry._replace(turn_b=turn_b)
-        return carry, euler_move(motion, acc_w, turn_b, length), whole.force_b / mass_of(plant)
+        return carry, euler_move(motion, acc_w, turn_b, length), total.force_b / mass_of(plant)
     thrust = _still(plant, rotors)
     half, air = 0.5 * length, carry.air
-    guess = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
-    middle = _midpoint(motion, *accelerations(plant, motion, guess), half)
+    predicted = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)
+    middle = _move(motion, *accelerations(plant, motion, predicted), half)
     middle_s = time_s + 0.5 * span.length_s
-    whole = _wrench(plant, middle, rotors, inputs, middle_s, rotor_acc)
-    air = _remainder(whole, thrust)
-    acc_w, turn_b = accelerations(plant, middle, whole)
-    end = _midpoint(motion, acc_w, turn_b, length)
-    # Rotor speeds change within the step, aerodynamic forces hardly do.
-    ends = _still(plant, steady(rotors.end))
-    acc_b = (ends.force_b + air.force_b) / mass_of(plant)
+    total = _wrench(plant, middle, rotors, inputs, middle_s, rotor_acc)
+    air = _difference(total, thrust)
+    acc_w, turn_b = accelerations(plant, middle, total)
+    end = _move(motion, acc_w, turn_b, length)
+    # Rotor speeds change within the step; aerodynamic forces hardly change.
+    end_thrust = _still(plant, steady(rotors.end))
+    acc_b = (end_thrust.force_b + air.force_b) / mass_of(plant)
     return carry._replace(turn_b=turn_b, air=air), end, acc_b
 
 
@@ -242,25 +248,25 @@ def _wrench(
     time_s: Array,
     rotor_acc: Array | None = None,
 ) -> Wrench:
-    """Return the whole force and torque on the body."""
+    """Return the total force and torque on the body."""
     _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
     flow = flow._replace(rotor_acc=rotor_acc)
     return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
 
 
-def _remainder(whole: Wrench, thrust: Wrench) -> Wrench:
-    """Return `whole` less the rotors' own `thrust`."""
-    return Wrench(whole.force_b - thrust.force_b, whole.torque_b - thrust.torque_b)
+def _difference(total: Wrench, thrust: Wrench) -> Wrench:
+    """Return `total` minus `thrust`."""
+    return Wrench(total.force_b - thrust.force_b, total.torque_b - thrust.torque_b)
 
 
-def _midpoint(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
-    """Return the motion after `length` (..., 1) [s] under accelerations held that long."""
+def _move(motion: Motion, acc_w: Array, turn_b: Array, length: Array) -> Motion:
+    """Return the motion after `length` (..., 1) [s] under constant accelerations."""
     rate_b = motion.rate_b + length * turn_b
-    turned = exp_rot(0.5 * length * (motion.rate_b + rate_b))
+    rotation = exp_rot(0.5 * length * (motion.rate_b + rate_b))
     xp = rate_b.__array_namespace__()
     return Motion(
         motion.pos_w + length * (motion.vel_w + 0.5 * length * acc_w),
-        xp.matmul(motion.rot_w, turned),
+        xp.matmul(motion.rot_w, rotation),
         motion.vel_w + length * acc_w,
         rate_b,
     )

@@ -1,4 +1,4 @@
-"""The nominal flight controller: torque from body rates, rotor thrusts from torque."""
+"""The nominal rate loop (body rates to torque) and mixer (torque to rotor thrusts)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ NEGLIGIBLE = 1e-9
 def largest(values: Array) -> Array:
     """Return the largest value along the last axis, by pairwise `maximum`.
 
-    The gradient of `max` divides by the number of values that equal it. That number is zero where a
-    compiler evaluates them twice with different rounding. `maximum` does not divide.
+    The gradient of `max` divides by the number of values that equal the maximum. That number is
+    zero if a compiler evaluates the values twice with different rounding. The gradient of `maximum`
+    does not divide.
     """
     xp = values.__array_namespace__()
     return reduce(xp.maximum, [values[..., k] for k in range(values.shape[-1])])
 
 
 def least(values: Array) -> Array:
-    """Return the least value along the last axis, as `largest` does."""
+    """Return the least value along the last axis, by pairwise `minimum` (see `largest`)."""
     xp = values.__array_namespace__()
     return reduce(xp.minimum, [values[..., k] for k in range(values.shape[-1])])
 
@@ -34,8 +35,8 @@ def rate_torque(rate_cmd_b: Array, rate_b: Array, gain: Array, inertia: Array) -
     """Return the wanted torque J (K (rate_cmd - rate)) + rate x (J rate), (..., 3) [N m].
 
     Args:
-        rate_cmd_b: (..., 3) [rad/s].
-        rate_b: (..., 3) [rad/s].
+        rate_cmd_b: (..., 3) commanded body rates [rad/s].
+        rate_b: (..., 3) body rates [rad/s].
         gain: (..., 3) diagonal of K [1/s].
         inertia: (..., 3) diagonal of the nominal J [kg m^2].
     """
@@ -46,8 +47,8 @@ def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np
     """Return the matrix (4, 4) from rotor thrusts [N] to (force along z, torque about x, y, z).
 
     Args:
-        position_b: (4, 3) hubs [m].
-        spin: (4,) +1 counter-clockwise seen from above.
+        position_b: (4, 3) positions of the hubs [m].
+        spin: (4,) +1 for a rotor turning counter-clockwise seen from above, -1 clockwise.
         torque_per_thrust: k_Q / k_T [m].
     """
     x, y, _ = np.asarray(position_b, dtype=float).T
@@ -57,36 +58,37 @@ def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np
 def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> Array:
     """Return the rotor thrusts (..., 4) [N], each in [0, thrust_max].
 
-    Where the exact solution is out of range, roll and pitch are scaled down together until their
-    spread fits, the collective is clamped to the feasible range, and yaw gets the remaining room.
-    The direction of thrust has priority over its size, and its size over the heading.
+    If the exact solution is out of range, roll and pitch are scaled down together until their
+    spread fits, the collective thrust is clamped to the feasible range, and yaw is scaled down to
+    the remaining range. The direction of thrust has priority over its magnitude, and its magnitude
+    over the heading.
 
     Args:
         unmixer: (4, 4) inverse of `mixer_matrix`.
         thrust_max: largest thrust of one rotor [N].
-        force_z: (...,) wanted collective [N].
+        force_z: (...,) wanted collective thrust [N].
         torque_b: (..., 3) wanted torque [N m].
     """
     xp = torque_b.__array_namespace__()
     per_force, per_yaw = unmixer[:, 0], unmixer[:, 3]
-    # Written out: a matrix product may round a row differently at another batch size.
-    level = torque_b[..., 0, None] * unmixer[:, 1] + torque_b[..., 1, None] * unmixer[:, 2]
+    # Written out, since a matrix product may round a row differently at another batch size.
+    roll_pitch = torque_b[..., 0, None] * unmixer[:, 1] + torque_b[..., 1, None] * unmixer[:, 2]
     yaw = torque_b[..., 2, None] * per_yaw
-    exact = force_z[..., None] * per_force + level + yaw
+    exact = force_z[..., None] * per_force + roll_pitch + yaw
     outside = xp.any((exact < 0.0) | (exact > thrust_max), axis=-1, keepdims=True)
     if nowhere(outside):
         return exact
 
-    spread = largest(level) - least(level)
-    level = level * (thrust_max / xp.maximum(spread, thrust_max))[..., None]
-    lowest = largest(-level / per_force)
-    highest = least((thrust_max - level) / per_force)
+    spread = largest(roll_pitch) - least(roll_pitch)
+    roll_pitch = roll_pitch * (thrust_max / xp.maximum(spread, thrust_max))[..., None]
+    lowest = largest(-roll_pitch / per_force)
+    highest = least((thrust_max - roll_pitch) / per_force)
     force = xp.minimum(xp.maximum(force_z, lowest), highest)
-    without_yaw = xp.clip(force[..., None] * per_force + level, 0.0, thrust_max)
-    room = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
+    without_yaw = xp.clip(force[..., None] * per_force + roll_pitch, 0.0, thrust_max)
+    margin = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
     size = xp.abs(yaw)
-    # The clip removes what exceeds the room by rounding alone.
-    beyond = size > xp.maximum(room, NEGLIGIBLE)
-    share = xp.where(beyond, room / xp.where(beyond, size, 1.0), 1.0)
+    # An excess over the margin by rounding is left to the clip below.
+    exceeds = size > xp.maximum(margin, NEGLIGIBLE)
+    share = xp.where(exceeds, margin / xp.where(exceeds, size, 1.0), 1.0)
     limited = without_yaw + least(share)[..., None] * yaw
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

@@ -1,9 +1,9 @@
-"""The quadrotor as a MuJoCo body, with the true mass and inertia.
+"""Add the quadrotor to a MuJoCo model as a body with the true mass and inertia.
 
-The suite's simulators leave the actuators at zero and write the plant's force and torque into
-`qfrc_applied` of the free joint as `[R force_b, torque_b]`. (A free joint's forces are in world
-axes, its torques in body axes, and the body's origin is its centre of mass. The rotors' actuators
-alone could not apply drag, tilt and trim of the effects.) Without the plant, a user controls the
+The suite's simulators leave the actuators at zero. They write the plant's force and torque (those
+of rotors and effects) into `qfrc_applied` of the free joint, as `[R force_b, torque_b]`: forces of
+a free joint are in world axes, torques in body axes, and the body's origin is its centre of mass.
+The rotors' actuators could not apply effects such as drag. A user without the plant may control the
 four actuators, whose control is a rotor's thrust in newton.
 """
 
@@ -18,6 +18,7 @@ from eval.vehicles.vehicle import Vehicle
 BODY = "quadrotor"
 """Name of the body and of its free joint."""
 CAMERA = "depth"
+"""Name of the camera."""
 COLLIDES = "quadrotor box"
 """Name of the only geom of the quadrotor that collides."""
 VISUAL_GROUP = 2
@@ -32,12 +33,12 @@ def rotor_name(index: int) -> str:
 def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Add `vehicle` to the world body of `spec`, with its effects on mass, inertia and gravity.
 
-    The body's origin is the true centre of mass. Gravity of the whole model is set, for a tilted
-    frame. `compile_quadrotor` compiles the result.
+    The body's origin is the true centre of mass. The model's gravity is set, since the effect
+    `frame_tilt` changes it. `compile_quadrotor` compiles the result.
 
     Args:
-        spec: to be added to; its integrator must stay Euler for parity with the JAX quadrotor.
-        vehicle: to be added.
+        spec: the model; its integrator must stay Euler for parity with the quadrotor in JAX.
+        vehicle: the vehicle.
 
     Raises:
         ValueError: where the effects make the mass zero or negative.
@@ -79,15 +80,15 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
 def compile_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle, dt: float) -> mujoco.MjModel:
     """Return the model of `spec` with `vehicle` in it, for steps of `dt` [s].
 
-    MuJoCo's compiler refuses moments of inertia that break the triangle inequality, which a
-    fitted `inertia_scale` of a flat quadrotor easily does by a few percent. Its dynamics work with
-    any values, so the true ones are set in the compiled model.
+    MuJoCo's compiler refuses moments of inertia that break the triangle inequality. A fitted
+    `inertia_scale` of a flat quadrotor often breaks it by a few percent. MuJoCo's dynamics work
+    with any values, so the true ones are set in the compiled model.
     """
     spec.option.timestep = dt
     add_quadrotor(spec, vehicle)
     model = spec.compile()
     model.body(BODY).inertia[:] = make_plant(vehicle, dt).constants.inertia
-    # For a lone free body MuJoCo steps with constants that it derived from the inertia.
+    # MuJoCo derives further constants from the inertia, which its steps use.
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
@@ -101,6 +102,7 @@ def _possible(inertia: np.ndarray) -> np.ndarray:
 def _add_visuals(
     body: mujoco.MjsBody, name: str, origin: np.ndarray, hub: np.ndarray, spin: int
 ) -> None:
+    """Add an arm and a disk for one rotor, which neither collide nor weigh anything."""
     visual = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0.0}
     body.add_geom(
         name=f"{name} arm",
@@ -110,7 +112,7 @@ def _add_visuals(
         rgba=[0.15, 0.15, 0.18, 1.0],
         **visual,
     )
-    # One colour a direction of spin.
+    # The colour shows the direction of spin.
     rgba = [0.9, 0.35, 0.1, 0.5] if spin > 0 else [0.2, 0.5, 0.9, 0.5]
     body.add_geom(
         name=f"{name} disk",
@@ -123,6 +125,7 @@ def _add_visuals(
 
 
 def _add_camera(body: mujoco.MjsBody, vehicle: Vehicle, origin: np.ndarray) -> None:
+    """Add the vehicle's depth camera at the nominal centre of mass."""
     pitch = np.deg2rad(vehicle.camera.pitch_deg)
     # MuJoCo's cameras look along their -z with y up.
     right = [0.0, -1.0, 0.0]

@@ -1,8 +1,8 @@
-"""The `Plant`: the nominal quadrotor and every effect of its vehicle, as arrays.
+"""The `Plant`: the constants of a quadrotor and of all effects of its vehicle, as arrays.
 
 A `Plant` is a pytree of numpy or JAX arrays with any leading batch shape, so it can be built from
-traced values inside a differentiated function. `eval.quadrotor.stepper` steps it. This file also
-has the rigid body in free flight, which steps as MuJoCo's Euler integrator does.
+traced values inside a differentiated function. `eval.quadrotor.stepper` simulates it. This file
+also has the equations of the rigid body, with a step like that of MuJoCo's Euler integrator.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.rotation import cross, exp_rot, to_world
 
 MAX_DELAY = 0.1
-"""Room for a command delay that is fitted [s]; the upper bound of `command_delay`."""
+"""Longest command delay that can be fitted [s]; the upper bound of the effect `command_delay`."""
 
 
 class Command(NamedTuple):
     """Collective thrust and body rates (CTBR)."""
 
     thrust: Array
-    """(...,) along body z per nominal mass [m/s^2]."""
+    """(...,) collective thrust along body z per nominal mass [m/s^2]."""
     rate_b: Array
-    """(..., 3) [rad/s]."""
+    """(..., 3) body rates [rad/s]."""
 
     @property
     def packed(self) -> Array:
-        """(..., 4) thrust and rates."""
+        """Thrust and rates as one array (..., 4)."""
         xp = self.rate_b.__array_namespace__()
         return xp.concatenate([self.thrust[..., None], self.rate_b], axis=-1)
 
 
-def unpacked(command: Array) -> Command:
-    """Return the `Command` of thrust and rates (..., 4)."""
+def unpack_command(command: Array) -> Command:
+    """Return the `Command` for an array (..., 4) of thrust and rates."""
     return Command(command[..., 0], command[..., 1:])
 
 
@@ -76,11 +76,11 @@ class Nominal(NamedTuple):
     unmixer: Array
     """(4, 4) from (force, torque) to rotor thrusts."""
     thrust_max: Array
-    """Of one rotor [N]."""
+    """Largest thrust of one rotor [N]."""
     thrust_coefficient: Array
     """k_T [N/(rad/s)^2]."""
     spin: Array
-    """(4,) s_i."""
+    """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above, -1 clockwise."""
 
 
 class Plant(NamedTuple):
@@ -93,7 +93,7 @@ class Plant(NamedTuple):
     effects: dict[str, Any]
     """Values of all effects, as arrays, by name."""
     delay_weight: Array
-    """(..., L) share of each remembered command in the one that acts; L = 0 without a delay."""
+    """(..., L) weight of each of the last L commands in the delayed one; L = 0 without a delay."""
     dt: Array
     """Length of a step [s]."""
     loop: Loop | None = None
@@ -109,27 +109,27 @@ def make_plant(
     """Return the plant of `vehicle` for steps of `dt` [s].
 
     Args:
-        vehicle: its nominal values are constants.
-        dt: 1 / controller.frequency.
-        effects: values in place of `vehicle.effects`, by name; traced JAX arrays may be among
-            them, also with leading batch axes (one vehicle a trial).
+        vehicle: gives the nominal values.
+        dt: length of a step, 1 / controller.frequency [s].
+        effects: values by name that replace `vehicle.effects`; they may be traced JAX arrays, and
+            have leading batch axes (one vehicle for each trial).
         max_delay: longest delay for which commands are stored [s]; required for a traced delay,
             otherwise the delay itself.
 
     Raises:
         ValueError: for an effect that is not in the catalogue.
     """
-    given = dict(vehicle.effects) if effects is None else effects
-    values = {find_effect(name).name: as_arrays(value) for name, value in given.items()}
+    effects = dict(vehicle.effects) if effects is None else effects
+    values = {find_effect(name).name: as_arrays(value) for name, value in effects.items()}
     return assemble(*nominal_quadrotor(vehicle), values, dt, max_delay, loop_of(vehicle))
 
 
 def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = None) -> Plant:
-    """Return a plant that holds every effect of the catalogue at once, to fit any of them.
+    """Return a plant with all effects of the catalogue at once, to fit any of them.
 
     Args:
-        vehicle: its nominal values and its own effects.
-        effects: values to use in their place, by name; may be traced.
+        vehicle: gives the nominal values and its effects; other effects are neutral.
+        effects: values by name that replace these; they may be traced.
         dt: length of a step [s]; 1 / controller.frequency if not given.
     """
     values = {**all_values(vehicle), **effects}
@@ -149,7 +149,7 @@ def nominal_quadrotor(vehicle: Vehicle) -> tuple[Nominal, Constants]:
         torque_coefficient=np.full(4, rotors.torque_coefficient),
         thrust_axis_b=np.array([0.0, 0.0, 1.0]),
         time_constant=np.asarray(rotors.time_constant),
-        # A firmware's loop is scaled as a whole: its gains are not in 1/s.
+        # The gains of a firmware's loop are not in 1/s; a factor of 1 on its output is used.
         rate_gain=np.asarray(vehicle.controller.rate_gain)
         if vehicle.controller.kind == NOMINAL
         else np.ones(3),
@@ -180,7 +180,13 @@ def assemble(
 ) -> Plant:
     """Return the plant of a `nominal_quadrotor` with effects; every array may be traced.
 
-    The arguments are those of `make_plant`; `values` are arrays; `loop` is the vehicle's.
+    Args:
+        nominal: the controller's constants.
+        constants: the constants without effects.
+        values: values of the effects by name, as arrays.
+        dt: length of a step [s].
+        max_delay: as for `make_plant`.
+        loop: a firmware's rate loop, if the vehicle has one.
     """
     for name, value in in_order(values):
         change = EFFECTS[name].constants
@@ -192,7 +198,7 @@ def assemble(
 
 
 def uses_noise(plant: Plant) -> bool:
-    """Return whether an effect of `plant` needs normal draws at every step."""
+    """Return whether an effect of `plant` needs random numbers at every step."""
     return any(EFFECTS[name].gust is not None for name in plant.effects)
 
 
@@ -202,17 +208,21 @@ def uses_rotor_acc(plant: Plant) -> bool:
 
 
 def uses_memory(plant: Plant) -> bool:
-    """Return whether an effect of `plant` has a state of its own."""
+    """Return whether an effect of `plant` has a state."""
     return any(EFFECTS[name].start is not None for name in plant.effects)
 
 
 def in_order(effects: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the effects in the table's order, in which they act; JAX sorts dicts by name."""
+    """Return (name, values) in the catalogue's order, in which effects act (JAX sorts dicts)."""
     return [(name, effects[name]) for name in EFFECTS if name in effects]
 
 
 def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, Array]:
-    """Return dv/dt in the world (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2]."""
+    """Return the accelerations of the rigid body by the Newton-Euler equations.
+
+    Returns:
+        dv/dt in world axes (..., 3) [m/s^2] and dw/dt in body axes (..., 3) [rad/s^2].
+    """
     constants = plant.constants
     force_w = to_world(motion.rot_w, wrench.force_b)
     momentum_b = constants.inertia * motion.rate_b
@@ -221,15 +231,15 @@ def accelerations(plant: Plant, motion: Motion, wrench: Wrench) -> tuple[Array, 
 
 
 def euler_step(plant: Plant, motion: Motion, wrench: Wrench) -> Motion:
-    """Return the motion after `plant.dt` under a held wrench (`euler_move`)."""
+    """Return the motion after `plant.dt` under a constant wrench, by `euler_move`."""
     return euler_move(motion, *accelerations(plant, motion, wrench), plant.dt)
 
 
 def euler_move(motion: Motion, acc_w: Array, turn_b: Array, dt: Array) -> Motion:
     """Return the motion after `dt` (..., 1) [s] under accelerations (semi-implicit Euler, order 1).
 
-    Velocities are stepped first, and the new ones carry position and attitude: the attitude
-    along the exact rotation of the new body rate.
+    The velocities are stepped first. The new ones move the position and the attitude, the latter by
+    the exact rotation of the new body rate.
     """
     xp = motion.rot_w.__array_namespace__()
     vel_w = motion.vel_w + dt * acc_w

@@ -1,8 +1,8 @@
-"""Rotors: speed follows its command with a delay and a first-order lag.
+"""Rotor dynamics: the speed follows its command with a delay and a first-order lag.
 
 If the delay is not a multiple of the step, a step's command is the weighted mean of two commands,
-so that the delay has a gradient. The diagnosis knows all commands in advance and takes means over
-its own steps instead (`suite/diagnose/evidence/rollout.py`).
+so the delay has a gradient. The diagnosis knows all commands in advance and uses means over its
+steps instead (`suite/diagnose/evidence/rollout.py`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from tracks.geometry.scene import Array
 
 SHORT_S = 1e-4
-"""Shortest time over which a change of speed is divided [s]."""
+"""Least divisor in the rate of change of a speed [s]."""
 NEGLIGIBLE = 1e-6
 """Thrusts below this count as zero [N]."""
 
@@ -34,16 +34,17 @@ class RotorStep(NamedTuple):
 def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
     """Return the speeds (..., 4) [rad/s] that nominally produce `thrust` (..., 4) >= 0 [N]."""
     xp = thrust.__array_namespace__()
-    # Near zero thrust the root's slope has no bound, and it would dominate all gradients.
-    pushes = thrust > NEGLIGIBLE
-    return xp.where(pushes, xp.sqrt(xp.where(pushes, thrust, 1.0) / thrust_coefficient), 0.0)
+    # Near zero thrust the root's slope is unbounded and would dominate all gradients.
+    positive = thrust > NEGLIGIBLE
+    return xp.where(positive, xp.sqrt(xp.where(positive, thrust, 1.0) / thrust_coefficient), 0.0)
 
 
 def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> RotorStep:
     """Return the rotors' step under dOmega/dt = (command - Omega) / time_constant.
 
-    Thrust is computed from the mean square speed, so that lags far shorter than a step count to
-    first order. A time constant of 0 follows at once, and the gradient with respect to it exists.
+    Thrust is computed from the mean square speed, so that lags far shorter than a step still have
+    an effect, to first order. With a time constant of 0 there is no lag, but the gradient with
+    respect to it exists.
 
     Args:
         speed: (..., 4) at the start of the step [rad/s].
@@ -54,53 +55,54 @@ def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> Rot
     xp = speed.__array_namespace__()
     time_constant = xp.asarray(time_constant)
     lags = time_constant > 0.0
-    left = xp.where(lags, xp.exp(-dt / xp.where(lags, time_constant, 1.0)), 0.0)
+    decay = xp.where(lags, xp.exp(-dt / xp.where(lags, time_constant, 1.0)), 0.0)
     steps = (time_constant / dt)[..., None]
-    left = left[..., None]
-    behind = speed - command
-    mean = command + behind * steps * (1.0 - left)
+    decay = decay[..., None]
+    # Omega(t) = command + error exp(-t / time_constant); its means over the step are integrals.
+    error = speed - command
+    mean = command + error * steps * (1.0 - decay)
     mean_square = (
         command**2
-        + 2.0 * command * behind * steps * (1.0 - left)
-        + behind**2 * 0.5 * steps * (1.0 - left**2)
+        + 2.0 * command * error * steps * (1.0 - decay)
+        + error**2 * 0.5 * steps * (1.0 - decay**2)
     )
-    return RotorStep(command + behind * left, mean, mean_square)
+    return RotorStep(command + error * decay, mean, mean_square)
 
 
 def acceleration(
     start: Array, rotors: RotorStep, command: Array | None, time_constant: Array, dt: Array
 ) -> Array:
-    """Return the mean change of the rotor speeds (..., 4) over a step [rad/s^2].
+    """Return the mean rate of change of the rotor speeds (..., 4) over a step [rad/s^2].
 
-    If the lag is longer than the step, the lag's equation gives the slope, even for a step of zero
-    length. Otherwise the slope is the change divided by the step.
+    If the lag is longer than the step, it follows from the lag's equation, even for a step of zero
+    length. Otherwise it is the change divided by the step.
 
     Args:
-        start: (..., 4) at the start of the step [rad/s].
+        start: (..., 4) speeds at the start of the step [rad/s].
         rotors: the step.
-        command: (..., 4) that the rotors followed [rad/s]; None: their speeds are measured.
-        time_constant: (...,) of the rotors [s].
+        command: (..., 4) commanded speeds [rad/s]; None if the speeds are measured.
+        time_constant: (...,) time constant of the lag [s].
         dt: length of the step [s].
     """
     xp = start.__array_namespace__()
-    changed = (rotors.end - start) / xp.maximum(xp.asarray(dt), SHORT_S)
+    quotient = (rotors.end - start) / xp.maximum(xp.asarray(dt), SHORT_S)
     if command is None:
-        return changed
+        return quotient
     lag = xp.asarray(time_constant)[..., None]
     lags = lag > dt
     slope = (command - 0.5 * (start + rotors.end)) / xp.where(lags, lag, 1.0)
-    return xp.where(lags, slope, changed)
+    return xp.where(lags, slope, quotient)
 
 
 def steady(speed: Array) -> RotorStep:
-    """Return the step of rotors with a constant speed (..., 4), such as a measured one [rad/s]."""
+    """Return the step of rotors with a constant, such as a measured, speed (..., 4) [rad/s]."""
     return RotorStep(speed, speed, speed**2)
 
 
 def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
     """Return `delay` (...,) [s] as whole steps of `dt` [s] and the remaining share of a step."""
     steps = delay / dt
-    # 0.043 s are 43 steps of 0.001 s in spite of rounding.
+    # With rounding, 0.043 / 0.001 may be a little less than 43.
     whole = steps.__array_namespace__().floor(steps + 1e-9)
     return whole, steps - whole
 
@@ -108,22 +110,25 @@ def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
 def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
     """Return the weight (..., L) of each stored command in the delayed one, newest first.
 
-    L is the number of commands that `max_delay` [s] requires, 0 for no delay.
+    Args:
+        delay: (...,) delay of the commands [s].
+        dt: length of a step [s].
+        max_delay: longest delay [s], which determines the number L of stored commands; 0: L = 0.
     """
     xp = delay.__array_namespace__()
     length = math.ceil(max_delay / dt - 1e-9) + 1 if max_delay > 0.0 else 0
     age = np.arange(length)
-    whole, part = (each[..., None] for each in whole_steps(delay, dt))
+    whole, part = (steps[..., None] for steps in whole_steps(delay, dt))
     return xp.where(age == whole, 1.0 - part, 0.0) + xp.where(age == whole + 1.0, part, 0.0)
 
 
 def delayed(weight: Array, past: Array, command: Array) -> tuple[Array, Array]:
-    """Return the stored commands (..., C, L) with `command` (..., C), and the delayed one.
+    """Store a command, and return the stored commands (..., C, L) and the delayed one (..., C).
 
     Args:
         weight: (..., L) from `delay_weight`, L > 0.
-        past: (..., C, L) of the steps before, newest first.
-        command: (..., C) of this step.
+        past: (..., C, L) commands of the previous steps, newest first.
+        command: (..., C) command of this step.
     """
     xp = command.__array_namespace__()
     past = xp.concatenate([command[..., None], past[..., :-1]], axis=-1)

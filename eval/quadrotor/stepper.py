@@ -1,10 +1,10 @@
-"""The stepper: one step of a quadrotor, for numpy and JAX and any leading batch shape.
+"""Simulate a quadrotor step by step, for numpy and JAX arrays of any leading batch shape.
 
 `plant_step` computes the force and torque on the body from command, delay, rate loop, mixer, rotors
-and effects; a simulator passes them to MuJoCo's engine. `step` also moves the rigid body, as
-MuJoCo's Euler integrator does. `rollout` is many steps in JAX: the differentiable quadrotor. It can
-be compiled, mapped over flights and differentiated with respect to its start, its inputs and the
-values of every effect, delay and lag included.
+and effects; a simulator passes them to MuJoCo. `step` also moves the rigid body, like MuJoCo's
+Euler integrator. `rollout` is many steps in JAX: the differentiable quadrotor. It can be compiled,
+mapped over flights, and differentiated with respect to its start, its inputs and the values of all
+effects, delay and lag included.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from eval.quadrotor.plant import (
     accelerations,
     euler_step,
     in_order,
-    unpacked,
+    unpack_command,
     uses_memory,
     uses_rotor_acc,
 )
@@ -42,7 +42,7 @@ class PlantState(NamedTuple):
     past_commands: Array
     """(..., 4, L) thrust and rates of the last L steps, newest first; L = 0 without a delay."""
     wind: dict[str, Array]
-    """(..., 3) of each effect that makes random wind [m/s]."""
+    """(..., 3) current wind of each effect with random wind, by name [m/s]."""
     loop: Any = ()
     """State of a firmware's rate loop; empty for the nominal one."""
     carried: dict[str, Memory] = {}
@@ -53,26 +53,26 @@ class Inputs(NamedTuple):
     """Inputs of a quadrotor during one step; (T, ...) for `rollout`'s T steps."""
 
     command: Command | None = None
-    """Held during the step."""
+    """Thrust and body rates, constant during the step."""
     rotor_speed: Array | None = None
-    """(..., 4) measured and held during the step, in place of the command [rad/s]."""
+    """(..., 4) measured rotor speeds, constant during the step, instead of a command [rad/s]."""
     noise: Array | None = None
-    """(..., 3) normal draws for random wind; None for no random wind."""
+    """(..., 3) normal random numbers for random wind; None for no random wind."""
     voltage_drop: Array | None = None
     """(...,) battery voltage at the start of the flight minus now [V]."""
     push_b: Array | None = None
-    """(..., 6) further acceleration [m/s^2] and angular acceleration [rad/s^2] in body axes."""
+    """(..., 6) additional acceleration [m/s^2] and angular acceleration [rad/s^2], body axes."""
     speed_cmd: Array | None = None
-    """(..., 4) commanded rotor speeds in place of a command; delay and lag act on them [rad/s]."""
+    """(..., 4) commanded rotor speeds instead of a command; delay and lag act on them [rad/s]."""
 
 
 class Feedback(NamedTuple):
-    """A function of the simulated state that adds a push, such as a network."""
+    """A function of the simulated state, such as a network, that computes `Inputs.push_b`."""
 
     start: Any
-    """Its own state at the start."""
+    """State of the function at the start."""
     act: Callable[[Any, Motion, Inputs, Array], tuple[Any, Array]]
-    """(state, motion, inputs, number of the step) -> (state, `Inputs.push_b`)."""
+    """Maps (state, motion, inputs, number of the step) to (state, `Inputs.push_b`)."""
 
 
 class Rollout(NamedTuple):
@@ -95,9 +95,10 @@ def hover_state(
 
     Args:
         plant: the plant.
-        batch_shape: leading shape of the states that will be flown.
+        batch_shape: leading shape of the states.
         xp: numpy or jax.numpy.
-        noise: (*batch_shape, 3) normal draws for the random wind at the start; None: no wind.
+        noise: (*batch_shape, 3) normal random numbers for the random wind at the start; None: no
+            wind.
     """
     still = xp.zeros((*batch_shape, 3))
     hover = Command(xp.full(batch_shape, GRAVITY), still)
@@ -128,9 +129,14 @@ def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[st
 
 
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
-    """Return the rotor speeds (..., 4) [rad/s] that the rate loop and the mixer command.
+    """Return the rotor speeds (..., 4) [rad/s] that rate loop and mixer command.
 
-    For a firmware's loop this is its first update.
+    For a firmware's loop they are those of its first update.
+
+    Args:
+        plant: the plant.
+        command: (...) thrust and body rates.
+        rate_b: (..., 3) current body rates [rad/s].
     """
     xp = rate_b.__array_namespace__()
     memory = loops.start(plant.loop, rate_b.shape[:-1], xp)
@@ -144,9 +150,9 @@ def loop_update(
 
     Args:
         plant: the plant.
-        memory: of the loop; see `PlantState.loop`.
-        command: with its delay already applied.
-        rate_b: (..., 3) [rad/s].
+        memory: state of the loop, as `PlantState.loop`.
+        command: (...) thrust and body rates, already delayed.
+        rate_b: (..., 3) current body rates [rad/s].
         dt: (...,) time since the last update [s].
     """
     nominal = plant.nominal
@@ -164,7 +170,10 @@ def loop_update(
 def rotor_step(
     plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, RotorStep]:
-    """Return the state after one step and the rotors' step; see `rotor_command`."""
+    """Return the plant's state after one step of rate loop and rotors, and the rotors' step.
+
+    The arguments are those of `rotor_command`.
+    """
     state, wanted = rotor_command(plant, state, command, rate_b, speed_cmd)
     rotors = follow(state.rotor_speed, wanted, plant.constants.time_constant, plant.dt)
     return state._replace(rotor_speed=rotors.end), rotors
@@ -173,11 +182,19 @@ def rotor_step(
 def rotor_command(
     plant: Plant, state: PlantState, command: Any, rate_b: Array, speed_cmd: Array | None = None
 ) -> tuple[PlantState, Array]:
-    """Return the state with `command` or `speed_cmd` stored, and the commanded rotor speeds."""
+    """Return the state after an update of the rate loop, and the commanded rotor speeds (..., 4).
+
+    Args:
+        plant: the plant.
+        state: before the step.
+        command: (...) thrust and body rates; unused with `speed_cmd`.
+        rate_b: (..., 3) current body rates [rad/s].
+        speed_cmd: (..., 4) commanded rotor speeds that bypass the rate loop [rad/s], or None.
+    """
     if plant.delay_weight.shape[-1] > 0:
-        wanted = command.packed if speed_cmd is None else speed_cmd
-        past, acting = delayed(plant.delay_weight, state.past_commands, wanted)
-        state, command = state._replace(past_commands=past), unpacked(acting)
+        newest = command.packed if speed_cmd is None else speed_cmd
+        past, acting = delayed(plant.delay_weight, state.past_commands, newest)
+        state, command = state._replace(past_commands=past), unpack_command(acting)
         speed_cmd = None if speed_cmd is None else acting
     if speed_cmd is not None:
         return state, speed_cmd
@@ -188,14 +205,14 @@ def rotor_command(
 def plant_step(
     plant: Plant, state: PlantState, motion: Motion, inputs: Inputs, time_s: Array | float
 ) -> tuple[PlantState, Wrench]:
-    """Return the state after one step of `plant.dt` and the wrench to hold during it.
+    """Return the state after one step of `plant.dt`, and the constant wrench during it.
 
     Args:
         plant: the plant.
         state: from `hover_state` or the step before.
-        motion: at the start of the step.
+        motion: rigid-body state at the start of the step.
         inputs: a command or measured rotor speeds, voltage, wind and pushes.
-        time_s: (...,) since the start of the flight [s].
+        time_s: (...,) time since the start of the flight [s].
     """
     before = state.rotor_speed
     if inputs.rotor_speed is not None:
@@ -207,7 +224,7 @@ def plant_step(
     if uses_rotor_acc(plant):
         flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)
     wrench = with_push(plant, wrench_on(plant, rotors, flow, state.carried), inputs.push_b)
-    carried = _carried_on(plant, state.carried, motion, flow, wrench)
+    carried = _next_states(plant, state.carried, motion, flow, wrench)
     return state._replace(wind=winds, carried=carried), wrench
 
 
@@ -230,13 +247,13 @@ def rollout(
     start_s: Array | float = 0.0,
     feedback: Feedback | None = None,
 ) -> Rollout:
-    """Fly `inputs` (T, ...) from `motion` (...) in JAX.
+    """Simulate T steps from `motion` in JAX, and return the states after them.
 
     Args:
         plant: the plant.
-        motion: at the start.
-        inputs: of T steps.
-        state: (...) at the start; that of a hover if not given.
+        motion: (...) rigid-body state at the start.
+        inputs: (T, ...) inputs of the steps.
+        state: (...) plant's state at the start; None: that of a hover.
         start_s: (...,) time since the start of the flight at the first step [s].
         feedback: computes a push that replaces `inputs.push_b`.
     """
@@ -247,28 +264,28 @@ def rollout(
     start, motion = jax.tree.map(jnp.asarray, (start, motion))
     steps = jnp.arange(len(jax.tree.leaves(inputs)[0]))
 
-    def one(carry: Any, row: tuple[Array, Inputs]) -> tuple[Any, Any]:
-        state, motion, remembered = carry
-        index, now = row
+    def one_step(carry: Any, row: tuple[Array, Inputs]) -> tuple[Any, Any]:
+        state, motion, memory = carry
+        index, row_inputs = row
         if feedback is not None:
-            remembered, push_b = feedback.act(remembered, motion, now, index)
-            now = now._replace(push_b=push_b)
-        state, motion, wrench = step(plant, state, motion, now, start_s + index * plant.dt)
+            memory, push_b = feedback.act(memory, motion, row_inputs, index)
+            row_inputs = row_inputs._replace(push_b=push_b)
+        state, motion, wrench = step(plant, state, motion, row_inputs, start_s + index * plant.dt)
         acc_b = wrench.force_b / mass_of(plant)
-        return (state, motion, remembered), (motion, state.rotor_speed, acc_b)
+        return (state, motion, memory), (motion, state.rotor_speed, acc_b)
 
     begin = (start, motion, None if feedback is None else feedback.start)
-    (last, _, _), (motions, speeds, acc_b) = jax.lax.scan(one, begin, (steps, inputs))
-    motions, speeds = from_start((motion, start.rotor_speed), (motions, speeds))
+    (last, _, _), (motions, speeds, acc_b) = jax.lax.scan(one_step, begin, (steps, inputs))
+    motions, speeds = prepend_start((motion, start.rotor_speed), (motions, speeds))
     return Rollout(motions, speeds, acc_b, last)
 
 
-def from_start(start: Any, rest: Any) -> Any:
-    """Return a pytree's values at the start (...) with the T that followed, (T + 1, ...)."""
+def prepend_start(start: Any, following: Any) -> Any:
+    """Return pytrees of values at the start (...) and T following ones as one of (T + 1, ...)."""
     import jax
     import jax.numpy as jnp
 
-    return jax.tree.map(lambda first, then: jnp.concatenate([first[None], then]), start, rest)
+    return jax.tree.map(lambda first, then: jnp.concatenate([first[None], then]), start, following)
 
 
 def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
@@ -284,7 +301,7 @@ def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
 def mass_of(plant: Plant) -> Array:
     """Return the true mass (..., 1) to divide vectors (..., 3) by; a plain number for one plant.
 
-    XLA rounds a division by a number otherwise than one by an array of one.
+    XLA rounds a division by a number differently from one by an array with one element.
     """
     mass = plant.constants.mass
     return mass[..., None] if mass.ndim else mass
@@ -298,7 +315,16 @@ def wind_and_flow(
     inputs: Inputs,
     time_s: Array | float,
 ) -> tuple[dict[str, Array], Flow]:
-    """Return the random winds of this step, after `wind`, and the inputs of the effects."""
+    """Return the random winds of this step, and the inputs of the effects' hooks.
+
+    Args:
+        plant: the plant.
+        wind: random winds of the previous step, by effect.
+        motion: rigid-body state.
+        rotors: the rotors' step.
+        inputs: noise and voltage of the step.
+        time_s: (...,) time since the start of the flight [s].
+    """
     winds, air_vel_w = winds_on(plant, wind, motion, inputs.noise)
     return winds, Flow(
         constants=plant.constants,
@@ -316,18 +342,25 @@ def wind_and_flow(
 def winds_on(
     plant: Plant, wind: Mapping[str, Array], motion: Motion, noise: Array | None
 ) -> tuple[dict[str, Array], Array]:
-    """Return the random winds of this step, after `wind`, and the velocity through the air.
+    """Return the random winds of this step and the velocity through the air.
+
+    Args:
+        plant: the plant.
+        wind: random winds of the previous step, by effect.
+        motion: rigid-body state.
+        noise: (..., 3) normal random numbers, or None.
 
     Returns:
-        The winds by effect, and (..., 3) of the centre of mass relative to the air, in the world.
+        The winds by effect, and the velocity of the centre of mass relative to the air (..., 3) in
+        world axes [m/s].
     """
     air_vel_w, winds = motion.vel_w, dict(wind)
     still = air_vel_w.__array_namespace__().zeros_like(air_vel_w)
     for name, value in in_order(plant.effects):
-        blow = EFFECTS[name].wind
-        if blow is not None:
-            before = wind.get(name, still)
-            wind_w = blow(value, Gust(before, air_vel_w, noise, plant.dt))
+        wind_of = EFFECTS[name].wind
+        if wind_of is not None:
+            previous_w = wind.get(name, still)
+            wind_w = wind_of(value, Gust(previous_w, air_vel_w, noise, plant.dt))
             air_vel_w = air_vel_w - wind_w
             if name in wind:
                 winds[name] = wind_w
@@ -340,7 +373,10 @@ def still_thrust(plant: Plant, rotors: RotorStep) -> Array:
 
 
 def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
-    """Return the rotors' force and torque on the body for thrusts (..., 4) [N]."""
+    """Return the rotors' force and torque on the body for thrusts (..., 4) [N].
+
+    `rotors` gives the speeds, which determine the torque about z.
+    """
     constants, arm = plant.constants, plant.constants.rotor_position_b
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b
     about_z = -(plant.nominal.spin * constants.torque_coefficient * rotors.mean_square).sum(axis=-1)
@@ -354,7 +390,13 @@ def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
 def wrench_on(
     plant: Plant, rotors: RotorStep, flow: Flow, carried: Mapping[str, Memory] | None = None
 ) -> Wrench:
-    """Return the force and torque of rotors and effects; `carried` is `PlantState.carried`.
+    """Return the force and torque of rotors and effects.
+
+    Args:
+        plant: the plant.
+        rotors: the rotors' step.
+        flow: inputs of the effects' hooks.
+        carried: states of effects, as `PlantState.carried`.
 
     Raises:
         ValueError: where the state of an effect is missing in `carried`.
@@ -363,29 +405,29 @@ def wrench_on(
     for name, value in in_order(plant.effects):
         change = EFFECTS[name].thrust
         if change is not None:
-            thrust = change(value, _seen(plant, name, flow, carried), thrust)
+            thrust = change(value, _with_state(plant, name, flow, carried), thrust)
     force_b, torque_b = rotor_wrench(plant, rotors, thrust)
     for name, value in in_order(plant.effects):
-        push, twist = EFFECTS[name].force, EFFECTS[name].torque
-        sees = _seen(plant, name, flow, carried)
-        force_b = force_b if push is None else force_b + push(value, sees)
-        torque_b = torque_b if twist is None else torque_b + twist(value, sees)
+        force_of, torque_of = EFFECTS[name].force, EFFECTS[name].torque
+        effect_flow = _with_state(plant, name, flow, carried)
+        force_b = force_b if force_of is None else force_b + force_of(value, effect_flow)
+        torque_b = torque_b if torque_of is None else torque_b + torque_of(value, effect_flow)
     return Wrench(force_b, torque_b)
 
 
-def _seen(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | None) -> Flow:
+def _with_state(plant: Plant, name: str, flow: Flow, carried: Mapping[str, Memory] | None) -> Flow:
     """Return `flow` with the state of the effect `name`, if the effect has one."""
     if EFFECTS[name].start is None:
         return flow
     if not carried or name not in carried:
         raise ValueError(
             f"effects.{name} has a motion of its own, which is not simulated here; leave it out of "
-            "the vehicle, or fly it with eval.quadrotor.stepper from hover_state on"
+            "the vehicle, or fly it with eval.quadrotor.stepper, starting at hover_state"
         )
     return flow._replace(memory=carried[name], dt=plant.dt)
 
 
-def _carried_on(
+def _next_states(
     plant: Plant, carried: Mapping[str, Memory], motion: Motion, flow: Flow, wrench: Wrench
 ) -> dict[str, Memory]:
     """Return the states of effects that have one, after a step under `wrench`."""
@@ -395,5 +437,5 @@ def _carried_on(
         for name, value in in_order(plant.effects):
             carry = EFFECTS[name].carry
             if carry is not None:
-                after[name] = carry(value, _seen(plant, name, flow, carried), acc_w)
+                after[name] = carry(value, _with_state(plant, name, flow, carried), acc_w)
     return after

@@ -1,7 +1,6 @@
-"""The vehicle file (TOML): read, checked by key, written.
+"""Read, check and write vehicle files (TOML), which describe a quadrotor.
 
-What a file may hold is in docs/vehicle.md; every refusal names the file, the key, the value and
-what is allowed.
+docs/vehicle.md lists the keys. Errors name the file, the key, the value and what is allowed.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from eval.effects import EFFECTS, find_effect
-from eval.effects.interface import Effect, at
+from eval.effects.interface import Effect, bound_value
 from eval.quadrotor.loops import KINDS, NOMINAL
 from eval.vehicles.vehicle import CollisionBox, Controller, MotorMap, Rotors, Vector, Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
@@ -25,12 +24,14 @@ from tracks.common.toml_table import REQUIRED, Table, load_shipped, shipped_name
 from tracks.geometry.camera import Camera
 
 SCHEMA = 1
+"""Version of the file's layout."""
 SHIPPED = Path(__file__).resolve().parents[1] / "vehicles"
-
+"""Folder of the vehicle files that the suite ships."""
 KEYS = (
     *("name", "schema", "mass", "inertia", "rotors", "controller"),
     *("motors", "body", "camera", "effects"),
 )
+"""Keys and tables at the top of a file."""
 
 
 class VehicleFileError(ValueError):
@@ -49,8 +50,8 @@ def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
         source: a path (it ends in .toml, has a folder or exists) or a shipped name.
 
     Raises:
-        VehicleFileError: for what the file says or lacks.
-        ValueError: for a name that is neither.
+        VehicleFileError: for a file that cannot be used.
+        ValueError: for a source that is neither a path nor a shipped name.
     """
     return load_shipped(source, SHIPPED, "vehicle", parse_vehicle, VehicleFileError)
 
@@ -84,15 +85,15 @@ def parse_vehicle(table: Mapping[str, Any]) -> Vehicle:
 
 
 def save_vehicle(vehicle: Vehicle, path: str | os.PathLike[str], comment: str = "") -> None:
-    """Write `vehicle` as a file that `load_vehicle` reads back equal, whole or not at all.
+    """Write `vehicle` as a file, from which `load_vehicle` reads an equal vehicle.
 
     Args:
-        vehicle: what to write; it is checked as a file would be.
-        path: where to.
-        comment: lines for the head of the file.
+        vehicle: the vehicle; it is checked first, as when a file is read.
+        path: path of the file.
+        comment: lines for the beginning of the file.
 
     Raises:
-        ValueError: for a vehicle that could not be read back.
+        ValueError: for a vehicle that the check refuses.
     """
     table = vehicle_table(vehicle)
     parse_vehicle(table)
@@ -127,6 +128,7 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
+    """Return the values of the tables [effects.NAME], by name, checked against their bounds."""
     values = {}
     for name in tables.values:
         effect, table = find_effect(name), tables.table(name)
@@ -142,6 +144,7 @@ def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
 
 
 def _effect_values(effect: Effect, table: Table, vehicle: Vehicle) -> Any:
+    """Return the values of an effect whose keys are the names of its parameters."""
     table.expect(parameter.name for parameter in effect.parameters)
     if not table.values:
         names = " or ".join(parameter.name for parameter in effect.parameters)
@@ -150,7 +153,7 @@ def _effect_values(effect: Effect, table: Table, vehicle: Vehicle) -> Any:
     for parameter in effect.parameters:
         default = REQUIRED
         if not parameter.required:
-            number = at(parameter.neutral, vehicle)
+            number = bound_value(parameter.neutral, vehicle)
             default = (number,) * parameter.size if parameter.size else number
         kind = tuple[(float,) * parameter.size] if parameter.size else float
         values.append(table.value(parameter.name, kind, default))
@@ -164,7 +167,7 @@ def check_bounds(effect: Effect, values: Any, vehicle: Vehicle) -> None:
         ValueError: with the key, the value and the bounds.
     """
     for parameter, value in zip(effect.parameters, values, strict=True):
-        low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
+        low, high = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
         for number in value if parameter.size else (value,):
             if not (math.isfinite(number) and low <= number <= high):
                 raise ValueError(
@@ -174,27 +177,29 @@ def check_bounds(effect: Effect, values: Any, vehicle: Vehicle) -> None:
 
 
 def _controller(table: Table) -> Controller:
+    """Return the controller of the table [controller], with the settings of a firmware's loop."""
     kind = table.choice("kind", (NOMINAL, *KINDS))
     if kind == NOMINAL:
         return table.read(Controller, ["kind"], kind=kind, settings=None)
     module = KINDS[kind]
     keys = list(module.Settings.__dataclass_fields__)
-    inside, own = table, keys
+    settings_table, extra_keys = table, keys
     if module.GROUP:
-        inside, own = table.table(module.GROUP, {}), [module.GROUP]
-        inside.expect(keys)
-    # Its settings are in place of the nominal loop's gain.
-    held = {} if table.has("rate_gain") else {"rate_gain": (1.0, 1.0, 1.0)}
-    controller = table.read(Controller, ["kind", *own], kind=kind, settings=None, **held)
-    given = {key: inside.value(key, float) for key in keys if inside.has(key)}
-    for key, value in given.items():
+        settings_table, extra_keys = table.table(module.GROUP, {}), [module.GROUP]
+        settings_table.expect(keys)
+    # A firmware's loop does not use the nominal loop's gain, so the key may be missing.
+    fixed = {} if table.has("rate_gain") else {"rate_gain": (1.0, 1.0, 1.0)}
+    controller = table.read(Controller, ["kind", *extra_keys], kind=kind, settings=None, **fixed)
+    settings = {key: settings_table.value(key, float) for key in keys if settings_table.has(key)}
+    for key, value in settings.items():
         low, high = module.LIMITS.get(key, (0.0, 1e6))
         if not low <= value <= high:
-            raise inside.error(key, value, f"from {low:g} to {high:g}")
-    return replace(controller, settings=module.Settings(**given))
+            raise settings_table.error(key, value, f"from {low:g} to {high:g}")
+    return replace(controller, settings=module.Settings(**settings))
 
 
 def _controller_table(controller: Controller) -> dict[str, Any]:
+    """Return the table [controller] of a controller."""
     table = _plain({k: v for k, v in vars(controller).items() if k not in ("kind", "settings")})
     if controller.kind == NOMINAL:
         return table
@@ -214,6 +219,7 @@ def _camera(table: Table) -> Camera:
 
 
 def _plain(value: Any) -> Any:
+    """Return a value as dicts, lists and floats, as TOML has them."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, (tuple, list)) or getattr(value, "ndim", 0) > 0:

@@ -1,1 +1,1 @@
-"""The vehicle as data, and the vehicle files that are shipped."""
+"""The vehicle as a dataclass, its physical checks, and the vehicle files that the suite ships."""

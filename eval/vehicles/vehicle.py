@@ -1,10 +1,12 @@
-"""A quadrotor as its vehicle file describes it: frozen, hashable, plain Python numbers.
+"""The `Vehicle`: a quadrotor as its vehicle file (TOML) describes it, in plain Python numbers.
 
-Body frame: x forward, y left, z up, origin at the nominal centre of mass. SI units.
+The dataclasses are frozen. The body frame is x forward, y left, z up, with its origin at the
+nominal centre of mass. Units are SI.
 
-A motor's thrust by `[motors]` is `T = t1 u + t2 u^2` with `u = command (V / V0)^n`: command from 0
-to 1, V the battery's voltage, V0 the nominal one. n = 1 where the command is a share of the
-battery's voltage (PWM of a brushed motor), n = 0 where the firmware compensates the battery.
+The table `[motors]` gives a motor's thrust as `T = t1 u + t2 u^2` with `u = command (V / V0)^n`,
+where the command is from 0 to 1, V is the battery's voltage and V0 its nominal voltage. n is 1 if
+the command is a share of the battery's voltage (PWM of a brushed motor), and 0 if the firmware
+compensates the voltage.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import Any
 from tracks.geometry.camera import Camera
 
 Vector = tuple[float, float, float]
+"""x, y, z."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Rotors:
     """Four rotors with parallel axes along body z."""
 
     position: tuple[Vector, Vector, Vector, Vector]
-    """Hubs in body axes [m]."""
+    """Positions of the hubs in body axes [m]."""
     spin: tuple[int, int, int, int]
     """s_i: +1 turns counter-clockwise seen from above, -1 clockwise."""
     thrust_coefficient: float
@@ -32,7 +35,7 @@ class Rotors:
     torque_coefficient: float
     """k_Q [N m/(rad/s)^2]."""
     time_constant: float
-    """tau_m of the first-order lag [s]; 0 follows at once."""
+    """tau_m of the first-order lag [s]; 0: no lag."""
     speed_max: float
     """Largest commanded speed [rad/s]."""
 
@@ -44,20 +47,20 @@ class Rotors:
 
 @dataclass(frozen=True)
 class Controller:
-    """The loops that turn an attitude into rates and rates into torque."""
+    """The attitude loop (attitude error to body rates) and the rate loop (body rates to torque)."""
 
     rate_gain: Vector
     """K of the rate loop [1/s]; a firmware's loop uses its settings instead."""
     frequency: float
-    """Rate of the rate loop, and of the physics [Hz]."""
+    """Frequency of the rate loop, and of the physics [Hz]."""
     attitude_gain: Vector = (8.0, 8.0, 4.0)
-    """Body rate per attitude error [1/s]."""
+    """Gain of the attitude loop: body rate per attitude error [1/s]."""
     rate_max: Vector = (6.0, 6.0, 6.0)
-    """Commanded body rates are clipped to this [rad/s]."""
+    """Largest commanded body rates [rad/s]."""
     kind: str = "p"
-    """The nominal rate loop `p`, or a firmware's, one of `eval.quadrotor.loops.KINDS`."""
+    """Kind of rate loop: the nominal one `p`, or a firmware in `eval.quadrotor.loops.KINDS`."""
     settings: Any = None
-    """That firmware's settings, `Settings` of its module; None for `p`."""
+    """Settings of the firmware's loop, `Settings` of its module; None for `p`."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class CollisionBox:
     """The box for collisions: the vehicle file's `[body]`."""
 
     half_size: Vector = (0.064, 0.064, 0.025)
-    """Half of the edges of a box around the origin [m]."""
+    """Half edge lengths of a box around the origin [m]."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +89,9 @@ class Vehicle:
 
     name: str
     mass: float
-    """Nominal [kg]."""
+    """Nominal mass [kg]."""
     inertia: Vector
-    """Nominal, principal, body axes [kg m^2]."""
+    """Nominal principal moments of inertia, body axes [kg m^2]."""
     rotors: Rotors
     controller: Controller
     body: CollisionBox = field(default_factory=CollisionBox)
@@ -96,10 +99,10 @@ class Vehicle:
     motors: MotorMap | None = None
     """Thrust of motor commands; None where unknown."""
     effects: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    """Values (the effect's NamedTuple) by the effect's name, see `eval.effects.EFFECTS`."""
+    """Values (the effect's NamedTuple) by name of the effect; see `eval.effects.EFFECTS`."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled and copied: a read-only view of a dict cannot be."""
+        """Return the state for pickle and copy, which do not support the read-only `effects`."""
         return {**vars(self), "effects": dict(self.effects)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -107,22 +110,22 @@ class Vehicle:
 
     @property
     def full_thrust(self) -> float:
-        """Nominal largest collective thrust per mass [m/s^2]; a share of it is a throttle."""
+        """Nominal largest collective thrust per mass [m/s^2], that of full throttle."""
         return 4.0 * self.rotors.thrust_max / self.mass
 
 
 def with_effects(nominal: Vehicle, effects: Mapping[str, Any]) -> Vehicle:
-    """Return `nominal` with `effects`, values by name, in place of its own of these names."""
+    """Return `nominal` with `effects` (values by name) added to its own, or replacing them."""
     return replace(nominal, effects=MappingProxyType({**nominal.effects, **effects}))
 
 
 def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
-    """Return the thrusts (..., 4) [N].
+    """Return the thrusts (..., 4) [N] of motor commands.
 
     Args:
-        motors: the map.
-        command: (..., 4) from 0 to 1.
-        voltage: (...,) of the battery [V]; None: the nominal one.
+        motors: the vehicle's map from commands to thrust.
+        command: (..., 4) motor commands from 0 to 1.
+        voltage: (...,) battery voltage [V]; None: the nominal one.
     """
     applied = command
     if voltage is not None and motors.voltage_exponent:
@@ -136,16 +139,22 @@ def command_of_thrust(curve: tuple[Any, Any], thrust: Any) -> Any:
 
     Args:
         curve: t1, t2 [N] of an increasing curve.
-        thrust: [N].
+        thrust: (...) thrusts [N].
     """
     first, second = curve
     xp = thrust.__array_namespace__()
+    # The root of the quadratic in the form that also holds for t2 = 0.
     root = xp.sqrt(xp.maximum(first**2 + 4.0 * second * thrust, 1e-12))
     return 2.0 * thrust / xp.maximum(first + root, 1e-6)
 
 
 def motor_speed(vehicle: Vehicle, command: Any, voltage: Any = None) -> Any:
-    """Return the commanded rotor speeds (..., 4) [rad/s] of motor commands; see `motor_thrust`.
+    """Return the commanded rotor speeds (..., 4) [rad/s] for motor commands.
+
+    Args:
+        vehicle: its `[motors]` map commands to thrust.
+        command: (..., 4) motor commands from 0 to 1.
+        voltage: (...,) battery voltage [V]; None: the nominal one.
 
     Raises:
         ValueError: where the vehicle has no `[motors]`.

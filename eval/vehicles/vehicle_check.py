@@ -1,4 +1,4 @@
-"""Physical checks of a vehicle file: can such a vehicle exist, and can it hover?"""
+"""Check that a vehicle is possible: values in range, independent rotors, and able to hover."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def check_vehicle(vehicle: Vehicle) -> None:
     _between("mass", vehicle.mass, 0.0001, 10000.0, "kg")
     _between("inertia", vehicle.inertia, 1e-10, 10000.0, "kg m^2")
     x, y, z = vehicle.inertia
-    # A flat body has A + B = C exactly; rounding must not refuse it.
+    # A flat body has Jx + Jy = Jz exactly; the factor allows for rounding.
     if 2.0 * max(x, y, z) > (x + y + z) * (1.0 + 1e-12):
         raise ValueError(
-            f"inertia = {list(vehicle.inertia)}: no body has this; the largest must be at most "
-            "the sum of the other two"
+            f"inertia = {list(vehicle.inertia)}: impossible for a body; the largest must be at "
+            "most the sum of the other two"
         )
     _between("rotors.thrust_coefficient", rotors.thrust_coefficient, 1e-15, 1000.0, "N/(rad/s)^2")
     _between("rotors.torque_coefficient", rotors.torque_coefficient, 1e-18, 1000.0, "N m/(rad/s)^2")
@@ -47,6 +47,7 @@ def check_vehicle(vehicle: Vehicle) -> None:
 
 
 def _check_motors(motors: MotorMap) -> None:
+    """Refuse a map whose thrust does not grow with the command."""
     _between("motors.voltage", motors.voltage, 0.5, 1000.0, "V")
     _between("motors.voltage_exponent", motors.voltage_exponent, 0.0, 4.0, "")
     _between("motors.thrust", motors.thrust, -100000.0, 100000.0, "N")
@@ -59,6 +60,7 @@ def _check_motors(motors: MotorMap) -> None:
 
 
 def _check_rotors(vehicle: Vehicle) -> None:
+    """Refuse rotors that cannot produce all torques independently, or cannot hover."""
     rotors = vehicle.rotors
     matrix = mixer_matrix(
         rotors.position, rotors.spin, rotors.torque_coefficient / rotors.thrust_coefficient
@@ -68,21 +70,21 @@ def _check_rotors(vehicle: Vehicle) -> None:
     if np.linalg.matrix_rank(rows, tol=1e-6) < 4:
         raise ValueError(
             f"rotors.position = {[list(hub) for hub in rotors.position]}, rotors.spin = "
-            f"{list(rotors.spin)}: these rotors cannot make roll, pitch and yaw independently; "
-            "diagonal neighbours usually spin the same way"
+            f"{list(rotors.spin)}: these rotors cannot produce roll, pitch and yaw independently; "
+            "rotors at opposite corners usually spin in the same direction"
         )
     hover = np.linalg.solve(matrix, [vehicle.mass * GRAVITY, 0.0, 0.0, 0.0])
     if hover.min() <= 0.0:
         raise ValueError(
             f"rotors.position = {[list(hub) for hub in rotors.position]}: the origin (centre of "
-            "mass) must lie between the rotors, so that all of them push up in hover"
+            "mass) must be between the rotors, so that all of them push up in hover"
         )
-    given = {f"rotors.speed_max = {rotors.speed_max}": rotors.thrust_max}
+    limits = {f"rotors.speed_max = {rotors.speed_max}": rotors.thrust_max}
     if vehicle.motors is not None and vehicle.controller.settings is not None:
-        # With a firmware's loop the motor's own curve limits its thrust.
+        # With a firmware's loop, `[motors]` limits the thrust too.
         full = motor_thrust(vehicle.motors, 1.0)
-        given[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
-    for entry, most in given.items():
+        limits[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
+    for entry, most in limits.items():
         if hover.max() >= most:
             raise ValueError(
                 f"{entry}: too weak to hover; a rotor gives {most:.3g} N and {hover.max():.3g} N "
@@ -92,5 +94,5 @@ def _check_rotors(vehicle: Vehicle) -> None:
 
 def _between(key: str, value: Any, low: float, high: float, unit: str) -> None:
     if not (np.min(value) >= low and np.max(value) <= high):
-        given = list(value) if isinstance(value, tuple) else value
-        raise ValueError(f"{key} = {given}: must be from {low:g} to {high:g} {unit}")
+        text = list(value) if isinstance(value, tuple) else value
+        raise ValueError(f"{key} = {text}: must be from {low:g} to {high:g} {unit}")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.quadrotor.autopilot import AutopilotState, attitude_step, speed_asked
+from eval.quadrotor.autopilot import AutopilotState, attitude_step, motor_speed_command
 from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import rotor_command, winds_on
 from eval.vehicles.vehicle import Vehicle
@@ -100,7 +100,7 @@ class RotorpyWorld(SceneSlots):
     ) -> tuple[AutopilotState, Push]:
         loops = attitude_step(self._autopilot, self._loops, motion, action_b, gate_w, step)
         plant = self._autopilot.plant
-        commanded = speed_asked(self._autopilot, action_b)
+        commanded = motor_speed_command(self._autopilot, action_b)
         state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b, commanded)
         winds, air_vel_w = winds_on(plant, state.wind, motion, noise)
         loops = loops._replace(plant=state._replace(wind=winds))

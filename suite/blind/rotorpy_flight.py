@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.flights.follow import Recording, Step, follow, wanted_of
+from eval.flights.follow import Recording, Step, follow, reference_of
 from eval.flights.simulate import FULL_V
 from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
@@ -53,7 +53,7 @@ def fly_rotorpy(
     check_effects(truth)
     frequency = nominal.controller.frequency
     dt, period = 1.0 / frequency, round(frequency / rate_hz)
-    wanted = wanted_of(trajectories, period, dt)
+    wanted = reference_of(trajectories, period, dt)
     bodies = _RotorpyBodies(nominal, truth, wanted, dt)
     return follow(bodies, nominal, trajectories, wanted, period, dt)
 

@@ -29,7 +29,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         ValueError: for a name that is not in the catalogue.
     """
     from eval.effects import EFFECTS, find_effect
-    from eval.effects.interface import at
+    from eval.effects.interface import bound_value
     from eval.quadrotor.vehicle_file import load_vehicle
 
     if not config.name:
@@ -45,12 +45,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     for parameter in effect.parameters:
         count = f" x {parameter.size}" if parameter.size else ""
         low, high = parameter.typical
-        neutral = at(parameter.neutral, vehicle)
+        neutral = bound_value(parameter.neutral, vehicle)
         off = f" away from {neutral:g}" if neutral and not parameter.whole else ""
         by_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
         whose = f" (for vehicle {vehicle.name})" if by_vehicle else ""
         given = "" if parameter.required else "; optional"
-        least, most = at(parameter.low, vehicle), at(parameter.high, vehicle)
+        least, most = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
         console.say(
             f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{off}; "
             f"allowed {least:g} to {most:g}{whose}{given}"

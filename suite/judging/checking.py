@@ -121,14 +121,14 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
 
 def _in_flight(policy: Policy, trials: int, console: Console) -> list[tuple[str, str, str]]:
     from eval.judging.judge import JudgeOptions, fly
-    from eval.judging.outputs import actions_of
+    from eval.judging.outputs import action_report
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import Rules, TrialSpec
 
     trial_specs = [TrialSpec("random", 0, 500_000 + seed) for seed in range(trials)]
     options = JudgeOptions(workers=1, rules=Rules(time_limit_s=TIME_LIMIT_S))
     results = fly(policy, trial_specs, load_vehicle("racer5"), options=options)
-    actions = actions_of(results, policy.spec.action)
+    actions = action_report(results, policy.spec.action)
     if actions["decisions"]:
         share, count = actions["limited"], actions["decisions"]
         console.say(f"{share:.1%} of {count} actions were limited in {trials} flights")

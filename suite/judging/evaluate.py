@@ -163,10 +163,10 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
     """Return and print the share of limited actions of a policy, and warnings."""
-    from eval.judging.outputs import actions_of
+    from eval.judging.outputs import action_report
 
     rows = [result for result in results if result.policy == entry.label]
-    found = actions_of(rows, entry.policy.spec.action)
+    found = action_report(rows, entry.policy.spec.action)
     if found["decisions"]:
         console.say(
             f"{entry.label}: {found['limited']:.1%} of {found['decisions']} actions exceeded the "

@@ -72,7 +72,7 @@ def neighbour_dependent(state, image, hidden):
 
 
 def test_a_model_whose_rows_depend_on_each_other_is_refused():
-    with pytest.raises(PolicyError, match=r"other rows of its batch; .*module.eval\(\)"):
+    with pytest.raises(PolicyError, match=r"with its batch; .*module.eval\(\)"):
         verify_rows(BlockPolicy("x", PolicySpec(), neighbour_dependent, (0,)), "x")
 
 

@@ -1,8 +1,8 @@
-"""Rate loops of flight controllers' firmwares, one file each: `[controller] kind`.
+"""The rate loops of flight controller firmwares (body rates to motor commands), one file each.
 
-A kind's module has `Settings` (keys as in the firmware), `GROUP` (their table under `[controller]`,
-"" for none), `gains`, `start` and `update`. The nominal loop, kind `p`, is
-`eval.quadrotor.mixer.rate_torque` and has no state.
+A vehicle file selects one by `[controller] kind`. Its module has `Settings` (with the firmware's
+keys), `GROUP` (their table under `[controller]`, "" for none), `gains`, `start` and `update`. The
+nominal loop, kind `p`, is `eval.quadrotor.mixer.rate_torque` and has no state.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from eval.vehicles.vehicle import MotorMap, Vehicle, command_of_thrust
 from tracks.geometry.scene import Array
 
 NOMINAL = "p"
+"""Kind of the nominal rate loop."""
 KINDS: dict[str, Any] = {"betaflight": betaflight, "px4": px4, "crazyflie": crazyflie}
-"""Modules by kind, without `p`."""
+"""Kind -> module of the firmware's loop; `p` is not among them."""
 _MODULES = {module.Gains: module for module in KINDS.values()}
+"""Class of the constants -> module."""
 
 
 class Loop(NamedTuple):
@@ -26,14 +28,14 @@ class Loop(NamedTuple):
     gains: Any
     """`Gains` of the kind's module."""
     thrust: tuple[Array, Array]
-    """t1, t2 of T = t1 u + t2 u^2 [N], u the motor command at the nominal voltage."""
+    """t1, t2 of T = t1 u + t2 u^2 [N], where u is the motor command at the nominal voltage."""
 
 
 def loop_of(vehicle: Vehicle) -> Loop | None:
-    """Return the vehicle's loop, or None for the nominal one.
+    """Return the firmware's loop of a vehicle, or None for the nominal one.
 
-    Without `[motors]` a command is a share of full speed. For the Crazyflie, whose firmware
-    compensates the motors' curve, it is a share of full thrust.
+    Without `[motors]`, a motor command is the ratio of the speed to the largest speed. For the
+    Crazyflie, whose firmware compensates the motors' curve, it is the ratio of thrusts.
     """
     controller = vehicle.controller
     if controller.kind == NOMINAL:
@@ -49,7 +51,7 @@ def loop_of(vehicle: Vehicle) -> Loop | None:
 
 
 def start(loop: Loop | None, shape: tuple[int, ...], xp: Any) -> Any:
-    """Return the state of loops of this batch shape before their first update."""
+    """Return the state of loops with the batch shape `shape` before their first update."""
     return () if loop is None else _MODULES[type(loop.gains)].start(shape, xp)
 
 
@@ -66,17 +68,17 @@ def update(
 
     Args:
         loop: the loop.
-        memory: from `start` or the update before.
-        force_z: (...,) wanted collective [N].
-        rate_cmd_b: (..., 3) [rad/s].
-        rate_b: (..., 3) [rad/s].
+        memory: state from `start` or the previous update.
+        force_z: (...,) wanted collective thrust [N].
+        rate_cmd_b: (..., 3) commanded body rates [rad/s].
+        rate_b: (..., 3) current body rates [rad/s].
         dt: time since the last update [s].
         scale: (..., 3) factor on the loop's output [1].
     """
     xp = rate_b.__array_namespace__()
     first, second = loop.thrust
-    each = xp.maximum(0.25 * force_z, 0.0)
-    throttle = xp.clip(command_of_thrust(loop.thrust, each), 0.0, 1.0)
+    rotor_thrust = xp.maximum(0.25 * force_z, 0.0)
+    throttle = xp.clip(command_of_thrust(loop.thrust, rotor_thrust), 0.0, 1.0)
     module = _MODULES[type(loop.gains)]
     memory, command = module.update(loop.gains, memory, throttle, rate_cmd_b, rate_b, dt, scale)
     return memory, first * command + second * command**2

@@ -1,14 +1,17 @@
-"""Betaflight's rate loop: PID on deg/s in its units of a thousandth, feed-forward, airmode mixer.
+"""Betaflight's rate loop: PID on body rates, feed-forward, and its mixer in airmode.
+
+Errors e are in deg/s, outputs in thousandths of a motor's range:
 
     P = 0.032029 p e,  I += 0.244381 i e dt,  D = -0.000529 d d(rate)/dt,
     F = 0.00013754 f d(setpoint)/dt;  motor = throttle + sum / 1000
 
-where yaw's i counts 2.5 times, as in the firmware without `use_integrated_yaw`. Gyro, derivative
-and set point pass their first-order filters; the integral is relaxed by fast set points and near
-full motors, and limited; so is the sum. Where the motors' range is more than 1 it is scaled to 1,
-and the throttle is moved so that all fit (airmode). Left out: dynamic notches and RPM filters
-(which meet vibration that is not simulated), D max, anti gravity, thrust linearisation.
-Source: Betaflight's documentation and wiki (PID tuning guides of 4.2 to 4.5, CLI reference).
+The gain i of yaw is multiplied by 2.5, as in the firmware without `use_integrated_yaw`. Gyro,
+derivative and set point pass first-order filters. The integral grows more slowly while the set
+point changes fast or the motors are near their limits, and it is limited, as is the sum. If the
+differences between motors exceed their range, they are scaled down, and the throttle is shifted so
+that all commands fit (airmode). Not modelled: dynamic notches and RPM filters (vibration is not
+simulated), D max, anti gravity and thrust linearisation. Source: Betaflight's documentation and
+wiki (PID tuning guides of 4.2 to 4.5, CLI reference).
 """
 
 from __future__ import annotations
@@ -23,26 +26,29 @@ from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
 GROUP = ""
+"""Name of the settings' table under `[controller]`; "": they are in `[controller]` itself."""
 DEG = float(180.0 / np.pi)
+"""Degrees in a radian."""
 P_UNIT, I_UNIT, D_UNIT, F_UNIT = 0.032029, 0.244381, 0.000529, 0.00013754
 """One unit of p, i, d and f, in thousandths of a motor's range per deg/s, deg or deg/s^2."""
 YAW_I = 2.5
-"""The firmware's factor on yaw's i."""
+"""The firmware's factor on the gain i of yaw."""
 SUM = 1000.0
+"""Output that is a motor's full range."""
 LIMITS = {
     "iterm_windup": (0.0, 100.0),
     "tpa_rate": (0.0, 100.0),
     "tpa_breakpoint": (1000.0, 2000.0),
     "dshot_idle_value": (0.0, 2000.0),
 }
-"""Allowed ranges of settings that are not simply 0 or more."""
+"""Allowed ranges of settings; the others must be 0 or more."""
 RELAXED = 40.0
-"""Difference between the set point and its slow part that stops the integral [deg/s]."""
+"""Difference between the set point and its low-passed value that stops the integral [deg/s]."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """`[controller]`, settings of the CLI."""
+    """Keys in `[controller]`, named and scaled as in Betaflight's CLI."""
 
     p_roll: float = 45.0
     i_roll: float = 80.0
@@ -57,18 +63,18 @@ class Settings:
     d_yaw: float = 0.0
     f_yaw: float = 120.0
     gyro_lpf1_static_hz: float = 250.0
-    """First-order filter of the gyro [Hz]; 0: off; so are the next five."""
+    """Cutoff of a first-order filter of the gyro [Hz]; 0: off; also for the next five settings."""
     gyro_lpf2_static_hz: float = 500.0
     dterm_lpf1_static_hz: float = 75.0
     dterm_lpf2_static_hz: float = 150.0
     yaw_lowpass_hz: float = 100.0
     rc_smoothing_setpoint_cutoff: float = 30.0
-    """Third-order filter of the set point [Hz]."""
+    """Cutoff of the third-order filter of the set point [Hz]."""
     iterm_limit: float = 400.0
     iterm_windup: float = 85.0
-    """Share of the motors' range above which the integral slows down [%]; 100: it does not."""
+    """Share of the motors' range above which the integral grows more slowly [%]; 100: off."""
     iterm_relax_cutoff: float = 15.0
-    """[Hz]; 0: the integral is not relaxed."""
+    """Cutoff of the set point's low pass for I-term relax [Hz]; 0: off."""
     pidsum_limit: float = 500.0
     pidsum_limit_yaw: float = 400.0
     tpa_rate: float = 65.0
@@ -87,18 +93,18 @@ class Gains(NamedTuple):
     d: Array
     f: Array
     limit: Array
-    """(3,) of the sum."""
+    """(3,) limits of the sum."""
     gyro_hz: Array
-    """(2,)."""
+    """(2,) cutoffs of the gyro's filters [Hz]."""
     dterm_hz: Array
-    """(2,)."""
+    """(2,) cutoffs of the derivative's filters [Hz]."""
     yaw_hz: Array
     setpoint_hz: Array
     i_limit: Array
     windup: Array
     relax_hz: Array
     relaxed: Array
-    """(3,) 1 for the axes that are relaxed."""
+    """(3,) 1 for axes with I-term relax, else 0."""
     tpa: Array
     """(2,) reduction of D at full throttle, and the throttle where it begins."""
     idle: Array
@@ -117,13 +123,13 @@ class State(NamedTuple):
     setpoint: Array
     """(..., 3, 3) outputs of the set point's filters [deg/s]."""
     slow: Array
-    """(..., 3) slow part of the set point [deg/s]."""
+    """(..., 3) low-passed set point [deg/s]."""
     integral: Array
-    """(..., 3) I."""
+    """(..., 3) the term I."""
     yaw: Array
-    """(..., 1) filtered P of yaw."""
+    """(..., 1) filtered term P of yaw."""
     span: Array
-    """(...,) range of the motors' differences at the last update, before scaling."""
+    """(...,) largest difference between motors at the last update, before scaling."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
@@ -156,10 +162,10 @@ def gains(settings: Settings, layout: Layout) -> Gains:
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state of loops of this batch shape before the first update."""
-    none, still = xp.zeros(shape), xp.zeros((*shape, 3))
+    """Return the state of loops with the batch shape `shape` before the first update."""
+    scalar, vector = xp.zeros(shape), xp.zeros((*shape, 3))
     two, three = xp.zeros((*shape, 2, 3)), xp.zeros((*shape, 3, 3))
-    return State(none, two, two, three, still, still, xp.zeros((*shape, 1)), none)
+    return State(scalar, two, two, three, vector, vector, xp.zeros((*shape, 1)), scalar)
 
 
 def update(
@@ -171,64 +177,67 @@ def update(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands; see `crazyflie.update`."""
+    """Return the state after an update and the motor commands (..., 4); see `crazyflie.update`."""
     xp = rate_b.__array_namespace__()
-    fresh = state.started
-    gyro = _chain(fresh, state.gyro, DEG * rate_b, gain.gyro_hz, dt)
+    started = state.started
+    gyro = _chain(started, state.gyro, DEG * rate_b, gain.gyro_hz, dt)
     rate = gyro[..., -1, :]
-    dterm = _chain(fresh, state.dterm, rate, gain.dterm_hz, dt)
-    slope = (dterm[..., -1, :] - pick(fresh, dterm[..., -1, :], state.dterm[..., -1, :])) / dt
+    dterm = _chain(started, state.dterm, rate, gain.dterm_hz, dt)
+    slope = (dterm[..., -1, :] - pick(started, dterm[..., -1, :], state.dterm[..., -1, :])) / dt
     cutoffs = xp.stack([gain.setpoint_hz] * 3)
-    setpoint = _chain(fresh, state.setpoint, DEG * rate_cmd_b, cutoffs, dt)
-    wanted = setpoint[..., -1, :]
-    change = (wanted - pick(fresh, wanted, state.setpoint[..., -1, :])) / dt
-    error = wanted - rate
+    setpoints = _chain(started, state.setpoint, DEG * rate_cmd_b, cutoffs, dt)
+    setpoint = setpoints[..., -1, :]
+    change = (setpoint - pick(started, setpoint, state.setpoint[..., -1, :])) / dt
+    error = setpoint - rate
 
-    slow = pt1(pick(fresh, wanted, state.slow), wanted, gain.relax_hz, dt)
-    relax = xp.maximum(1.0 - gain.relaxed * xp.abs(wanted - slow) / RELAXED, 0.0)
-    slows = gain.windup < 1.0
-    room = (1.0 - state.span) / xp.where(slows, 1.0 - gain.windup, 1.0)
-    room = xp.where(slows, xp.clip(room, 0.0, 1.0), 1.0)
-    added = state.integral + gain.i * relax * room[..., None] * error * dt
-    integral = xp.clip(added, -gain.i_limit, gain.i_limit)
+    slow = pt1(pick(started, setpoint, state.slow), setpoint, gain.relax_hz, dt)
+    relax = xp.maximum(1.0 - gain.relaxed * xp.abs(setpoint - slow) / RELAXED, 0.0)
+    has_windup = gain.windup < 1.0
+    margin = (1.0 - state.span) / xp.where(has_windup, 1.0 - gain.windup, 1.0)
+    margin = xp.where(has_windup, xp.clip(margin, 0.0, 1.0), 1.0)
+    integral = state.integral + gain.i * relax * margin[..., None] * error * dt
+    integral = xp.clip(integral, -gain.i_limit, gain.i_limit)
 
     p = gain.p * error
-    yaw = pt1(pick(fresh, p[..., 2:], state.yaw), p[..., 2:], gain.yaw_hz, dt)
+    yaw = pt1(pick(started, p[..., 2:], state.yaw), p[..., 2:], gain.yaw_hz, dt)
     p = xp.concatenate([p[..., :2], yaw], axis=-1)
-    level = (throttle - gain.idle) / (1.0 - gain.idle)
-    high = xp.clip((level - gain.tpa[1]) / xp.maximum(1.0 - gain.tpa[1], 1e-6), 0.0, 1.0)
-    d = -gain.d * (1.0 - gain.tpa[0] * high)[..., None] * slope
+    throttle = (throttle - gain.idle) / (1.0 - gain.idle)
+    above = xp.clip((throttle - gain.tpa[1]) / xp.maximum(1.0 - gain.tpa[1], 1e-6), 0.0, 1.0)
+    d = -gain.d * (1.0 - gain.tpa[0] * above)[..., None] * slope
     total = xp.clip(scale * (p + integral + d + gain.f * change), -gain.limit, gain.limit)
-    span, command = mixed(gain, level, total / SUM)
-    state = State(xp.ones_like(fresh), gyro, dterm, setpoint, slow, integral, yaw, span)
+    span, command = mixed(gain, throttle, total / SUM)
+    state = State(xp.ones_like(started), gyro, dterm, setpoints, slow, integral, yaw, span)
     return state, command
 
 
-def mixed(gain: Gains, level: Array, turning: Array) -> tuple[Array, Array]:
-    """Return the range of the motors' differences (...,), and the motor commands (..., 4).
+def mixed(gain: Gains, throttle: Array, torque: Array) -> tuple[Array, Array]:
+    """Return the largest difference between motors (...,), and the motor commands (..., 4).
 
     Args:
-        gain: the layout and the idle command.
-        level: (...,) throttle from 0 to 1.
-        turning: (..., 3) sums, as shares of a motor's range.
+        gain: gives the layout and the idle command.
+        throttle: (...,) from 0 (idle) to 1.
+        torque: (..., 3) roll, pitch and yaw sums, relative to a motor's range.
     """
-    xp = turning.__array_namespace__()
+    xp = torque.__array_namespace__()
     roll, pitch, yaw = gain.layout
-    add = turning[..., 0, None] * roll + turning[..., 1, None] * pitch
-    add = add + turning[..., 2, None] * yaw
-    low, high = least(add), largest(add)
+    mix = torque[..., 0, None] * roll + torque[..., 1, None] * pitch
+    mix = mix + torque[..., 2, None] * yaw
+    low, high = least(mix), largest(mix)
     span = high - low
-    fits = xp.maximum(span, 1.0)
-    level = xp.minimum(xp.maximum(level, -low / fits), 1.0 - high / fits)
-    share = xp.clip(level[..., None] + add / fits[..., None], 0.0, 1.0)
-    return span, gain.idle + (1.0 - gain.idle) * share
+    divisor = xp.maximum(span, 1.0)
+    throttle = xp.minimum(xp.maximum(throttle, -low / divisor), 1.0 - high / divisor)
+    command = xp.clip(throttle[..., None] + mix / divisor[..., None], 0.0, 1.0)
+    return span, gain.idle + (1.0 - gain.idle) * command
 
 
-def _chain(fresh: Array, before: Array, value: Array, cutoffs_hz: Array, dt: Array) -> Array:
-    """Return the outputs (..., K, 3) of first-order filters one after another."""
+def _chain(started: Array, before: Array, value: Array, cutoffs_hz: Array, dt: Array) -> Array:
+    """Return the outputs (..., K, 3) of K first-order filters, each the input of the next.
+
+    Before the first update (`started` is 0) the filters start at their input.
+    """
     xp = value.__array_namespace__()
     outputs = []
     for k in range(before.shape[-2]):
-        value = pt1(pick(fresh, value, before[..., k, :]), value, cutoffs_hz[k], dt)
+        value = pt1(pick(started, value, before[..., k, :]), value, cutoffs_hz[k], dt)
         outputs.append(value)
     return xp.stack(outputs, axis=-2)

@@ -1,12 +1,12 @@
-"""The Crazyflie's rate loop: PID on deg/s with outputs in 16 bits, and its power distribution.
+"""The Crazyflie's rate loop: PID on body rates in deg/s, and its distribution of power to motors.
 
-    out = kp e + ki integral(e) + kd (-d rate/dt) + kff setpoint, within 16 bits
+    out = kp e + ki integral(e) + kd (-d rate/dt) + kff setpoint, limited to 16 bits
     motor = thrust -+ roll/2 -+ pitch/2 -+ yaw, all in 1/65535 of a motor's full command
 
-Where a motor would exceed its full command, all are lowered equally. Left out:
-that the firmware stops all motors and resets its integrals at a thrust of exactly 0. Source:
-Bitcraze's documentation of the firmware ("Controllers", "PID tuning", parameter groups `pid_rate`),
-its values for the Crazyflie 2.x.
+If a motor would exceed its full command, all motors are reduced equally. Not modelled: at a thrust
+of exactly 0, the firmware stops all motors and resets its integrals. Source: Bitcraze's
+documentation of the firmware ("Controllers", "PID tuning", parameter group `pid_rate`), with its
+values for the Crazyflie 2.x.
 """
 
 from __future__ import annotations
@@ -21,16 +21,20 @@ from eval.quadrotor.mixer import largest
 from tracks.geometry.scene import Array
 
 DEG = float(180.0 / np.pi)
+"""Degrees in a radian."""
 FULL = 65535.0
+"""A motor's full command."""
 SIGNED = 32767.0
+"""Largest output of the PID, a signed number of 16 bits."""
 GROUP = "pid_rate"
+"""Name of the settings' table under `[controller]`."""
 LIMITS: dict[str, tuple[float, float]] = {}
-"""Allowed ranges of settings that are not simply 0 or more."""
+"""Allowed ranges of settings; the others must be 0 or more."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """`[controller.pid_rate]`, the firmware's parameters."""
+    """Keys in `[controller.pid_rate]`, named and scaled as the firmware's parameters."""
 
     roll_kp: float = 250.0
     roll_ki: float = 500.0
@@ -45,11 +49,11 @@ class Settings:
     yaw_kd: float = 0.0
     yaw_kff: float = 0.0
     roll_ilimit: float = 33.3
-    """Largest integral of the error [deg], 0: no limit; a constant of the firmware."""
+    """Largest integral of the error [deg], 0: no limit; a constant in the firmware."""
     pitch_ilimit: float = 33.3
     yaw_ilimit: float = 166.7
     lpf_cutoff: float = 0.0
-    """Cut-off of the derivative's second-order filter [Hz]; 0: off, the firmware's default."""
+    """Cutoff of the derivative's second-order filter [Hz]; 0: off, as in the firmware."""
 
 
 class Gains(NamedTuple):
@@ -70,11 +74,11 @@ class State(NamedTuple):
     started: Array
     """(...,) 0 before the first update."""
     integral: Array
-    """(..., 3) [deg]."""
+    """(..., 3) integral of the error [deg]."""
     rate: Array
-    """(..., 3) at the last update [deg/s]."""
+    """(..., 3) body rates at the last update [deg/s]."""
     slope: Pair
-    """(..., 3) of the derivative's filter."""
+    """(..., 3) state of the derivative's filter."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
@@ -93,9 +97,9 @@ def gains(settings: Settings, layout: Layout) -> Gains:
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state of loops of this batch shape before the first update."""
-    still = xp.zeros((*shape, 3))
-    return State(xp.zeros(shape), still, still, Pair(still, still))
+    """Return the state of loops with the batch shape `shape` before the first update."""
+    zeros = xp.zeros((*shape, 3))
+    return State(xp.zeros(shape), zeros, zeros, Pair(zeros, zeros))
 
 
 def update(
@@ -111,29 +115,29 @@ def update(
 
     Args:
         gain: the loop's constants.
-        state: before.
+        state: state before the update.
         throttle: (...,) motor command without roll, pitch and yaw, from 0 to 1.
-        rate_cmd_b: (..., 3) [rad/s].
-        rate_b: (..., 3) [rad/s].
+        rate_cmd_b: (..., 3) commanded body rates [rad/s].
+        rate_b: (..., 3) current body rates [rad/s].
         dt: time since the last update [s].
         scale: (..., 3) factor on the outputs [1].
     """
     xp = rate_b.__array_namespace__()
-    wanted, rate = DEG * rate_cmd_b, DEG * rate_b
-    error = wanted - rate
-    before = pick(state.started, rate, state.rate)
-    raw = -(rate - before) / dt
-    slope, falling = butterworth(state.slope, raw, gain.cutoff_hz, dt)
+    setpoint, rate = DEG * rate_cmd_b, DEG * rate_b
+    error = setpoint - rate
+    previous = pick(state.started, rate, state.rate)
+    unfiltered = -(rate - previous) / dt
+    slope, derivative = butterworth(state.slope, unfiltered, gain.cutoff_hz, dt)
     integral = xp.clip(state.integral + error * dt, -gain.i_limit, gain.i_limit)
-    out = gain.p * error + gain.i * integral + gain.d * falling + gain.f * wanted
+    out = gain.p * error + gain.i * integral + gain.d * derivative + gain.f * setpoint
     out = xp.clip(scale * out, -SIGNED, SIGNED)
-    motor = throttle[..., None] * FULL + turning(gain.layout, out)
-    over = xp.maximum(largest(motor) - FULL, 0.0)
-    command = xp.clip((motor - over[..., None]) / FULL, 0.0, 1.0)
+    motor = throttle[..., None] * FULL + motor_shares(gain.layout, out)
+    excess = xp.maximum(largest(motor) - FULL, 0.0)
+    command = xp.clip((motor - excess[..., None]) / FULL, 0.0, 1.0)
     return State(xp.ones_like(state.started), integral, rate, slope), command
 
 
-def turning(layout: Layout, out: Array) -> Array:
-    """Return the outputs' share (..., 4) in each motor; roll and pitch count half."""
+def motor_shares(layout: Layout, out: Array) -> Array:
+    """Return the contributions (..., 4) of outputs (..., 3) to the motors; two are halved."""
     half = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
     return half + out[..., 2, None] * layout.yaw

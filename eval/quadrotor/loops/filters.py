@@ -1,6 +1,6 @@
-"""Low-pass filters of the firmwares' rate loops, and the mixer's signs from the rotors.
+"""Low-pass filters of the firmwares' rate loops, and the mixer's layout of the rotors.
 
-The filters are discrete, for numpy and JAX; a cutoff of 0 disables a filter.
+The filters are discrete, and take numpy and JAX arrays; a cutoff of 0 disables a filter.
 """
 
 from __future__ import annotations
@@ -13,65 +13,80 @@ from eval.vehicles.vehicle import Rotors
 from tracks.geometry.scene import Array
 
 PT3_SCALE = 1.961459177
-"""Three equal first-order filters have -3 dB together where each has this many times the cutoff:
+"""Ratio of the cutoff of each of three equal first-order filters to that of all three in series:
 1 / sqrt(2^(1/3) - 1)."""
 
 
 class Pair(NamedTuple):
-    """State of a second-order filter."""
+    """State of a second-order filter in direct form II: its last two inner values."""
 
     first: Array
+    """The last value."""
     second: Array
+    """The value before it."""
 
 
 def pt1(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
-    """Return a first-order low pass of `value` after its output `before`.
+    """Return the next output of a first-order low pass, by the backward Euler step.
 
-    `y += k (x - y)` with `k = dt / (dt + 1 / (2 pi f))`: the backward Euler step of a RC filter.
+    `y += k (x - y)` with `k = dt / (dt + 1 / (2 pi f))`.
+
+    Args:
+        before: y, its last output.
+        value: x, its input.
+        cutoff_hz: f [Hz]; 0: the input is returned.
+        dt: time since the last output [s].
     """
     xp = value.__array_namespace__()
-    on = cutoff_hz > 0.0
-    turn = 2.0 * xp.pi * xp.where(on, cutoff_hz, 1.0) * dt
-    return before + xp.where(on, turn / (1.0 + turn), 1.0) * (value - before)
+    enabled = cutoff_hz > 0.0
+    phase = 2.0 * xp.pi * xp.where(enabled, cutoff_hz, 1.0) * dt
+    return before + xp.where(enabled, phase / (1.0 + phase), 1.0) * (value - before)
 
 
 def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tuple[Pair, Array]:
     """Return the state and the output of a second-order Butterworth low pass (bilinear).
 
-    `H(s) = 1 / (s^2 + sqrt(2) s + 1)` with the cutoff prewarped to `tan(pi f dt)`; at a cutoff of
-    half the sampling rate or more, or 0, it passes all.
+    `H(s) = 1 / (s^2 + sqrt(2) s + 1)` with the cutoff prewarped to `tan(pi f dt)`. For a cutoff of
+    0, or of half the sampling rate or more, the output is the input.
+
+    Args:
+        memory: state before.
+        value: input.
+        cutoff_hz: f [Hz].
+        dt: time between inputs [s].
     """
     xp = value.__array_namespace__()
-    on = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
-    warped = xp.tan(xp.pi * xp.where(on, cutoff_hz * dt, 0.25))
-    below = 1.0 + 2.0**0.5 * warped + warped**2
-    gain = warped**2 / below
-    back_one = 2.0 * (warped**2 - 1.0) / below
-    back_two = (1.0 - 2.0**0.5 * warped + warped**2) / below
-    now = value - back_one * memory.first - back_two * memory.second
-    out = gain * (now + 2.0 * memory.first + memory.second)
-    return Pair(now, memory.first), xp.where(on, out, value)
+    enabled = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
+    warped = xp.tan(xp.pi * xp.where(enabled, cutoff_hz * dt, 0.25))
+    # Coefficients of the transfer function in z, divided by a0.
+    a0 = 1.0 + 2.0**0.5 * warped + warped**2
+    gain = warped**2 / a0
+    a1 = 2.0 * (warped**2 - 1.0) / a0
+    a2 = (1.0 - 2.0**0.5 * warped + warped**2) / a0
+    inner = value - a1 * memory.first - a2 * memory.second
+    out = gain * (inner + 2.0 * memory.first + memory.second)
+    return Pair(inner, memory.first), xp.where(enabled, out, value)
 
 
 def settled(value: Array, cutoff_hz: Array, dt: Array) -> Pair:
-    """Return the state of `butterworth` after a long constant input `value`."""
+    """Return the state of `butterworth` after a long time with the constant input `value`."""
     xp = value.__array_namespace__()
-    on = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
-    warped = xp.tan(xp.pi * xp.where(on, cutoff_hz * dt, 0.25))
-    below = 1.0 + 2.0**0.5 * warped + warped**2
-    # At rest w (1 + a1 + a2) = x, and the sum is 4 tan^2 / below.
-    rest = value * below / (4.0 * warped**2)
-    return Pair(rest, rest)
+    enabled = (cutoff_hz > 0.0) & (cutoff_hz * dt < 0.5)
+    warped = xp.tan(xp.pi * xp.where(enabled, cutoff_hz * dt, 0.25))
+    a0 = 1.0 + 2.0**0.5 * warped + warped**2
+    # In equilibrium inner (1 + a1 + a2) = value, and the sum is 4 warped^2 / a0.
+    inner = value * a0 / (4.0 * warped**2)
+    return Pair(inner, inner)
 
 
-def pick(fresh: Array, then: Any, otherwise: Any) -> Any:
-    """Return `then` where `fresh` (...,) is 0, else `otherwise`, for arrays (..., 3)."""
-    xp = fresh.__array_namespace__()
-    return xp.where(fresh[..., None] == 0.0, then, otherwise)
+def pick(started: Array, initial: Any, running: Any) -> Any:
+    """Return `initial` where `started` (...,) is 0, else `running`, for arrays (..., 3)."""
+    xp = started.__array_namespace__()
+    return xp.where(started[..., None] == 0.0, initial, running)
 
 
 class Layout(NamedTuple):
-    """Shares (4,) of each motor, up to 1, in roll, pitch and yaw torque (FLU)."""
+    """Contribution (4,) of each motor, -1 to 1, to roll, pitch and yaw torque (FLU axes)."""
 
     roll: Array
     pitch: Array
@@ -79,7 +94,7 @@ class Layout(NamedTuple):
 
 
 def layout_of(rotors: Rotors) -> Layout:
-    """Return the layout of `rotors`: arms divided by the longest arm, and minus the spin."""
+    """Return the layout of `rotors`: lever arms over the longest one, and the negative spin."""
     x, y, _ = np.asarray(rotors.position, dtype=float).T
     spin = np.asarray(rotors.spin, dtype=float)
     return Layout(y / np.max(np.abs(y)), -x / np.max(np.abs(x)), -spin)

@@ -1,14 +1,14 @@
-"""PX4's rate loop: PID on rad/s with normalised torques, and its sequential allocation.
+"""PX4's rate loop: PID on body rates in rad/s, and its sequential control allocation.
 
     torque = K (P e + I-term - D accel) + FF setpoint
     I-term += I e (1 - (e / 400 deg/s)^2) dt, within MC_xR_INT_LIM, not further into saturation
 
-`accel` is the slope of the gyro behind its second-order low pass, filtered to first order (as in
-PX4's source since 2021; its parameter reference says second). A motor command is thrust plus 0.707
-of roll and pitch plus yaw; where motors saturate, thrust is reduced first, then roll
-and pitch. Yaw is then added with 15 % more room at the top and reduced where it saturates, and
-thrust once more (airmode off). Source: PX4's user guide ("Multicopter PID Tuning Guide", "Control
-Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
+Torques are normalised. `accel` is the derivative of the gyro after its second-order low pass,
+filtered by a first-order one (as in PX4's source since 2021; its parameter reference says second).
+A motor command is thrust plus 0.707 of roll and pitch plus yaw. If motors saturate, thrust is
+reduced first, then roll and pitch. Yaw is added next, up to 15 % above full command; it is reduced
+where it saturates, and then thrust once more (airmode off). Source: PX4's user guide ("Multicopter
+PID Tuning Guide", "Control Allocation", the parameter reference MC_*, IMU_*, THR_MDL_FAC).
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from eval.quadrotor.mixer import largest, least
 from tracks.geometry.scene import Array
 
 GROUP = ""
+"""Name of the settings' table under `[controller]`; "": they are in `[controller]` itself."""
 FAST = float(np.deg2rad(400.0))
 """Errors larger than this do not change the integral [rad/s]."""
 YAW_ROOM = 0.15
-"""Room above full command in which yaw is mixed."""
+"""Excess over full command that is allowed while yaw is mixed."""
 SMALL = 1e-6
+"""Torques and contributions below this count as zero."""
 LIMITS = {"THR_MDL_FAC": (0.0, 1.0)}
-"""Allowed ranges of settings that are not simply 0 or more."""
+"""Allowed ranges of settings; the others must be 0 or more."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """`[controller]`, the firmware's parameters."""
+    """Keys in `[controller]`, named and scaled as the firmware's parameters."""
 
     MC_ROLLRATE_K: float = 1.0
     MC_ROLLRATE_P: float = 0.15
@@ -55,13 +57,13 @@ class Settings:
     MC_YAWRATE_FF: float = 0.0
     MC_YR_INT_LIM: float = 0.3
     MC_YAW_TQ_CUTOFF: float = 0.0
-    """First-order filter of the yaw torque [Hz]; 0: off, as before v1.15."""
+    """Cutoff of the yaw torque's first-order filter [Hz]; 0: off, as before v1.15."""
     IMU_GYRO_CUTOFF: float = 40.0
-    """Second-order filter of the gyro [Hz]; 0: off."""
+    """Cutoff of the gyro's second-order filter [Hz]; 0: off."""
     IMU_DGYRO_CUTOFF: float = 30.0
-    """First-order filter of the gyro's slope [Hz]; 0: off."""
+    """Cutoff of the first-order filter of the gyro's derivative [Hz]; 0: off."""
     THR_MDL_FAC: float = 0.0
-    """Relative thrust is FAC u^2 + (1 - FAC) u of the motor command u."""
+    """FAC in the relative thrust FAC u^2 + (1 - FAC) u of the motor command u."""
 
 
 class Gains(NamedTuple):
@@ -88,13 +90,13 @@ class State(NamedTuple):
     started: Array
     """(...,) 0 before the first update."""
     integral: Array
-    """(..., 3) normalised torque."""
+    """(..., 3) the I-term, a normalised torque."""
     rate: Array
-    """(..., 3) filtered rate at the last update [rad/s]."""
+    """(..., 3) filtered body rates at the last update [rad/s]."""
     gyro: Pair
-    """(..., 3) of the gyro's filter."""
+    """(..., 3) state of the gyro's filter."""
     accel: Array
-    """(..., 3) filtered slope of that rate [rad/s^2]."""
+    """(..., 3) filtered derivative of the filtered rates [rad/s^2]."""
     yaw: Array
     """(..., 1) filtered yaw torque."""
     lost: Array
@@ -118,16 +120,16 @@ def gains(settings: Settings, layout: Layout) -> Gains:
         slope_cutoff_hz=np.asarray(settings.IMU_DGYRO_CUTOFF),
         model=np.asarray(settings.THR_MDL_FAC),
         layout=layout,
-        # All four columns: on uneven arms pure thrust would otherwise count as roll or pitch.
+        # With all four columns, since on unequal arms a pure thrust also causes roll and pitch.
         unmixer=np.linalg.inv(np.stack([np.ones(4), *columns(layout)], axis=-1))[1:],
     )
 
 
 def start(shape: tuple[int, ...], xp: Any) -> State:
-    """Return the state of loops of this batch shape before the first update."""
-    still = xp.zeros((*shape, 3))
-    gyro = Pair(still, still)
-    return State(xp.zeros(shape), still, still, gyro, still, xp.zeros((*shape, 1)), still)
+    """Return the state of loops with the batch shape `shape` before the first update."""
+    zeros = xp.zeros((*shape, 3))
+    gyro = Pair(zeros, zeros)
+    return State(xp.zeros(shape), zeros, zeros, gyro, zeros, xp.zeros((*shape, 1)), zeros)
 
 
 def update(
@@ -139,42 +141,47 @@ def update(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands; see `crazyflie.update`."""
+    """Return the state after an update and the motor commands (..., 4); see `crazyflie.update`."""
     xp = rate_b.__array_namespace__()
-    rest = settled(rate_b, gain.gyro_cutoff_hz, dt)
-    gyro = Pair(*(pick(state.started, a, b) for a, b in zip(rest, state.gyro, strict=True)))
+    initial = settled(rate_b, gain.gyro_cutoff_hz, dt)
+    gyro = Pair(*(pick(state.started, a, b) for a, b in zip(initial, state.gyro, strict=True)))
     gyro, rate = butterworth(gyro, rate_b, gain.gyro_cutoff_hz, dt)
-    before = pick(state.started, rate, state.rate)
-    accel = _alpha(state.accel, (rate - before) / dt, gain.slope_cutoff_hz, dt)
+    previous = pick(state.started, rate, state.rate)
+    accel = _alpha(state.accel, (rate - previous) / dt, gain.slope_cutoff_hz, dt)
     error = rate_cmd_b - rate
     torque = gain.k * (gain.p * error - gain.d * accel) + state.integral + gain.f * rate_cmd_b
     torque = scale * torque
     # The torque uses the previous integral, which is updated afterwards.
-    further = xp.where(state.lost * error > 0.0, 0.0, error)
+    unsaturated_error = xp.where(state.lost * error > 0.0, 0.0, error)
     share = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
-    # The integral contains K, as in the firmware: its limit is a torque.
-    added = state.integral + share * gain.k * gain.i * further * dt
-    integral = xp.clip(added, -gain.i_limit, gain.i_limit)
+    # As in the firmware, the integral contains K, so its limit is a torque.
+    integral = state.integral + share * gain.k * gain.i * unsaturated_error * dt
+    integral = xp.clip(integral, -gain.i_limit, gain.i_limit)
     wanted_yaw = torque[..., 2:]
     yaw = _alpha(pick(state.started, wanted_yaw, state.yaw), wanted_yaw, gain.yaw_cutoff_hz, dt)
     torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
     thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
-    given = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)
-    # From the clipped thrusts: with yaw's room the allocation may end below zero.
-    lost = torque - (given[..., None, :] * gain.unmixer).sum(axis=-1)
+    motor_thrust = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)
+    lost = torque - (motor_thrust[..., None, :] * gain.unmixer).sum(axis=-1)
     lost = xp.where(xp.abs(lost) > SMALL, lost, 0.0)
     state = State(xp.ones_like(state.started), integral, rate, gyro, accel, yaw, lost)
-    return state, signal(gain.model, given)
+    return state, signal(gain.model, motor_thrust)
 
 
 def columns(layout: Layout) -> tuple[Array, Array, Array]:
-    """Return the motors' shares (4,) of a unit of roll, pitch and yaw torque."""
+    """Return each motor's relative thrust (4,) for a unit of roll, of pitch and of yaw torque."""
     root = 2.0**-0.5
     return root * layout.roll, root * layout.pitch, layout.yaw
 
 
 def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
-    """Return relative motor thrusts (..., 4), within [0, 1] as far as possible."""
+    """Return relative motor thrusts (..., 4), within [0, 1] as far as possible.
+
+    Args:
+        layout: contributions of the motors.
+        thrust: (...,) relative collective thrust.
+        torque: (..., 3) normalised torque.
+    """
     xp = torque.__array_namespace__()
     roll, pitch, yaw = columns(layout)
     down = -xp.ones(4)
@@ -195,32 +202,40 @@ def signal(model: Array, thrust: Array) -> Array:
 
 
 def _alpha(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
-    """Return a first-order low pass; as in PX4, cutoffs from half the sampling rate pass all."""
+    """Return `pt1`, which as in PX4 is off for cutoffs from half the sampling rate."""
     xp = value.__array_namespace__()
     return pt1(before, value, xp.where(cutoff_hz * dt < 0.5, cutoff_hz, 0.0), dt)
 
 
 def _fit(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:
-    """Return the motors moved along a column so that they fit into [0, top] as far as possible.
+    """Return the motors shifted along a vector so that they fit into [0, top] as far as possible.
 
-    A second, half move balances the motors that exceed either end.
+    A second shift, by half, balances the motors that exceed the lower and the upper limit.
+
+    Args:
+        motor: (..., 4) relative thrusts.
+        along: (4,) direction of the shift.
+        top: upper limit.
+        only_more: allow only shifts in the direction of `along`.
     """
     xp = motor.__array_namespace__()
     gain = _gain(motor, along, top)
     if only_more:
         gain = xp.where(gain > 0.0, gain, 0.0)
-        off = gain == 0.0
+        unshifted = gain == 0.0
     else:
-        off = xp.zeros_like(gain, dtype=bool)
-    moved = motor + gain[..., None] * along
-    half = xp.where(off, 0.0, 0.5 * _gain(moved, along, top))
-    return moved + half[..., None] * along
+        unshifted = xp.zeros_like(gain, dtype=bool)
+    shifted = motor + gain[..., None] * along
+    half = xp.where(unshifted, 0.0, 0.5 * _gain(shifted, along, top))
+    return shifted + half[..., None] * along
 
 
 def _gain(motor: Array, along: Array, top: float) -> Array:
+    """Return the factor (...,) on `along` that brings the motors into [0, top]."""
     xp = motor.__array_namespace__()
-    moves = xp.abs(along) > SMALL
-    by = xp.where(moves, along, 1.0)
-    need = xp.where(motor < 0.0, -motor / by, 0.0) + xp.where(motor > top, (top - motor) / by, 0.0)
-    need = xp.where(moves, need, 0.0)
-    return xp.minimum(least(need), 0.0) + xp.maximum(largest(need), 0.0)
+    affected = xp.abs(along) > SMALL
+    slope = xp.where(affected, along, 1.0)
+    below = xp.where(motor < 0.0, -motor / slope, 0.0)
+    above = xp.where(motor > top, (top - motor) / slope, 0.0)
+    factor = xp.where(affected, below + above, 0.0)
+    return xp.minimum(least(factor), 0.0) + xp.maximum(largest(factor), 0.0)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import lsq_linear, root_scalar
 
 from eval.effects import EFFECTS, all_values, nameable_effects
-from eval.effects.interface import Parameter, Values, at, neutral
+from eval.effects.interface import Parameter, Values, bound_value, neutral
 from eval.flights.simulate import Sensors, fly, log_of
 from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import FlightLog
@@ -70,7 +70,9 @@ class Column(NamedTuple):
     def room(self, nominal: Vehicle) -> tuple[float, float]:
         """Return the allowed change down and up from its value in the given vehicle."""
         given = self.value(all_values(nominal)[self.effect])
-        return at(self.spec.low, nominal) - given, at(self.spec.high, nominal) - given
+        return bound_value(self.spec.low, nominal) - given, bound_value(
+            self.spec.high, nominal
+        ) - given
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def gust_strength(
         raised = np.exp(2.0 * log_size) * eigenvalues
         return float(0.5 * (raised - np.log1p(raised)).sum()) - THRESHOLD
 
-    ends = np.log((1e-4, at(EFFECTS[name].parameters[0].high, nominal)))
+    ends = np.log((1e-4, bound_value(EFFECTS[name].parameters[0].high, nominal)))
     return float(np.exp(root_scalar(beyond, bracket=ends).root)) if beyond(ends[1]) > 0 else np.inf
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS, all_values
-from eval.effects.interface import Parameter, at
+from eval.effects.interface import Parameter, bound_value
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
@@ -144,8 +144,8 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
                         effect=name,
                         parameter=parameter.name,
                         component=k if parameter.size else None,
-                        low=at(parameter.low, vehicle),
-                        high=at(parameter.high, vehicle),
+                        low=bound_value(parameter.low, vehicle),
+                        high=bound_value(parameter.high, vehicle),
                         start=float(now[k]),
                         step=parameter.typical[1],
                     )

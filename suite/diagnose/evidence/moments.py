@@ -20,7 +20,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.effects.interface import Array, Sample
-from eval.effects.log_faults import restored
+from eval.effects.log_faults import to_true
 from eval.quadrotor.plant import Motion, Plant, accelerations, assemble, nominal_quadrotor
 from eval.quadrotor.rotors import steady
 from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
@@ -100,7 +100,7 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
 def motion_of(plant: Plant, rows: FlightRows) -> Motion:
     """Return how the body moved (N, ...) where the faults of the log among the effects are true."""
     logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
-    return Motion(*restored(plant.effects, logged)[:4])
+    return Motion(*to_true(plant.effects, logged)[:4])
 
 
 @cache

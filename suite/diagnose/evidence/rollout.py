@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from eval.effects.interface import Sample
-from eval.effects.log_faults import lateness, measured, restored
+from eval.effects.log_faults import pose_delay, to_logged, to_true
 from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loop
-from eval.quadrotor.plant import Motion, Plant, Wrench, unpacked
+from eval.quadrotor.plant import Motion, Plant, Wrench, unpack_command
 from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
 from suite.diagnose.data.sampling import LONGEST_S
 from suite.diagnose.data.windows import CHANNELS, KNOTS, LENGTH_S, STATE, FlightWindows
@@ -61,7 +61,7 @@ def fly_windows(
     spans, command = jax.tree.map(
         lambda field: jnp.swapaxes(field, 0, 1), (spans, _acting(windows, plant.constants.delay))
     )
-    start = restored(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
+    start = to_true(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
     motion = Motion(
         start.pos_w + offset[:, :3],
         jnp.matmul(start.rot_w, exp_rot(offset[:, 3:6])),
@@ -80,7 +80,7 @@ def fly_windows(
         begin_speed = _burned_in(plant, values, before, command[:burn_in], windows)
         begin_speed = begin_speed + offset[:, STATE:]
     inputs = Inputs(
-        unpacked(command[burn_in:]),
+        unpack_command(command[burn_in:]),
         rotor_speed,
         voltage_drop=jnp.swapaxes(jnp.asarray(windows.voltage_drop), 0, 1) if voltage else None,
         push_b=None if push is None else jnp.swapaxes(jnp.matmul(_hats(middle_s), push), 0, 1),
@@ -102,10 +102,10 @@ def difference(
     """
     track, speeds, forces = flown
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
-    pose = _at(windows.row_s - lateness(values), edge_s)
+    pose = _at(windows.row_s - pose_delay(values), edge_s)
     now = _at(jnp.asarray(windows.row_s), edge_s)
     rate_b, force_b = _pick(track.rate_b, now), _pick(forces, now)
-    seen = measured(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
+    seen = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
     turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), seen.rot_w)
     attitude = 0.5 * jnp.stack(
         [
@@ -145,12 +145,12 @@ def _burned_in(
     The loop must be one that remembers nothing.
     """
     # Before the start only rates are known.
-    rates_b = restored(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
-    speed = wanted_speed(plant, unpacked(command[0]), rates_b[0])
+    rates_b = to_true(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
+    speed = wanted_speed(plant, unpack_command(command[0]), rates_b[0])
 
     def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
         span, acting, rate_b = row
-        carry = update_loop(plant, carry, span, unpacked(acting), rate_b)
+        carry = update_loop(plant, carry, span, unpack_command(acting), rate_b)
         return turn_rotors(plant, carry, span)[0], None
 
     # The rates where the loop samples are known here: none has to be carried on.

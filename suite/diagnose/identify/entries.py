@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.interface import at
+from eval.effects.interface import bound_value
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.drive import DrivenVehicle, log_inertia_ratio
@@ -140,7 +140,7 @@ def _clipped(vehicle: Vehicle, entry: Number) -> Number:
     if not table.startswith(EFFECTS_TABLE):
         return entry
     parameter = EFFECTS[table.removeprefix(EFFECTS_TABLE)].parameters[0]
-    low, high = at(parameter.low, vehicle), at(parameter.high, vehicle)
+    low, high = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
     return entry._replace(value=[min(max(v, low), high) for v in entry.value])
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.log_faults import lateness
+from eval.effects.log_faults import pose_delay
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE
 from suite.diagnose.data.whitening import make_whitening
@@ -318,4 +318,4 @@ def pose_delays(found: SearchResult) -> dict[str, float]:
     """Return by named effect the delay of the logged pose that it describes [s]."""
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
-    return {name: float(lateness({name: values[name]})) for name in named if EFFECTS[name].late}
+    return {name: float(pose_delay({name: values[name]})) for name in named if EFFECTS[name].late}

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eval.effects.log_faults import lateness
+from eval.effects.log_faults import pose_delay
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise
@@ -146,7 +146,7 @@ def overlap(limits: Thresholds) -> float:
 
 def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
     """Return the start states (W, F), relative to the measured ones, under the clock offset."""
-    late = lateness(model.space.effects(theta))
+    late = pose_delay(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
     offset[:, :3] = late * windows.vel_w
     offset[:, 3:6] = late * windows.rate_b

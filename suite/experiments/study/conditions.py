@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.effects.interface import Effect, at, neutral
+from eval.effects.interface import Effect, bound_value, neutral
 from eval.effects.wind import CONSTANT_WIND
 from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
 from eval.vehicles.vehicle import Vehicle
@@ -72,7 +72,9 @@ def _with(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     none = np.zeros_like(none) if parameter.whole else none
     share = np.asarray(parameter.direction) if parameter.direction else np.ones(none.shape)
     changed = none + sign * size * share
-    changed = np.clip(changed, at(parameter.low, vehicle), at(parameter.high, vehicle))
+    changed = np.clip(
+        changed, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
+    )
     own = np.asarray(getattr(values, parameter.name), float)
     changed = np.where(np.abs(own - none) > np.abs(changed - none), own, changed)
     value = _plain(changed)

@@ -19,7 +19,7 @@ from eval.quadrotor.attitude import (
     level_heading,
 )
 from eval.quadrotor.autopilot import ATTITUDE_HZ
-from eval.quadrotor.plant import unpacked
+from eval.quadrotor.plant import unpack_command
 from eval.vehicles.vehicle import Vehicle
 from policies.observation import observe, view_of
 from policies.policy import Policy
@@ -205,7 +205,7 @@ class Companion:
             return self._hand_over(trouble)
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
         self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
-        command = unpacked(self._action_b)
+        command = unpack_command(self._action_b)
         if self._kind == "acceleration":
             force_w = action_to_force(self._action_b, rot_w)
             command = attitude_command(self._vehicle.controller, force_w, rot_w, self._heading_w)

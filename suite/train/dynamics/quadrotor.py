@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from eval.effects import EFFECTS, as_arrays, neutral
-from eval.effects.interface import Values, at
+from eval.effects.interface import Values, bound_value
 from eval.quadrotor.attitude import action_to_force, attitude_command, blend_heading
 from eval.quadrotor.plant import Command, Motion, Plant, make_plant, uses_noise
 from eval.quadrotor.stepper import Inputs, PlantState, hover_state, step
@@ -105,7 +105,7 @@ def draw_effects(
     drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
     delay = own("command_delay").delay + config.delay_spread_s * either_way()
     wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
-    lightest = vehicle.mass + at(EFFECTS["mass_offset"].parameters[0].low, vehicle)
+    lightest = vehicle.mass + bound_value(EFFECTS["mass_offset"].parameters[0].low, vehicle)
 
     def lag(either: np.ndarray) -> np.ndarray:
         whole = own("motor_lag").time_constant * (1 + config.lag_spread * either)
@@ -157,7 +157,7 @@ class DrawnVehicle:
 def longest_delay(config: QuadrotorConfig) -> float:
     """Return the longest delay of commands in any world [s]."""
     own = config.vehicle.effects.get("command_delay")
-    limit = at(EFFECTS["command_delay"].parameters[0].high, config.vehicle)
+    limit = bound_value(EFFECTS["command_delay"].parameters[0].high, config.vehicle)
     delay = 0.0 if own is None else float(own.delay)
     return min(delay + config.delay_spread_s, max(limit, delay))
 

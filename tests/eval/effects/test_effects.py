@@ -12,7 +12,7 @@ import pytest
 from eval.effects import EFFECTS, all_values
 from eval.effects.body import MASS_OFFSET as MASS
 from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays
-from eval.effects.log_faults import apply_log_faults, lateness, measured, restored, shifted
+from eval.effects.log_faults import apply_log_faults, pose_delay, time_shifted, to_logged, to_true
 from eval.effects.slung_load import SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step
@@ -163,20 +163,20 @@ def a_sample(rng, n=5):
 def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():
     time_s, series = np.array([0.0, 1.0, 2.0, 4.0]), np.array([[0.0], [1.0], [5.0], [1.0]])
     for offset, wanted in ((0.5, [-0.5, 0.5, 3.0, 2.0]), (-0.5, [0.5, 3.0, 4.0, 0.0])):
-        np.testing.assert_allclose(shifted(time_s, series, np.asarray(offset))[:, 0], wanted)
+        np.testing.assert_allclose(time_shifted(time_s, series, np.asarray(offset))[:, 0], wanted)
 
 
 def test_the_catalogue_undoes_its_own_faults_on_a_sample():
     rng = np.random.default_rng(2)
     drawn = {n: as_arrays(v) for n, v in drawn_effects(rng, PLAIN).effects.items()}
     sample = a_sample(rng)
-    seen = measured(drawn, sample)
+    seen = to_logged(drawn, sample)
     np.testing.assert_array_equal(seen.rate_b, sample.rate_b + drawn["gyro_bias"].bias)
     np.testing.assert_array_equal(seen.acc_b, sample.acc_b + drawn["accelerometer_bias"].bias)
-    assert lateness(drawn) == drawn["clock_offset"].offset
-    for one, other in zip(restored(drawn, seen), sample, strict=True):
+    assert pose_delay(drawn) == drawn["clock_offset"].offset
+    for one, other in zip(to_true(drawn, seen), sample, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    assert lateness({}) == 0.0 and measured({}, sample) is sample
+    assert pose_delay({}) == 0.0 and to_logged({}, sample) is sample
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
@@ -198,9 +198,9 @@ def test_a_small_fault_of_another_package_is_undone(monkeypatch):
     with_imu_fault(monkeypatch)
     sample = a_sample(np.random.default_rng(3))
     fault = {"imu_fault": as_arrays(ImuFault((1e-4, -2e-4, 3e-4), 1.0002, 0.0))}
-    seen = measured(fault, sample)
+    seen = to_logged(fault, sample)
     assert np.abs(seen.rate_b - sample.rate_b).max() > 1e-4
-    for one, other in zip(restored(fault, seen), sample, strict=True):
+    for one, other in zip(to_true(fault, seen), sample, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 

@@ -56,7 +56,7 @@ def test_a_step_of_the_line_is_backward_euler_of_a_damped_spring():
         memory=LoadState(np.array([0.0, 0.0, -LENGTH - at_m]), np.array([0.0, 0.0, -speed])), dt=dt
     )
     values = SlungLoad(np.asarray(LOAD), np.asarray(LENGTH))
-    parting = float(slung_load._pull(values, flow)[1][0])
+    parting = float(slung_load._tension(values, flow)[1][0])
     after = speed - dt * parting
     spring = slung_load.STIFFNESS**2 * (at_m + dt * after)
     damper = 2.0 * slung_load.DAMPING * slung_load.STIFFNESS * after

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.flights.follow import FlightFailed, Step, follow, wanted_of
+from eval.flights.follow import FlightFailed, Step, follow, reference_of
 from eval.flights.trajectory import Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench
 from tests.support.vehicles import PLAIN
@@ -40,7 +40,7 @@ class Points:
 
 
 def flown(off_m=0.0):
-    wanted = wanted_of(WAYS, 5, DT)
+    wanted = reference_of(WAYS, 5, DT)
     bodies = Points(wanted, off_m)
     return bodies, follow(bodies, PLAIN, WAYS, wanted, 5, DT)
 

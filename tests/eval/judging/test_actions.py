@@ -9,7 +9,7 @@ import pytest
 from eval.effects.interface import GRAVITY
 from eval.judging.guard import ActionLimits, first_action, guard_action, limits_of
 from eval.judging.judge import JudgeOptions, fly
-from eval.judging.outputs import actions_of, notes_of, probable_faults
+from eval.judging.outputs import action_report, notes_of, probable_faults
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec
 from policies.block_policy import BlockPolicy
@@ -147,7 +147,7 @@ class Changed:
 )
 def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     policy = Changed(change, PolicySpec(action=action))
-    found = actions_of([flown(policy)], action)
+    found = action_report([flown(policy)], action)
     assert [doubt.fault for doubt in found["warnings"]] == ([fault] if fault else [])
     assert found["decisions"] >= 5
     if fault == "action_limited":
@@ -160,11 +160,11 @@ def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     trials, tracks = [TrialSpec(track.family, 0, 0)], {track.family: track}
     result = fly(Pursuit(), trials, heavy, "mujoco", options, tracks=tracks)[0]
     assert result.pos_z < 1.0 and result.output_max > 6.0, result
-    assert actions_of([result], ActionSpec())["warnings"] == []
+    assert action_report([result], ActionSpec())["warnings"] == []
 
 
 def test_gravity_and_frames_show_in_flight_or_in_made_up_observations():
-    found = actions_of([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
+    found = action_report([flown(Steady((0.0, 0.0, 9.81)))], ActionSpec())
     assert "action_gravity" in [doubt.fault for doubt in found["warnings"]]
     policy = load_policy("race-small")
     assert isinstance(policy, BlockPolicy) and probable_faults(policy) == ()

@@ -124,7 +124,7 @@ def test_another_kind_a_newer_schema_and_a_wrong_top_level_are_refused(tmp_path)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_weights_that_are_not_finite_are_refused_unless_asked_for(tmp_path, bad):
     save(tmp_path / "c", {"w": np.array([1.0, bad], np.float32)})
-    with pytest.raises(PolicyError, match="'w' holds 1 of 2"):
+    with pytest.raises(PolicyError, match="'w' has 1 of 2"):
         load_arrays(tmp_path / "c", kind="policy")
     load_arrays(tmp_path / "c", kind="policy", finite=False)
 

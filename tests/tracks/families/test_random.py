@@ -100,7 +100,7 @@ def test_dense_tracks_are_as_dense_at_the_end_as_at_the_start():
 
 def test_obstacles_stand_in_the_way_where_they_are_to_be_near(monkeypatch):
     def share_in_line(beside_m):
-        monkeypatch.setattr(random, "BESIDE_M", beside_m)
+        monkeypatch.setattr(random, "OFFSET_M", beside_m)
         rng, inside, total = np.random.default_rng(5), 0, 0
         for _ in range(40):
             track = random_track(0.5, rng, Mix(bare_share=0.0))

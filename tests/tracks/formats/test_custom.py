@@ -156,7 +156,7 @@ def test_parts_of_a_mesh_have_names_of_their_own(tmp_path):
     mesh = '[[meshes]]\nname = "A"\nfile = "two.obj"\nposition = [0, 9, 1]\n'
     assert load_track(write(tmp_path, GATE + mesh)).names[-2:] == ("A part 0", "A part 1")
     box = '[[boxes]]\nname = "A part 0"\ncenter = [0, -9, 1]\nsize = [1, 1, 1]\n'
-    with pytest.raises(ValueError, match=r"meshes\[0\].name is 'A'.*as others: 'A part 0'"):
+    with pytest.raises(ValueError, match=r"meshes\[0\].name is 'A'.*is called 'A part 0' already"):
         load_track(write(tmp_path, GATE + box + mesh))
 
 

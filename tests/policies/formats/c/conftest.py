@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from policies.formats.c.compiler import find_compiler
-from policies.formats.c.project import c_project, drawn
+from policies.formats.c.project import c_project, random_observations
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from tests.policies.conftest import SPEC, lively
 from tracks.geometry.camera import Camera
@@ -46,7 +46,9 @@ def exports(tmp_path_factory, checkpoint):
         ("odd8", odd, "int8"),
     ):
         stored = load_policy_checkpoint(source)
-        project = c_project(stored, source.name, dtype, drawn(stored.spec, 40, seed=5))
+        project = c_project(
+            stored, source.name, dtype, random_observations(stored.spec, 40, seed=5)
+        )
         folder = tmp_path_factory.mktemp(name)
         for file, text in project.files.items():
             (folder / file).write_text(text)

@@ -102,7 +102,7 @@ def test_sums_that_32_bits_do_not_hold_are_refused(exports, monkeypatch):
         quantised.check_sums("image", weight)
     stored = exports["odd"].checkpoint
     monkeypatch.setattr(quantised, "SUM_MOST", 1000)
-    with pytest.raises(PolicyError, match="adds up to 1000 at most; export it as float32"):
+    with pytest.raises(PolicyError, match="allowed for int8 is up to 1000; export it as float32"):
         c_project(stored, "odd", "int8", random_observations(stored.spec, 2))
 
 
@@ -212,7 +212,7 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
     policy = foreign(tmp_path, "state->seen")
     assert policy.name == "policy.c"
     assert (policy.spec.rate_hz, policy.state_bytes) == (30.0, 4)
-    with pytest.raises(PolicyError, match="belongs into policy_state"):
+    with pytest.raises(PolicyError, match="keep all memory of the policy in policy_state"):
         foreign(tmp_path, "(float)steps")
     with pytest.raises(PolicyError, match="expected by its POLICY_JSON"):
         foreign(tmp_path, "state->seen", size=15)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
-from eval.effects.interface import at
+from eval.effects.interface import bound_value
 from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 from eval.sensors.sensors_file import PERFECT, sensor_set
 from eval.worlds.trial import TrialSpec
@@ -201,8 +201,8 @@ def test_no_effect_is_beyond_what_a_vehicle_may_have(name):
     for condition in effect_conditions(vehicle):
         parameter = EFFECTS[condition.name].parameters[0]
         value = np.array(getattr(condition.vehicle.effects[condition.name], parameter.name))
-        assert (value >= at(parameter.low, vehicle)).all(), condition.words
-        assert (value <= at(parameter.high, vehicle)).all(), condition.words
+        assert (value >= bound_value(parameter.low, vehicle)).all(), condition.words
+        assert (value <= bound_value(parameter.high, vehicle)).all(), condition.words
 
 
 def test_all_drag_of_a_vehicle_grows_and_where_there_is_none_it_comes_anew():
