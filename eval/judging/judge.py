@@ -147,26 +147,18 @@ def fly(
 
     workers = _workers(task, len(trials))
     most = len(trials) if compiles(world) else MOST_A_PIECE
-    shares = [
-        share
-        for group in fitting(trials, tracks)
-        for share in pieces_of(
-            [(number, trials[number]) for number in group], worker_count(workers), most
-        )
-    ]
+    count = worker_count(workers)
+    groups = ([(index, trials[index]) for index in group] for group in fitting(trials, tracks))
+    shares = [share for group in groups for share in pieces_of(group, count, most)]
     run_pieces(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
 
 
 def check_records(world: str) -> None:
-    """Refuse a simulator that records no flights.
-
-    Raises:
-        ValueError: with the alternative.
-    """
+    """Raise a ValueError for a simulator that cannot record flights; it names the alternative."""
     if world == REFERENCE:
         raise ValueError(
-            f"simulator {REFERENCE!r} cannot record flights; use 'mujoco', whose flights are equal"
+            f"simulator {REFERENCE!r} records no flights; record in 'mujoco', which flies equally"
         )
 
 
@@ -175,8 +167,7 @@ def pieces_of(
 ) -> list[Sequence[Trial]]:
     """Divide trials into pieces of at most `most`, an equal number for each process.
 
-    With small pieces little is lost when a process dies, but at the end of each piece some slots
-    are empty.
+    Small pieces lose little when a process dies, but some slots are empty at the end of each.
     """
     if processes == 1:
         return [trials] if trials else []
@@ -382,6 +373,8 @@ class _Slots:
         ended, step = int(progress.ended[slot]) or TIMEOUT, int(progress.step[slot])
         ending = ENDINGS[ended - 1]
         speeds = step + (ended != DIVERGED)  # number of speeds in v_sum
+        bad, limited, late = map(int, self._faults[slot])
+        x, y, z = map(float, progress.pos_w[slot])
         return TrialResult(
             *trial,
             policy=self._policy.name,
@@ -391,16 +384,16 @@ class _Slots:
             gates_passed=int(progress.gates[slot]),
             ended_by=ending,
             collided_with=self._world.collided_with(slot) if ending == "collision" else None,
-            pos_x=float(progress.pos_w[slot, 0]),
-            pos_y=float(progress.pos_w[slot, 1]),
-            pos_z=float(progress.pos_w[slot, 2]),
+            pos_x=x,
+            pos_y=y,
+            pos_z=z,
             time_s=step * self._world.dt,
             v_max=float(progress.v_max[slot]),
             v_mean=float(progress.v_sum[slot]) / max(speeds, 1),
             gates_8s=int(progress.gates_8s[slot]),
             gates_035=int(progress.gates_035[slot]),
-            bad_actions=int(self._faults[slot, 0]),
-            limited_actions=int(self._faults[slot, 1]),
-            late_actions=int(self._faults[slot, 2]),
+            bad_actions=bad,
+            limited_actions=limited,
+            late_actions=late,
             **self._outputs.columns(slot),
         )

@@ -13,6 +13,14 @@ from typing import Any, NamedTuple
 
 from eval.effects.interface import Array
 from eval.quadrotor import loops
+from eval.quadrotor.forces import (
+    mass_of,
+    rotor_wrench,
+    still_thrust,
+    wind_and_flow,
+    with_push,
+    wrench_on,
+)
 from eval.quadrotor.plant import (
     Command,
     Motion,
@@ -23,19 +31,7 @@ from eval.quadrotor.plant import (
     uses_rotor_acc,
 )
 from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
-from eval.quadrotor.stepper import (
-    Feedback,
-    Inputs,
-    loop_update,
-    mass_of,
-    prepend_start,
-    rotor_wrench,
-    still_thrust,
-    wanted_speed,
-    wind_and_flow,
-    with_push,
-    wrench_on,
-)
+from eval.quadrotor.stepper import Feedback, Inputs, loop_update, prepend_start, wanted_speed
 from tracks.geometry.rotation import exp_rot
 
 INTEGRATORS = ("continuous", "euler")
@@ -249,7 +245,7 @@ def _wrench(
     rotor_acc: Array | None = None,
 ) -> Wrench:
     """Return the total force and torque on the body."""
-    _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, time_s)
+    _, flow = wind_and_flow(plant, {}, motion, rotors, time_s, inputs.noise, inputs.voltage_drop)
     flow = flow._replace(rotor_acc=rotor_acc)
     return with_push(plant, wrench_on(plant, rotors, flow), inputs.push_b)
 

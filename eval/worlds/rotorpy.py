@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.quadrotor.autopilot import AutopilotState, attitude_step, motor_speed_command
+from eval.quadrotor.forces import winds_on
 from eval.quadrotor.plant import Motion
-from eval.quadrotor.stepper import rotor_command, winds_on
+from eval.quadrotor.stepper import rotor_command
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import rotorpy_vehicle
 from eval.worlds.scene_slots import TO_CONTACTS, SceneSlots

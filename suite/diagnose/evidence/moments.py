@@ -21,9 +21,9 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.effects.interface import Array, Sample
 from eval.effects.log_faults import to_true
+from eval.quadrotor.forces import wind_and_flow, wrench_on
 from eval.quadrotor.plant import Motion, Plant, accelerations, assemble, nominal_quadrotor
 from eval.quadrotor.rotors import steady
-from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import LONGEST_S
 from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
@@ -92,8 +92,8 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
     Numpy or JAX; `voltage`: whether the rows have one.
     """
     motion, rotors = motion_of(plant, rows), steady(rows.rotor_speed)
-    inputs = Inputs(voltage_drop=rows.voltage_drop if voltage else None)
-    _, flow = wind_and_flow(plant, {}, motion, rotors, inputs, rows.time_s)
+    voltage_drop = rows.voltage_drop if voltage else None
+    _, flow = wind_and_flow(plant, {}, motion, rotors, rows.time_s, voltage_drop=voltage_drop)
     return accelerations(plant, motion, wrench_on(plant, rotors, flow))
 
 

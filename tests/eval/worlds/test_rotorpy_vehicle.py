@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
+from eval.quadrotor.forces import wind_and_flow, wrench_on
 from eval.quadrotor.plant import Motion, make_plant
 from eval.quadrotor.rotors import steady
-from eval.quadrotor.stepper import Inputs, wind_and_flow, wrench_on
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.rotorpy_vehicle import AIR, differences, rotorpy_parameters
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects, with_lag
@@ -84,7 +84,7 @@ def test_forces_and_torques_are_ours_where_the_body_does_not_turn(name):
     for _ in range(5):
         vel_b, speed = rng.normal(0, 6, 3), rng.uniform(300, 2000, 4)
         motion = Motion(np.zeros(3), np.eye(3), vel_b, np.zeros(3))
-        _, flow = wind_and_flow(plant, {}, motion, steady(speed), Inputs(), 0.0)
+        _, flow = wind_and_flow(plant, {}, motion, steady(speed), 0.0)
         ours = wrench_on(plant, steady(speed), flow)
         force_b, torque_b = theirs.compute_body_wrench(np.zeros(3), speed, vel_b)
         np.testing.assert_allclose(force_b, ours.force_b, rtol=1e-9, atol=1e-9)
