@@ -9,7 +9,7 @@ import pytest
 
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
-from policies.formats.c.project import drawn
+from policies.formats.c.project import random_observations
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import PolicySpec
@@ -49,7 +49,9 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
 @needs_cc
 def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
     spec = load_policy_checkpoint(folder).spec
-    monkeypatch.setattr(exporting, "observed_flights", lambda policy: drawn(spec, 30, seed=3))
+    monkeypatch.setattr(
+        exporting, "observed_flights", lambda policy: random_observations(spec, 30, seed=3)
+    )
     asked = ["export", str(folder), "--format", "c", "--dtype", "int8", "--out", str(tmp_path)]
     assert cli.main(asked) == 0
     assert "on flights" in capsys.readouterr().out
