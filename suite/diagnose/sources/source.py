@@ -158,12 +158,10 @@ class Source(ABC):
 
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
         """Return whether held-out flights are sensitive to `candidate` at its fitted size."""
-        del found, candidate
         return False
 
     def is_relevant(self, gap: Gap) -> bool:
         """Return whether `gap` may exceed the noise by a relevant amount."""
-        del gap
         return True
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
@@ -171,22 +169,18 @@ class Source(ABC):
 
         Empty if the size has no physical unit; then no effect counts as too small.
         """
-        del found
         return {}
 
     def explained_by_steps(self, found: SearchResult) -> bool:
         """Return whether a simulator's time steps may cause the named effects."""
-        del found
         return False
 
     def model_error(self, found: SearchResult) -> float | None:
         """Return the share of the noise floor that is the model's numerical error, if known."""
-        del found
         return None
 
     def series(self, found: SearchResult) -> Series | None:
         """Return a held-out stretch for a chart, simulated as given and with named effects."""
-        del found
         return None
 
 

@@ -191,7 +191,6 @@ class MotionSource(ViewSource):
 
     def search(self, say: Callable[[str], None], seed: int) -> SearchResult:
         """Search for an effect that has changed since the reference flights, see `Source`."""
-        del say, seed
         found = search_motion_change(self.reference, self.fitted, self.candidates)
         evidence, block = self.weighed
         none = Evaluation(evidence, self.start, block)
