@@ -236,7 +236,7 @@ def fit_torque(
         at_limit = [
             u.name
             for u, value in zip(unknowns, fitted.value, strict=True)
-            if u.name in correction and fitted.has(u.name) and not u.low < value < u.high
+            if u.name in correction and fitted.identifies(u.name) and not u.low < value < u.high
         ]
         if not at_limit:
             return replace(fitted, unknowns=original)

@@ -72,7 +72,7 @@ def torque_entries(
     if "yaw" in fitted.names:
         # Flights show the ratio of torque to inertia about z. The inertia's uncertainty counts as
         # far as the inertia is identified; otherwise it is held fixed.
-        identified = [name for name in INERTIAS if fitted.has(name)]
+        identified = [name for name in INERTIAS if fitted.identifies(name)]
 
         def torque_coefficient(n: Mapping[str, float]) -> float:
             numbers = {name: n[name] for name in (*identified, "yaw")}

@@ -97,7 +97,7 @@ class Fitted:
     known: tuple[str, ...] = ()
     """Names of numbers that an earlier fit has identified."""
 
-    def has(self, name: str) -> bool:
+    def identifies(self, name: str) -> bool:
         """Return whether this fit identified the number `name`."""
         return name in self.names and name not in (*self.not_identified, *self.known)
 

@@ -195,7 +195,7 @@ class _Fits:
         if result is None:
             return
         start_lag_s = self.start.rotors.time_constant
-        if result.has("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
+        if result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
             # No rotor follows at once. Commands that are blurred in the log hide its lag.
             self.lag_s = start_lag_s
             unknowns = [u._replace(start=start_lag_s) if u.name == "lag" else u for u in unknowns]

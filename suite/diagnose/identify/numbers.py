@@ -75,7 +75,7 @@ def number_from(
         slopes[:, k] = change / (2.0 * unknown.step)
     variance = np.einsum("vi,ij,vj->v", slopes, fitted.covariance, slopes)
     half = Z95 * np.sqrt(np.maximum(variance, 0.0))
-    is_known = [fitted.has(name) for name in needs]
+    is_known = [fitted.identifies(name) for name in needs]
     spans = [
         (float(v - h), float(v + h)) if known and h <= max_half_width else None
         for v, h, known in zip(values, half, is_known, strict=True)
@@ -142,10 +142,10 @@ def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) 
         entries: entries of the vehicle file, by their keys.
     """
     fits = list(fitted.values())
-    identified = {name for fit in fits for name in fit.names if fit.has(name)}
+    identified = {name for fit in fits for name in fit.names if fit.identifies(name)}
     names = dict.fromkeys(name for fit in fits for name in fit.not_identified)
     lines = [WHY[name] for name in names if name not in identified and name in WHY]
-    total_s = [fit.values()["late"] for fit in fits if fit.has("late")]
+    total_s = [fit.values()["late"] for fit in fits if fit.identifies("late")]
     if total_s and not entries[DELAY].is_identified:
         delay_s = max(entries[DELAY].value[0], 0.0)
         lines.append(

@@ -108,13 +108,13 @@ def rolled(noise, **limits):
 def test_noise_of_the_rotor_speeds_makes_no_body_heavier_and_is_doubted_by_half(noise, half):
     """At 100 rad/s 15 % of the variance is noise, by which the inertia would seem larger."""
     found = rolled(noise)
-    assert found.has("inertia_x") and abs(found.value[0] - np.log(2.0)) < 0.02
+    assert found.identifies("inertia_x") and abs(found.value[0] - np.log(2.0)) < 0.02
     assert found.half_width[0] == pytest.approx(half, rel=0.1)
 
 
 def test_what_is_mostly_noise_or_at_its_limit_is_not_told():
-    assert not rolled(300.0).has("inertia_x")
-    assert not rolled(0.0, high=0.3).has("inertia_x")
+    assert not rolled(300.0).identifies("inertia_x")
+    assert not rolled(0.0, high=0.3).identifies("inertia_x")
 
 
 def test_the_inertia_about_z_follows_the_others_but_for_its_own_ratio():

@@ -65,7 +65,11 @@ def test_what_is_known_widens_what_depends_on_it():
     np.testing.assert_allclose(found.value, [1.5, 0.5], atol=0.02)
     wanted = np.hypot(alone.half_width[0], 1.96 * 0.1)
     np.testing.assert_allclose(found.half_width[0], wanted, rtol=1e-6)
-    assert np.isnan(found.half_width[1]) and not found.has("other") and found.not_identified == ()
+    assert (
+        np.isnan(found.half_width[1])
+        and not found.identifies("other")
+        and found.not_identified == ()
+    )
     np.testing.assert_allclose(found.known_numbers("other", "none").covariance, [[0.01]])
 
 
