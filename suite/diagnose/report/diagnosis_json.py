@@ -98,20 +98,12 @@ def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for finding in diagnosis.findings
         for name, names in finding.by_effect().items()
     ]
+    shared = ("name", "parameters", "gap_removed", "p_value", "view")
     tested = [
-        {
-            "name": effect.name,
-            "alternatives": [],
-            "parameters": effect.parameters,
-            "gap_removed": effect.gap_removed,
-            "p_value": effect.p_value,
-            "size": None,
-            "relevant": True,
-            "view": effect.view,
-        }
+        {**{key: getattr(effect, key) for key in shared}, "alternatives": [], "size": None}
         for effect in diagnosis.tested
     ]
-    return [*searched, *tested]
+    return [{**effect, "relevant": True} for effect in (*searched, *tested)]
 
 
 def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
@@ -128,7 +120,6 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
         "gap_removed": finding.removed(names),
         "p_value": max(named.p_value for named in names),
         "size": size and size._asdict(),
-        "relevant": True,
         "view": finding.source.name,
     }
 

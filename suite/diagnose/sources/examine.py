@@ -40,13 +40,16 @@ def examine(
     """
     found, warnings = source.search(say, seed), list[str]()
     if earlier and not source.names_small:
-        allowed, first = source.candidates, earlier[0]
-        for refused, words in contradicted(first.search, found):
-            warnings.append(
-                f"{source.name}: {refused.label} is contradicted by {first.source.name} ({words}): "
-                "left out"
-            )
-            allowed = [c for c in allowed if not set(c.indices) & set(refused.indices)]
+        first = earlier[0]
+        refused = contradicted(first.search, found)
+        warnings += [
+            f"{source.name}: {candidate.label} is contradicted by {first.source.name} ({words}): "
+            "left out"
+            for candidate, words in refused
+        ]
+        if refused:
+            excluded = set(indices_of([candidate for candidate, _ in refused]))
+            allowed = [c for c in source.candidates if not set(c.indices) & excluded]
             found = replace(source, candidates=allowed).search(say, seed)
     if not found.named and source.fallback:
         other = source.fallback.search(say, seed)
