@@ -46,6 +46,7 @@ _OWN = (
     gate_map.SENSOR,
     state_errors.STATE_DRIFT,
     state_errors.STATE_NOISE,
+    state_errors.DRAG_TILT,
     measured_state.SENSOR,
     intermittent.STATE_LOSS,
     gate_detection.SENSOR,

@@ -1,9 +1,10 @@
-"""Errors of an estimated state: drift of dead reckoning, coloured noise with a bias, delay."""
+"""Errors of an estimated state: drift, coloured noise with a bias, tilt by drag, delay."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from eval.effects.interface import GRAVITY
 from eval.sensors.interface import (
     Ages,
     Array,
@@ -19,7 +20,7 @@ from eval.sensors.interface import (
     turned_by,
     yawed,
 )
-from tracks.geometry.rotation import exp_rot, to_world
+from tracks.geometry.rotation import cross, exp_rot, to_world
 
 SMALL = 1e-3
 """Distances [m] and angles [rad] below this add no drift, which keeps the root's slope finite."""
@@ -171,6 +172,54 @@ STATE_NOISE = Sensor(
     observation=Needs(normal=9),
     start=state_noise_start,
     sense=state_noise_sense,
+)
+
+
+class DragTilt(NamedTuple):
+    """Values of `drag_tilt`."""
+
+    drag: Array
+    """Deceleration over speed of the drag that the estimator neglects."""
+    lasts: Array
+    """Correlation time: how fast the estimator corrects its tilt."""
+
+
+def drag_tilt_start(values: DragTilt, moment: Moment) -> dict[str, Any]:
+    """Return the tilt error per unit of drag (..., 3) in steady flight, world axes [s]."""
+    del values
+    return {"lean_w": _lean(moment.truth)}
+
+
+def drag_tilt_sense(
+    values: DragTilt, memory: dict[str, Any], seen: View, moment: Moment
+) -> tuple[View, dict[str, Any]]:
+    """Return the view with an attitude from which the drag's deceleration is missing."""
+    xp = seen.pos_w.__array_namespace__()
+    kept = column(xp.exp(-moment.dt_s / xp.maximum(values.lasts, 1e-9)))
+    lean_w = kept * memory["lean_w"] + (1.0 - kept) * _lean(moment.truth)
+    turn_w = exp_rot(column(values.drag) * lean_w)
+    return seen._replace(rot_w=product(turn_w, seen.rot_w)), {"lean_w": lean_w}
+
+
+def _lean(truth: View) -> Array:
+    return cross(truth.vel_w, truth.rot_w[..., 2]) / GRAVITY
+
+
+DRAG_TILT = Sensor(
+    name="drag_tilt",
+    stage="state",
+    summary="The estimator neglects drag and takes the deceleration for a tilt",
+    equation="Exp(c q) R, dq/dt = (v x e / g - q) / lasts, e = R e_z",
+    source="Leishman et al. 2014 (Quadrotors and accelerometers) of the cause; NanoBench (Ullah "
+    "and Baca 2026) by `suite identify --sensors`: 0.4 1/s and 0.8 s; the rest is our estimate",
+    values=DragTilt,
+    parameters=(
+        Parameter("drag", "1/s", 0.0, 0.0, 2.0, (0.1, 0.5)),
+        Parameter("lasts", "s", 0.0, 0.0, 1000.0, (0.3, 2.0)),
+    ),
+    grows=("drag",),
+    start=drag_tilt_start,
+    sense=drag_tilt_sense,
 )
 
 

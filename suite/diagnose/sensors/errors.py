@@ -16,13 +16,14 @@ import numpy as np
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from eval.effects.interface import GRAVITY
 from eval.judging.statistics import Interval
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.estimate.block import NormalEquations, without_nuisance
 from suite.diagnose.estimate.gauss_newton import intervals95
 from suite.diagnose.identify.grid import attitude_at, interpolated
-from tracks.geometry.rotation import to_local
+from tracks.geometry.rotation import cross, to_local
 
 PARTS = {"position": "pos", "velocity": "vel", "attitude": "quat"}
 """Parts of the state, three axes each, and the columns that hold them."""
@@ -46,6 +47,10 @@ class Errors(NamedTuple):
     """(T, 9) time derivative of the reference, in the same axes."""
     vel_b: np.ndarray
     """(T, 3) velocity of the reference [m/s]."""
+    rot_w: np.ndarray
+    """(T, 3, 3) attitude of the reference, body to world."""
+    lean_w: np.ndarray
+    """(L + T, 3) velocity x body z over gravity, also of L rows before the first error [s]."""
 
 
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
@@ -67,16 +72,19 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
             reason = f"no reference for the estimate: {GROUPS[group][0]} is missing in every row"
             raise FlightLogError(log.name, GROUPS[group][0], None, reason)
     step_s = float(np.median(np.diff(log.time_s)))
-    grid = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
-    grid = grid[(grid >= grid[0] + SETTLES_S) & (grid <= grid[-1] - SETTLES_S)]
+    whole = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
+    whole = whole[whole <= whole[-1] - SETTLES_S]
+    grid = whole[whole >= whole[0] + SETTLES_S]
     if len(grid) < LEAST_S / step_s:
         reason = (
             f"{log.duration_s:.1f} s of flight; allowed are {LEAST_S + 2 * SETTLES_S:g} s or more"
         )
         raise FlightLogError(log.name, None, None, reason)
+    vel_w = interpolated(log.time_s, log.vel_w, whole - late_s)
+    rot_w = attitude_at(log.time_s, log.quat_wxyz, whole - late_s)
+    lean_w = cross(vel_w, rot_w[..., 2]) / GRAVITY
+    vel_w, rot_w = vel_w[-len(grid) :], rot_w[-len(grid) :]
     then = grid - late_s
-    vel_w = interpolated(log.time_s, log.vel_w, then)
-    rot_w = attitude_at(log.time_s, log.quat_wxyz, then)
     value, rate_b = np.full((len(grid), 9), np.nan), np.full((len(grid), 3), np.nan)
     for k, (part, estimate) in enumerate(estimates.items()):
         if estimate is None:
@@ -92,7 +100,7 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
     if np.isfinite(log.rate_b).any():
         rate_b = interpolated(log.time_s, log.rate_b, then)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
-    return Errors(log.name, step_s, value, slope, to_local(rot_w, vel_w))
+    return Errors(log.name, step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
 
 
 def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
@@ -201,10 +209,19 @@ def _scale_slope(flight: Errors) -> np.ndarray:
 
 def _equations(flights: Sequence[Errors], channels: slice) -> NormalEquations:
     """Return the normal equations of delay and scale on the errors of `channels`, by stretch."""
+    columns = [np.stack([one.value, -one.slope, _scale_slope(one)], axis=-1) for one in flights]
+    return equations_of(flights, [values[:, channels] for values in columns])
+
+
+def equations_of(flights: Sequence[Errors], columns: Sequence[np.ndarray]) -> NormalEquations:
+    """Return the normal equations, by stretch, of two numbers.
+
+    Args:
+        flights: the errors.
+        columns: for each flight C errors and their slopes along the numbers, (T, C, 3).
+    """
     rows, stretch, flight_of = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for number, flight in enumerate(flights):
-        columns = [flight.value, -flight.slope, _scale_slope(flight)]
-        values = np.stack(columns, axis=-1)[:, channels]
+    for number, (flight, values) in enumerate(zip(flights, columns, strict=True)):
         complete = np.isfinite(values).all(axis=-1, keepdims=True)
         values = np.where(complete, values, 0.0)
         mean = values.sum(axis=0) / np.maximum(complete.sum(axis=0), 1)

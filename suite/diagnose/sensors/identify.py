@@ -22,6 +22,7 @@ from suite.common.console import Console
 from suite.common.provenance import stamp
 from suite.delta.run import flight_files
 from suite.diagnose.identify.numbers import Number, number_lines, numbers_json
+from suite.diagnose.sensors.clock import clock_of, on_gyro_clock
 from suite.diagnose.sensors.colour import SHORT_S, Coloured, Series, fit_colour
 from suite.diagnose.sensors.errors import (
     Errors,
@@ -31,6 +32,7 @@ from suite.diagnose.sensors.errors import (
     significant,
     without_scale,
 )
+from suite.diagnose.sensors.tilt import Tilt, fit_tilt
 
 SCHEMA = 1
 """Version of the JSON that `suite identify --sensors` prints."""
@@ -49,6 +51,8 @@ class Fitted(NamedTuple):
     """Parameters of each axis that has enough data."""
     drift: Interval
     """Random walk of the position, averaged over its axes [m/sqrt(m)]."""
+    tilt: Tilt
+    """Attitude error of an estimator that neglects drag."""
 
 
 class HeldOut(NamedTuple):
@@ -80,14 +84,14 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
         FlightLogError: for a log without an estimate or without a reference.
     """
     lateness, flights = fit_lateness(logs)
-    axes = {}
+    tilt, axes = fit_tilt(flights), {}
     for channel, axis in enumerate(AXES):
-        coloured = fit_colour(_series(flights, lateness, channel))
+        coloured = fit_colour(_series(flights, lateness, tilt, channel))
         if coloured is not None:
             axes[axis] = coloured
     drifts = [axes[axis].drift for axis in AXES[:3] if axis in axes]
     rms = (float(np.sqrt(np.mean(np.square(ends)))) for ends in zip(*drifts, strict=True))
-    return Fitted(lateness, axes, Interval(*rms) if drifts else ZERO)
+    return Fitted(lateness, axes, Interval(*rms) if drifts else ZERO, tilt)
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
@@ -102,7 +106,7 @@ def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
         late_s = significant(fitted.lateness.delay_s)
         flights = [errors_of(log, late_s) for log in logs[1 - half :: 2]]
         for channel, axis in enumerate(AXES):
-            series = _series(flights, fitted.lateness, channel)
+            series = _series(flights, fitted.lateness, fitted.tilt, channel)
             if axis not in fitted.axes or not any(np.isfinite(s.value).any() for s in series):
                 continue
             compared = _compare(fitted.axes[axis], series)
@@ -143,11 +147,14 @@ def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float,
     return float(covariance[0]), covariance / covariance[0]
 
 
-def _series(flights: Sequence[Errors], lateness: Lateness, channel: int) -> list[Series]:
-    """Return one error of every flight, without the part by the velocity's scale."""
+def _series(
+    flights: Sequence[Errors], lateness: Lateness, tilt: Tilt, channel: int
+) -> list[Series]:
+    """Return one error of every flight, without the parts by the velocity's scale and by drag."""
     series, can_drift = [], AXES[channel].startswith("position")
     for flight in flights:
-        values = without_scale(flight, significant(lateness.velocity_scale))[:, channel]
+        values = without_scale(flight, significant(lateness.velocity_scale))
+        values = (values - tilt.errors(flight))[:, channel]
         speed = np.linalg.norm(flight.vel_b, axis=1)
         series.append(Series(values, speed if can_drift else 0.0 * speed, flight.step_s))
     return series
@@ -168,6 +175,9 @@ def parameters_of(fitted: Fitted) -> dict[str, tuple[Interval, str]]:
             parameters[f"measured_state.{axis}_fast_lasts"] = (coloured.fast_s, "s")
     parameters["measured_state.velocity_scale"] = (fitted.lateness.velocity_scale, "1")
     parameters["measured_state.position_drift"] = (fitted.drift, "m/sqrt(m)")
+    if fitted.tilt.drag.value:
+        parameters["drag_tilt.drag"] = (fitted.tilt.drag, "1/s")
+        parameters["drag_tilt.lasts"] = (fitted.tilt.lasts_s, "s")
     return parameters
 
 
@@ -198,6 +208,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
     warnings += [f"not used: {text}" for text in refused]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
+    used, clocks_s = _on_gyro_clock(used)
     fitted, checked = fit_sensors(used), held_out(used)
     if not fitted.axes:
         raise ValueError(
@@ -206,6 +217,15 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         )
     parameters = parameters_of(fitted)
     header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
+    if clocks_s:
+        low = 1e3 * min(least for least, _ in clocks_s.values())
+        high = 1e3 * max(largest for _, largest in clocks_s.values())
+        text = (
+            f"In {len(clocks_s)} of them the gyro is {low:.0f} to {high:.0f} ms later than the "
+            "reference; the reference was moved to the gyro's times."
+        )
+        console.say(text)
+        header.insert(1, text)
     numbers = [
         Number(key, unit, [interval.value], [(interval.low, interval.high)])
         for key, (interval, unit) in parameters.items()
@@ -220,10 +240,23 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             axis: {**compared._asdict(), "fits": compared.fits, "within": WITHIN}
             for axis, compared in checked.items()
         },
+        "clock_s": clocks_s,
         "flights": [log.name for log in used],
         "warnings": warnings,
         **stamp(SCHEMA, None),
     }
+
+
+def _on_gyro_clock(logs: Sequence[FlightLog]) -> tuple[list[FlightLog], dict[str, list[float]]]:
+    """Return flights on the gyro's clock, and by flight the least and largest nonzero shift."""
+    clocks = [clock_of(log) for log in logs]
+    moved = [on_gyro_clock(log, clock) for log, clock in zip(logs, clocks, strict=True)]
+    shifts_s = {
+        log.name: [float(clock.shift_s.min()), float(clock.shift_s.max())]
+        for log, clock in zip(logs, clocks, strict=True)
+        if clock.shift_s.any()
+    }
+    return moved, shifts_s
 
 
 def say_held_out(result: Mapping[str, Any], console: Console) -> None:

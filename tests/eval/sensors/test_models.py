@@ -111,6 +111,40 @@ def test_state_drift_grows_with_the_root_of_the_way_and_of_the_angle():
     assert about_z == pytest.approx((0.0, 0.0, 0.2 * math.sqrt(0.1)), rel=0.01)
 
 
+def test_a_measured_state_has_a_size_a_bias_and_two_colours_for_every_axis():
+    values = {
+        "position_x": 0.1, "position_x_lasts": 0.2, "position_y_bias": 0.3, "velocity_z": 0.5,
+        "velocity_z_fast": 0.36, "velocity_z_fast_lasts": 0.0, "velocity_z_lasts": 0.1,
+        "velocity_scale": 0.1, "position_drift": 0.05,
+    }  # fmt: skip
+    trial = {"normal": np.repeat([1.0, 7.0, 2.0], 9)}  # slow, fast and bias at the start
+    each = np.repeat([0.5, 3.0, 1.0], [9, 9, 3])  # slow, fast, drift
+    views = [view(), view(pos=(4.0, 0.0, 0.0))]
+    shown = seen_through("measured_state", values, views, trial, normal=each)
+    x, z = (math.exp(-k) + 0.5 * math.sqrt(1.0 - math.exp(-2.0 * k)) for k in (0.5, 1.0))
+    assert shown[0].pos_w[0] == pytest.approx((0.1 * x, 0.6, 0.0), abs=1e-4)
+    assert shown[0].vel_w[0] == pytest.approx((2.2, 0.0, 0.5 * (0.8 * z + 0.6 * 3.0)))
+    assert shown[1].pos_w[0, 1:] == pytest.approx((0.6 + 0.05 * 2.0, 0.05 * 2.0), abs=1e-4)
+    values = {"attitude_y": 0.1, "attitude_y_lasts": 0.0, "attitude_y_bias": 0.02}
+    tilted = seen_through("measured_state", values, [view()], trial, normal=each)[0]
+    about_y = Rotation.from_matrix(tilted.rot_w).as_rotvec()[0]
+    assert about_y == pytest.approx((0.0, 0.1 * 0.5 + 0.02 * 2.0, 0.0))
+
+
+def test_neglected_drag_tilts_the_estimate_against_the_velocity():
+    # Flight along world x at 2 m/s, with the nose to world y: the true lean is forward, about +y.
+    rot = Rotation.from_euler("z", [90.0], degrees=True).as_matrix()
+    still = view(rot=rot)._replace(vel_w=np.zeros((1, 3)))
+    values = {"drag": 0.4, "lasts": 0.2}
+    shown = seen_through("drag_tilt", values, [still, view(rot=rot), view(rot=rot)])
+    off = [Rotation.from_matrix(one.rot_w @ rot.swapaxes(-1, -2)).as_rotvec()[0] for one in shown]
+    steady = -0.4 * 2.0 / 9.81
+    expected = [steady * (1.0 - math.exp(-0.5 * k)) for k in range(3)]
+    assert np.array(off) == pytest.approx(np.array([(0.0, y, 0.0) for y in expected]))
+    begun = seen_through("drag_tilt", values, [view()])[0]
+    assert Rotation.from_matrix(begun.rot_w).as_rotvec()[0] == pytest.approx((0.0, steady, 0.0))
+
+
 def test_a_lost_estimate_runs_away_and_jumps_as_it_is_found():
     values = {"share": 0.5, "length": 1.0, "acceleration": 2.0, "jump": 0.3}
     sensor, models = SENSORS["state_loss"], sensing(sensor_set({"state_loss": values}).models)
@@ -348,3 +382,19 @@ def test_gradients_through_state_and_gates_are_finite(name):
     for moving in (0.0, 1.0):
         found = gradient(truth.pos_w, truth.rot_w, truth.vel_w, moving)
         assert all(np.isfinite(part).all() and np.abs(part).max() < 1e3 for part in found)
+
+
+def test_gradients_through_an_inertial_sensor_are_finite():
+    sensor, rng = SENSORS["imu"], np.random.default_rng(3)
+    first, each = (random_draws(need, rng) for need in (sensor.trial, sensor.observation))
+    values = as_arrays(usual("imu"))
+    memory = sensor.start(values, Moment(view(), first, 0.01, CAMERA))
+    truth = Inertial(rng.normal(size=(3, 3)), np.array([[0.0, 1.0, 9.0]] * 3))
+    draws = jax.tree.map(jnp.asarray, each)
+
+    @jax.grad
+    def gradient(truth):
+        found, _ = sensor.measure(values, memory, truth, draws, 0.01)
+        return sum(jnp.sum(part) for part in found)
+
+    assert all(np.isfinite(part).all() for part in gradient(truth))

@@ -36,6 +36,7 @@ def test_all_holds_every_model():
         "tof",
         "imu",
         "measured_state",
+        "drag_tilt",
         "gate_filter",
     }
 

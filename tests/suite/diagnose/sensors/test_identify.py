@@ -15,6 +15,8 @@ from eval.logs.flight_log import FlightLog, write_flight
 from eval.sensors.interface import Draws, View
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from suite.common.console import Console
+from suite.diagnose.sensors.clock import Clock, clock_of, on_gyro_clock
+from suite.diagnose.sensors.errors import errors_of
 from suite.diagnose.sensors.identify import fit_sensors, held_out, identify_sensors, parameters_of
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import exp_rot, rot_to_quat
@@ -32,8 +34,13 @@ TRUE = {
 DELAY_S = 0.06
 
 
-def flown(numbers: Sequence[int], delay_s: float = DELAY_S, **changed: float) -> list[FlightLog]:
-    """Return flights with an estimate by a model of `TRUE` that is late by `delay_s`."""
+def flown(
+    numbers: Sequence[int], delay_s: float = DELAY_S, drag: float = 0.0, **changed: float
+) -> list[FlightLog]:
+    """Return flights with an estimate by a model of `TRUE` that is late by `delay_s`.
+
+    Its tilt errs by a neglected `drag`, with a correlation time of 0.8 s.
+    """
     lead, count = round(delay_s / STEP_S), round(LONG_S / STEP_S)
     time_s = STEP_S * np.arange(-lead, count)
     drawn = np.array([np.random.default_rng(number).uniform(size=(2, 3)) for number in numbers])
@@ -42,13 +49,16 @@ def flown(numbers: Sequence[int], delay_s: float = DELAY_S, **changed: float) ->
     pos_w, vel_w = 3.0 * np.sin(phase), 3.0 * speed * np.cos(phase)
     rot_w = exp_rot(0.3 * np.sin(phase + 1.0))
     turn = np.swapaxes(rot_w[:-1], -1, -2) @ rot_w[1:]
-    rate_b = np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1) / STEP_S
-    models = sensors.sensing(sensor_set({"measured_state": {**TRUE, **changed}}).models)
+    between_b = np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1) / STEP_S
+    rate_b = np.concatenate([between_b[:1], 0.5 * (between_b[:-1] + between_b[1:])])
+    wanted = {"measured_state": {**TRUE, **changed}, "drag_tilt": {"drag": drag, "lasts": 0.8}}
+    models = sensors.sensing(sensor_set(wanted).models)
     sensor, camera, rng = sensors.SENSORS["measured_state"], Camera(), np.random.default_rng(99)
     none: Any = np.zeros((len(numbers), 0))
 
     def draws(count: int) -> dict[str, Draws]:
-        return {"measured_state": Draws(rng.normal(size=(len(numbers), count)), *[none] * 3)}
+        drawn = Draws(rng.normal(size=(len(numbers), count)), *[none] * 3)
+        return {"measured_state": drawn, "drag_tilt": Draws(*[none] * 4)}
 
     seen, memory = [], None
     for place in zip(pos_w, rot_w, vel_w, strict=True):
@@ -124,6 +134,33 @@ def test_a_drift_is_found():
     drift = fit_sensors(drifting).axes["position_x"].drift
     assert drift.low <= 0.05 <= drift.high
     assert drift.value > 0.02
+
+
+def test_a_tilt_by_neglected_drag_is_found_and_fits_other_flights():
+    assert not fit_sensors(flights()).tilt.drag.value
+    tilted = flown(range(30, 36), drag=0.4)
+    tilt = fit_sensors(tilted).tilt
+    assert tilt.drag.value == pytest.approx(0.4, abs=0.01)
+    assert tilt.lasts_s.value == pytest.approx(0.8, abs=0.04)
+    assert tilt.drag.high - tilt.drag.low < 0.05
+    assert all(one.fits for one in held_out(tilted).values())
+
+
+def test_a_wandering_clock_is_found_by_the_gyro_and_leaves_no_errors():
+    log = flights()[0]
+    assert not clock_of(log).shift_s.any()
+    true_s = 0.08 * np.sin(0.2 * log.time_s)
+    # The reference is earlier by as much as the gyro and the estimate are late.
+    off = on_gyro_clock(log, Clock(log.time_s, -true_s))
+    found = clock_of(off)
+    error_s = found.shift_s - np.interp(found.time_s, log.time_s, true_s)
+    assert np.sqrt((error_s**2).mean()) < 0.01
+    rms = [
+        np.sqrt(np.nanvar(errors_of(one, DELAY_S).value[:, :3]))
+        for one in (log, off, on_gyro_clock(off, found))
+    ]
+    assert rms[1] > 2.0 * rms[0]
+    assert rms[2] < 1.1 * rms[0]
 
 
 def test_the_file_that_is_written_reads_back_with_what_was_found(tmp_path):
