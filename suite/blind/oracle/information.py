@@ -28,7 +28,7 @@ from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.windows import LENGTH_S, cut
 from suite.diagnose.estimate.block import Block
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
+from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
 from suite.diagnose.thresholds import THRESHOLDS
 
 SHORT_S, LONG_S = 0.5, LENGTH_S
@@ -143,14 +143,14 @@ def linearised(
     windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, stepped)
     assert windows is not None, "flights of a case have a whole second"
     row_s = np.asarray(windows.row_s)
-    windows = windows._replace(seen=windows.seen & (row_s < horizon_s + 1e-6)[..., None])
+    windows = windows._replace(valid=windows.valid & (row_s < horizon_s + 1e-6)[..., None])
     begin = start_estimate(model, windows)
     linear = model.linearise(begin.theta, begin.free, windows, [*along, *model.starts])
     each = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
     sigma = np.array([*np.repeat(each, 3), *[sensors.rotor] * 4])
     rows = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
     sigma = np.where(sigma > 0.0, sigma * np.sqrt(rows / sensors.rate_hz), np.nan)
-    return weighed_by(model, windows, linear, LIMITS, Noise(sigma, {}), along)[1]
+    return rollout_evidence(model, windows, linear, LIMITS, Noise(sigma, {}), along)[1]
 
 
 def gust_strength(

@@ -24,13 +24,8 @@ from eval.quadrotor.plant import make_plant, nominal_quadrotor
 from eval.vehicles.vehicle import Vehicle, motor_speed
 from suite.diagnose.data.inertial import InertialLog, is_inertial, posed
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import (
-    LONGEST_S,
-    interpolate,
-    on_every_row,
-    torque_between_rows,
-    with_fewer_rows,
-)
+from suite.diagnose.data.sampling import interpolate, on_every_row, with_fewer_rows
+from suite.diagnose.data.steps import LONGEST_S, torque_between_rows
 from suite.diagnose.data.view import (
     FORCE,
     LEAST_ROWS,

@@ -1,4 +1,7 @@
-"""Measurement noise of every channel: residuals that change too fast for a model error."""
+"""Estimates each channel's measurement noise from residuals that change too fast for a model.
+
+A polynomial is subtracted from a few consecutive rows at a time; the remainder is noise.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
-    """Return the noise of measured rotor speeds that are an input [rad/s], or too large a one.
+    """Return an upper limit of the noise of measured rotor speeds that are an input [rad/s].
 
-    A cubic over few of their own rows is taken off the speeds themselves: what the rotors truly do
-    within 30 ms counts as noise.
+    There are no residuals, so a cubic over few rows is subtracted from the speeds themselves: their
+    true changes within 30 ms count as noise.
     """
     rotors = SLICES["rotor speed"]
-    speeds = np.zeros(np.asarray(windows.seen).shape)
+    speeds = np.zeros(np.asarray(windows.valid).shape)
     speeds[..., rotors] = windows.row_rotor_speed
-    seen = np.zeros(speeds.shape, dtype=bool)
-    seen[..., rotors] = windows.rotor_seen
-    sigma = noise_of(speeds, windows._replace(seen=seen), limits.rotor_noise_rows, limits)
+    valid = np.zeros(speeds.shape, dtype=bool)
+    valid[..., rotors] = windows.rotor_valid
+    sigma = noise_of(speeds, windows._replace(valid=valid), limits.rotor_noise_rows, limits)
     return float(np.sqrt((sigma[rotors] ** 2).mean()))
 
 
@@ -29,21 +32,26 @@ def noise_of(
     rows_together: int | None = None,
     limits: Thresholds = THRESHOLDS,
 ) -> np.ndarray:
-    """Return the standard deviation of each channel's noise, (19,) in its unit; NaN where unseen.
+    """Return the standard deviation (19,) of each channel's noise, in its unit.
 
-    `residual` (W, N, 19) is measured - simulated in `windows`; a polynomial is taken off
-    `rows_together` of a channel's own rows at a time, by default `limits.noise_rows`, or off all of
-    a window where it has fewer. A channel with too few rows for that in every window is given the
-    RMS of its residuals, which no noise exceeds.
+    NaN where nothing was measured. A channel with too few rows in every window gets the RMS of its
+    residuals, which is an upper limit.
+
+    Args:
+        residual: (W, N, 19) measured - simulated.
+        windows: W stretches of 1 s.
+        rows_together: rows of a channel from which one polynomial is subtracted; by default
+            `limits.noise_rows`, or all rows of a window where it has fewer.
+        limits: degree of the polynomial, and least noise.
     """
     block, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]
     freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
-    seen = np.asarray(windows.seen)
+    valid = np.asarray(windows.valid)
     for w in range(len(residual)):
-        for mask in {column.tobytes() for column in seen[w].T}:
+        for mask in {column.tobytes() for column in valid[w].T}:  # channels with the same rows
             own = np.flatnonzero(np.frombuffer(mask, dtype=bool))
-            channels = [c for c in range(CHANNELS) if seen[w, :, c].tobytes() == mask]
+            channels = [c for c in range(CHANNELS) if valid[w, :, c].tobytes() == mask]
             count = min(block, len(own))
             if count < degree + 4:
                 continue
@@ -51,8 +59,8 @@ def noise_of(
                 rows = own[first : first + count]
                 values = residual[w, rows][:, channels]
                 basis = np.linalg.qr(_powers(np.asarray(windows.row_s)[w, rows], degree))[0]
-                left = values - basis @ (basis.T @ values)
-                for channel, energy in zip(channels, (left**2).sum(axis=0), strict=True):
+                remainder = values - basis @ (basis.T @ values)
+                for channel, energy in zip(channels, (remainder**2).sum(axis=0), strict=True):
                     power[channel].append(float(energy))
                     freedom[channel].append(count - degree - 1)
     sigma = np.full(CHANNELS, np.nan)
@@ -60,30 +68,30 @@ def noise_of(
         if power[c]:
             n = np.array(freedom[c])
             sigma[c] = np.sqrt(typical_variance(np.array(power[c]), n))
-        elif seen[..., c].any():
-            sigma[c] = np.sqrt((residual[..., c][seen[..., c]] ** 2).mean())
+        elif valid[..., c].any():
+            sigma[c] = np.sqrt((residual[..., c][valid[..., c]] ** 2).mean())
     return at_least(sigma, limits)
 
 
 def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return noise `sigma` (19,), at least that of rounding and of the model's steps."""
+    """Return noise `sigma` (19,), raised to that of rounding and of the model's time steps."""
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
 
 
 def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarray:
-    """Return the variance of noise whose `energy` (V, ...) has so many degrees of freedom.
+    """Return the variance of noise from the `energy` (V, ...) of blocks with `freedom` each.
 
-    It is that of the median, so that a few bad blocks do not decide: the median of chi-square over
-    n is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
+    It follows from the median, so that a few bad blocks do not matter: the median of chi-square
+    with n degrees of freedom, over n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
     """
     return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
 
 
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return simulated noise (T, R) of the size of each rotor's `speed` noise; NaN where that is.
+    """Return simulated noise (T, R) of the same size as that in the rotor speeds `speed` (T, R).
 
-    It shows what the real noise does to sums over rows. Noise is the residual of a cubic over a few
-    of a rotor's own rows; a rotor with too few rows gets none.
+    It shows the effect of the real noise on sums over rows. The noise is the remainder of a cubic
+    over a few of a rotor's own rows; zero with too few rows, and NaN where the speed is NaN.
     """
     draw = np.random.default_rng(0).standard_normal(speed.shape)
     out = np.full(speed.shape, np.nan)
@@ -99,8 +107,8 @@ def _rotor_sigma(speed: np.ndarray, limits: Thresholds) -> float:
     if not len(blocks):
         return 0.0
     basis = np.linalg.qr(_powers(np.arange(block, dtype=float), degree))[0]
-    left = blocks - blocks @ basis @ basis.T
-    return float(np.sqrt(typical_variance((left**2).sum(axis=1), block - degree - 1)))
+    remainder = blocks - blocks @ basis @ basis.T
+    return float(np.sqrt(typical_variance((remainder**2).sum(axis=1), block - degree - 1)))
 
 
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:

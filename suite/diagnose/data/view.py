@@ -1,8 +1,9 @@
 """Views: force or torque of a flight, as mean accelerations over short smooth windows (bumps).
 
-Measured velocities and modelled accelerations are weighted by the same bumps w(t), which are zero
-at both ends. The mean of an acceleration is then -integral(w' v) / integral(w): measurements are
-never differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
+A view is one part of the dynamics, which is compared with the model while all other signals are as
+measured. Measured velocities and modelled accelerations are weighted by the same bumps w(t), which
+are zero at both ends. The mean of an acceleration is then -integral(w' v) / integral(w), so that
+measurements are never differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from eval.importers.rows import nearest
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
-from suite.diagnose.data.sampling import interpolate
+from suite.diagnose.data.sampling import voltage_drop
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
 
 class FlightRows(NamedTuple):
-    """N rows of one flight; rows with a missing signal are filled in and not `good`."""
+    """N rows of one flight; where a signal is missing, it is filled in and the row not `good`."""
 
     time_s: Array
     """(N,) since the flight's first row [s]."""
@@ -41,11 +42,12 @@ class FlightRows(NamedTuple):
     voltage_drop: Array
     """(N,) battery voltage at the start less the present one [V]; zeros without a voltage."""
     good: Array
-    """(N,) bool: all signals are there."""
+    """(N,) bool: which rows are in flight and have all signals."""
     imu_acc_w: Array | None = None
-    """(N, 3) acceleration by the accelerometer, in flights without a pose [m/s^2]."""
+    """(N, 3) acceleration by the accelerometer [m/s^2]; only in flights without a pose."""
     pose_slope_b: Array | None = None
-    """(N, 3, K) change of the drag by each uncertainty of such a flight's pose [m/s^2]."""
+    """(N, 3, K) change of the drag's acceleration by each uncertainty of such a flight's pose
+    [m/s^2]."""
 
     @property
     def vel_b(self) -> Array:
@@ -61,43 +63,46 @@ def rows_of(
 ) -> FlightRows:
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
-    Rows at rest with too little thrust to fly are on the ground: they, and rows near them, are not
-    good.
+    Rows at rest with too little thrust to fly are on the ground. They, and rows near them in time,
+    are not good.
     """
     rot_w = log.rot_w
-    parts = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
-    good = np.isfinite(np.concatenate(parts, axis=1)).all(axis=1)
+    signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
+    good = np.isfinite(np.concatenate(signals, axis=1)).all(axis=1)
     good &= np.isfinite(rot_w).all(axis=(1, 2))
     imu_acc_w = specific_force_w(log)
     if imu_acc_w is not None:
         good &= np.isfinite(imu_acc_w).all(axis=1)
         imu_acc_w = np.nan_to_num(imu_acc_w)
     pose_slope_b = log.pose_slope_b if isinstance(log, InertialLog) else None
-    push = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
-    stands = (push < limits.ground_thrust * vehicle.mass * GRAVITY) & (
+    thrust = vehicle.rotors.thrust_coefficient * (rotor_speed**2).sum(axis=1)
+    grounded = (thrust < limits.ground_thrust * vehicle.mass * GRAVITY) & (
         np.linalg.norm(log.vel_w, axis=1) < limits.ground_speed
     )
-    good &= ~_near(log.time_s, stands, limits.ground_margin_s)
-    drop = np.zeros(len(good))
-    if log.voltage is not None and np.isfinite(log.voltage).any():
-        now = interpolate(log.time_s, log.time_s, log.voltage[:, None])[:, 0]
-        drop = now[0] - now
-    pos_w, vel_w, rate_b, speed = (np.nan_to_num(part) for part in parts)
-    rot_w = np.where(np.isfinite(rot_w), rot_w, np.eye(3))
-    since = log.time_s - log.time_s[0]
+    good &= ~_near(log.time_s, grounded, limits.ground_margin_s)
+    pos_w, vel_w, rate_b, speed = (np.nan_to_num(signal) for signal in signals)
     return FlightRows(
-        since, pos_w, rot_w, vel_w, rate_b, speed, drop, good, imu_acc_w, pose_slope_b
+        log.time_s - log.time_s[0],
+        pos_w,
+        np.where(np.isfinite(rot_w), rot_w, np.eye(3)),
+        vel_w,
+        rate_b,
+        speed,
+        voltage_drop(log, log.time_s),
+        good,
+        imu_acc_w,
+        pose_slope_b,
     )
 
 
 def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:
-    """Return which rows (N,) are within `margin_s` of one that is `marked` (N,)."""
+    """Return which rows (N,) are within `margin_s` of a `marked` row (N,)."""
     if not marked.any():
         return marked
-    at = time_s[marked]
-    place = np.searchsorted(at, time_s)
-    before = np.abs(time_s - at[np.maximum(place - 1, 0)])
-    after = np.abs(time_s - at[np.minimum(place, len(at) - 1)])
+    marked_s = time_s[marked]
+    place = np.searchsorted(marked_s, time_s)
+    before = np.abs(time_s - marked_s[np.maximum(place - 1, 0)])
+    after = np.abs(time_s - marked_s[np.minimum(place, len(marked_s) - 1)])
     return np.minimum(before, after) <= margin_s
 
 
@@ -106,19 +111,19 @@ class View:
     """One part of the dynamics, force or torque, with all other signals as measured."""
 
     name: str
-    """As in a diagnosis."""
+    """Its name in a diagnosis."""
     about: str
-    """For people: what is compared, given which measurements."""
+    """What is compared under which measurements, for people."""
     unit: str
-    """Of its three axes."""
+    """Unit of its three axes."""
     columns: slice
-    """Of the model's accelerations."""
+    """Its columns in the model's accelerations."""
     width_s: float
-    """Of the bumps [s]."""
+    """Width of the bumps [s]."""
     in_world: bool
-    """Whether its accelerations are in world axes; residuals are turned into body axes."""
+    """Whether its accelerations are in world axes; residuals are rotated into body axes."""
     axes: tuple[int, ...] = (0, 1, 2)
-    """Of the body, along which it is identifiable."""
+    """Body axes along which it is identifiable."""
 
 
 FORCE = View(
@@ -136,10 +141,10 @@ class SmoothedFlight(NamedTuple):
     rows: FlightRows
     form: WeakForm
     measured: np.ndarray
-    """(M, 3) mean accelerations, axes as the view's model has them."""
+    """(M, 3) mean accelerations, in the view's axes."""
     reliability: np.ndarray = np.ones(3)
-    """(3,) factor on the model's changes within the flight: the share of the rotors' torque that is
-    not noise, and a correction for what happens between rows."""
+    """(3,) factor on deviations of the model from its mean over the flight: the share of the
+    rotors' torque that is not noise, times a correction for torque between rows."""
 
 
 def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> SmoothedFlight:
@@ -151,7 +156,9 @@ def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> S
     return SmoothedFlight(rows, form, measured)
 
 
-def calibrated(flight: SmoothedFlight, turned: np.ndarray, noise: np.ndarray) -> SmoothedFlight:
+def calibrated(
+    flight: SmoothedFlight, acceleration: np.ndarray, noise: np.ndarray
+) -> SmoothedFlight:
     """Return a flight whose model is corrected for noise in the measured rotor speeds.
 
     Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
@@ -159,23 +166,23 @@ def calibrated(flight: SmoothedFlight, turned: np.ndarray, noise: np.ndarray) ->
     calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4).
 
     Args:
-        flight: in a view.
-        turned: (N, 3) angular acceleration by the measured rotor speeds.
-        noise: (N, 3) what a simulated noise of the same size adds to it.
+        flight: in the torque view.
+        acceleration: (N, 3) angular acceleration by the measured rotor speeds [rad/s^2].
+        noise: (N, 3) addition to it by simulated noise of the same size.
     """
     mean = flight.form.mean
     if len(flight.form.middle_s) < 2:
         return flight
-    whole = np.var(mean @ turned, axis=0)
-    share = np.mean((mean @ noise) ** 2, axis=0) / np.maximum(whole, 1e-12)
-    return flight._replace(reliability=np.maximum(1.0 - share, 0.0))
+    variance = np.var(mean @ acceleration, axis=0)
+    noise_share = np.mean((mean @ noise) ** 2, axis=0) / np.maximum(variance, 1e-12)
+    return flight._replace(reliability=np.maximum(1.0 - noise_share, 0.0))
 
 
 class WeakForm(NamedTuple):
-    """M bumps over the N rows of a flight."""
+    """M bumps over the N rows of a flight, as matrices on series of the rows."""
 
     middle_s: np.ndarray
-    """(M,) since the first row [s]."""
+    """(M,) middle of each bump, since the first row [s]."""
     middle_row: np.ndarray
     """(M,) row nearest to it."""
     change: sparse.csr_array
@@ -185,30 +192,29 @@ class WeakForm(NamedTuple):
 
     def take(self, chosen: np.ndarray) -> WeakForm:
         """Return the bumps that are `chosen` (M,) bool."""
-        at = np.flatnonzero(chosen)
-        matrices = (sparse.csr_array(part[at]) for part in (self.change, self.mean))
-        return WeakForm(self.middle_s[at], self.middle_row[at], *matrices)
+        bumps = np.flatnonzero(chosen)
+        matrices = (sparse.csr_array(matrix[bumps]) for matrix in (self.change, self.mean))
+        return WeakForm(self.middle_s[bumps], self.middle_row[bumps], *matrices)
 
 
 def weak_form(
     time_s: np.ndarray, good: np.ndarray, width_s: float, hole_s: float, slope: bool = False
 ) -> WeakForm:
-    """Return bumps of `width_s`, half of it apart, without a bad row or a hole inside.
+    """Return bumps of `width_s`, half a width apart, without a bad row or a hole inside.
 
     Args:
         time_s: (N,) increasing [s].
         good: (N,) bool: rows that can be used.
-        width_s: from a bump's begin to its end [s].
-        hole_s: rows further apart are a hole [s].
-        slope: weigh by -w'(t) in place of the bump w(t): `mean` takes accelerations to the mean
+        width_s: from the begin of a bump to its end [s].
+        hole_s: rows further apart than this are a hole [s].
+        slope: weight by -w'(t) in place of the bump w(t): `mean` takes accelerations to the mean
             of their slopes, and `change` positions to mean accelerations.
     """
     span = np.diff(time_s)
     middle = 0.5 * (time_s[1:] + time_s[:-1])
     usable = good[1:] & good[:-1] & (span <= hole_s)
-    centres = np.arange(time_s[0] + 0.5 * width_s, time_s[-1] - 0.5 * width_s, 0.5 * width_s)
-    kept, rows, columns, shares, spans = [], [], [], [], []
-    for centre in centres:
+    centres, rows, columns, shares, spans = [], [], [], [], []
+    for centre in np.arange(time_s[0] + 0.5 * width_s, time_s[-1] - 0.5 * width_s, 0.5 * width_s):
         first, last = np.searchsorted(middle, (centre - 0.5 * width_s, centre + 0.5 * width_s))
         if last - first < LEAST_ROWS or not usable[first:last].all():
             continue
@@ -220,15 +226,15 @@ def weak_form(
         else:
             share = np.cos(np.pi * since / width_s) ** 2
             share /= (share * span[first:last]).sum()
-        rows.append(np.full(last - first, len(kept)))
+        rows.append(np.full(last - first, len(centres)))
         columns.append(np.arange(first, last))
         shares.append(share)
         spans.append(share * span[first:last])
-        kept.append(centre)
-    shape = (len(kept), len(time_s))
-    if not kept:
-        none = sparse.csr_array(shape)
-        return WeakForm(np.zeros(0), np.zeros(0, int), none, none)
+        centres.append(centre)
+    shape = (len(centres), len(time_s))
+    if not centres:
+        empty = sparse.csr_array(shape)
+        return WeakForm(np.zeros(0), np.zeros(0, int), empty, empty)
     row, column = np.concatenate(rows), np.concatenate(columns)
 
     def matrix(before: np.ndarray, after: np.ndarray) -> sparse.csr_array:
@@ -236,10 +242,10 @@ def weak_form(
         return sparse.csr_array((np.concatenate([before, after]), places), shape=shape)
 
     share, weight = np.concatenate(shares), 0.5 * np.concatenate(spans)
-    centres = np.array(kept)
-    middle_row = nearest(time_s, centres)
-    return WeakForm(centres, middle_row, matrix(-share, share), matrix(weight, weight))
+    middle_s = np.array(centres)
+    middle_row = nearest(time_s, middle_s)
+    return WeakForm(middle_s, middle_row, matrix(-share, share), matrix(weight, weight))
 
 
 LEAST_ROWS = 4
-"""Steps between rows in a bump, at least."""
+"""Least number of steps between rows in a bump."""

@@ -1,7 +1,8 @@
-"""Windows: stretches of 1 s of flight logs, on time steps of the model between the logs' rows.
+"""Cuts flight logs into windows of 1 s, in which rollouts (simulated stretches) are compared.
 
-A window starts at a row of the log. Commands act from the times of their rows on; measured rotor
-speeds are interpolated by the rotors' lag. Measurements are compared at their own times.
+A window starts at a row of the log. It holds the start state, the model's inputs (commands or
+measured rotor speeds) on the model's time steps (`data/steps.py`), and the measured rows, which are
+compared at their own times. All windows have arrays of a few fixed shapes, for few compilations.
 """
 
 from __future__ import annotations
@@ -13,21 +14,23 @@ import numpy as np
 
 from eval.effects.interface import GRAVITY
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.loops import NOMINAL
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import (
-    LONGEST_S,
-    StepGrid,
-    integral_of_held,
     interpolate,
     longest_gap_s,
     on_every_row,
     own_spacing_s,
+    thinned,
+    voltage_drop,
+)
+from suite.diagnose.data.steps import (
+    LONGEST_S,
+    StepGrid,
+    integral_of_held,
     padded_grid,
     rotors_at,
     start_rotor_error,
     step_grid,
-    thinned,
     with_hidden_torque,
     with_lost_rows,
 )
@@ -38,26 +41,30 @@ from tracks.geometry.scene import Array
 LENGTH_S = 1.0
 """A window's length [s]."""
 HISTORY_S = 0.1
-"""Commands before a window that a delay may reach [s]."""
+"""Time before the burn-in from which commands are used, since they act with a delay [s]."""
 BURN_IN_S = 0.2
-"""Before a window: the rotors follow the commands at the measured rates [s]."""
+"""Time before a window in which the rotors follow the commands at the measured rates [s]."""
 STEPS = (512, 704)
 """Numbers of steps of a window: 1 s of 2 ms steps, and more where rows need shorter ones. Windows
 are padded to one of them, so that few array shapes are compiled."""
 BURN_IN_STEPS = (144,)
-"""The same of the burn-in."""
+"""The same for the burn-in."""
 COMMANDS = (192, 1536)
-"""The same of its commands: rows of 100 Hz, and of 1,000 Hz."""
+"""The same for the commands: rows of 100 Hz, and of 1,000 Hz."""
 ROWS = 101
 """Measured rows in a window; a log that has more of them is thinned."""
 STATE = 12
-"""Numbers of the state in which a window starts: pos_w, rotation vector, vel_w, rate_b."""
+"""Numbers of the state at a window's start: pos_w, rotation vector, vel_w, rate_b."""
 KNOTS = 11
-"""Number of knots of a window: what is free along it is linear between knots."""
+"""Number of knots of a window: functions of time that are fitted in it are linear between knots."""
 CHANNELS = 19
-"""pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
+"""Number of measured channels: pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
+LEAST_ROWS = 12
+"""Least number of a log's rows in a window."""
+RETRY_S = 0.1
+"""Where no window can start, this much later is tried next [s]."""
 STATE_GROUPS = ("position", "attitude", "velocity", "rates")
-"""What a state is made of, three channels each, in their order."""
+"""Groups of the state's channels, three each, in their order."""
 SLICES = {
     "position": slice(0, 3),
     "attitude": slice(3, 6),
@@ -73,9 +80,9 @@ UNITS = {
 
 
 class FlightWindows(NamedTuple):
-    """W windows of S steps, after Q of burn-in, with N measured rows each.
+    """W windows of S steps, after Q steps of burn-in, with N measured rows each.
 
-    All times are since a window's start, but for `start_s`.
+    All times but `start_s` are relative to a window's start.
     """
 
     flight: Array
@@ -85,53 +92,48 @@ class FlightWindows(NamedTuple):
     edge_s: Array
     """(W, Q + S + 1) ends of steps; edge Q is the window's start [s]."""
     sample_s: Array
-    """(W, Q + S) and `lead_s`, as `StepGrid` has them [s]."""
+    """(W, Q + S); it and `lead_s` are as `StepGrid` has them [s]."""
     lead_s: Array
     command_s: Array
     """(W, K) times from which commands act, before any delay [s]."""
     command: Array
-    """(W, K, 4) thrust and rates."""
+    """(W, K, 4) thrust over mass [m/s^2] and body rates [rad/s]."""
     command_sum: Array
-    """(W, K, 4) their integral from the first one's time to each one's."""
+    """(W, K, 4) integral of the commands over time, from the first command to each one."""
     burn_in_rate_b: Array
-    """(W, Q, 3) measured, where the loop samples [rad/s]."""
+    """(W, Q, 3) measured rates where the loop samples [rad/s]."""
     rotor_speed: Array
-    """(W, S, 4) measured, in the middle of each step [rad/s]; zeros where there is none."""
+    """(W, S, 4) measured speeds in the middle of each step [rad/s]; zeros without any."""
     voltage_drop: Array
-    """(W, S) [V]; zeros where there is none."""
+    """(W, S) battery voltage at the log's start less the present one [V]; zeros without any."""
     pos_w: Array
-    """(W, 3) at the start, measured, and so on."""
+    """(W, 3) measured at the start [m]."""
     rot_w: Array
+    """(W, 3, 3) body to world, measured at the start."""
     vel_w: Array
+    """(W, 3) measured at the start [m/s]."""
     rate_b: Array
+    """(W, 3) measured at the start [rad/s]."""
     row_s: Array
-    """(W, N) times of the rows since the window's start [s]."""
+    """(W, N) times of the measured rows [s]."""
     row_pos_w: Array
-    """(W, N, 3), and so on."""
+    """(W, N, 3) [m]; this and the next fields are zero where nothing was measured."""
     row_rot_w: Array
+    """(W, N, 3, 3) body to world."""
     row_vel_w: Array
+    """(W, N, 3) [m/s]."""
     row_rate_b: Array
+    """(W, N, 3) [rad/s]."""
     row_acc_b: Array
+    """(W, N, 3) specific force [m/s^2]."""
     row_rotor_speed: Array
-    seen: Array
-    """(W, N, 19) bool: whether there is a value that is compared."""
-    rotor_seen: Array
-    """(W, N, 4) bool: whether there is a rotor speed, compared or an input."""
+    """(W, N, 4) [rad/s]."""
+    valid: Array
+    """(W, N, 19) bool: which channels have a measured value that is compared."""
+    rotor_valid: Array
+    """(W, N, 4) bool: which rotor speeds were measured, for comparison or as the input."""
     start_rotor_error: Array
     """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 where they are the input."""
-
-
-def step_s(vehicle: Vehicle) -> float:
-    """Return about the length of a step [s]: the rate loop's period, at least 2 ms."""
-    return max(1.0 / vehicle.controller.frequency, LONGEST_S)
-
-
-def remembers(vehicle: Vehicle) -> bool:
-    """Return whether the rate loop is a firmware's, with integrators and filters.
-
-    No log contains their state at the start of a window.
-    """
-    return vehicle.controller.kind != NOMINAL
 
 
 def cut(
@@ -146,50 +148,49 @@ def cut(
 ) -> tuple[FlightWindows | None, list[str]]:
     """Return the windows of `logs` and warnings; None where no flight has one.
 
-    Above the limits' number an even selection of windows is kept.
+    Above the limits' number, an even selection of windows is used.
 
     Args:
-        logs: flights, known by their place.
-        vehicle: whose rate loop's frequency and motor lag are used.
-        rotor_input: measured rotor speeds are the input, and no measurement.
-        stride_s: from the start of a window to the next's [s]; by default no row counts twice.
-        limits: the longest hole in a window.
-        integrator: whose steps they are; those of "euler" are the rate loop's periods.
-        coarser: the same windows, for steps twice as long, every second rotor speed, and what
-            `with_hidden_torque` adds.
-        only: places of the flights that count; all if not given.
+        logs: F flights, numbered in their order.
+        vehicle: whose rate loop's frequency and rotor lag are used.
+        rotor_input: measured rotor speeds are the input, and are not compared.
+        stride_s: from the start of a window to that of the next [s]; by default none overlap.
+        limits: longest hole in a window, and numbers of windows.
+        integrator: of the model; with "euler" its steps are the rate loop's periods.
+        coarser: the same windows as returned before. If given, they are cut with steps of twice the
+            length, from every second rotor speed with what `with_hidden_torque` adds.
+        only: numbers of the flights that are cut; all if not given.
     """
-    places, warnings = list[tuple[int, int]](), list[str]()
-    shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
+    starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
     states = [on_every_row(log, limits) for log in logs]
     for number, (log, state) in enumerate(zip(logs, states, strict=True)):
         if number not in (range(len(logs)) if only is None else only):
             continue
-        starts = _starts(log, state.whole, rotor_input, stride_s, limits.longest_hole_s)
-        if not starts:
+        rows = _start_rows(log, state.whole, rotor_input, stride_s, limits.longest_hole_s)
+        if not rows:
+            shortest_s = LENGTH_S + BURN_IN_S + HISTORY_S
             warnings.append(f"{log.name}: no stretch of {shortest_s:g} s without a hole")
-        places += [(number, first) for first in starts]
-    if not places:
+        starts += [(number, row) for row in rows]
+    if not starts:
         return None, warnings
-    most = min(limits.most_windows, limits.most_rotor_windows if rotor_input else len(places))
-    if len(places) > most:
-        warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(places)}")
-        kept = np.linspace(0, len(places) - 1, most).astype(int)
-        places = [places[k] for k in kept]
+    most = min(limits.most_windows, limits.most_rotor_windows if rotor_input else len(starts))
+    if len(starts) > most:
+        warnings.append(f"{most} stretches of 1 s, evenly spread, are used of {len(starts)}")
+        starts = [starts[k] for k in np.linspace(0, len(starts) - 1, most).astype(int)]
     longest_s = 1.0 / vehicle.controller.frequency if integrator == "euler" else LONGEST_S
     if coarser is not None and integrator != "euler":
         longest_s *= 2.0
-    drives = [_drive(logs[number], first, vehicle, longest_s) for number, first in places]
-    every = 1 if coarser is None else 2
-    parts = [
-        _window(logs[number], states[number], number, first, vehicle, rotor_input, drive, every)
-        for (number, first), drive in zip(places, _of_one_shape(drives, coarser), strict=True)
+    inputs = [_input_of(logs[number], row, vehicle, longest_s) for number, row in starts]
+    stride = 1 if coarser is None else 2
+    windows = [
+        _window(logs[number], states[number], number, row, vehicle, rotor_input, one, stride)
+        for (number, row), one in zip(starts, _of_one_shape(inputs, coarser), strict=True)
     ]
-    return FlightWindows(*(np.stack(field) for field in zip(*parts, strict=True))), warnings
+    return FlightWindows(*(np.stack(field) for field in zip(*windows, strict=True))), warnings
 
 
 def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
-    """Return the windows at `chosen` (indices or bool)."""
+    """Return the windows at `chosen` (indices, or bool of all W)."""
     return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
@@ -199,53 +200,53 @@ def trusted(
     """Return `windows`, each shortened to where the model is still near the flight.
 
     Further away the linearisation does not hold: the model may have tipped over or be below the
-    ground. With the named effects it stays near for longer, and the next evaluation is longer.
-    `residual` is (W, N, 19).
+    ground. With the named effects it stays near for longer, so the next evaluation is longer.
+    `residual` is (W, N, 19), measured - simulated.
     """
     error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
-    lost = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
+    far = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
         error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
     )
-    lost |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
+    far |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
     row_s = np.asarray(windows.row_s)
     until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
-    for horizon in reversed(limits.trusted_horizons_s):
-        there = ~(lost & (row_s <= horizon)).any(axis=1)
-        until_s = np.where(there, horizon, until_s)
-    seen = np.asarray(windows.seen) & (row_s <= until_s[:, None] + 1e-9)[..., None]
-    return windows._replace(seen=seen)
+    for horizon_s in reversed(limits.trusted_horizons_s):
+        near = ~(far & (row_s <= horizon_s)).any(axis=1)
+        until_s = np.where(near, horizon_s, until_s)
+    in_time = (row_s <= until_s[:, None] + 1e-9)[..., None]
+    return windows._replace(valid=np.asarray(windows.valid) & in_time)
 
 
-def _starts(
-    log: FlightLog, whole: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
+def _start_rows(
+    log: FlightLog, complete: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
 ) -> list[int]:
-    """Return rows at which windows start, of those (T,) where the `whole` state is known."""
-    time = log.time_s
-    driven = [time[rows] for rows in _driven(log, rotor_input)]
-    next_s, found = time[0] + BURN_IN_S + HISTORY_S, []
+    """Return rows at which windows start, of those whose state is `complete` (T,) bool."""
+    time_s = log.time_s
+    inputs_s = [time_s[rows] for rows in _input_rows(log, rotor_input)]
+    next_s, starts = time_s[0] + BURN_IN_S + HISTORY_S, []
     while True:
-        later = np.flatnonzero((time >= next_s - 1e-9) & whole)
-        if not len(later) or time[later[0]] + LENGTH_S > time[-1] + 1e-6:
-            return found
-        first = int(later[0])
-        begin_s, end_s = time[first], time[first] + LENGTH_S
-        inside = time[(time >= begin_s - 1e-9) & (time <= end_s + 1e-9)]
-        # What drives reaches back: the rotors follow it before the start, and it acts late.
-        back_s = begin_s - BURN_IN_S - HISTORY_S
-        hole = max(
-            longest_gap_s(inside, begin_s, end_s),
-            *(longest_gap_s(rows_s, back_s, end_s) for rows_s in driven),
+        later = np.flatnonzero((time_s >= next_s - 1e-9) & complete)
+        if not len(later) or time_s[later[0]] + LENGTH_S > time_s[-1] + 1e-6:
+            return starts
+        row = int(later[0])
+        begin_s, end_s = time_s[row], time_s[row] + LENGTH_S
+        inside_s = time_s[(time_s >= begin_s - 1e-9) & (time_s <= end_s + 1e-9)]
+        # Inputs are used before the start, too: by the burn-in, and by a delay.
+        input_begin_s = begin_s - BURN_IN_S - HISTORY_S
+        longest_s = max(
+            longest_gap_s(inside_s, begin_s, end_s),
+            *(longest_gap_s(rows_s, input_begin_s, end_s) for rows_s in inputs_s),
         )
-        if len(inside) < 12 or hole > hole_s:
-            next_s = begin_s + 0.1
+        if len(inside_s) < LEAST_ROWS or longest_s > hole_s:
+            next_s = begin_s + RETRY_S
         else:
-            found.append(first)
+            starts.append(row)
             next_s = begin_s + stride_s
 
 
-def _driven(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
-    """Return (T,) bool each: rows of what drives, and of the rates that the loop samples."""
+def _input_rows(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
+    """Return (T,) bool for each input, and for the rates that the loop samples: its own rows."""
     if rotor_input:
         assert log.rotor_speed is not None
         return [np.isfinite(column) for column in log.rotor_speed.T]
@@ -254,8 +255,8 @@ def _driven(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
     return [np.asarray(np.isfinite(part).all(axis=1)) for part in (command, log.rate_b)]
 
 
-class _Drive(NamedTuple):
-    """What drives one window, as in `FlightWindows`."""
+class _Input(NamedTuple):
+    """Steps and commands of one window, as in `FlightWindows`."""
 
     burn_in: StepGrid
     window: StepGrid
@@ -263,137 +264,136 @@ class _Drive(NamedTuple):
     command: np.ndarray
 
 
-def _drive(log: FlightLog, first: int, vehicle: Vehicle, longest_s: float) -> _Drive:
-    begin, period = log.time_s[first], 1.0 / vehicle.controller.frequency
-    end = log.time_s[_rows(log, begin)[-1]] - begin
-    time, given = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
+def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _Input:
+    """Return the input of the window that starts at `row`; without commands, those of a hover."""
+    begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
+    length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
+    time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
     if log.thrust_cmd is not None and log.rate_cmd_b is not None:
-        command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-        good = np.isfinite(command).all(axis=1)
-        if good.any():
-            time, given = time[good], command[good]
+        logged = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
+        finite = np.isfinite(logged).all(axis=1)
+        if finite.any():
+            time_s, command = time_s[finite], logged[finite]
     near = slice(
-        max(np.searchsorted(time, begin - BURN_IN_S - HISTORY_S - 1e-9) - 1, 0),
-        np.searchsorted(time, begin + end + 1e-9) + 1,
+        max(np.searchsorted(time_s, begin_s - BURN_IN_S - HISTORY_S - 1e-9) - 1, 0),
+        np.searchsorted(time_s, begin_s + length_s + 1e-9) + 1,
     )
-    time, given = with_lost_rows(time[near] - begin, given[near])
+    time_s, command = with_lost_rows(time_s[near] - begin_s, command[near])
 
-    def grid(since: float, until: float) -> StepGrid:
-        inside = time[(time > since + 1e-6) & (time < until - 1e-6)]
-        return step_grid(np.array([since, *inside, until]), period, longest_s)
+    def grid(since_s: float, until_s: float) -> StepGrid:
+        inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]
+        return step_grid(np.array([since_s, *inside_s, until_s]), period_s, longest_s)
 
-    return _Drive(grid(-BURN_IN_S, 0.0), grid(0.0, end), time, given)
+    return _Input(grid(-BURN_IN_S, 0.0), grid(0.0, length_s), time_s, command)
 
 
-def _of_one_shape(drives: Sequence[_Drive], like: FlightWindows | None) -> list[_Drive]:
-    """Return `drives` with as many steps and commands each, so that few shapes are compiled.
+def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
+    """Return `inputs` padded to equal numbers of steps and commands, so that few are compiled.
 
-    They are those of `like` where it is given.
+    The numbers are those of `like` where it is given.
     """
 
-    def most(counts: Iterable[int], sizes: Sequence[int]) -> int:
+    def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:
         count = max(counts)
         fitting = [size for size in sizes if size >= count]
         return fitting[0] if fitting else -(-count // sizes[0]) * sizes[0]
 
-    burn_in = most((len(d.burn_in.sample_s) for d in drives), BURN_IN_STEPS)
-    steps = most((len(d.window.sample_s) for d in drives), STEPS)
-    commands = most((len(d.command_s) for d in drives), COMMANDS)
-    if like is not None:
+    if like is None:
+        burn_in = padded_size((len(one.burn_in.sample_s) for one in inputs), BURN_IN_STEPS)
+        steps = padded_size((len(one.window.sample_s) for one in inputs), STEPS)
+        commands = padded_size((len(one.command_s) for one in inputs), COMMANDS)
+    else:
         burn_in, steps = like.burn_in_rate_b.shape[1], like.rotor_speed.shape[1]
         commands = like.command_s.shape[1]
     return [
-        _Drive(
-            padded_grid(d.burn_in, burn_in, at_front=True),
-            padded_grid(d.window, steps),
-            np.pad(d.command_s, (0, commands - len(d.command_s)), constant_values=np.inf),
-            np.pad(d.command, ((0, commands - len(d.command)), (0, 0))),
+        _Input(
+            padded_grid(one.burn_in, burn_in, at_front=True),
+            padded_grid(one.window, steps),
+            np.pad(one.command_s, (0, commands - len(one.command_s)), constant_values=np.inf),
+            np.pad(one.command, ((0, commands - len(one.command)), (0, 0))),
         )
-        for d in drives
+        for one in inputs
     ]
 
 
-def _rows(log: FlightLog, begin: float) -> np.ndarray:
-    """Return the rows of the window from `begin` [s] on, thinned to `ROWS` at most."""
-    time = log.time_s
-    rows = np.flatnonzero((time >= begin - 1e-9) & (time <= begin + LENGTH_S + 1e-9))
-    blank = np.full((len(time), 1), np.nan)
+def _rows(log: FlightLog, begin_s: float) -> np.ndarray:
+    """Return the rows of the window from `begin_s` [s] on, thinned to `ROWS` at most."""
+    time_s = log.time_s
+    rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
+    missing = np.full((len(time_s), 1), np.nan)
     signals = (log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b, log.acc_b, log.rotor_speed)
-    there = [(blank if values is None else values)[rows] for values in signals]
-    seen = np.stack([np.isfinite(values).all(axis=1) for values in there], axis=1)
-    return rows[thinned(seen, time[rows], ROWS)]
+    values = [(missing if signal is None else signal)[rows] for signal in signals]
+    valid = np.stack([np.isfinite(one).all(axis=1) for one in values], axis=1)
+    return rows[thinned(valid, time_s[rows], ROWS)]
 
 
 def _window(
     log: FlightLog,
     state: FlightLog,
     number: int,
-    first: int,
+    row: int,
     vehicle: Vehicle,
     rotor_input: bool,
-    drive: _Drive,
-    every: int,
+    inputs: _Input,
+    stride: int,
 ) -> FlightWindows:
-    time, begin = log.time_s, log.time_s[first]
-    before, window = drive.burn_in, drive.window
-    rates = interpolate(begin + before.edge_s[:-1] + before.lead_s, time, log.rate_b)
-    middle = begin + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
-    speed = np.zeros((len(middle), 4))
+    """Return the window (without the axis W) that starts at `row` of `log`.
+
+    `state` is the log with its state on every row; every `stride` rotor speeds one is used.
+    """
+    time_s, begin_s = log.time_s, log.time_s[row]
+    before, window = inputs.burn_in, inputs.window
+    sample_s = begin_s + before.edge_s[:-1] + before.lead_s
+    middle_s = begin_s + 0.5 * (window.edge_s[:-1] + window.edge_s[1:])
+    speed = np.zeros((len(middle_s), 4))
     if log.rotor_speed is not None and rotor_input:
-        smooth = remembers(vehicle)
-        speed = rotors_at(middle, time, log.rotor_speed, vehicle, smooth, every)
-        if every > 1:
-            speed = with_hidden_torque(speed, vehicle, own_spacing_s(time, log.rotor_speed))
-    drop = np.zeros(len(middle))
-    if log.voltage is not None and np.isfinite(log.voltage).any():
-        first_volt = log.voltage[np.flatnonzero(np.isfinite(log.voltage))[0]]
-        drop = first_volt - interpolate(middle, time, log.voltage[:, None])[:, 0]
-    rows = _rows(log, begin)
-    blank = np.full((len(time), 4), np.nan)
-    acc = blank[:, :3] if log.acc_b is None else log.acc_b
-    rotors = blank if log.rotor_speed is None else log.rotor_speed
-    vel = np.full_like(log.vel_w, np.nan) if log.velocity_derived else log.vel_w
-    rot_rows = quat_to_rot(log.quat_wxyz[rows])
-    measured = [log.pos_w[rows], rot_rows, vel[rows], log.rate_b[rows], acc[rows], rotors[rows]]
-    turned = np.isfinite(rot_rows.reshape(len(rows), 9).sum(axis=1, keepdims=True))
-    attitude_seen = np.repeat(turned, 3, axis=1)
-    seen = [attitude_seen if m.ndim == 3 else np.isfinite(m) for m in measured]
-    turning = seen[5]
+        speed = rotors_at(middle_s, time_s, log.rotor_speed, vehicle, stride)
+        if stride > 1:
+            speed = with_hidden_torque(speed, vehicle, own_spacing_s(time_s, log.rotor_speed))
+    rows = _rows(log, begin_s)
+    none = np.full((len(time_s), 4), np.nan)
+    acc_b = none[:, :3] if log.acc_b is None else log.acc_b
+    rotors = none if log.rotor_speed is None else log.rotor_speed
+    vel_w = np.full_like(log.vel_w, np.nan) if log.velocity_derived else log.vel_w
+    rot_w = quat_to_rot(log.quat_wxyz[rows])
+    measured = [log.pos_w[rows], rot_w, vel_w[rows], log.rate_b[rows], acc_b[rows], rotors[rows]]
+    has_attitude = np.isfinite(rot_w.reshape(len(rows), 9).sum(axis=1, keepdims=True))
+    valid = [
+        np.repeat(has_attitude, 3, axis=1) if values.ndim == 3 else np.isfinite(values)
+        for values in measured
+    ]
+    rotor_valid = valid[5]
     if rotor_input:
-        seen[5] = np.zeros_like(turning)  # an input is no measurement
-    seen[4][0] = False  # the force before the window is not simulated
-    missing = ROWS - len(rows)
+        valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
+    valid[4][0] = False  # the force before the window is not simulated
 
     def padded(values: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.nan_to_num(values), np.zeros((missing, *values.shape[1:]))])
+        padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)
+        return np.concatenate([np.nan_to_num(values), padding])
 
-    mask = np.concatenate([np.concatenate(seen, axis=1), np.zeros((missing, CHANNELS), bool)])
-    turning = np.concatenate([turning, np.zeros((missing, 4), bool)])
+    rotor_error = 0.0
+    if not rotor_input:
+        burn_in = (time_s > begin_s - BURN_IN_S - 1e-9) & (time_s <= begin_s + 1e-9)
+        rotor_error = start_rotor_error(time_s[burn_in], state.rate_b[burn_in], vehicle)
     return FlightWindows(
         np.asarray(number),
-        np.asarray(begin - time[0]),
+        np.asarray(begin_s - time_s[0]),
         np.concatenate([before.edge_s[:-1], window.edge_s]),
         np.concatenate([before.sample_s, window.sample_s]),
         np.concatenate([before.lead_s, window.lead_s]),
-        drive.command_s,
-        drive.command,
-        integral_of_held(drive.command_s, drive.command),
-        rates,
+        inputs.command_s,
+        inputs.command,
+        integral_of_held(inputs.command_s, inputs.command),
+        interpolate(sample_s, time_s, log.rate_b),
         speed,
-        drop,
-        state.pos_w[first],
-        quat_to_rot(state.quat_wxyz[first]),
-        state.vel_w[first],
-        state.rate_b[first],
-        padded(time[rows] - begin),
+        voltage_drop(log, middle_s),
+        state.pos_w[row],
+        quat_to_rot(state.quat_wxyz[row]),
+        state.vel_w[row],
+        state.rate_b[row],
+        padded(time_s[rows] - begin_s),
         *(padded(values) for values in measured),
-        seen=mask,
-        rotor_seen=turning,
-        start_rotor_error=np.asarray(0.0 if rotor_input else _start_error(state, begin, vehicle)),
+        valid=padded(np.concatenate(valid, axis=1)),
+        rotor_valid=padded(rotor_valid),
+        start_rotor_error=np.asarray(rotor_error),
     )
-
-
-def _start_error(log: FlightLog, begin: float, vehicle: Vehicle) -> float:
-    """Return how far off the burn-in to `begin` [s] leaves the rotor speeds [rad/s]."""
-    near = (log.time_s > begin - BURN_IN_S - 1e-9) & (log.time_s <= begin + 1e-9)
-    return start_rotor_error(log.time_s[near], log.rate_b[near], vehicle)

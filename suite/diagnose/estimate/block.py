@@ -1,7 +1,8 @@
 """Blocks: whitened residuals and Jacobians of stretches of flights, and their normal equations.
 
-Fit, intervals, search and hold-out use blocks only, so a new source of evidence is one class that
-makes blocks. A number is one scalar parameter of the vehicle model.
+A stretch is a piece of a flight whose rows may be correlated. Fit, intervals, search and hold-out
+use blocks only, so a new kind of evidence is one class that makes blocks. A number is one scalar
+parameter of the vehicle model; all of them form one vector (`estimate/parameters.py`).
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 
 
 class Estimate(NamedTuple):
-    """Values of all numbers and of the nuisance parameters."""
+    """Values of all parameters: those of the vehicle model, and the nuisance parameters."""
 
     theta: np.ndarray
-    """(P,) the vector of all numbers."""
-    free: np.ndarray
-    """(B, F) nuisance numbers of each of B stretches, as a rollout's start; (B, 0) for none."""
+    """(P,) vector of the model's parameters."""
+    free: np.ndarray = np.zeros((0, 0))
+    """(B, F) nuisance parameters of each of B stretches, such as a rollout's start state; (0, 0)
+    without any."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +38,22 @@ class Block:
     residual: np.ndarray
     """(B, M) measured - model."""
     slope: np.ndarray
-    """(B, M, K) of the model."""
+    """(B, M, K) derivative of the model along K parameters."""
     along: tuple[int, ...]
-    """Place in the vector of each column's number; inactive ones come once more, last."""
+    """Place in the vector of each column's parameter. Inactive parameters may have a second column,
+    at the end (see `search/evaluation.py`)."""
     flight: np.ndarray
     """(B,) number of each stretch's flight."""
     start_s: np.ndarray
     """(B,) since the first row of the flight [s]."""
     free: np.ndarray
-    """(B, F) change of the nuisance numbers that fits best, with the numbers as they are."""
+    """(B, F) best-fitting change of the nuisance parameters, at the present parameters."""
     free_slope: np.ndarray
-    """(B, F, K) by how much that change falls for a unit change of each number."""
+    """(B, F, K) decrease of that change for a unit change of each parameter."""
 
     @cached_property
     def equations(self) -> NormalEquations:
-        """The sums that a fit needs."""
+        """The normal equations of the stretches."""
         return NormalEquations(
             *products(self.slope, self.residual[..., None]),
             (self.residual**2).sum(axis=1),
@@ -59,20 +62,20 @@ class Block:
         )
 
     def acts(self) -> np.ndarray:
-        """Return which columns (K,) do something."""
+        """Return which columns (K,) change the model at all."""
         return np.abs(self.slope).max(axis=(0, 1), initial=0.0) > 0.0
 
 
 class Linearised(Protocol):
-    """A source of evidence whose noise is known."""
+    """Evidence whose noise is known: all that a fit needs."""
 
     @property
     def space(self) -> ParameterSpace:
-        """The numbers."""
+        """The parameters."""
         ...
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block at an estimate, along the numbers at `indices` or along all.
+        """Return the block at an estimate, along the parameters at `indices` or along all.
 
         A source that computes all slopes at once may return more columns.
         """
@@ -80,7 +83,7 @@ class Linearised(Protocol):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton's sums of each of B stretches along K numbers."""
+    """Terms of the normal equations of each of B stretches, along K parameters."""
 
     hessian: np.ndarray
     """(B, K, K) J'J."""
@@ -89,38 +92,38 @@ class NormalEquations(NamedTuple):
     chi2: np.ndarray
     """(B,) r'r."""
     flight: np.ndarray | None = None
-    """(B,) and `along`, as a block has them; None where each column is along the number of its
-    place."""
+    """(B,) number of each stretch's flight."""
     along: tuple[int, ...] | None = None
+    """As in a block; None where each column is along the parameter of its own place."""
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Place in the vector of each column's number."""
+        """Place in the vector of each column's parameter."""
         return tuple(range(self.gradient.shape[1])) if self.along is None else self.along
 
     def columns_of(self, candidate: Candidate) -> list[int]:
-        """Return the columns of `candidate`; of a composite the repeated ones."""
+        """Return the columns of `candidate`; for a composite the second ones, if there are any."""
         numbers = self.numbers
         place = {number: column for column, number in enumerate(numbers)}
         if not candidate.parts:
-            place |= {n: numbers.index(n) for n in candidate.indices}
+            place |= {number: numbers.index(number) for number in candidate.indices}
         return [place[number] for number in candidate.indices]
 
     def repeated(self) -> tuple[int, ...]:
-        """Return the numbers whose columns come twice."""
+        """Return the places of the parameters that have two columns."""
         return tuple(n for k, n in enumerate(self.numbers) if n in self.numbers[:k])
 
     def take(self, columns: Sequence[int]) -> NormalEquations:
-        """Return the equations along `columns` alone."""
-        at = np.array(columns, dtype=int)
+        """Return the equations along `columns` only."""
+        chosen = np.array(columns, dtype=int)
         return self._replace(
-            hessian=self.hessian[:, at][:, :, at],
-            gradient=self.gradient[:, at],
-            along=tuple(self.numbers[k] for k in at),
+            hessian=self.hessian[:, chosen][:, :, chosen],
+            gradient=self.gradient[:, chosen],
+            along=tuple(self.numbers[k] for k in chosen),
         )
 
     def along_numbers(self, indices: Sequence[int]) -> NormalEquations:
-        """Return the equations along the numbers at `indices` of the vector, in that order."""
+        """Return the equations along the parameters at `indices` of the vector, in that order."""
         return self.take([self.numbers.index(number) for number in indices])
 
     def sums(self, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -131,14 +134,14 @@ class NormalEquations(NamedTuple):
 
 def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return J'J (B, K, K) and J'r (B, K) of `slope` (B, M, K) and `residual` (B, M, 1)."""
-    turned = np.swapaxes(slope, 1, 2)
-    return turned @ slope, (turned @ residual)[..., 0]
+    transposed = np.swapaxes(slope, 1, 2)
+    return transposed @ slope, (transposed @ residual)[..., 0]
 
 
 def stacked(rows: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-    """Return `rows` (R, ...) by stretch (B, M, ...), zeros where one has fewer than another.
+    """Return `rows` (R, ...) by stretch (B, M, ...), padded with zeros.
 
-    `stretch` (R,) is the number of each row's, from 0 on without a gap.
+    `stretch` (R,) is the number of each row's stretch, from 0 without a gap.
     """
     count = np.bincount(stretch) if len(stretch) else np.zeros(0, int)
     order = np.argsort(stretch, kind="stable")
@@ -157,15 +160,15 @@ def without_nuisance(
     flight: np.ndarray,
     start_s: np.ndarray,
 ) -> Block:
-    """Return the block of rows in which nothing is free.
+    """Return the block of rows without nuisance parameters.
 
     Args:
         residual: (R, C) over its noise.
         slope: (R, C, K) over the noise.
-        along: place in the vector of each column's number.
-        stretch: (R,) number of each row's stretch, from 0 on without a gap.
-        flight: (B,) and `start_s`, as a block has them.
-        start_s: (B,) [s].
+        along: place in the vector of each column's parameter.
+        stretch: (R,) number of each row's stretch, from 0 without a gap.
+        flight: (B,) number of each stretch's flight.
+        start_s: (B,) start of each stretch [s].
     """
     count, size = len(flight), slope.shape[2]
     residual = stacked(residual, stretch).reshape(count, -1)

@@ -1,8 +1,8 @@
-"""Composites: effects that are tested together as one hypothesis, as a wind and a drag.
+"""Composites: effects that are tested together as one hypothesis, such as a wind and a drag.
 
-A wind does nothing where no drag passes it on, and no drag pushes a vehicle that hovers: where the
-vehicle file has none, each alone explains nothing, and both together do. The catalogue's other
-names are weighed against the whole, with all its numbers counted; what is named are its parts.
+Without a drag a wind has no effect, and without a wind a drag has none on a vehicle that hovers:
+where the vehicle file has neither, each alone explains nothing, but both together may. A composite
+is compared with single effects at the number of all its parameters; its parts are named.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from suite.diagnose.estimate.parameters import JOIN, Candidate, ParameterSpace
 
 @dataclass(frozen=True)
 class Composite:
-    """Effects that are one hypothesis."""
+    """Effects that are tested as one hypothesis."""
 
     parts: tuple[str, ...]
     """Names of the effects."""
     about: str
-    """For people."""
+    """Description for people."""
     carried: str | None = None
-    """Which of the parts acts through the others alone; None where each acts on its own."""
+    """The part that only acts through the others; None where each acts on its own."""
 
 
 COMPOSITES = (
@@ -41,84 +41,91 @@ COMPOSITES = (
     ),
     Composite(("mass_offset", "com_offset"), "a payload: its mass, and where it sits"),
 )
-"""What is tried together."""
+"""All composites."""
+LEAST_USUAL = 0.3
+"""A fit of a composite begins with a drag of at least this share of its usual size."""
 
 
 def composites(among: Sequence[Candidate]) -> list[Candidate]:
     """Return the composites whose parts are all `among` the candidates."""
-    found = []
+    candidates = []
     for composite in COMPOSITES:
         parts = [c for name in composite.parts for c in among if c.name == name]
         if len(parts) == len(composite.parts):
             name = JOIN.join(composite.parts)
             indices = tuple(sorted(i for part in parts for i in part.indices))
-            found.append(Candidate(name, indices, name, tuple(parts)))
-    return found
+            candidates.append(Candidate(name, indices, name, tuple(parts)))
+    return candidates
 
 
-def acts_through(one: Candidate) -> bool:
-    """Return whether `one`, or a part of it, acts through other effects alone."""
-    return any(composite.carried in one.effects for composite in COMPOSITES if composite.carried)
+def acts_through(candidate: Candidate) -> bool:
+    """Return whether `candidate`, or a part of it, only acts through other effects."""
+    return any(one.carried in candidate.effects for one in COMPOSITES if one.carried)
 
 
 def carried(among: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates that may act through another part of a composite `among` them alone."""
+    """Return the parts of composites `among` the candidates that only act through other parts."""
     names = {composite.carried for composite in COMPOSITES}
     return [part for one in among for part in one.parts if part.name in names]
 
 
 def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the words on composites in the `sets` of names of a diagnosis, a line each.
+    """Return lines for people on the composites in a diagnosis.
 
-    A set has the name first and then what could stand in its place.
+    Each of `sets` has the name of an effect, and then its alternatives.
     """
-    first, others = {one[0] for one in sets}, {name for one in sets for name in one[1:]}
+    names, alternatives = {one[0] for one in sets}, {name for one in sets for name in one[1:]}
     lines = []
     for composite in COMPOSITES:
-        if set(composite.parts) <= first and composite.carried:
+        if set(composite.parts) <= names and composite.carried:
             lines.append(
                 f"{' and '.join(composite.parts)} belong together: {composite.about}. One without "
                 "the other explains nothing here, or less."
             )
-        if JOIN.join(composite.parts) in others:
+        if JOIN.join(composite.parts) in alternatives:
             lines.append(f"{JOIN.join(composite.parts)}: {composite.about}, as one hypothesis.")
     return lines
 
 
 @dataclass(frozen=True)
 class Inactive:
-    """Numbers that do nothing as things stand, and where what they act through is there."""
+    """Parameters without an effect at the present estimate, and values at which they have one."""
 
-    numbers: tuple[int, ...]
+    indices: tuple[int, ...]
     """Their places in the vector."""
     theta: np.ndarray
-    """(P,) where they act: with what they act through at its usual size."""
+    """(P,) all parameters, with the effects through which these act at their usual size."""
 
 
 def inactive_at(
     space: ParameterSpace, theta: np.ndarray, among: Sequence[Candidate], acts: np.ndarray
 ) -> Inactive | None:
-    """Return what acts through parts of composites alone and so does nothing at `theta` (P,).
+    """Return the parameters that only act through others and so have no effect at `theta` (P,).
 
-    None where all of it acts. The first composite of a number determines through what it acts;
-    `acts` (P,) holds which numbers do something at `theta`.
+    None where all of them have one. If several composites contain them, the first one counts.
+
+    Args:
+        space: of the vehicle.
+        theta: (P,) all parameters.
+        among: the candidates.
+        acts: (P,) bool: which parameters have an effect at `theta`.
     """
     for composite in COMPOSITES:
         whole = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
         if composite.carried is None or whole is None:
             continue
-        carried = _part(whole, composite.carried).indices
-        if acts[list(carried)].any() or theta[list(carried)].any():
-            continue  # it acts, or it is named and what it acts through was taken out
+        own = next(part for part in whole.parts if part.name == composite.carried).indices
+        if acts[list(own)].any() or theta[list(own)].any():
+            continue  # it acts; or it is named, and the effect through which it acts was dropped
         raised, usual = theta.copy(), usual_size(space)
-        through = [i for i in whole.indices if i not in carried]
+        through = [i for i in whole.indices if i not in own]
         raised[through] = theta[through] + usual[through]
-        return Inactive(carried, raised)
+        return Inactive(own, raised)
     return None
 
 
 def usual_size(space: ParameterSpace) -> np.ndarray:
-    """Return the middle (P,) of the usual magnitudes of every number."""
+    """Return the usual magnitude (P,) of every parameter, the middle of its usual range."""
     usual = {(e.name, p.name): p.typical for e in EFFECTS.values() for p in e.parameters}
     return np.array([np.mean(usual[entry.effect, entry.parameter]) for entry in space.entries])
 
@@ -129,34 +136,31 @@ def begin_of(
     candidate: Candidate,
     inactive: Sequence[int],
     change: np.ndarray,
-    weight: np.ndarray,
+    information: np.ndarray,
 ) -> np.ndarray:
-    """Return the numbers (P,) from which a composite with `inactive` numbers is fitted.
+    """Return the parameters (P,) from which a composite with `inactive` parameters is fitted.
 
-    The slopes identify a drag times a wind; where they give no drag it takes the smallest
-    usual one, and the wind as much more.
+    The linear fit only identifies the product of a drag and a wind. If its drag is too small, the
+    fit begins with the least usual drag, and with as much more wind.
 
     Args:
         space: of the vehicle.
-        theta: (P,) where the slopes were taken.
+        theta: (P,) all parameters at the linear fit.
         candidate: the composite.
-        inactive: its numbers that act through the others, whose slopes were taken with those at
-            their usual size.
-        change: (P,) of all numbers by the slopes.
-        weight: (P,) information of the flights on each number.
+        inactive: its parameters that act through the others, whose slopes were computed with those
+            at their usual size.
+        change: (P,) of all parameters by the linear fit.
+        information: (P,) of the flights on each parameter.
     """
     begin = np.clip(theta + change, space.array("low"), space.array("high"))
     through = np.array([i for i in candidate.indices if i not in inactive])
     usual = usual_size(space)[through]
-    least = space.array("start")[through] + 0.3 * usual
+    least = space.array("start")[through] + LEAST_USUAL * usual
     begin[through] = np.maximum(begin[through], least)
     share = (begin[through] - space.array("start")[through]) / usual
-    info = weight[through] * usual**2
-    mean = float((share * info).sum() / info.sum()) if info.sum() > 0.0 else float(share.mean())
-    at = np.array(inactive, dtype=int)
-    begin[at] = theta[at] + change[at] / mean
+    weight = information[through] * usual**2
+    total = weight.sum()
+    mean = float((share * weight).sum() / total) if total > 0.0 else float(share.mean())
+    own = np.array(inactive, dtype=int)
+    begin[own] = theta[own] + change[own] / mean
     return np.clip(begin, space.array("low"), space.array("high"))
-
-
-def _part(whole: Candidate, name: str) -> Candidate:
-    return next(part for part in whole.parts if part.name == name)

@@ -1,4 +1,8 @@
-"""Gauss-Newton with bounds and step halving, and 95 % intervals, for every source of evidence."""
+"""Gauss-Newton with bounds and step halving, and 95 % intervals, for every kind of evidence.
+
+All functions work on blocks, the linearised residuals of stretches of flights, and on their normal
+equations (`estimate/block.py`).
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,17 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 def solve(
     hessian: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return the change (K,) within [low, high] that lowers chi-square most.
+    """Return the change (K,) of K parameters within bounds that lowers chi-square most.
 
-    `scale` (K,), the usual size of each number, conditions the equations.
+    Args:
+        hessian: (K, K) J'J.
+        gradient: (K,) J'r.
+        low: (K,) lower bound of the change.
+        high: (K,) upper bound of the change.
+        scale: (K,) usual size of each parameter, which conditions the equations.
 
     Raises:
-        ValueError: where something is not finite, which no bound would show.
+        ValueError: for values that are not finite.
     """
     if not len(gradient):
         return np.zeros(0)
@@ -37,10 +46,10 @@ def solve(
     ridge = 1e-9 * max(float(np.trace(matrix)) / len(matrix), 1e-12)
     factor = np.linalg.cholesky(matrix + ridge * np.eye(len(matrix)))
     right = np.linalg.solve(factor, gradient * scale)
-    free = np.linalg.solve(factor.T, right)
+    unbounded = np.linalg.solve(factor.T, right)
     low, high = np.minimum(low / scale, -1e-12), np.maximum(high / scale, 1e-12)
-    if np.all((free >= low) & (free <= high)):
-        return free * scale
+    if np.all((unbounded >= low) & (unbounded <= high)):
+        return unbounded * scale
     return lsq_linear(factor.T, right, (low, high)).x * scale
 
 
@@ -50,46 +59,47 @@ def gauss_newton_step(
     space: ParameterSpace,
     inside: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
-    """Return the best change of the equations' numbers and the fall of chi-square it promises.
+    """Return the best change of the parameters and the expected fall of chi-square.
 
     Args:
-        equations: along numbers that are fitted together, taken at `theta`.
-        theta: (P,) all numbers.
+        equations: along the K fitted parameters, computed at `theta`.
+        theta: (P,) all parameters.
         space: their bounds.
-        inside: (B,) bool: the stretches that count; all if not given.
+        inside: (B,) bool: which stretches are fitted; all if not given.
     """
     hessian, gradient = equations.sums(inside)
-    at = np.array(equations.numbers, dtype=int)
-    low, high, scale = (space.array(name)[at] for name in ("low", "high", "step"))
-    change = solve(hessian, gradient, low - theta[at], high - theta[at], scale)
+    indices = np.array(equations.numbers, dtype=int)
+    low, high, scale = (space.array(name)[indices] for name in ("low", "high", "step"))
+    change = solve(hessian, gradient, low - theta[indices], high - theta[indices], scale)
     return change, float(2 * gradient @ change - change @ hessian @ change)
 
 
 def chi2_fall(
     equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, columns: Sequence[int]
 ) -> float:
-    """Return the fall of chi-square to first order where the numbers at `columns` are fitted."""
-    some = equations.take(sorted(set(columns)))
-    if not some.gradient.shape[1] or np.einsum("bkk->", some.hessian) < 1e-12:
+    """Return the fall of chi-square, to first order, by a fit of the parameters at `columns`."""
+    fitted = equations.take(sorted(set(columns)))
+    if not fitted.gradient.shape[1] or np.einsum("bkk->", fitted.hessian) < TINY:
         return 0.0
-    return gauss_newton_step(some, theta, space)[1]
+    return gauss_newton_step(fitted, theta, space)[1]
 
 
-def chi2_by_part(
-    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, part: np.ndarray
+def chi2_by_group(
+    equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, group: np.ndarray
 ) -> np.ndarray:
-    """Return the squared error (G,) of each part under what the others fit of the numbers.
+    """Return the squared error (G,) of each group of stretches, fitted on the other groups.
 
-    To first order about `theta` (P,), where the equations were taken; `part` (B,) is the number of
-    each stretch's part.
+    To first order about `theta` (P,), where the equations were computed; `group` (B,) is the number
+    of each stretch's group.
     """
-    found = []
-    for number in np.unique(part):
-        inside = part == number
-        moved, _ = gauss_newton_step(equations, theta, space, ~inside)
-        own, pull = equations.sums(inside)
-        found.append(equations.chi2[inside].sum() - 2.0 * pull @ moved + moved @ own @ moved)
-    return np.array(found, dtype=float)
+    errors = []
+    for number in np.unique(group):
+        inside = group == number
+        change, _ = gauss_newton_step(equations, theta, space, ~inside)
+        hessian, gradient = equations.sums(inside)
+        quadratic = change @ hessian @ change
+        errors.append(equations.chi2[inside].sum() - 2.0 * gradient @ change + quadratic)
+    return np.array(errors, dtype=float)
 
 
 def fit(
@@ -100,43 +110,51 @@ def fit(
     known: Block | None = None,
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[Estimate, Block]:
-    """Fit the numbers at `indices` and what is free in every stretch.
+    """Fit the parameters at `indices` and the nuisance parameters of every stretch.
 
-    At most `rounds` steps are taken (default: that of `limits`); `known` is the block at `start`,
-    to save its computation.
+    Args:
+        evidence: with known noise.
+        start: where the fit begins.
+        indices: places of the fitted parameters.
+        rounds: largest number of steps; that of `limits` if not given.
+        known: the block at `start`, if it was computed before.
+        limits: numbers of steps and convergence.
 
     Returns:
         The best estimate, and the block there.
     """
-    at, space = np.array(indices, dtype=int), evidence.space
-    low, high = space.array("low")[at], space.array("high")[at]
+    places, space = np.array(indices, dtype=int), evidence.space
+    low, high = space.array("low")[places], space.array("high")[places]
     best, block = start, known or evidence.linearise(start, indices)
     for done in range(limits.fit_rounds if rounds is None else rounds):
         equations = block.equations.along_numbers(indices)
-        change, promised = gauss_newton_step(equations, best.theta, space)
-        # What is free moves as well, at least once.
-        if promised < limits.converged and (done or not block.free.shape[1]):
+        change, expected_fall = gauss_newton_step(equations, best.theta, space)
+        # The nuisance parameters are corrected at least once.
+        if expected_fall < limits.converged and (done or not block.free.shape[1]):
             break
-        columns = [block.along.index(number) for number in indices]
-        moved = block.free - block.free_slope[..., columns] @ change
-        share, total = 1.0, float(equations.chi2.sum())
-        while share > 0.1:
+        columns = [block.along.index(index) for index in indices]
+        free_change = block.free - block.free_slope[..., columns] @ change
+        share, chi2_before = 1.0, float(equations.chi2.sum())
+        while share > LEAST_STEP:
             theta = best.theta.copy()
-            theta[at] = np.clip(theta[at] + share * change, low, high)
-            free = best.free + share * moved if moved.size else best.free
+            theta[places] = np.clip(theta[places] + share * change, low, high)
+            free = best.free + share * free_change if free_change.size else best.free
             trial = Estimate(theta, free)
-            there = evidence.linearise(trial, indices)
-            chi2 = float((there.residual**2).sum())
-            if np.isfinite(chi2) and chi2 <= total + 1e-6:
+            trial_block = evidence.linearise(trial, indices)
+            chi2 = float((trial_block.residual**2).sum())
+            if np.isfinite(chi2) and chi2 <= chi2_before + 1e-6:
                 break
             share /= 2.0
         else:
             break
-        best, block = trial, there
+        best, block = trial, trial_block
     return best, block
 
 
+LEAST_STEP = 0.1
+"""Smallest share of a step that is tried."""
 Z95 = 1.96
+"""Half-width of a normal 95 % interval, in standard deviations."""
 TINY = 1e-12
 """Information below this is none."""
 RIDGE = 1e-9
@@ -146,14 +164,14 @@ FEWEST = 3
 
 
 class Intervals(NamedTuple):
-    """Uncertainty of K fitted numbers."""
+    """Uncertainty of K fitted parameters."""
 
     half_width: np.ndarray
     """(K,) of the 95 % intervals."""
     by_stretch: np.ndarray
-    """(K, K) covariance by how stretches disagree."""
+    """(K, K) covariance estimated from the differences between stretches."""
     inverse: np.ndarray
-    """(K, K) of the information, which is the covariance by independent noise."""
+    """(K, K) inverse of the information, which is the covariance by independent noise."""
 
 
 def intervals95(
@@ -163,63 +181,64 @@ def intervals95(
     noise_share: float = 1.0,
     prior: np.ndarray | None = None,
 ) -> Intervals:
-    """Return the intervals at the fit whose normal equations these are.
+    """Return the 95 % intervals at a fit, from its normal equations.
 
-    The largest of these counts: by curvature, the covariance of the noise; by stretches, each of
-    which is one draw (the sandwich; Liang and Zeger 1986), which holds where errors within one are
-    not independent; and by flights, each left out in turn (jackknife), where they differ by more
-    than their stretches explain (Cochran's Q): a model's error comes back in all of a flight.
+    Each half-width is the largest of three. By curvature: the covariance of independent noise. By
+    stretches: each is one random draw (the sandwich estimator; Liang and Zeger 1986), which holds
+    where errors within a stretch are not independent. By flights: each is left out in turn
+    (jackknife), where they differ by more than their stretches explain (Cochran's Q), since a
+    model's error is the same all along a flight.
 
     Args:
-        equations: along the fitted numbers.
-        differ_p: flights differ where chance makes them do so more rarely than this: 0 never, 1
-            always.
-        leave_out: stretches are left out in turn, too (CR3): a stretch with much information fits
-            itself. With few of them their spread is itself not well known (Bell & McCaffrey 2002).
-        noise_share: share of the interval by curvature below which no interval is.
-        prior: (K,) information on each number in addition to the flights', as of a fixed one.
+        equations: along the K fitted parameters.
+        differ_p: significance level of the test for differences between flights: with 0 they never
+            differ, with 1 always.
+        leave_out: leave stretches out in turn, too (CR3), as a stretch with much information fits
+            itself. With few stretches their spread is uncertain (Bell & McCaffrey 2002).
+        noise_share: least half-width, as a share of that by curvature.
+        prior: (K,) information on each parameter in addition to the flights'.
     """
     count, size = equations.gradient.shape
     if not size:
-        none = np.zeros((0, 0))
-        return Intervals(np.zeros(0), none, none)
-    given = np.zeros(size) if prior is None else prior
-    hessian = equations.hessian.sum(axis=0) + np.diag(given)
+        empty = np.zeros((0, 0))
+        return Intervals(np.zeros(0), empty, empty)
+    prior = np.zeros(size) if prior is None else prior
+    hessian = equations.hessian.sum(axis=0) + np.diag(prior)
     gradient = equations.gradient
-    if not leave_out:  # what stands at a bound pulls on, in every stretch alike
+    if not leave_out:  # at a bound the mean gradient is not zero, which is no spread
         gradient = gradient - gradient.mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), TINY))
-    both = np.outer(scale, scale)
+    scales = np.outer(scale, scale)
 
     def inverted(matrix: np.ndarray) -> np.ndarray:
-        return np.linalg.inv(matrix * both + RIDGE * np.eye(size)) * both
+        return np.linalg.inv(matrix * scales + RIDGE * np.eye(size)) * scales
 
-    def moves(own: np.ndarray, pulls: np.ndarray) -> np.ndarray:
-        """Return by how much draws (N, K) move the numbers, by the others' estimate of these."""
-        return np.einsum("nij,nj->ni", inverted(hessian - own), pulls)
+    def changes_without(own_hessian: np.ndarray, own_gradient: np.ndarray) -> np.ndarray:
+        """Return the change (N, K) of the parameters when each of N draws is left out."""
+        return np.einsum("nij,nj->ni", inverted(hessian - own_hessian), own_gradient)
 
     inverse = inverted(hessian)
-    widths = noise_share * Z95 * np.sqrt(np.diag(inverse))
+    half_width = noise_share * Z95 * np.sqrt(np.diag(inverse))
     freedom = max(count - 1 if leave_out else count - size, 1 if leave_out else 2)
     if leave_out:
-        moved = moves(equations.hessian, gradient)
+        change = changes_without(equations.hessian, gradient)
     else:
-        moved = gradient @ inverse * np.sqrt(count / freedom)
-    by_stretch = moved.T @ moved + inverse @ np.diag(given) @ inverse
+        change = gradient @ inverse * np.sqrt(count / freedom)
+    by_stretch = change.T @ change + inverse @ np.diag(prior) @ inverse
     spread = np.sqrt(np.diag(by_stretch)) * float(student.ppf(0.975, freedom))
-    widths = np.maximum(widths, spread)
+    half_width = np.maximum(half_width, spread)
     flight = equations.flight
     numbers = [] if flight is None or not differ_p else np.unique(flight)
     if len(numbers) >= FEWEST:
         inside = np.array([flight == number for number in numbers], dtype=float)
-        away, share = inside @ moved, len(numbers) / (len(numbers) - 1)
-        q = away**2 / np.maximum(inside @ moved**2, 1e-300)
+        by_flight, share = inside @ change, len(numbers) / (len(numbers) - 1)
+        q = by_flight**2 / np.maximum(inside @ change**2, 1e-300)
         differ = chi2.sf(q.sum(axis=0), len(numbers) - 1) < differ_p
-        if not leave_out:  # a flight with much information fits itself, where its stretches do not
-            own = np.einsum("fb,bij->fij", inside, equations.hessian)
-            away, share = moves(own, inside @ gradient), 1.0 / share
-            away -= away.mean(axis=0)
-        among = share * (away**2).sum(axis=0)
-        wide = np.sqrt(among) * float(student.ppf(0.975, len(numbers) - 1))
-        widths = np.where(differ, np.maximum(widths, wide), widths)
-    return Intervals(widths, by_stretch, inverse)
+        if not leave_out:  # a flight with much information fits itself; its stretches do not
+            own_hessian = np.einsum("fb,bij->fij", inside, equations.hessian)
+            by_flight = changes_without(own_hessian, inside @ gradient)
+            by_flight, share = by_flight - by_flight.mean(axis=0), 1.0 / share
+        variance = share * (by_flight**2).sum(axis=0)
+        wide = np.sqrt(variance) * float(student.ppf(0.975, len(numbers) - 1))
+        half_width = np.where(differ, np.maximum(half_width, wide), half_width)
+    return Intervals(half_width, by_stretch, inverse)

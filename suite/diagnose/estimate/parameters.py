@@ -1,7 +1,7 @@
-"""The fitted parameters of all effects as one vector, and the candidates that may explain a gap.
+"""The parameters of all effects as one vector, and the candidates that a diagnosis may name.
 
-A number is one scalar of the vector, as the x component of a drag coefficient. A candidate is an
-effect, or a part of one, that a diagnosis may name.
+A number is one scalar of the vector, such as the x component of a drag coefficient. A candidate is
+an effect of the catalogue, or a part of one, that may explain how flights differ from the model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
 JOIN = " + "
-"""Between the names of effects that are one hypothesis."""
+"""Separator between the names of effects that are one hypothesis."""
 ParameterLayout = tuple[tuple[str, str, int | None], ...]
 """Effect, parameter and component of each number."""
 
@@ -32,29 +32,30 @@ class FittedNumber:
     effect: str
     parameter: str
     component: int | None
-    """Which of a vector, or None for a plain number."""
+    """Place in the parameter, if that is a vector; None for a scalar."""
     low: float
-    """Bounds of the fit, in the parameter's unit."""
+    """Lower bound of the fit, in the parameter's unit."""
     high: float
+    """Upper bound of the fit."""
     start: float
-    """As the vehicle file has it."""
+    """The vehicle file's value."""
     step: float
-    """Usual magnitude, to scale equations."""
+    """Usual magnitude, which scales the equations."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to explain a gap: numbers that are fitted together."""
+    """Numbers that are fitted together, to explain how flights differ from the model."""
 
     name: str
-    """Of the effect; one whose components come one at a time comes once each. Of several effects
-    that are one hypothesis, their names joined."""
+    """Name of the effect; for several effects as one hypothesis, their names joined. An effect of
+    single components (such as one motor) has one candidate for each, of the same name."""
     indices: tuple[int, ...]
-    """Places in the vector."""
+    """Places of its numbers in the vector."""
     label: str
-    """For people: the name, and the component (from 1) where it comes once each."""
+    """For people: the name, and the component (from 1) where there is one candidate for each."""
     parts: tuple[Candidate, ...] = ()
-    """Where several effects are one hypothesis: each of them."""
+    """Its effects as candidates, where several are one hypothesis (a composite)."""
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -63,7 +64,7 @@ class Candidate:
 
     @property
     def singles(self) -> tuple[Candidate, ...]:
-        """Each of its effects as a candidate of its own."""
+        """One candidate for each of its effects."""
         return self.parts or (self,)
 
 
@@ -73,7 +74,7 @@ class ParameterSpace:
 
     entries: tuple[FittedNumber, ...]
     base: Mapping[str, Any]
-    """Values of every effect, as the vehicle file has them."""
+    """The vehicle file's values of every effect."""
 
     def array(self, field: str) -> np.ndarray:
         """Return `field` of all entries, (P,)."""
@@ -85,12 +86,12 @@ class ParameterSpace:
 
     @property
     def layout(self) -> ParameterLayout:
-        """Which number of the vector is what; the same for every vehicle."""
+        """Meaning of each number of the vector; the same for every vehicle."""
         return tuple((e.effect, e.parameter, e.component) for e in self.entries)
 
 
 def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
-    """Return `base` with the numbers `theta` (P,) in their places; all may be traced."""
+    """Return the effects `base` with the values of `theta` (P,), numpy or JAX (also traced)."""
     xp = theta.__array_namespace__()
     values = {name: value._asdict() for name, value in base.items()}
     place = {entry: i for i, entry in enumerate(layout)}
@@ -108,10 +109,12 @@ def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -
 
 
 def refuse_own_motion(vehicle: Vehicle) -> None:
-    """Refuse a vehicle that no stretch of a flight can begin with.
+    """Refuse a vehicle with an effect that has a state of its own, as a swinging load.
+
+    No log holds that state, so no stretch of a flight can be simulated.
 
     Raises:
-        ValueError: for an effect with a motion of its own, and what to do about it.
+        ValueError: for such an effect, with what to do.
     """
     for name in vehicle.effects:
         if EFFECTS[name].start is not None:
@@ -122,7 +125,7 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 
 
 def make_space(vehicle: Vehicle) -> ParameterSpace:
-    """Return the vector of `vehicle`: all but what acts by chance or is not identifiable.
+    """Return the vector of `vehicle`, without random effects and what is not identifiable.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -160,9 +163,9 @@ def with_fitted(
     names: Collection[str],
     further: Mapping[str, Any] | None = None,
 ) -> Vehicle:
-    """Return `vehicle` with the effects `names` at `theta` (P,) in place of what it has of them.
+    """Return `vehicle` with the effects `names` replaced by their values in `theta` (P,).
 
-    `further` are values of other effects by name.
+    `further` holds values of other effects by name.
     """
     fitted, effects = space.effects(theta), dict(vehicle.effects)
     for name in set(names):
@@ -176,24 +179,27 @@ def with_fitted(
 
 
 def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> list[Candidate]:
-    """Return what may be named on logs with or without a voltage.
+    """Return the candidates that can be identified from the signals of the logs.
 
     Args:
         space: of the vehicle.
-        voltage: the logs have one.
-        has: what else they have of what effects need (`acc_b`; `command` where commands drive).
+        voltage: whether the logs have a battery voltage.
+        has: which other signals they have that effects need: `acc_b`, an accelerometer; `command`,
+            commands as the model's input.
     """
-    found = []
+    chosen = []
     for name, effect in EFFECTS.items():
         fitted = {parameter.name: parameter for parameter in effect.identifiable(voltage)}
-        at_ = [i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in fitted]
-        if not at_ or not set(effect.needs) <= set(has):
+        indices = tuple(
+            i for i, e in enumerate(space.entries) if e.effect == name and e.parameter in fitted
+        )
+        if not indices or not set(effect.needs) <= set(has):
             continue
         if any(parameter.one_at_a_time for parameter in fitted.values()):
-            found += [Candidate(name, (i,), f"{name} {k + 1}") for k, i in enumerate(at_)]
+            chosen += [Candidate(name, (i,), f"{name} {k + 1}") for k, i in enumerate(indices)]
         else:
-            found.append(Candidate(name, tuple(at_), name))
-    return found
+            chosen.append(Candidate(name, indices, name))
+    return chosen
 
 
 def effects_in(name: str) -> tuple[str, ...]:
@@ -202,7 +208,7 @@ def effects_in(name: str) -> tuple[str, ...]:
 
 
 def indices_of(chosen: Sequence[Candidate]) -> list[int]:
-    """Return the places of all numbers of `chosen`, in order and once each."""
+    """Return the places of all numbers of the `chosen` candidates, sorted, each once."""
     return sorted({i for candidate in chosen for i in candidate.indices})
 
 
@@ -212,17 +218,16 @@ def implausible(
     candidate: Candidate,
     limits: Thresholds = THRESHOLDS,
 ) -> list[str]:
-    """Return the numbers of `candidate` that are beyond their usual size at `theta` (P,), in words.
+    """Return the implausible numbers of `candidate` at `theta` (P,), in words.
 
-    Usual is what the catalogue has as the upper usual magnitude; beyond three times that a number
-    is implausible.
+    A number is implausible beyond three times the upper usual magnitude in the catalogue.
     """
     words = []
     for index in candidate.indices:
         entry = space.entries[index]
         parameter = _parameter(entry)
-        away = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
-        if away > limits.implausible_times * parameter.typical[1]:
+        size = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
+        if size > limits.implausible_times * parameter.typical[1]:
             place = "" if entry.component is None else f" {entry.component + 1}"
             words.append(
                 f"{entry.effect} {entry.parameter}{place} = {theta[index]:.3g} {parameter.unit}"
@@ -231,17 +236,17 @@ def implausible(
 
 
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
-    """Return whether a number of `candidate` has run to an end of what is physical.
+    """Return whether a number of `candidate` is at a physical bound at `theta` (P,).
 
-    An end at which nothing acts is none: a drag that the vehicle file has may turn out not to be.
+    A bound without any effect is allowed: a drag of the vehicle file may turn out to be zero.
     """
     for index in candidate.indices:
         entry, value = space.entries[index], theta[index]
-        close = 1e-6 * (entry.high - entry.low)
-        sound = (entry.start, _neutral(entry))
-        if value <= entry.low + close and entry.low not in sound:
+        tolerance = 1e-6 * (entry.high - entry.low)
+        allowed = (entry.start, _neutral(entry))
+        if value <= entry.low + tolerance and entry.low not in allowed:
             return True
-        if value >= entry.high - close and entry.high not in sound:
+        if value >= entry.high - tolerance and entry.high not in allowed:
             return True
     return False
 
@@ -249,10 +254,9 @@ def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> 
 def usual_first(
     space: ParameterSpace, theta: np.ndarray, candidate: Candidate
 ) -> tuple[bool, int, int]:
-    """Return by what those of equal fit are ordered: what is plausible comes first.
+    """Return the sort key of candidates that fit equally well, each at its own fit `theta` (P,).
 
-    Then one effect comes before several, and then as the catalogue has them; `theta` (P,) is with
-    this candidate.
+    Plausible ones come first, then single effects, then the order of the catalogue.
     """
     effects = candidate.effects
     far = bool(implausible(space, theta, candidate))
@@ -264,6 +268,6 @@ def _parameter(entry: FittedNumber) -> Parameter:
 
 
 def _neutral(entry: FittedNumber) -> float:
-    """Return the value with which nothing acts; the file's where it depends on the vehicle."""
+    """Return the value without any effect; the file's value where that depends on the vehicle."""
     neutral = _parameter(entry).neutral
     return entry.start if callable(neutral) else float(neutral)

@@ -1,7 +1,9 @@
-"""Base class of evidence, the interface between a source of residuals and the search.
+"""Base class of evidence: the interface between residuals of flights and the search for effects.
 
-Each source, such as rollouts or forces, is one subclass. It linearises its residuals in blocks and
-estimates their noise; the other methods have defaults. A number is a parameter of the model.
+Each kind of residual is one subclass, such as the errors of rollouts (simulated stretches of 1 s)
+or of forces. It linearises its residuals along the model's parameters and estimates their noise;
+the other methods have defaults. A block is the result of a linearisation (`estimate/block.py`), and
+a stretch is a piece of a flight whose residuals may be correlated.
 """
 
 from __future__ import annotations
@@ -16,39 +18,39 @@ from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
 from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_candidates
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
-NOTHING = 1e-9
-"""Smallest squared error that a share is computed of, in units of the noise variance."""
+LEAST_ERROR = 1e-9
+"""Lower limit of a squared error that is divided by, in units of the noise variance."""
 
 
 class Evidence(ABC):
-    """A source of whitened residuals, with information on the numbers of a space."""
+    """A source of whitened residuals, with information on the parameters of a space."""
 
     limits: Thresholds = THRESHOLDS
     """Thresholds of all steps of the diagnosis."""
-    off: bool = False
+    misfit_is_noise: bool = False
     """Whether the model is wrong, so that its whole residual counts as noise."""
 
     @property
     @abstractmethod
     def space(self) -> ParameterSpace:
-        """The numbers, with their starts and bounds."""
+        """The parameters, with their starts and bounds."""
 
     @abstractmethod
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return residuals and slopes at an estimate, along the numbers `indices` or along all."""
+        """Return residuals and slopes at `at`, along the parameters `indices` or along all."""
 
     @abstractmethod
-    def weighed(self, at: Estimate) -> tuple[Evidence, Block]:
+    def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
         """Return this with its noise estimated from the residuals at `at`, and its block there.
 
-        The block has slopes along all numbers.
+        The block has slopes along all parameters.
         """
 
-    def again(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this with its noise unchanged, and its block at `at`."""
+    def relinearise(self, at: Estimate) -> tuple[Evidence, Block]:
+        """Return this with its noise unchanged, and its block at `at` along all parameters."""
         return self, self.linearise(at)
 
-    def misfit(self, at: Estimate, block: Block) -> tuple[Evidence, Block] | None:
+    def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[Evidence, Block] | None:
         """Return this with the whole residual of the best model as its noise, and its block.
 
         None if that residual is measurement noise only. `at` and `block` are of the best model.
@@ -57,7 +59,7 @@ class Evidence(ABC):
         return None
 
     @property
-    def draws(self) -> float:
+    def flights_differ_p(self) -> float:
         """`differ_p` of `intervals95`: 1 if each flight is one random draw, 0 if not."""
         return 1.0
 
@@ -75,9 +77,15 @@ class Evidence(ABC):
         among: Sequence[Candidate],
         seed: int,
     ) -> list[CandidateScore]:
-        """Return the scores of `among` when fitted with the numbers `named`, best first.
+        """Return the scores of candidate effects, best first.
 
-        `equations` are those of `block`, at the numbers `theta` (P,); `seed` is of random draws.
+        Args:
+            block: with slopes along all parameters.
+            equations: normal equations of `block`.
+            theta: (P,) parameters at which `block` was computed.
+            named: parameters that are fitted with every candidate.
+            among: the candidates.
+            seed: of random draws.
         """
         fold = self.folds(block)
         return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
@@ -86,26 +94,29 @@ class Evidence(ABC):
         """Return the fold (B,) of each stretch; cross-validation leaves out one fold at a time."""
         return folds_of(block.flight, block.start_s, self.limits.folds)
 
-    def parts(self, block: Block) -> np.ndarray:
-        """Return the group (B,) of each stretch, by default its flight; `share` compares them."""
+    def groups(self, block: Block) -> np.ndarray:
+        """Return the group (B,) of each stretch, by default its flight.
+
+        `explained_share` tests whether the groups agree.
+        """
         return block.flight
 
-    def share(
-        self, now: Block, at: Estimate, then: Block, candidate: Candidate, gains: np.ndarray
+    def explained_share(
+        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return the share of the squared error that a candidate explains; None if refused.
+        """Return the share of the squared error that a candidate explains; None if rejected.
 
         Args:
-            now: block without the candidate.
+            before: block without the candidate.
             at: estimate with the candidate.
-            then: block with the candidate.
+            after: block with the candidate.
             candidate: the fitted one.
             gains: (G,) fall of the squared error of each group, fitted on the other groups.
         """
         del at, candidate, gains
-        return 1.0 - float((then.residual**2).sum() / max((now.residual**2).sum(), NOTHING))
+        return 1.0 - float((after.residual**2).sum() / max((before.residual**2).sum(), LEAST_ERROR))
 
-    def order(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
+    def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
         """Return the sort key of candidates that fit about equally well; the smallest wins."""
         del at, candidate
         return ()
@@ -114,7 +125,7 @@ class Evidence(ABC):
 def flights_agree(gains: np.ndarray) -> bool:
     """Return whether all flights, or all but one, have positive `gains` (G,).
 
-    Their sum without the largest must be positive, too. Fewer than three flights always agree.
+    The sum without the largest gain must be positive, too. Fewer than three flights always agree.
     """
     if len(gains) < 3:
         return True

@@ -1,4 +1,8 @@
-"""FlightWindows flown through the model, and how that differs from what was measured in them."""
+"""Simulates windows (1 s stretches of flights) with the model, and compares them with the logs.
+
+Each window starts from its measured state. Its inputs are the logged commands, through the rate
+loop, or the measured rotor speeds. All functions are JAX, for many windows at a time.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +18,26 @@ from eval.effects.log_faults import pose_delay, to_logged, to_true
 from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loop
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpack_command
 from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
-from suite.diagnose.data.sampling import LONGEST_S
-from suite.diagnose.data.windows import CHANNELS, KNOTS, LENGTH_S, STATE, FlightWindows
+from suite.diagnose.data.steps import LONGEST_S
+from suite.diagnose.data.windows import (
+    CHANNELS,
+    KNOTS,
+    LENGTH_S,
+    STATE,
+    FlightWindows,
+)
 from tracks.geometry.rotation import exp_rot
 
 
 class Flown(NamedTuple):
-    """B windows at their S + 1 ends of steps."""
+    """Simulated states of B windows at the S + 1 ends of their steps."""
 
     track: Motion
-    """(B, S + 1, ...)."""
+    """(B, S + 1, ...) position, attitude, velocity and rates."""
     rotor_speed: Any
     """(B, S + 1, 4) [rad/s]."""
     force_b: Any
-    """(B, S + 1, 3) specific force as a step ends, before what acts next does [m/s^2]."""
+    """(B, S + 1, 3) specific force at the end of the step before [m/s^2]."""
 
 
 def fly_windows(
@@ -41,19 +51,19 @@ def fly_windows(
     push: Any = None,
     feedback: Feedback | None = None,
 ) -> Flown:
-    """Fly B windows from their measured starts.
+    """Simulate B windows from their measured start states.
 
     Args:
         plant: with the effects `values`.
-        values: of all effects; the log's own faults are read from them.
+        values: of all effects; faults of the log are read from them.
         rotor_input: measured rotor speeds are the input, not the commands.
         voltage: the windows have a voltage.
         integrator: one of `eval.quadrotor.continuous.INTEGRATORS`.
-        offset: (B, F) of the start from what was measured and, last, of the rotor speeds: of their
-            errors at the knots where they are the input, else at the start from the burn-in's.
+        offset: (B, F) corrections: 12 of the measured start state, and then of the rotor speeds:
+            at the knots where these are the input, else at the start.
         windows: B of them.
-        push: (B, KNOTS, 6) what pushes, as `Inputs.push_b` has it; none if not given.
-        feedback: what pushes in place of `push`.
+        push: (B, KNOTS, 6) additional force and torque at the knots, as `Inputs.push_b` has it.
+        feedback: a function that computes such forces from the state, in place of `push`.
     """
     burn_in = windows.burn_in_rate_b.shape[1]
     edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
@@ -96,17 +106,17 @@ def fly_windows(
 def difference(
     values: Mapping[str, Any], integrator: str, flown: Flown, windows: FlightWindows
 ) -> Any:
-    """Return simulated - measured (B, N, 19) of `flown`, zero where nothing was measured.
+    """Return simulated - measured (B, N, 19), zero where nothing was measured.
 
-    `values` and `integrator` are those of `fly_windows`.
+    The arguments `values` and `integrator` are those of `fly_windows`, and `flown` is its result.
     """
     track, speeds, forces = flown
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
     pose = _at(windows.row_s - pose_delay(values), edge_s)
     now = _at(jnp.asarray(windows.row_s), edge_s)
     rate_b, force_b = _pick(track.rate_b, now), _pick(forces, now)
-    seen = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
-    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), seen.rot_w)
+    logged = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
+    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), logged.rot_w)
     attitude = 0.5 * jnp.stack(
         [
             turn[..., 2, 1] - turn[..., 1, 2],
@@ -115,17 +125,17 @@ def difference(
         ],
         axis=-1,
     )
-    parts = [
-        seen.pos_w - windows.row_pos_w,
+    errors = [
+        logged.pos_w - windows.row_pos_w,
         attitude,
-        seen.vel_w - windows.row_vel_w,
-        seen.rate_b - windows.row_rate_b,
-        seen.acc_b - windows.row_acc_b,
+        logged.vel_w - windows.row_vel_w,
+        logged.rate_b - windows.row_rate_b,
+        logged.acc_b - windows.row_acc_b,
         _pick(speeds, now) - windows.row_rotor_speed,
     ]
-    apart = jnp.concatenate(parts, axis=-1)
-    assert apart.shape[-1] == CHANNELS
-    return jnp.where(windows.seen, apart, 0.0)
+    error = jnp.concatenate(errors, axis=-1)
+    assert error.shape[-1] == CHANNELS
+    return jnp.where(windows.valid, error, 0.0)
 
 
 def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
@@ -140,65 +150,66 @@ def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
 def _burned_in(
     plant: Plant, values: Mapping[str, Any], spans: Steps, command: Any, windows: FlightWindows
 ) -> Any:
-    """Return the rotor speeds (B, 4) at the starts, by what was commanded (Q, B, 4) before them.
+    """Return the rotor speeds (B, 4) at the starts, by the commands (Q, B, 4) before them.
 
-    The loop must be one that remembers nothing.
+    The rate loop must have no state of its own (no integrators and filters).
     """
     # Before the start only rates are known.
     rates_b = to_true(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
     speed = wanted_speed(plant, unpack_command(command[0]), rates_b[0])
 
     def burn_in_step(carry: Carry, row: Any) -> tuple[Carry, None]:
-        span, acting, rate_b = row
-        carry = update_loop(plant, carry, span, unpack_command(acting), rate_b)
+        span, acting_command, rate_b = row
+        carry = update_loop(plant, carry, span, unpack_command(acting_command), rate_b)
         return turn_rotors(plant, carry, span)[0], None
 
-    # The rates where the loop samples are known here: none has to be carried on.
-    still = jnp.zeros_like(rates_b[0])
-    carry = Carry(speed, speed, still, Wrench(still, still))
+    # The rates where the loop samples are known here, so no acceleration has to predict them.
+    zeros = jnp.zeros_like(rates_b[0])
+    carry = Carry(speed, speed, zeros, Wrench(zeros, zeros))
     carry, _ = jax.lax.scan(burn_in_step, carry, (spans, command, rates_b))
     return carry.rotor_speed
 
 
 def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
-    """Return a sample (..., 3) without an accelerometer, and at rest where no pose is given."""
+    """Return a sample (..., 3) without an accelerometer; without a pose at rest in the origin."""
     rate_b = jnp.asarray(rate_b)
-    still = jnp.zeros_like(rate_b)
+    zeros = jnp.zeros_like(rate_b)
     if pos_w is None:
-        pos_w, rot_w, vel_w = still, jnp.broadcast_to(jnp.eye(3), (*still.shape, 3)), still
-    return Sample(pos_w, rot_w, vel_w, rate_b, still)
+        pos_w, rot_w, vel_w = zeros, jnp.broadcast_to(jnp.eye(3), (*zeros.shape, 3)), zeros
+    return Sample(pos_w, rot_w, vel_w, rate_b, zeros)
 
 
 def _acting(windows: FlightWindows, delay: Any) -> Any:
-    """Return the commands (B, Q + S, 4) that act between samples of the loop, as means.
+    """Return the mean commands (B, Q + S, 4) between samples of the loop.
 
-    They act `delay` (...,) [s] after their rows, within steps too.
+    A command acts `delay` (...,) [s] after its row, which may be within a step.
     """
     since_s = jnp.asarray(windows.edge_s)[:, :-1] - delay
-    # Where the loop takes no sample any command will do, but for the first: rotors begin with it.
+    # Without a sample of the loop the command is not used, but for the first: rotors start there.
     sample_s = jnp.asarray(windows.sample_s)
-    held = jnp.where(sample_s > 0.0, sample_s, LONGEST_S)
+    held_s = jnp.where(sample_s > 0.0, sample_s, LONGEST_S)
 
     def integral(at_s: Any, time_s: Any, command: Any, total: Any) -> Any:
-        # At a row's own time the command before it: a delay can only grow from none.
+        # At a row's own time the command before it is used, since a delay is never negative.
         row = jnp.maximum(jnp.searchsorted(time_s, at_s - 1e-9, side="right") - 1, 0)
         return total[row] + (at_s - time_s[row])[:, None] * command[row]
 
     series = [jnp.asarray(x) for x in (windows.command_s, windows.command, windows.command_sum)]
-    whole = jax.vmap(integral)
-    return (whole(since_s + held, *series) - whole(since_s, *series)) / held[..., None]
+    integrals = jax.vmap(integral)
+    until, since = integrals(since_s + held_s, *series), integrals(since_s, *series)
+    return (until - since) / held_s[..., None]
 
 
 def _hats(time_s: Any) -> Any:
-    """Return the share (B, S, KNOTS) of each knot at times (B, S) [s], linear between knots."""
+    """Return the hat function (B, S, KNOTS) of each knot at times (B, S) [s]."""
     place = time_s / LENGTH_S * (KNOTS - 1)
     return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(KNOTS)))
 
 
 def _at(time_s: Any, edge_s: Any) -> Any:
-    """Return (step before, time after it, length of the step) for times (B, N), edges (B, S + 1).
+    """Return the places of times (B, N) [s] among the ends of steps (B, S + 1) [s].
 
-    Times and lengths are (B, N) [s].
+    A place is (number of the step, time since its start [s], its length [s]), each (B, N).
     """
     ends = edge_s.shape[1] - 1
     index = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1
@@ -210,26 +221,26 @@ def _at(time_s: Any, edge_s: Any) -> Any:
 
 def _pick(series: Any, place: Any) -> Any:
     """Return `series` (B, S + 1, K) at `place`, linear between ends of steps."""
-    index, left, length = place
-    here = jnp.take_along_axis(series, index[..., None], axis=1)
-    there = jnp.take_along_axis(series, index[..., None] + 1, axis=1)
-    return here + (left / length)[..., None] * (there - here)
+    index, since_s, length_s = place
+    start = jnp.take_along_axis(series, index[..., None], axis=1)
+    end = jnp.take_along_axis(series, index[..., None] + 1, axis=1)
+    return start + (since_s / length_s)[..., None] * (end - start)
 
 
 def _pose(track: Motion, place: Any, integrator: str) -> tuple[Any, Any, Any]:
-    """Return position, attitude and velocity at `place`; times before the start extend back."""
-    index, left, length = place
-    left, length = left[..., None], length[..., None]
+    """Return position, attitude and velocity at `place`, extrapolated before the start."""
+    index, since_s, length_s = place
+    since_s, length_s = since_s[..., None], length_s[..., None]
 
     def pick(series: Any, at: Any) -> Any:
         return jnp.take_along_axis(series, at.reshape(*at.shape, *[1] * (series.ndim - 2)), axis=1)
 
     vel_w, new_vel_w = pick(track.vel_w, index), pick(track.vel_w, index + 1)
     rate_b, new_rate_b = pick(track.rate_b, index), pick(track.rate_b, index + 1)
-    gained_w = left / length * (new_vel_w - vel_w)
-    if integrator == "euler":  # a step's new velocity carries the position
-        pos_w, turn = pick(track.pos_w, index) + left * new_vel_w, left * new_rate_b
+    gained_w = since_s / length_s * (new_vel_w - vel_w)
+    if integrator == "euler":  # semi-implicit: the step's new velocity moves the position
+        pos_w, turn = pick(track.pos_w, index) + since_s * new_vel_w, since_s * new_rate_b
     else:
-        pos_w = pick(track.pos_w, index) + left * (vel_w + 0.5 * gained_w)
-        turn = left * (rate_b + 0.5 * left / length * (new_rate_b - rate_b))
+        pos_w = pick(track.pos_w, index) + since_s * (vel_w + 0.5 * gained_w)
+        turn = since_s * (rate_b + 0.5 * since_s / length_s * (new_rate_b - rate_b))
     return pos_w, jnp.matmul(pick(track.rot_w, index), exp_rot(turn)), vel_w + gained_w

@@ -1,4 +1,8 @@
-"""Rollouts (simulated stretches of 1 s) as evidence: whitened, start states projected out."""
+"""Rollouts (simulated stretches of 1 s) as evidence on the model's parameters.
+
+`RolloutModel` computes the errors of rollouts and their Jacobian, compiled once for all vehicles.
+`RolloutEvidence` whitens them by the measurement noise and projects out the unknown start states.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,8 @@ from eval.quadrotor.loops import Loop, loop_of
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
 from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.colour import Noise, left_as_noise, measured_noise
-from suite.diagnose.data.sampling import LONGEST_S
+from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
+from suite.diagnose.data.steps import LONGEST_S, step_s
 from suite.diagnose.data.whitening import (
     Linearisation,
     Whitening,
@@ -27,7 +31,13 @@ from suite.diagnose.data.whitening import (
     whiten,
     whitened_residual,
 )
-from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, step_s, take, trusted
+from suite.diagnose.data.windows import (
+    KNOTS,
+    STATE,
+    FlightWindows,
+    take,
+    trusted,
+)
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -47,76 +57,75 @@ class RolloutEvidence(Evidence):
 
     model: RolloutModel
     windows: FlightWindows
-    """At full length."""
+    """The stretches at full length."""
     trusted: FlightWindows
-    """As long as the linearisation holds."""
+    """The same, each as long as the linearisation holds."""
     noise: Noise
     whitening: Whitening
     limits: Thresholds = THRESHOLDS
-    off: bool = False
-    """Whether the whole residual counts as noise."""
+    misfit_is_noise: bool = False
 
     @property
     def space(self) -> ParameterSpace:
-        """The catalogue's numbers."""
+        """The parameters of all effects in the catalogue."""
         return self.model.space
 
     @property
-    def draws(self) -> float:
-        """1 where the model is off, as its error is the same all along a flight; else 0."""
-        return 1.0 if self.off else 0.0
+    def flights_differ_p(self) -> float:
+        """1 where the model is wrong, as its error is the same all along a flight; else 0."""
+        return 1.0 if self.misfit_is_noise else 0.0
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block along these numbers, see `Evidence`."""
+        """Return the block along these parameters, see `Evidence`."""
         linear = self.model.linearise(at.theta, at.free, self.trusted, indices)
         along = range(self.model.size) if indices is None else indices
         return block_of(self.whitening, linear, along, self.windows)
 
-    def weighed(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this with its noise as it is there, see `Evidence`."""
+    def estimate_noise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
+        """Return this with its noise estimated at `at`, see `Evidence`."""
         # The noise estimate is best where the model fits best; the linearisation holds for longer.
-        return weighed_by(self.model, self.windows, self._everything(at), self.limits)
+        return rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
 
-    def again(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this with the noise that it has, see `Evidence`."""
-        linear = self._everything(at)
-        found, block = weighed_by(self.model, self.windows, linear, self.limits, self.noise)
-        return replace(found, off=self.off), block
+    def relinearise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
+        """Return this with its noise unchanged, see `Evidence`."""
+        linear = self._linear(at)
+        new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
+        return replace(new, misfit_is_noise=self.misfit_is_noise), block
 
-    def misfit(self, at: Estimate, block: Block) -> tuple[RolloutEvidence, Block] | None:
-        """Return this where more than noise is left, see `Evidence`."""
+    def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[RolloutEvidence, Block] | None:
+        """Return this with the whole residual as its noise, see `Evidence`."""
         slow, expected = self.slow_errors(block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
-        linear = self._everything(at)
-        noise = left_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
+        linear = self._linear(at)
+        noise = residual_as_noise(linear.residual, linear.start_slope, self.trusted, self.limits)
         whitening = make_whitening(linear, noise, self.trusted, self.limits)
-        found = replace(self, noise=noise, whitening=whitening, off=True)
-        return found, block_of(whitening, linear, range(self.model.size), self.windows)
+        new = replace(self, noise=noise, whitening=whitening, misfit_is_noise=True)
+        return new, block_of(whitening, linear, range(self.model.size), self.windows)
 
-    def share(
-        self, now: Block, at: Estimate, then: Block, candidate: Candidate, gains: np.ndarray
+    def explained_share(
+        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return what a candidate takes, see `Evidence`."""
-        if self.off and not flights_agree(gains):
+        """Return the share that a candidate explains, see `Evidence`."""
+        if self.misfit_is_noise and not flights_agree(gains):
             return None
-        return super().share(now, at, then, candidate, gains)
+        return super().explained_share(before, at, after, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        """Return the energy (W, 12) of slow errors of the state, and what noise gives of it."""
+        """Return the energy (W, 12) of slow errors of the state, and that expected by noise."""
         energy = slow_energy(self.whitening, block.residual)
         return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
-    def _everything(self, at: Estimate) -> Linearisation:
+    def _linear(self, at: Estimate) -> Linearisation:
         return self.model.linearise(at.theta, at.free, self.windows, None)
 
 
 def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
-    """Return the vehicle file's numbers and the measured starts."""
+    """Return the vehicle file's parameters and the measured start states."""
     return Estimate(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
 
 
-def weighed_by(
+def rollout_evidence(
     model: RolloutModel,
     windows: FlightWindows,
     linear: Linearisation,
@@ -124,92 +133,91 @@ def weighed_by(
     noise: Noise | None = None,
     along: Sequence[int] | None = None,
 ) -> tuple[RolloutEvidence, Block]:
-    """Return the evidence of `windows` whose noise is that of the slopes `linear`, and its block.
+    """Return the evidence of `windows`, and its block where it was linearised.
 
     Args:
         model: the rollout.
-        windows: W of them.
-        linear: slopes along all numbers and what is free.
-        limits: of every step.
-        noise: where it is known already.
-        along: the numbers of the first slopes; all numbers if not given.
+        windows: W stretches.
+        linear: their residuals, with slopes along parameters and then along the start numbers.
+        limits: thresholds of all steps.
+        noise: of the channels; by default it is estimated from `linear`.
+        along: the parameters of the first slopes; all parameters if not given.
     """
-    view = trusted(windows, linear.residual, limits)
-    noise = noise or measured_noise(linear.residual, linear.start_slope, view, limits)
-    whitening = make_whitening(linear, noise, view, limits)
-    found = RolloutEvidence(model, windows, view, noise, whitening, limits)
-    numbers = range(model.size) if along is None else along
-    return found, block_of(whitening, linear, numbers, windows)
+    near = trusted(windows, linear.residual, limits)
+    noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
+    whitening = make_whitening(linear, noise, near, limits)
+    evidence = RolloutEvidence(model, windows, near, noise, whitening, limits)
+    indices = range(model.size) if along is None else along
+    return evidence, block_of(whitening, linear, indices, windows)
 
 
 def block_of(
     whitening: Whitening, linear: Linearisation, along: Sequence[int], windows: FlightWindows
 ) -> Block:
-    """Return the block of `linear`, whose first columns are `along` these numbers."""
+    """Return the block of `linear`, whose first slopes are `along` these parameters."""
     residual = whitened_residual(whitening, linear)
     slope = whiten(whitening, linear.slope[..., : len(along)])
-    turned = np.swapaxes(whitening.start, 1, 2)
-    by_start = turned @ np.concatenate([residual, slope], axis=2)
-    moved = np.linalg.solve(whitening.upper, by_start)
+    rows = np.concatenate([residual, slope], axis=2)
+    start_part = np.swapaxes(whitening.start, 1, 2) @ rows
+    start_change = np.linalg.solve(whitening.upper, start_part)
     return Block(
-        (residual - whitening.start @ by_start[..., :1])[..., 0],
-        slope - whitening.start @ by_start[..., 1:],
+        (residual - whitening.start @ start_part[..., :1])[..., 0],
+        slope - whitening.start @ start_part[..., 1:],
         tuple(along),
         np.asarray(windows.flight),
         np.asarray(windows.start_s),
-        moved[..., 0],
-        moved[..., 1:],
+        start_change[..., 0],
+        start_change[..., 1:],
     )
 
 
 def information(
     linear: Linearisation, windows: FlightWindows, size: int, limits: Thresholds = THRESHOLDS
 ) -> np.ndarray:
-    """Return the information of each window on each of the first `size` numbers, (W, K)."""
+    """Return the information (W, K) of each window on each of the first `size` parameters."""
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
     block = block_of(whitening, linear, range(size), windows)
     return np.asarray((block.slope**2).sum(axis=1))
 
 
-def least_left(
+def best_fit_error(
     model: RolloutModel,
     windows: FlightWindows,
     linear: Linearisation,
     limits: Thresholds,
     enough: float = 0.0,
 ) -> float:
-    """Return the mean squared error, 1 for noise, after a fit of all numbers of the catalogue.
+    """Return the mean squared error after a fit of all parameters; 1 is noise alone.
 
-    It is linear about `linear`, the slopes of `windows` along all numbers. Large effects are not
-    linear: where more than `enough` remains, some windows are fitted with the full model.
+    The fit is linear about `linear`, with slopes along all parameters. Large effects are not
+    linear: where the error exceeds `enough`, some windows are fitted with the full model.
     """
-    evidence, block = weighed_by(model, windows, linear, limits)
+    evidence, block = rollout_evidence(model, windows, linear, limits)
 
-    def left(chi2: float) -> float:
-        return chi2 / max(int(np.asarray(evidence.trusted.seen).sum()), 1)
+    def mean_error(chi2: float) -> float:
+        return chi2 / max(int(np.asarray(evidence.trusted.valid).sum()), 1)
 
     equations = block.equations
-    some = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
+    informed = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
     start = model.space.array("start")
-    _, fall = gauss_newton_step(equations.take(some), start, model.space)
-    first = left(float(equations.chi2.sum()) - fall)
+    _, fall = gauss_newton_step(equations.take(informed), start, model.space)
+    first = mean_error(float(equations.chi2.sum()) - fall)
     if first <= enough:
         return first
-    few = np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int)
-    few = np.unique(few)
-    part = Linearisation(*(field[few] for field in linear))
-    evidence, block = weighed_by(model, take(windows, few), part, limits)
+    few = np.unique(np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int))
+    few_linear = Linearisation(*(field[few] for field in linear))
+    evidence, block = rollout_evidence(model, take(windows, few), few_linear, limits)
     at = Estimate(start, linear.offset[few])
-    _, block = fit(evidence, at, some, limits.hopeless_rounds, block, limits)
-    return min(first, left(float((block.residual**2).sum())))
+    _, block = fit(evidence, at, informed, limits.hopeless_rounds, block, limits)
+    return min(first, mean_error(float((block.residual**2).sum())))
 
 
 BATCH = 12
-"""Windows a call: one shape, compiled once."""
+"""Windows of one call: a fixed shape, compiled once."""
 DIRECTIONS = 8
-"""Slopes a call, compiled once. A second, wider program would take longer to compile than it saves
-below some 150 stretches."""
+"""Slopes of one call, compiled once. A second, wider program would take longer to compile than it
+saves below some 150 stretches."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
 
@@ -220,11 +228,11 @@ class KnotResponse(NamedTuple):
     slope: np.ndarray
     """(W, N, 19, KNOTS * 6) of the simulated values, per m/s^2 and rad/s^2 in body axes."""
     knot: Flown
-    """(W, KNOTS, ...) the state at the knots."""
+    """(W, KNOTS, ...) simulated state at the knots."""
 
 
 class VehicleArrays(NamedTuple):
-    """What a vehicle file fixes, as arrays, so that one compiled rollout serves every vehicle."""
+    """Contents of a vehicle file as arrays, so that one compiled rollout serves every vehicle."""
 
     nominal: Nominal
     constants: Constants
@@ -245,18 +253,17 @@ class RolloutModel:
         voltage: bool,
         integrator: str = "continuous",
     ) -> None:
-        """Prepare the rollout of `vehicle` with the numbers of `space`.
+        """Prepare the rollout of `vehicle` with the parameters of `space`.
 
-        With `rotor_input` measured rotor speeds are the input, not the commands; `voltage` is
-        whether the windows have one; `integrator` is that of `fly_windows`.
+        The other arguments are those of `fly_windows`.
         """
         self.space = space
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
-        """Numbers F that are free in each window: its start, and the rotor speeds' errors, where
-        they are the input all along it."""
+        """Number F of start numbers of each window, which are fitted, too: its state, and the
+        errors of the rotor speeds (at all knots where these are the input)."""
         self.starts = list(range(self.size, self.size + self.free))
-        """Places of the free numbers among all directions."""
+        """Places of the start numbers among all directions, after the parameters."""
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
         self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
         self.dt = step_s(vehicle)
@@ -265,21 +272,21 @@ class RolloutModel:
         self._kind = (space.layout, rotor_input, voltage, integrator)
         self._linear = _slopes(*self._kind)
         self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
-        """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), to be
-        compiled by who needs it."""
+        """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), which
+        the caller compiles."""
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
-        """Return measured - simulated (W, N, 19) from starts moved by `offset` (W, F)."""
+        """Return measured - simulated (W, N, 19) with starts corrected by `offset` (W, F)."""
         return self.linearise(theta, offset, windows, []).residual
 
     def respond(
         self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
     ) -> KnotResponse:
-        """Return the response of each window's rows to additional forces and torques along it."""
-        pushed = _responses(*self._kind)
+        """Return the response of each window's rows to additional forces and torques in it."""
+        respond = _responses(*self._kind)
         with jax.enable_x64(True):
             parts = [
-                jax.tree.map(lambda x, n=count: np.asarray(x)[:n], pushed(self.given, theta, x, w))
+                jax.tree.map(lambda x, n=count: np.asarray(x)[:n], respond(self.given, theta, x, w))
                 for x, w, count in batches(offset, windows)
             ]
         return jax.tree.map(lambda *p: np.concatenate(p), *parts)
@@ -291,35 +298,35 @@ class RolloutModel:
         windows: FlightWindows,
         indices: Sequence[int] | None,
     ) -> Linearisation:
-        """Return residuals and slopes along the numbers at `indices`.
+        """Return residuals and slopes at `theta` (P,), with starts corrected by `offset` (W, F).
 
-        With None the directions are all numbers and then the F free ones, whose places are
-        `starts`.
+        The slopes are along the directions at `indices`: parameters, or start numbers at the places
+        `starts`. With None they are along all parameters and then all start numbers.
         """
-        everything = np.eye(self.size + self.free)
-        count = len(everything if indices is None else indices)
-        groups = grouped(everything, indices)
+        directions = np.eye(self.size + self.free)
+        count = len(directions if indices is None else indices)
+        groups = direction_groups(directions, indices)
         values, slopes = [], []
         with jax.enable_x64(True):
-            for x, w, whole in batches(offset, windows):
-                answers = [self._linear(self.given, theta, x, w, group) for group in groups]
-                values.append(np.asarray(answers[0][0])[:whole])
-                slopes.append(np.concatenate([np.asarray(a[1])[:whole] for a in answers], axis=-1))
+            for x, w, own in batches(offset, windows):
+                results = [self._linear(self.given, theta, x, w, group) for group in groups]
+                values.append(np.asarray(results[0][0])[:own])
+                slopes.append(np.concatenate([np.asarray(r[1])[:own] for r in results], axis=-1))
         slope = np.concatenate(slopes)[..., :count]
         return Linearisation(-np.concatenate(values), slope, offset)
 
 
-def grouped(everything: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
-    """Return `DIRECTIONS` rows at a time, at least once, of `everything` or those at `indices`."""
-    rows = everything if indices is None else everything[list(indices)]
-    parts = [rows[k : k + DIRECTIONS] for k in range(0, max(len(rows), 1), DIRECTIONS)]
-    return [np.pad(part, ((0, DIRECTIONS - len(part)), (0, 0))) for part in parts]
+def direction_groups(directions: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
+    """Return the rows of `directions` (at `indices`) by `DIRECTIONS`, padded with zeros."""
+    rows = directions if indices is None else directions[list(indices)]
+    groups = [rows[k : k + DIRECTIONS] for k in range(0, max(len(rows), 1), DIRECTIONS)]
+    return [np.pad(group, ((0, DIRECTIONS - len(group)), (0, 0))) for group in groups]
 
 
 def batches(
     offset: np.ndarray, windows: FlightWindows
 ) -> Iterator[tuple[np.ndarray, FlightWindows, int]]:
-    """Yield `BATCH` offsets and windows at a time, and how many of them are no repetition."""
+    """Yield (offsets, windows, number) by `BATCH`; beyond `number` the last one is repeated."""
     count = len(windows.flight)
     for first in range(0, count, BATCH):
         rows = np.minimum(np.arange(first, first + BATCH), count - 1)
@@ -330,7 +337,7 @@ def batches(
 def _slopes(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., Any]:
-    """Return the compiled slopes: XLA takes longer over them than a diagnosis does."""
+    """Return the compiled residuals and slopes; compiling takes longer than a diagnosis."""
     fly = _flight(layout, rotor_input, voltage, integrator)
 
     def linear(
@@ -373,7 +380,7 @@ def _responses(
 def _flight(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., tuple[Any, Flown]]:
-    """Return the function that flies windows: simulated - measured, and the flight itself."""
+    """Return the function that simulates windows: simulated - measured, and the flight itself."""
 
     def fly(
         given: VehicleArrays,

@@ -1,4 +1,8 @@
-"""Force and torque as evidence: flights of one view, weighted by the residual's own noise."""
+"""Force and torque as evidence on the model's parameters.
+
+A view is one part of the dynamics, force or torque, whose mean accelerations are compared with
+those of the model. The noise of the residuals is estimated from the residuals themselves.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +29,11 @@ from suite.diagnose.evidence.moments import (
     Weights,
     block_of,
     compare,
+    error_share_removed,
     fast_share,
     means_of,
-    share_taken,
-    stretch_of,
-    units_of,
+    stretch_numbers,
+    validation_groups,
     weights_of,
 )
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
@@ -37,14 +41,14 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 @dataclass(frozen=True)
 class ViewBlock(Block):
-    """A block, with the moments that it is made of."""
+    """A block (linearised residuals), with the mean accelerations that it is made of."""
 
     data: ViewData
 
 
 @dataclass(frozen=True)
 class ViewEvidence(Evidence):
-    """The flights of one view; its noise is estimated by `weighed`."""
+    """The flights of one view; its noise is estimated by `estimate_noise`."""
 
     view: View
     model: ForceModel
@@ -59,25 +63,24 @@ class ViewEvidence(Evidence):
 
     @property
     def space(self) -> ParameterSpace:
-        """The catalogue's numbers."""
+        """The parameters of all effects in the catalogue."""
         return self.model.space
 
     @property
     def repeatability(self) -> np.ndarray:
-        """(3,) how flights' means differ among themselves; infinite where too few show it."""
+        """(3,) standard deviation of flights' means; infinite with too few flights."""
         return np.full(3, np.inf) if self.weights is None else self.weights.trim
 
     @property
     def start(self) -> Estimate:
-        """The vehicle file's numbers."""
-        return self.at(self.space.array("start"))
+        """The vehicle file's parameters."""
+        return Estimate(self.space.array("start"))
 
-    def at(self, theta: np.ndarray) -> Estimate:
-        """Return the estimate with the numbers `theta` (P,): nothing else is free."""
-        return Estimate(theta, np.zeros((0, 0)))
+    def residuals(self, theta: np.ndarray, indices: Sequence[int] | None = ()) -> ViewData:
+        """Return the residuals at the parameters `theta` (P,), with slopes along `indices`.
 
-    def left(self, theta: np.ndarray, indices: Sequence[int] | None = ()) -> ViewData:
-        """Return the residuals at the numbers `theta` (P,), slopes along `indices`."""
+        With None as indices the slopes are along all parameters.
+        """
         data = compare(self.view, self.model, theta, self.flights, indices)
         if self.carried is not None:
             data = data._replace(residual=data.residual - self.carried)
@@ -87,14 +90,14 @@ class ViewEvidence(Evidence):
         return ViewData(flight.astype(int), *others)
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> ViewBlock:
-        """Return the block along these numbers, see `Evidence`."""
-        return self._block(self.left(at.theta, indices), indices)
+        """Return the block along these parameters, see `Evidence`."""
+        return self._block(self.residuals(at.theta, indices), indices)
 
-    def weighed(self, at: Estimate) -> tuple[ViewEvidence, ViewBlock]:
-        """Return this with its noise as it is there, see `Evidence`."""
-        data = self.left(at.theta, None)
-        found = replace(self, weights=weights_of(data, self.limits))
-        return found, found._block(data)
+    def estimate_noise(self, at: Estimate) -> tuple[ViewEvidence, ViewBlock]:
+        """Return this with its noise estimated at `at`, see `Evidence`."""
+        data = self.residuals(at.theta, None)
+        evidence = replace(self, weights=weights_of(data, self.limits))
+        return evidence, evidence._block(data)
 
     def folds(self, block: Block) -> np.ndarray:
         """Return the fold of each stretch: its flight, with three flights or more."""
@@ -102,64 +105,70 @@ class ViewEvidence(Evidence):
             return block.flight
         return folds_of(block.flight, np.arange(len(block.flight), dtype=float))
 
-    def parts(self, block: Block) -> np.ndarray:
-        """Return flights, or thirds of a lone one."""
-        return units_of(block.flight)
+    def groups(self, block: Block) -> np.ndarray:
+        """Return the flight of each stretch, or its third of a single flight."""
+        return validation_groups(block.flight)
 
-    def share(
-        self, now: Block, at: Estimate, then: Block, candidate: Candidate, gains: np.ndarray
+    def explained_share(
+        self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return what a candidate takes, see `Evidence`."""
-        assert isinstance(now, ViewBlock) and isinstance(then, ViewBlock)
+        """Return the share that a candidate explains, see `Evidence`."""
+        assert isinstance(before, ViewBlock) and isinstance(after, ViewBlock)
         if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
             return None
-        share = share_taken(now.data, then.data, self.limits)
-        away = at.theta - self.space.array("start")
-        known = holds_at_any_speed(then, candidate.indices, away, self.limits)
-        return share if share >= self.limits.least_view_share and known else None
+        share = error_share_removed(before.data, after.data, self.limits)
+        change = at.theta - self.space.array("start")
+        consistent = fast_changes_agree(after, candidate.indices, change, self.limits)
+        return share if share >= self.limits.least_view_share and consistent else None
 
-    def order(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
-        """Return what is usual first."""
+    def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
+        """Return a sort key by which usual effects come first."""
         return usual_first(self.space, at.theta, candidate)
 
     def _block(self, data: ViewData, indices: Sequence[int] | None = None) -> ViewBlock:
         assert self.weights is not None
-        each = np.arange(len(data.flight))
-        stretch = each if self.means else stretch_of(data, self.limits)
+        rows = np.arange(len(data.flight))
+        stretch = rows if self.means else stretch_numbers(data, self.limits)
         along = range(len(self.space.entries)) if indices is None else indices
         return ViewBlock(**vars(block_of(data, self.weights, stretch, along)), data=data)
 
 
-def holds_at_any_speed(
-    then: ViewBlock, indices: Sequence[int], away: np.ndarray, limits: Thresholds
+def fast_changes_agree(
+    block: ViewBlock, indices: Sequence[int], change: np.ndarray, limits: Thresholds
 ) -> bool:
-    """Return whether fast changes are consistent with the numbers at `indices`, fitted in `then`.
+    """Return whether fast changes are consistent with fitted parameters (see `fast_share`).
 
-    They are not where they give less than a share of these values, and significantly less than all.
-    Means of flights have no changes. `away` (P,) is the change of all numbers since the vehicle
-    file.
+    They are not if they give less than a share of the fitted values and significantly less than
+    all. Means of flights have no fast changes and are always consistent.
+
+    Args:
+        block: at the fit.
+        indices: the fitted parameters.
+        change: (P,) all parameters less those of the vehicle file.
+        limits: least share.
     """
-    if len(np.unique(then.data.flight)) == len(then.data.flight):
+    if len(np.unique(block.data.flight)) == len(block.data.flight):
         return True
-    columns = [then.along.index(number) for number in indices]
-    share, half_width = fast_share(then.data, columns, away[list(indices)], limits)
+    columns = [block.along.index(index) for index in indices]
+    share, half_width = fast_share(block.data, columns, change[list(indices)], limits)
     return share >= limits.least_fast_share or share + half_width >= 1.0
 
 
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
-    """Return the candidates to which a view is sensitive, without faults of sensors.
+    """Return the candidates that change a view's accelerations, without faults of sensors.
 
-    Of a composite each effect has to act on it, if only through another.
+    Each effect of a composite (several effects as one hypothesis) has to change them, if only
+    through another one.
     """
-    seen, through = block.acts(), carried(among)
+    acts, acting_through_others = block.acts(), carried(among)
 
-    def moves(one: Candidate) -> bool:
-        effect = EFFECTS[one.name]
+    def changes_view(candidate: Candidate) -> bool:
+        effect = EFFECTS[candidate.name]
         return (
-            (bool(seen[list(one.indices)].any()) or one in through)
+            (bool(acts[list(candidate.indices)].any()) or candidate in acting_through_others)
             and effect.measure is None
             and effect.late is None
             and "command" not in effect.needs
         )
 
-    return [one for one in among if all(moves(part) for part in one.singles)]
+    return [one for one in among if all(changes_view(part) for part in one.singles)]

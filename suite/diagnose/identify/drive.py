@@ -17,7 +17,8 @@ from eval.effects import EFFECTS
 from eval.quadrotor.plant import Plant, Wrench, accelerations, make_plant
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.data.sampling import LONGEST_S, follow_lag
+from suite.diagnose.data.sampling import follow_lag
+from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
 from suite.diagnose.evidence.moments import accelerations_on, motion_of
 from suite.diagnose.identify.grid import STEP_S, FlightGrid

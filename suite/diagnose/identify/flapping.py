@@ -16,6 +16,7 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ViewFlights, ready
 from suite.diagnose.data.view import TORQUE
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
@@ -55,7 +56,7 @@ def flapping_of(
     evidence = _torque_evidence(flights, vehicle, voltage)
     every = candidates(evidence.model.space, voltage, ())
     flapping = [candidate for candidate in every if candidate.name == FLAPPING]
-    weighed, block = evidence.weighed(evidence.start)
+    weighed, block = evidence.estimate_noise(evidence.start)
     allowed = view_candidates(flapping, block)
     result = search(weighed, evidence.start, allowed, known=(weighed, block))
     if not result.named:
@@ -79,7 +80,7 @@ def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
     last = result.last.evidence
     assert isinstance(last, ViewEvidence)
     weighted = replace(evidence, weights=last.weights)
-    hessian, gradient = weighted.linearise(weighted.at(theta), [index]).equations.sums()
+    hessian, gradient = weighted.linearise(Estimate(theta), [index]).equations.sums()
     return float(gradient[0] / hessian[0, 0])
 
 

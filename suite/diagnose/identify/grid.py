@@ -17,7 +17,7 @@ from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import specific_force_w
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import on_one_side
+from suite.diagnose.data.sampling import sign_continuous
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
 from tracks.geometry.rotation import quat_to_rot, rot_to_quat
 
@@ -159,7 +159,7 @@ def interpolated(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> 
 
 def attitude_at(time_s: np.ndarray, quat_wxyz: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
     """Return rotations (G, 3, 3), body to world, of quaternions (T, 4); NaN as `interpolated`."""
-    mixed = interpolated(time_s, on_one_side(quat_wxyz), grid_s)
+    mixed = interpolated(time_s, sign_continuous(quat_wxyz), grid_s)
     return quat_to_rot(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 
 

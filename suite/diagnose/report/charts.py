@@ -194,7 +194,7 @@ def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[Track, np.nda
 
     The errors are those of position [m], velocity [m/s], attitude [deg] and rates [rad/s].
     """
-    seen = np.asarray(window.seen)
+    seen = np.asarray(window.valid)
     rows = seen[:, 0] & seen[:, 3]
     if rows.sum() < 2 or not np.isfinite(residual[rows]).all():
         return None

@@ -1,4 +1,7 @@
-"""What a search sees of its evidence at one estimate, and how candidates are fitted there."""
+"""Fits candidate effects from one estimate of the parameters, and holds the result of a search.
+
+A candidate is an effect (or several, as one hypothesis) that may explain the residuals of flights.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 
 from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
 from suite.diagnose.estimate.composites import acts_through, begin_of, inactive_at
-from suite.diagnose.estimate.gauss_newton import chi2_by_part, fit, gauss_newton_step, intervals95
+from suite.diagnose.estimate.gauss_newton import chi2_by_group, fit, gauss_newton_step, intervals95
 from suite.diagnose.estimate.parameters import Candidate, indices_of
 from suite.diagnose.estimate.permutation import CandidateScore
 from suite.diagnose.evidence.evidence import Evidence
@@ -18,24 +21,24 @@ from suite.diagnose.evidence.evidence import Evidence
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """One effect that was named."""
+    """One effect that the search has named."""
 
     candidate: Candidate
     p_value: float
     gain: float
-    """Fall of chi-square on stretches left out when it is added last."""
+    """Fall of chi-square on left-out stretches when it is added last."""
     rivals: tuple[str, ...] = ()
-    """Names that explain the same."""
+    """Names of effects that explain the flights about as well."""
     worse_by: dict[str, float] = field(default_factory=dict)
-    """By label of what was fitted in its place: rise of chi-square, with one for each number."""
+    """Rise of chi-square plus the number of parameters, by label of a candidate in its place."""
     gains: tuple[float, ...] = ()
-    """Fall of the squared error of each flight that the others' fit brings."""
+    """Fall of each flight's squared error, with the parameters fitted to the other flights."""
     share: float = 0.0
-    """Of the squared error that was to be explained [1]."""
+    """Share of the squared error that it explains [1]."""
 
 
 class Evaluation(NamedTuple):
-    """What the evidence gives at one estimate."""
+    """Evidence at one estimate, with its block there."""
 
     evidence: Evidence
     at: Estimate
@@ -43,125 +46,134 @@ class Evaluation(NamedTuple):
 
     @property
     def equations(self) -> NormalEquations:
-        """The block's sums."""
+        """The block's normal equations."""
         return self.block.equations
 
 
 def evaluated_at(
-    found: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()
+    linearised: tuple[Evidence, Block], at: Estimate, among: Sequence[Candidate] = ()
 ) -> Evaluation:
-    """Return what evidence gives at an estimate, with columns of what acts through composites."""
-    evidence, block = found
+    """Return the evaluation at an estimate, with further columns for inactive parameters.
+
+    A wind, for one, acts through a drag alone: without a drag its column is zero, and a second
+    column is added with the drag at its usual size (see `estimate/composites.py`).
+    """
+    evidence, block = linearised
     inactive = inactive_at(evidence.space, at.theta, among, block.acts())
     if inactive is not None:
-        numbers = inactive.numbers
-        there = evidence.linearise(Estimate(inactive.theta, at.free), numbers)
-        columns = [there.along.index(number) for number in numbers]
+        indices = inactive.indices
+        active = evidence.linearise(Estimate(inactive.theta, at.free), indices)
+        columns = [active.along.index(index) for index in indices]
         block = replace(
             block,
-            slope=np.concatenate([block.slope, there.slope[..., columns]], axis=-1),
-            free_slope=np.concatenate([block.free_slope, there.free_slope[..., columns]], axis=-1),
-            along=(*block.along, *numbers),
+            slope=np.concatenate([block.slope, active.slope[..., columns]], axis=-1),
+            free_slope=np.concatenate([block.free_slope, active.free_slope[..., columns]], axis=-1),
+            along=(*block.along, *indices),
         )
     return Evaluation(evidence, at, block)
 
 
 def fit_with(
-    here: Evaluation, others: Sequence[int], candidate: Candidate
+    start: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[Estimate, Block]:
-    """Fit `candidate` and the numbers at `others`, from where `here` was taken."""
-    evidence, equations, limits = here.evidence, here.equations, here.evidence.limits
-    at, space, theta = sorted({*others, *candidate.indices}), evidence.space, here.at.theta
-    inactive = [number for number in equations.repeated() if number in candidate.indices]
+    """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
+    evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
+    indices = sorted({*others, *candidate.indices})
+    inactive = [index for index in start.equations.repeated() if index in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
-        return fit(evidence, here.at, at, rounds, here.block, limits)
-    change, informed = wanted_change(here, others, candidate)
-    begin = begin_of(space, theta, candidate, inactive, change, informed)
-    return fit(evidence, Estimate(begin, here.at.free), at, limits.bilinear_rounds, None, limits)
+        return fit(evidence, estimate, indices, rounds, start.block, limits)
+    change, information = linear_change(start, others, candidate)
+    theta = begin_of(evidence.space, estimate.theta, candidate, inactive, change, information)
+    begin = Estimate(theta, estimate.free)
+    return fit(evidence, begin, indices, limits.bilinear_rounds, None, limits)
 
 
-def wanted_change(
-    here: Evaluation, others: Sequence[int], candidate: Candidate
+def linear_change(
+    start: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change (P,) of all numbers by the slopes, and the information on each (P,).
+    """Return the change (P,) of all parameters by one linear fit, and the information on each.
 
-    Those of `candidate` and at `others` are changed.
+    Only the parameters of `candidate` and those at `others` are fitted.
     """
-    equations = here.equations
-    some = equations.take(sorted({*others, *equations.columns_of(candidate)}))
-    moved, _ = gauss_newton_step(some, here.at.theta, here.evidence.space)
-    change, informed = np.zeros_like(here.at.theta), np.zeros_like(here.at.theta)
-    numbers = list(some.numbers)
-    change[numbers], informed[numbers] = moved, np.diag(some.sums()[0])
-    return change, informed
+    equations, theta = start.equations, start.at.theta
+    fitted = equations.take(sorted({*others, *equations.columns_of(candidate)}))
+    step, _ = gauss_newton_step(fitted, theta, start.evidence.space)
+    change, information = np.zeros_like(theta), np.zeros_like(theta)
+    indices = list(fitted.numbers)
+    change[indices], information[indices] = step, np.diag(fitted.sums()[0])
+    return change, information
 
 
-def chi2_of(here: Evaluation, block: Block, at: Estimate, indices: Sequence[int]) -> np.ndarray:
-    """Return the squared error (G,) of each part of the flights under the others' fit."""
+def cross_validated_chi2(
+    evidence: Evidence, block: Block, at: Estimate, indices: Sequence[int]
+) -> np.ndarray:
+    """Return the squared error (G,) of each group of stretches, fitted on the other groups.
+
+    The fit is linear about `at`, of the parameters at `indices`.
+    """
     equations = block.equations.along_numbers(sorted(indices))
-    return chi2_by_part(equations, at.theta, here.evidence.space, here.evidence.parts(block))
+    return chi2_by_group(equations, at.theta, evidence.space, evidence.groups(block))
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search found."""
+    """Named effects of a search, and the fit with them."""
 
     named: tuple[NamedEffect, ...]
     start: Estimate
-    """Where it began."""
+    """Estimate from which the search began."""
     last: Evaluation
-    """At the fit of all names, weighed by the noise that was measured with them."""
+    """At the fit of all names, weighted by the noise that was estimated with them."""
     judged: Evaluation
-    """The same, by which names, rivals and intervals were judged: where the model leaves more than
-    noise, the noise is what it leaves."""
+    """The same, by which names, rivals and intervals were decided. If the model leaves more than
+    noise, its whole residual counts as noise here."""
     first: list[CandidateScore]
-    """Scores of all candidates before anything was named, best first."""
+    """Scores of all candidates before any effect was named, best first."""
     explained: float
-    """Fall of chi-square that the named effects bring."""
+    """Fall of chi-square by the named effects."""
 
     @property
     def estimate(self) -> Estimate:
-        """Where the numbers stand with all names."""
+        """The estimate with all named effects."""
         return self.last.at
 
     @property
     def candidates(self) -> list[Candidate]:
-        """What was named, without the reasons."""
+        """The named candidates."""
         return [one.candidate for one in self.named]
 
     @property
     def indices(self) -> list[int]:
-        """Places in the vector of the named numbers."""
+        """Places of the named effects' parameters in the vector."""
         return indices_of(self.candidates)
 
     @property
     def moved(self) -> np.ndarray:
-        """(K,) how far the named numbers are from where they began."""
+        """(K,) change of the named effects' parameters since the start."""
         return (self.estimate.theta - self.start.theta)[self.indices]
 
     def half_widths(self) -> np.ndarray:
-        """Return half-widths (K,) of the 95 % intervals of the named numbers."""
+        """Return the half-widths (K,) of the 95 % intervals of the named effects' parameters."""
         equations = self.judged.equations.along_numbers(self.indices)
-        return intervals95(equations, self.judged.evidence.draws).half_width
+        return intervals95(equations, self.judged.evidence.flights_differ_p).half_width
 
     def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
-        """Return this with those of its names alone that are in `named`."""
+        """Return this with only those of its names that are in `named`, fitted again."""
         indices = indices_of([one.candidate for one in named])
         theta = self.start.theta.copy()
         theta[indices] = self.estimate.theta[indices]
         begin = Estimate(theta, self.estimate.free) if named else self.start
-        at, judged = self.judged, self.judged.evidence
-        best, block = fit(judged, begin, indices, limits=judged.limits)
-        last = at = Evaluation(judged, best, block)
+        evidence = self.judged.evidence
+        last = judged = Evaluation(evidence, *fit(evidence, begin, indices, limits=evidence.limits))
         if self.judged is not self.last:
-            block = self.last.evidence.linearise(best, indices)
-            last = Evaluation(self.last.evidence, best, block)
-        nothing = self.explained + float(self.last.equations.chi2.sum())
-        explained = nothing - float(last.equations.chi2.sum()) if named else 0.0
-        return replace(self, named=tuple(named), last=last, judged=at, explained=explained)
+            block = self.last.evidence.linearise(judged.at, indices)
+            last = Evaluation(self.last.evidence, judged.at, block)
+        chi2_without = self.explained + float(self.last.equations.chi2.sum())
+        explained = chi2_without - float(last.equations.chi2.sum()) if named else 0.0
+        return replace(self, named=tuple(named), last=last, judged=judged, explained=explained)
 
     def fitted_anew(self, begin: Estimate, indices: Sequence[int]) -> Estimate:
-        """Return the estimate where the numbers at `indices` alone are fitted from `begin`."""
-        judged = self.judged.evidence
-        return fit(judged, begin, indices, limits=judged.limits)[0]
+        """Return the estimate with only the parameters at `indices` fitted, from `begin`."""
+        evidence = self.judged.evidence
+        return fit(evidence, begin, indices, limits=evidence.limits)[0]

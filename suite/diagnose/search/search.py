@@ -1,15 +1,16 @@
-"""The search for effects: forward selection, then each named effect against its alternatives.
+"""Searches for the effects that explain flights: forward selection, then a test against rivals.
 
-A named effect must lower the error on left-out stretches by more than the best of all candidates
-does by chance, and pass further tests of its source of evidence. A rival is another candidate that
-explains the same flights; it is listed as an alternative. All sources use this search.
+A candidate (an effect of the catalogue) is named if it lowers the error on left-out stretches of
+the flights by more than the best of all candidates does by chance, and if it passes further tests
+of the evidence. A rival is another candidate that explains the same flights about as well; it is
+listed as an alternative. All kinds of evidence use this search.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,22 +23,32 @@ from suite.diagnose.search.evaluation import (
     Evaluation,
     NamedEffect,
     SearchResult,
-    chi2_of,
+    cross_validated_chi2,
     evaluated_at,
     fit_with,
 )
 from suite.diagnose.thresholds import Thresholds
 
-T = TypeVar("T")
-
 
 class SearchTask(NamedTuple):
-    """What a search is given."""
+    """Inputs of a search that all its steps share."""
 
     among: Sequence[Candidate]
+    """The candidates."""
     say: Callable[[str], None]
+    """Receives a line for people about each step."""
     seed: int
+    """Of the permutation test."""
     limits: Thresholds
+
+
+class _Trial(NamedTuple):
+    """A fitted candidate."""
+
+    cost: float
+    """Chi-square plus the number of the candidate's parameters."""
+    name: NamedEffect
+    at: Estimate
 
 
 def search(
@@ -48,41 +59,56 @@ def search(
     seed: int = 0,
     known: tuple[Evidence, Block] | None = None,
 ) -> SearchResult:
-    """Return which of `among` explain what the model leaves of the evidence at `start`.
+    """Return the candidates of `among` that explain the residual of the evidence at `start`.
 
-    `say` receives a line for people about each step; `known` is the evidence weighed at `start`, to
-    save its calculation; `seed` is of the null's draws.
+    Args:
+        evidence: of the flights.
+        start: the vehicle file's parameters.
+        among: the candidates.
+        say: receives a line for people about each step.
+        seed: of the permutation test.
+        known: result of `evidence.estimate_noise(start)`, if it was computed before.
     """
     limits = evidence.limits
     task = SearchTask(among, say, seed, limits)
-    here = evaluated_at(known or evidence.weighed(start), start, among)
+    here = evaluated_at(known or evidence.estimate_noise(start), start, among)
     first = _scores(task, here, [], among)
     named: list[NamedEffect] = []
-    for _ in range(2 * limits.most_names):  # a name that went may come again
-        found = None
+    for _ in range(2 * limits.most_names):  # a name that was dropped may be named again
+        best = None
         if len(named) < limits.most_names:
             scores = first if here.at is start else None
-            found = _next_name(task, here, named, among, scores)
-        if found is None or (named and found[0].gain <= limits.least_name_share * first[0].gain):
+            best = _best_candidate(task, here, named, among, scores)
+        if best is None or (named and best[0].gain <= limits.least_name_share * first[0].gain):
             break
-        one, at = found
-        new = [replace(one, candidate=single) for single in one.candidate.singles]
-        known = here.evidence.weighed(at)
-        named, at = _without_idle_names(task, known[0], at, [*named, *new], len(new) == 1)
-        here = evaluated_at(known if at is found[1] else known[0].again(at), at, among)
-    named, at = _settled(task, here.evidence, here.at, named)
-    last = judged = _last_fit(here.evidence, at, named)
-    misfit = last.evidence.misfit(last.at, last.block)
+        name, at = best
+        new = _split(name)
+        known = here.evidence.estimate_noise(at)
+        named, at = _drop_unneeded(task, known[0], at, [*named, *new], len(new) == 1)
+        here = evaluated_at(known if at is best[1] else known[0].relinearise(at), at, among)
+    named, at = _settle(task, here.evidence, here.at, named)
+    last = judged = _final_fit(here.evidence, at, named)
+    misfit = last.evidence.misfit_as_noise(last.at, last.block)
     if misfit is not None:
         say("the model leaves more than noise: names are judged by what it leaves")
-        named, at = _settled(task, misfit[0], last.at, named)
-        judged = _last_fit(misfit[0], at, named)
-        last = _seen_by(last.evidence, judged.at, named)
+        named, at = _settle(task, misfit[0], last.at, named)
+        judged = _final_fit(misfit[0], at, named)
+        block = last.evidence.linearise(judged.at, _indices(named))
+        last = Evaluation(last.evidence, judged.at, block)
     explained = 0.0
     if named:
-        _, nothing = fit(last.evidence, start, [], limits=limits)
-        explained = float((nothing.residual**2).sum() - last.equations.chi2.sum())
+        _, without = fit(last.evidence, start, [], limits=limits)
+        explained = float((without.residual**2).sum() - last.equations.chi2.sum())
     return SearchResult(tuple(named), start, last, judged, first, explained)
+
+
+def _indices(named: Sequence[NamedEffect]) -> list[int]:
+    return indices_of([name.candidate for name in named])
+
+
+def _split(name: NamedEffect) -> list[NamedEffect]:
+    """Return one name for each effect of a composite; else the name alone."""
+    return [replace(name, candidate=single) for single in name.candidate.singles]
 
 
 def _scores(
@@ -91,169 +117,171 @@ def _scores(
     return here.evidence.scores(here.block, here.equations, here.at.theta, others, among, task.seed)
 
 
-def _seen_by(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
-    return Evaluation(
-        evidence, at, evidence.linearise(at, indices_of([n.candidate for n in named]))
-    )
-
-
-def _last_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
-    """Fit all names to the end, as some effects saturate; where there is none nothing is moved."""
-    indices, limits = indices_of([n.candidate for n in named]), evidence.limits
+def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
+    """Fit all names to convergence, as some effects saturate; without names keep the estimate."""
+    indices, limits = _indices(named), evidence.limits
     rounds = limits.last_rounds if indices else 0
     return Evaluation(evidence, *fit(evidence, at, indices, rounds, None, limits))
 
 
-def _next_name(
+def _best_candidate(
     task: SearchTask,
     here: Evaluation,
     named: Sequence[NamedEffect],
     among: Sequence[Candidate],
     known: Sequence[CandidateScore] | None = None,
-    now: Candidate | None = None,
+    tested: Candidate | None = None,
 ) -> tuple[NamedEffect, Estimate] | None:
-    """Return the best name next to `named`, and the fit with it; None where there is none.
+    """Return the candidate that explains most in addition to `named`, and the fit with it.
 
-    `known` are the scores there, to save their calculation. With `now`, a name that `here` is taken
-    without, all that may stand in its place is tried.
+    None where no candidate passes all tests.
+
+    Args:
+        task: the search.
+        here: evaluation without the candidate.
+        named: names that are fitted with every candidate.
+        among: the candidates.
+        known: their scores, if they were computed before.
+        tested: a name that is tested against its rivals, and missing from `here`. If given, all
+            candidates that could replace it are fitted, also those that are not significant.
     """
     limits, evidence, space = task.limits, here.evidence, here.evidence.space
-    others = indices_of([n.candidate for n in named])
-    left = [c for c in among if not set(c.indices) & set(others)]
-    scores = {s.candidate: s for s in known or _scores(task, here, others, left)}
+    others = _indices(named)
+    free = [c for c in among if not set(c.indices) & set(others)]
+    scores = {s.candidate: s for s in known or _scores(task, here, others, free)}
     near = list(scores)
-    if now is None:
-        most = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
+    if tested is None:
+        least = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
         near = [
             c
             for c, score in scores.items()
-            if score.p_value <= evidence.name_p_value and score.gain >= most
+            if score.p_value <= evidence.name_p_value and score.gain >= least
         ]
     columns, theta = here.equations.columns_of, here.at.theta
-    fallen = {c: chi2_fall(here.equations, theta, space, [*others, *columns(c)]) for c in near}
-    near = [c for c in near if c == now or could_be_best(fallen, c, limits)]
-    if now is None:
+    falls = {c: chi2_fall(here.equations, theta, space, [*others, *columns(c)]) for c in near}
+    near = [c for c in near if c == tested or could_be_best(falls, c, limits)]
+    if tested is None:
         single = [c for c in near if not c.parts][: limits.short_list]
         near = [c for c in near if c.parts or c in single]
-    before, tried = chi2_of(here, here.block, here.at, others), []
-    total = float(here.equations.chi2.sum())
+    before = cross_validated_chi2(evidence, here.block, here.at, others)
+    total, trials = float(here.equations.chi2.sum()), list[_Trial]()
     for candidate in near:
         at, block = fit_with(here, others, candidate)
-        gains = before - chi2_of(here, block, at, [*others, *candidate.indices])
-        share = evidence.share(here.block, at, block, candidate, gains)
+        indices = [*others, *candidate.indices]
+        gains = before - cross_validated_chi2(evidence, block, at, indices)
+        share = evidence.explained_share(here.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        fall = total - chi2
-        outcome = f"lowers the squared error by {fall:,.0f} times the noise variance"
+        outcome = f"lowers the squared error by {total - chi2:,.0f} times the noise variance"
         if share is None:
             outcome = "rejected: flights disagree, or a value is implausible or explains too little"
         task.say(f"fitted {candidate.label}: {outcome}")
         if share is not None:
-            one = NamedEffect(
+            name = NamedEffect(
                 candidate, scores[candidate].p_value, scores[candidate].gain,
                 gains=tuple(gains.tolist()), share=share,
             )  # fmt: skip
-            tried.append((chi2 + len(candidate.indices), candidate, (one, at)))
-    tried = without_idle(tried, limits)
-    if not tried:
+            trials.append(_Trial(chi2 + len(candidate.indices), name, at))
+    costs = {trial.name.candidate: trial.cost for trial in trials}
+    trials = [trial for trial in trials if needs_all_parts(costs, trial.name.candidate, limits)]
+    if not trials:
         return None
-    least = min(cost for cost, *_ in tried)
-    explained = total - chi2_fall(here.equations, theta, space, others) - least
+    lowest = min(trial.cost for trial in trials)
+    explained = total - chi2_fall(here.equations, theta, space, others) - lowest
     slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
-    alike = [one for one in tried if one[0] - least <= slack]
-    sure = [one for one in alike if one[2][0].p_value <= evidence.name_p_value]
-    if not sure:
+    close = [trial for trial in trials if trial.cost - lowest <= slack]
+    significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
+    if not significant:
         return None
-    cost, best, (one, at) = min(sure, key=lambda t: (*evidence.order(t[2][1], t[1]), t[0]))
-    rivals = dict.fromkeys(c.name for _, c, _ in alike if c.name != best.name)
-    worse_by = {c.label: other - cost for other, c, _ in tried if c != best}
-    return replace(one, rivals=tuple(rivals), worse_by=worse_by), at
+    best = min(significant, key=lambda t: (*evidence.preference(t.at, t.name.candidate), t.cost))
+    own = best.name.candidate
+    rivals = dict.fromkeys(c.name for c in (t.name.candidate for t in close) if c.name != own.name)
+    worse_by = {
+        t.name.candidate.label: t.cost - best.cost for t in trials if t.name.candidate != own
+    }
+    return replace(best.name, rivals=tuple(rivals), worse_by=worse_by), best.at
 
 
-def _judged(
+def _replace_or_drop(
     task: SearchTask,
     evidence: Evidence,
     at: Estimate,
     named: list[NamedEffect],
     place: int,
-    among: Sequence[Candidate] | None = None,
+    among: Sequence[Candidate],
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Weigh the name at `place` when added last: a better rival takes its place, or it goes.
+    """Test the name at `place` as if added last, against the candidates `among`.
 
-    It is weighed against `among`, all candidates if not given.
+    The best of them takes its place, which may be the name itself. Without any it is dropped.
     """
-    one, theta = named[place].candidate, at.theta.copy()
-    theta[list(one.indices)] = evidence.space.array("start")[list(one.indices)]
+    tested, theta = named[place].candidate, at.theta.copy()
+    theta[list(tested.indices)] = evidence.space.array("start")[list(tested.indices)]
     without = Estimate(theta, at.free)
     others = [*named[:place], *named[place + 1 :]]
-    left = [c for c in (task.among if among is None else among) if one not in c.parts]
-    here = evaluated_at(evidence.again(without), without, left)
-    found = _next_name(task, here, others, left, None, one)
-    if found is None:
+    among = [c for c in among if tested not in c.parts]
+    here = evaluated_at(evidence.relinearise(without), without, among)
+    best = _best_candidate(task, here, others, among, None, tested)
+    if best is None:
         return others, without
-    new = [replace(found[0], candidate=single) for single in found[0].candidate.singles]
-    return [*named[:place], *new, *named[place + 1 :]], found[1]
+    return [*named[:place], *_split(best[0]), *named[place + 1 :]], best[1]
 
 
-def _without_idle_names(
-    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], newest: bool
+def _drop_unneeded(
+    task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are needed next to all others, each weighed against nothing.
+    """Return the names that are significant in addition to all others.
 
-    With `newest` the last one has just been weighed.
+    With `last_tested` the last name has just been tested.
     """
     place = 0
-    while place < len(named) - newest:
-        kept, after = _judged(task, evidence, at, named, place, [named[place].candidate])
-        if len(kept) < len(named):
-            named, at = kept, after
+    while place < len(named) - last_tested:
+        single = [named[place].candidate]
+        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, single)
+        if len(remaining) < len(named):
+            named, at = remaining, refitted
         else:
             place += 1
     return named, at
 
 
-def _settled(
+def _settle(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect]
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Refit all names jointly and judge each against its rivals, until no name changes."""
+    """Refit all names jointly and test each against its rivals, until no name changes."""
     for _ in range(task.limits.settle_rounds):
-        before = [n.candidate for n in named]
+        before = [name.candidate for name in named]
         if not before:
             break
         at, _ = fit(evidence, at, indices_of(before), limits=task.limits)
         place = 0
         while place < len(named):
             count = len(named)
-            named, at = _judged(task, evidence, at, named, place)
+            named, at = _replace_or_drop(task, evidence, at, named, place, task.among)
             place += len(named) >= count
-        if [n.candidate for n in named] == before:
+        if [name.candidate for name in named] == before:
             break
     return named, at
 
 
 def could_be_best(
-    fallen: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
+    falls: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
 ) -> bool:
-    """Return whether `candidate` could be the best: slopes alone do not decide on large effects.
+    """Return whether `candidate` could be the best after a fit of the full model.
 
-    `fallen` holds the fall of chi-square to first order, by candidate. Several effects together
-    have to explain more than each of them alone.
+    `falls` holds the fall of chi-square by candidate, to first order, which is inexact for large
+    effects. Several effects together have to explain more than each of them alone.
     """
-    own, most = fallen.get(candidate, -np.inf), max(fallen.values())
-    alone = max((fallen.get(part, 0.0) for part in candidate.parts), default=-np.inf)
-    slack = limits.first_order_chi2 + limits.first_order_share * abs(most)
-    return own >= most - slack and own > alone + limits.rival_chi2
+    own, largest = falls.get(candidate, -np.inf), max(falls.values())
+    by_part = max((falls.get(part, 0.0) for part in candidate.parts), default=-np.inf)
+    slack = limits.first_order_chi2 + limits.first_order_share * abs(largest)
+    return own >= largest - slack and own > by_part + limits.rival_chi2
 
 
-def without_idle(
-    tried: Sequence[tuple[float, Candidate, T]], limits: Thresholds
-) -> list[tuple[float, Candidate, T]]:
-    """Return what was `tried`, without composites of which one part alone explains as much.
+def needs_all_parts(
+    costs: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
+) -> bool:
+    """Return whether no part of a composite alone explains as much as the whole.
 
-    Each comes with its squared error, to which its numbers were added.
+    `costs` holds chi-square plus the number of parameters, by fitted candidate.
     """
-    cost = {candidate: chi2 for chi2, candidate, _ in tried}
-    return [
-        (chi2, candidate, more)
-        for chi2, candidate, more in tried
-        if all(chi2 + limits.rival_chi2 < cost.get(part, np.inf) for part in candidate.parts)
-    ]
+    limit = costs[candidate] + limits.rival_chi2
+    return all(limit < costs.get(part, np.inf) for part in candidate.parts)

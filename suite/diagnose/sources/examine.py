@@ -126,7 +126,8 @@ def confirmed(
     while found.named:
         without = _without_each(source, found)
         # A mean score of 1 is noise; more is an error that no named effect explains.
-        excess = max(0.0, 1.0 - 1.0 / after.score.mean()) if found.judged.evidence.off else 0.0
+        misfit = found.judged.evidence.misfit_is_noise
+        excess = max(0.0, 1.0 - 1.0 / after.score.mean()) if misfit else 0.0
         least = (1.0 + limits.least_next_to_rest * excess) * after.energy.sum()
         refused = [
             one
@@ -238,7 +239,8 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
             continue
         fitted = sorted({*by.indices, *own})
         best, block = fit(evidence, by.estimate, fitted, limits=evidence.limits)
-        half = intervals95(block.equations.along_numbers(fitted), evidence.draws).half_width
+        equations = block.equations.along_numbers(fitted)
+        half = intervals95(equations, evidence.flights_differ_p).half_width
         for index in own:
             value, other = found.estimate.theta[index], best.theta[index]
             other_half = float(half[fitted.index(index)])

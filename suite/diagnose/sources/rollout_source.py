@@ -24,20 +24,20 @@ from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.rollouts import (
     RolloutEvidence,
     block_of,
-    weighed_by,
+    rollout_evidence,
 )
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.disturbances import Swing, find_turbulence, swing_left
+from suite.diagnose.verdict.disturbances import Swing, find_turbulence, residual_swing
 from suite.diagnose.verdict.gap import (
     FORCE_S,
     TORQUE_S,
     EffectSize,
     Gap,
+    remaining_share,
     rollout_size,
-    share_left,
 )
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
@@ -85,7 +85,7 @@ class RolloutSource(Source):
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""
-        return after.above(before, overlap(self.limits), 0, self.limits)
+        return after.exceeds(before, overlap(self.limits), 0, self.limits)
 
     def would_show(self, found: SearchResult, candidate: Candidate) -> bool:
         """Return whether held-out flights are sensitive to `candidate`, see `Source`."""
@@ -137,7 +137,7 @@ class RolloutSource(Source):
             directions = [*indices, *model.starts]
             linear = model.linearise(estimate.theta, estimate.free, self.coarser, directions)
             options = (found.last.evidence.limits, of_rollouts(found.last).noise, indices)
-            equations = weighed_by(model, self.coarser, linear, *options)[1].equations
+            equations = rollout_evidence(model, self.coarser, linear, *options)[1].equations
             moved, _ = gauss_newton_step(equations, estimate.theta, model.space)
             model_error = self.coarser_share * np.abs(moved)
         return sizes_by_effect(found, slope, lambda c: rollout_size(c, windows), model_error)
@@ -153,14 +153,14 @@ class RolloutSource(Source):
             "shapes": [shape._asdict() for shape in structure.shapes[:SHAPES]],
             "coloured": structure.coloured,
         }
-        share = share_left(*gaps) if found.named else 0.0
+        share = remaining_share(*gaps) if found.named else 0.0
         if not self.is_relevant(gaps[1]):
             return Remaining(False, share, details=details)
         slow = of_rollouts(found.last).slow_errors(found.last.block)
         where = structure_where(slow, structure, self.flown.rotor_input, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
         if wind and not swing:
-            return Remaining(False, share_left(*gaps), wind=wind, details=details)
+            return Remaining(False, remaining_share(*gaps), wind=wind, details=details)
         if (where or swing) and not found.named:
             share = 1.0
         return Remaining(bool(where or swing), share, where, swing=swing, details=details)
@@ -202,7 +202,7 @@ class RolloutSource(Source):
             return None
         voltage = all(log.voltage is not None for log in flown.logs)
         model = ForceModel(flown.vehicle, make_space(flown.vehicle), voltage)
-        return swing_left(ViewEvidence(FORCE, model, flights, self.limits), theta)
+        return residual_swing(ViewEvidence(FORCE, model, flights, self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:
         """Return whether MuJoCo's Euler steps explain the named delay between pose and rates."""
@@ -236,7 +236,7 @@ class RolloutSource(Source):
                 ("rates", windows.row_rate_b),
             )
         }
-        seen = np.asarray(windows.seen)[rows]
+        seen = np.asarray(windows.valid)[rows]
         errors = {label: values[rows] for label, values in simulated.items()}
         error_as_given = next(iter(errors.values()))
 

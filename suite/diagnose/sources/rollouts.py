@@ -13,22 +13,32 @@ import numpy as np
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import choose_held_out
-from suite.diagnose.data.sampling import own_spacing_s, rows_show_torque
+from suite.diagnose.data.sampling import own_spacing_s
+from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
 from suite.diagnose.data.whitening import Linearisation
-from suite.diagnose.data.windows import LENGTH_S, FlightWindows, cut, remembers, take
+from suite.diagnose.data.windows import (
+    LENGTH_S,
+    FlightWindows,
+    cut,
+    take,
+)
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
+    best_fit_error,
     information,
-    least_left,
+    rollout_evidence,
     start_estimate,
-    weighed_by,
 )
 from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.actuators import another_controller, integrator_of, rotors_are_input
+from suite.diagnose.verdict.actuators import (
+    flown_by_other_controller,
+    integrator_of,
+    rotors_are_input,
+)
 from suite.diagnose.verdict.rollout_gap import MEASURE, Rollouts, with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
@@ -91,7 +101,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         coarser = take(coarser, good)
         limits = with_model_error(model, start, windows, linear, coarser, limits)
     most = limits.hopeless_chi2
-    if not given.chosen and least_left(model, windows, linear, limits, most) > most:
+    if not given.chosen and best_fit_error(model, windows, linear, limits, most) > most:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
     informed = information(linear, windows, model.size, limits)
@@ -122,7 +132,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        weighed=weighed_by(model, fitted, _take(linear, is_fitted), limits),
+        weighed=rollout_evidence(model, fitted, _take(linear, is_fitted), limits),
         start=start_estimate(model, fitted),
         candidates=[*single, *composites(single)],
         limits=limits,
@@ -142,7 +152,8 @@ def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     rate loop without integrators and filters.
     """
     return not any(
-        log.partial or (log.rotor_speed is None and (log.rate_cmd_b is None or remembers(vehicle)))
+        log.partial
+        or (log.rotor_speed is None and (log.rate_cmd_b is None or has_firmware_loop(vehicle)))
         for log in logs
     )
 
@@ -153,7 +164,7 @@ def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thre
     Raises:
         ValueError: if so, and some flights have no rotor speeds.
     """
-    if not another_controller(logs, vehicle, limits):
+    if not flown_by_other_controller(logs, vehicle, limits):
         return False
     without = [log.name for log in logs if log.rotor_speed is None]
     if without:

@@ -15,12 +15,12 @@ import numpy as np
 
 from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.evidence.moments import centred, means_of, units_of
+from suite.diagnose.evidence.moments import centred, means_of, validation_groups
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence
 from suite.diagnose.search.change import search_motion_change
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
 from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
-from suite.diagnose.verdict.disturbances import swing_left
+from suite.diagnose.verdict.disturbances import residual_swing
 from suite.diagnose.verdict.gap import Channel, EffectSize, Gap, view_size
 
 STRETCH_S = 10.0
@@ -43,7 +43,7 @@ class ViewSource(Source):
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
-        data = self.held.left(theta)
+        data = self.held.residuals(theta)
         # If only means of flights are compared, there is no error within a flight.
         within = data.residual if self.held.means else centred(data.residual, data.flight)
         error = np.sqrt((data.residual**2).mean(axis=0))
@@ -79,7 +79,7 @@ class ViewSource(Source):
         )
         swing = None
         if self.all_flights is not None:
-            swing = swing_left(self.all_flights, found.estimate.theta)
+            swing = residual_swing(self.all_flights, found.estimate.theta)
             force = self._unexplained_force(found.estimate.theta, gaps[1], seed)
             if force and not structured:
                 structured, beyond = True, max(beyond, share_of_energy(*gaps, self._noise_power))
@@ -112,11 +112,11 @@ class ViewSource(Source):
         `gap` is the gap at `theta` (P,).
         """
         assert self.all_flights is not None
-        data, limits = self.all_flights.left(theta), self.limits
+        data, limits = self.all_flights.residuals(theta), self.limits
         offset = means_of(data.residual, data.flight)
         trim = limits.unexplained_trim * float(np.sqrt((offset**2).sum(axis=1).mean()))
         least = max(limits.relevance[0], min(trim, limits.unexplained_force))
-        if gap.least_energy(seed, limits) < self._noise_power + least**2:
+        if gap.energy_low95(seed, limits) < self._noise_power + least**2:
             return 0.0
         return float(np.sqrt(gap.energy.mean() - self._noise_power))
 
@@ -124,13 +124,15 @@ class ViewSource(Source):
         """Return the shares of the error that the named effects and a black box explain."""
         evidence = found.last.evidence
         assert isinstance(evidence, ViewEvidence)
-        before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
+        before = self.held.residuals(found.start.theta)
+        after = self.held.residuals(found.estimate.theta)
         trim = np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
         if self.held.means:
             power = (before.residual**2).mean(axis=0)
             closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, TINY)
             return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, trim)
-        start, fitted = evidence.left(found.start.theta), evidence.left(found.estimate.theta)
+        start = evidence.residuals(found.start.theta)
+        fitted = evidence.residuals(found.estimate.theta)
         inputs = np.concatenate([inputs_of(flight) for flight in evidence.flights])
         held_inputs = np.concatenate([inputs_of(flight) for flight in self.held.flights])
         black_box = fit_black_box(inputs, start.residual, start.flight)
@@ -151,7 +153,8 @@ class ViewSource(Source):
 
         If nothing is named, it is the stretch with the largest error. See `Source`.
         """
-        before, after = self.held.left(found.start.theta), self.held.left(found.estimate.theta)
+        before = self.held.residuals(found.start.theta)
+        after = self.held.residuals(found.estimate.theta)
         shares = self._shares(found)
         weight = shares.variance * (shares.closed if found.named else 1.0)
         axis = max(self.view.axes, key=lambda k: float(weight[k]))
@@ -262,7 +265,7 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
     Each flight's mean, its trim, is subtracted from inputs (M, K) and error. `flight` (M,) is the
     number of each row's flight; a single flight is split into thirds.
     """
-    groups = units_of(flight)
+    groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
     scale = np.maximum(inputs.std(axis=0), 1e-9)
     scaled = inputs / scale

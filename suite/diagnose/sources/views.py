@@ -22,11 +22,11 @@ from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
-from suite.diagnose.search.change import changed, changed_task
+from suite.diagnose.search.change import change_evidence, less_reference_residual
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet, TestedEffect
 from suite.diagnose.sources.view_source import MotionSource, ViewSource
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.actuators import LAG, RotorLag, another_lag
+from suite.diagnose.verdict.actuators import LAG, RotorLag, find_rotor_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
 """Estimated duration on two cores: fixed part, and for each row [s]."""
@@ -84,7 +84,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
             source = _since_reference(reference, evidence, held_evidence, spread, allowed, floor)
             source = replace(source, fallback=None) if partial else source
         sources.append(source)
-    lag = None if references else another_lag(logs, vehicle, limits)
+    lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
         held_names,
@@ -127,7 +127,7 @@ def _since_file(
     floor: np.ndarray,
 ) -> ViewSource:
     """Return the source that compares flights with the vehicle file."""
-    weighed = evidence.weighed(evidence.start)
+    weighed = evidence.estimate_noise(evidence.start)
     return ViewSource(
         weighed=weighed,
         start=evidence.start,
@@ -153,8 +153,8 @@ def _since_reference(
     It compares means of flights. If none has changed, its fallback searches for a change that shows
     in motion.
     """
-    difference, start = changed(reference, evidence.flights, spread)
-    weighed = difference.again(start)
+    difference, start = change_evidence(reference, evidence.flights, spread)
+    weighed = difference.relinearise(start)
     shared: dict[str, Any] = {
         **_descriptions(evidence.view), "weighed": weighed, "start": start, "floor": floor,
         "limits": evidence.limits, "names_small": True,
@@ -162,7 +162,7 @@ def _since_reference(
     in_motion = MotionSource(
         candidates=allowed, held=held, reference=reference, fitted=evidence, **shared
     )
-    means = replace(changed_task(reference, start.theta, held.flights), means=True)
+    means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
     compared = view_candidates(allowed, weighed[1])
     return ViewSource(candidates=compared, held=means, fallback=in_motion, **shared)
 
@@ -228,7 +228,7 @@ def _choose_held_out(
     """Return the numbers and the names of the held-out flights, chosen by their information."""
     view = flights.views[0]
     evidence = ViewEvidence(view, model, flights.smoothed[view.name], limits)
-    block = evidence.weighed(evidence.start)[1]
+    block = evidence.estimate_noise(evidence.start)[1]
     informed = (block.slope**2).sum(axis=1)
     _, names = choose_held_out(logs, block.flight, np.zeros(len(informed)), informed, limits)
     return [k for k, log in enumerate(logs) if log.name in names], names

@@ -1,9 +1,10 @@
-"""Measured rotor speeds against commanded ones: controller and motors, apart from aerodynamics.
+"""Compares measured rotor speeds with commanded ones: controller and motors without aerodynamics.
 
-Flight controllers have integrators and filters that the nominal rate loop lacks, so a difference
-between commanded and measured rotor speeds is not missing aerodynamics. Here the nominal rate loop,
-mixer and lag compute the rotor speeds of the logged commands at the measured rates. The same
-comparison decides what drives the model, and whether the rotors have another lag.
+Flight controllers have integrators and filters that the nominal rate loop (the vehicle file's
+proportional one) lacks, so a difference between commanded and measured rotor speeds is not missing
+aerodynamics. Here the nominal rate loop, mixer and rotor lag compute the rotor speeds of the logged
+commands at the measured body rates. By the same comparison the diagnosis chooses the model's input
+(commands or measured rotor speeds) and estimates the rotors' lag.
 """
 
 from __future__ import annotations
@@ -19,168 +20,176 @@ from scipy.optimize import minimize_scalar
 
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.continuous import INTEGRATORS
-from eval.quadrotor.mixer import mixer_matrix
 from eval.quadrotor.plant import Command, Plant, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
-from suite.diagnose.data.windows import remembers, step_s
+from suite.diagnose.data.sampling import (
+    follow_lag,
+    hold,
+    interpolate,
+    on_every_row,
+)
+from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class ActuatorMismatch(NamedTuple):
-    """How measured rotor speeds differ from the commanded ones."""
+    """How measured rotor speeds differ from the commanded ones; as diagnosis.json has it."""
 
     commanded_by: str
     """"nominal rate loop" or "logged motor commands"."""
     rms: float
-    """Of the difference with the vehicle file's lag [rad/s]."""
+    """RMS difference with the vehicle file's lag [rad/s]."""
     spread: float
     """Standard deviation of the measured speeds about each rotor's mean [rad/s]."""
     time_constant: float
-    """Of the lag that fits best [s]."""
+    """Time constant of the best-fitting lag [s]."""
     delay: float
-    """Of the commands, before it [s]."""
+    """Delay of the commands before that lag [s]."""
     scale: tuple[float, ...]
-    """Measured over commanded, by rotor, with that lag and delay."""
+    """Measured over commanded speed, by rotor, with that lag and delay."""
     rms_fitted: float
-    """Of the residual with that lag and delay [rad/s]."""
+    """RMS residual with that lag, delay and scale [rad/s]."""
     rms_own: float
     """The same with the vehicle file's lag and the delay that fits best with it [rad/s]."""
     thrust: tuple[float, float]
-    """Mean and spread of measured minus commanded collective thrust, over nominal mass [m/s^2]."""
+    """Mean and standard deviation of measured minus commanded collective thrust, over the nominal
+    mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
-    """The same of the angular acceleration about x, y, z [rad/s^2]."""
+    """The same for the angular acceleration about body x, y, z [rad/s^2]."""
 
     @property
     def followed(self) -> float:
-        """Share of the speeds' variance that the nominal loop and lag explain [1]."""
+        """Share of the speeds' variance that the commands and the vehicle file's lag explain."""
         return 1.0 - (self.rms / max(self.spread, 1e-9)) ** 2
 
 
-Demand = Callable[[float], np.ndarray]
+Commanded = Callable[[float], np.ndarray]
 """Delay of the commands [s] -> (S, 4) rotor speeds that are commanded in each step [rad/s]."""
 
 
 class _Stretch(NamedTuple):
-    """Rows without a hole, on the vehicle's steps."""
+    """Rows of a flight without a hole, with commanded speeds on the model's time steps."""
 
-    demand: Demand
+    commanded: Commanded
     row: np.ndarray
     """(N,) step at whose start each measured row was taken."""
     measured: np.ndarray
-    """(N, 4) [rad/s]."""
+    """(N, 4) measured rotor speeds [rad/s]."""
 
 
 def actuator_mismatches(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> list[ActuatorMismatch]:
-    """Return how measured rotor speeds differ from commands and logged motor commands.
+    """Return how measured rotor speeds differ from those by the rate loop and by motor commands.
 
-    Logs without measured rotor speeds do not count, nor do the effects of `vehicle`. What the logs
-    allow is one or both of them, or neither.
+    Each of the two comparisons is made where the logs have its signals. Logs without measured rotor
+    speeds and the effects of `vehicle` are ignored.
     """
     plant = make_plant(vehicle, step_s(vehicle), {})
-    found = []
-    for commanded_by, demand_of in (
-        ("nominal rate loop", partial(rate_loop_demand, plant=plant)),
-        ("logged motor commands", _logged_demand),
+    mismatches = []
+    for commanded_by, commanded_of in (
+        ("nominal rate loop", partial(rate_loop_speeds, plant=plant)),
+        ("logged motor commands", _logged_speeds),
     ):
         stretches: list[_Stretch] = []
         for log in logs:
-            rows = sum(len(part.row) for part in stretches)
+            rows = sum(len(stretch.row) for stretch in stretches)
             if rows * step_s(vehicle) < limits.actuator_flight_s:
-                stretches += _stretches(log, vehicle, demand_of, limits)
+                stretches += _stretches(log, vehicle, commanded_of, limits)
         if stretches:
-            found.append(_mismatch(commanded_by, stretches, vehicle, limits))
-    return found
+            mismatches.append(_mismatch(commanded_by, stretches, vehicle, limits))
+    return mismatches
 
 
-def rate_loop_demand(log: FlightLog, at_s: np.ndarray, plant: Plant) -> Demand | None:
-    """Return the speeds by the rate loop of `plant` at the measured rates and at times `at_s` (S,).
+def rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
+    """Return the rotor speeds commanded by the rate loop of `plant` at the measured body rates.
 
-    None where the log has no commands.
+    `step_time_s` (S,) are the starts of the steps [s]. None where the log has no commands.
     """
     if log.thrust_cmd is None or log.rate_cmd_b is None:
         return None
     command = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    rates = interpolate(at_s, log.time_s, log.rate_b)
+    rate_b = interpolate(step_time_s, log.time_s, log.rate_b)
 
-    def demand(delay: float) -> np.ndarray:
+    def commanded(delay_s: float) -> np.ndarray:
         # The loop uses the current rates; only the command is delayed.
-        late = hold(at_s - delay, log.time_s, command)
-        return np.asarray(wanted_speed(plant, Command(late[:, 0], late[:, 1:]), rates))
+        delayed = hold(step_time_s - delay_s, log.time_s, command)
+        return np.asarray(wanted_speed(plant, Command(delayed[:, 0], delayed[:, 1:]), rate_b))
 
-    return demand
+    return commanded
 
 
-def _logged_demand(log: FlightLog, at_s: np.ndarray) -> Demand | None:
+def _logged_speeds(log: FlightLog, step_time_s: np.ndarray) -> Commanded | None:
     command = log.rotor_speed_cmd
     if command is None:
         return None
-    return lambda delay: hold(at_s - delay, log.time_s, command)
+    return lambda delay_s: hold(step_time_s - delay_s, log.time_s, command)
 
 
 def _stretches(
     log: FlightLog,
     vehicle: Vehicle,
-    demand_of: Callable[[FlightLog, np.ndarray], Demand | None],
+    commanded_of: Callable[[FlightLog, np.ndarray], Commanded | None],
     limits: Thresholds,
 ) -> list[_Stretch]:
+    """Return the stretches of `log` that have measured and commanded rotor speeds."""
     if log.rotor_speed is None:
         return []
-    dt, found = step_s(vehicle), []
+    dt, stretches = step_s(vehicle), []
     rate_b = on_every_row(log, limits).rate_b
-    good = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(rate_b).all(axis=1)
-    rows = np.flatnonzero(good)
-    holes = np.flatnonzero(np.diff(log.time_s[rows]) > limits.longest_hole_s)
-    for part in np.split(rows, holes + 1):
-        if not len(part):
+    complete = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(rate_b).all(axis=1)
+    complete_rows = np.flatnonzero(complete)
+    holes = np.flatnonzero(np.diff(log.time_s[complete_rows]) > limits.longest_hole_s)
+    for rows in np.split(complete_rows, holes + 1):
+        if not len(rows):
             continue
-        time = log.time_s[part] - log.time_s[part[0]]
-        if time[-1] < 4.0 * limits.lag_settled_s:
+        time_s = log.time_s[rows] - log.time_s[rows[0]]
+        if time_s[-1] < 4.0 * limits.lag_settled_s:
             continue
-        at_s = log.time_s[part[0]] + dt * np.arange(int(time[-1] / dt) + 1)
-        demand = demand_of(log, at_s)
-        if demand is None or not np.isfinite(demand(0.0)).all():
+        step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
+        commanded = commanded_of(log, step_time_s)
+        if commanded is None or not np.isfinite(commanded(0.0)).all():
             continue
-        row = np.round(time / dt).astype(int)
-        late = (row * dt >= limits.lag_settled_s) & (row <= len(at_s))
-        found.append(_Stretch(demand, row[late], log.rotor_speed[part[late]]))
-    return found
+        step = np.round(time_s / dt).astype(int)
+        settled = (step * dt >= limits.lag_settled_s) & (step <= len(step_time_s))
+        stretches.append(_Stretch(commanded, step[settled], log.rotor_speed[rows[settled]]))
+    return stretches
 
 
 def _mismatch(
     commanded_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle, limits: Thresholds
 ) -> ActuatorMismatch:
-    dt, lag = step_s(vehicle), vehicle.rotors.time_constant
-    measured = np.concatenate([part.measured for part in stretches])
+    """Fit lag, delay and scales of the rotors, and return all differences."""
+    dt, nominal_lag = step_s(vehicle), vehicle.rotors.time_constant
+    measured = np.concatenate([stretch.measured for stretch in stretches])
 
-    def followed(wanted: Sequence[np.ndarray], time_constant: float) -> np.ndarray:
-        parts = zip(wanted, stretches, strict=True)
-        return np.concatenate([_follow(a, part.row, dt, time_constant) for a, part in parts])
+    def commanded(delay: float) -> list[np.ndarray]:
+        return [stretch.commanded(delay) for stretch in stretches]
+
+    def lagged(speeds: Sequence[np.ndarray], time_constant: float) -> np.ndarray:
+        pairs = zip(speeds, stretches, strict=True)
+        return np.concatenate([_at_rows(speed, s.row, dt, time_constant) for speed, s in pairs])
 
     def scales(speed: np.ndarray) -> np.ndarray:
         return (speed * measured).sum(0) / np.maximum((speed**2).sum(0), 1e-9)
 
-    def left(wanted: Sequence[np.ndarray], time_constant: float) -> float:
-        speed = followed(wanted, time_constant)
+    def squared_error(speeds: Sequence[np.ndarray], time_constant: float) -> float:
+        speed = lagged(speeds, time_constant)
         return float(((measured - scales(speed) * speed) ** 2).mean())
 
     def best_lag(delay: float) -> tuple[float, float]:
-        """Return the mean squared error that the best lag leaves, and the lag."""
-        cost = partial(left, [part.demand(delay) for part in stretches])
-        options = {"xatol": 1e-4}
-        best = minimize_scalar(
-            cost, bounds=(0.0, limits.longest_lag_s), method="bounded", options=options
-        )
+        """Return the mean squared error with the best lag, and that lag [s]."""
+        cost = partial(squared_error, commanded(delay))
+        bounds, options = (0.0, limits.longest_lag_s), {"xatol": 1e-4}
+        best = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
-    delay, _ = _least(lambda delay: best_lag(delay)[0], limits)
+    delay, _ = _best_delay(lambda delay: best_lag(delay)[0], limits)
     _, time_constant = best_lag(delay)
-    _, own = _least(lambda delay: left([part.demand(delay) for part in stretches], lag), limits)
-    nominal = followed([part.demand(0.0) for part in stretches], lag)
-    fitted = followed([part.demand(delay) for part in stretches], time_constant)
+    _, own = _best_delay(lambda delay: squared_error(commanded(delay), nominal_lag), limits)
+    nominal = lagged(commanded(0.0), nominal_lag)
+    fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
     thrust, turn = wrench_difference(measured, nominal, vehicle)
     return ActuatorMismatch(
@@ -197,31 +206,32 @@ def _mismatch(
     )
 
 
-def _least(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
+def _best_delay(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
-    tried = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
-    place = int(np.argmin([cost(delay) for delay in tried]))
-    near = (tried[max(place - 1, 0)], tried[min(place + 1, limits.delays_tried - 1)])
+    grid = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
+    place = int(np.argmin([cost(delay) for delay in grid]))
+    bounds = (grid[max(place - 1, 0)], grid[min(place + 1, limits.delays_tried - 1)])
     options = {"xatol": 2e-4}
-    refined = minimize_scalar(cost, bounds=near, method="bounded", options=options)
-    best, none = float(refined.fun), cost(0.0)
-    return (0.0, none) if none <= best else (float(refined.x), best)
+    refined = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
+    best, without = float(refined.fun), cost(0.0)
+    return (0.0, without) if without <= best else (float(refined.x), best)
 
 
-def _follow(wanted: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
-    """Return the rotor speeds (N, 4) at the rows after the lag."""
+def _at_rows(speed: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
+    """Return commanded speeds (S, 4) of steps `dt` [s] at the rows (N, 4), behind the lag [s]."""
     # The speed at the end of step k is that at the start of step k + 1.
-    return np.concatenate([wanted[:1], follow_lag(wanted, dt, time_constant)])[row]
+    return np.concatenate([speed[:1], follow_lag(speed, dt, time_constant)])[row]
 
 
 def wrench_difference(
-    measured: np.ndarray, wanted: np.ndarray, vehicle: Vehicle
+    measured: np.ndarray, commanded: np.ndarray, vehicle: Vehicle
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return thrust over mass (N,) and angular acceleration (N, 3) of measured minus commanded."""
-    rotors = vehicle.rotors
-    ratio = rotors.torque_coefficient / rotors.thrust_coefficient
-    mixer = mixer_matrix(np.array(rotors.position), np.array(rotors.spin), ratio)
-    wrench = rotors.thrust_coefficient * (measured**2 - wanted**2) @ mixer.T
+    """Return what rotor speeds `measured` (N, 4) do beyond `commanded` (N, 4) ones [rad/s].
+
+    These are thrust over mass (N,) [m/s^2] and angular acceleration (N, 3) [rad/s^2], body axes.
+    """
+    thrust = vehicle.rotors.thrust_coefficient * (measured**2 - commanded**2)
+    wrench = thrust @ rotor_mixer(vehicle).T
     return wrench[:, 0] / vehicle.mass, wrench[:, 1:] / np.array(vehicle.inertia)
 
 
@@ -230,7 +240,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) -> bool:
-    """Return whether measured rotor speeds drive the model, by the logs' columns and the rate loop.
+    """Return whether measured rotor speeds are the model's input, and not the commands.
+
+    Args:
+        logs: flights.
+        drive: the user's choice: "commands", "motors" or "auto", which prefers commands.
+        vehicle: whose rate loop would follow the commands.
 
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
@@ -240,21 +255,25 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
     if drive not in ("auto", "commands", "motors"):
         raise ValueError(f"drive = {drive!r}; allowed: auto, commands, motors")
     if not commands and not motors:
-        raise ValueError("some flights have commands only and some rotor speeds only: sort them")
+        raise ValueError(
+            "some flights have commands only and some rotor speeds only; diagnose each kind alone"
+        )
     if (drive == "commands" and not commands) or (drive == "motors" and not motors):
         raise ValueError(f"drive = {drive!r}, but not every flight has them")
-    if remembers(vehicle) and (drive == "commands" or not motors):
+    if has_firmware_loop(vehicle) and (drive == "commands" or not motors):
         raise ValueError(
             f"{vehicle.name}: no log holds the state of its {vehicle.controller.kind} rate loop "
-            "at the start of a stretch, so that commands cannot drive rollouts; give "
+            "at the start of a stretch, so commands cannot be the input of rollouts; give "
             "flights with measured rotor speeds (--drive motors), or a vehicle with a controller "
             "of kind p"
         )
-    return drive == "motors" or not commands or remembers(vehicle)
+    return drive == "motors" or not commands or has_firmware_loop(vehicle)
 
 
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
-    """Return how the bodies of `logs` were moved: as chosen, or as all logs have it.
+    """Return the integrator that made the bodies' motion in `logs`, "continuous" or "euler".
+
+    `integrator` is the user's choice; with "auto" it is "euler" where all logs have that.
 
     Raises:
         ValueError: for an unknown `integrator`.
@@ -264,102 +283,101 @@ def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
     if integrator != "auto":
         allowed = ", ".join(("auto", *INTEGRATORS))
         raise ValueError(f"integrator = {integrator!r}; allowed: {allowed}")
-    used = {log.integrator for log in logs}
-    return "euler" if used == {"euler"} else "continuous"
+    return "euler" if {log.integrator for log in logs} == {"euler"} else "continuous"
 
 
-def another_controller(
+def flown_by_other_controller(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> bool:
     """Return whether the measured rotor speeds are not those of the nominal rate loop.
 
-    The loop is given the measured rates, so that nothing but the controller and the rotors is
-    compared: what the air or a moved centre of mass does shows in the rates.
+    The loop is computed at the measured rates, so only the controller and the rotors are compared:
+    aerodynamics or a shifted centre of mass change the rates themselves.
     """
     dt, plant = step_s(vehicle), make_plant(vehicle, step_s(vehicle))
     delay, lag = float(plant.constants.delay), float(plant.constants.time_constant)
-    missed, change, count = 0.0, 0.0, 0
+    error, change, count = 0.0, 0.0, 0
     for log in logs:
-        demand_of = partial(rate_loop_demand, plant=plant)
-        for part in _stretches(log, vehicle, demand_of, limits):
-            wanted = _follow(part.demand(delay), part.row, dt, lag)
-            place = (part.row * dt / limits.speed_mean_s).astype(int)
+        commanded_of = partial(rate_loop_speeds, plant=plant)
+        for stretch in _stretches(log, vehicle, commanded_of, limits):
+            commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
+            place = (stretch.row * dt / limits.speed_mean_s).astype(int)
             bins, number = np.unique(place, return_inverse=True)
             sums = np.zeros((len(bins), 8))
-            np.add.at(sums, number, np.concatenate([part.measured, wanted], axis=1))
-            own, loop = np.split(sums / np.bincount(number)[:, None], 2, axis=1)
-            missed += float(((own - loop) ** 2).sum())
-            change += float(((own - own.mean(axis=0)) ** 2).sum())
-            count += own.size
+            np.add.at(sums, number, np.concatenate([stretch.measured, commanded], axis=1))
+            measured, by_loop = np.split(sums / np.bincount(number)[:, None], 2, axis=1)
+            error += float(((measured - by_loop) ** 2).sum())
+            change += float(((measured - measured.mean(axis=0)) ** 2).sum())
+            count += measured.size
     still = count * limits.still_speed**2
-    return bool(missed > still and missed > limits.fitted_loop_share**2 * max(change, still))
+    return bool(error > still and error > limits.fitted_loop_share**2 * max(change, still))
 
 
 LAG = "motor_lag"
-"""Name of the effect."""
+"""Name of the rotor lag in the catalogue of effects."""
 
 
 class RotorLag(NamedTuple):
-    """A time constant of the rotors that differs from the vehicle file's."""
+    """A time constant of the rotors that differs significantly from the vehicle file's."""
 
     time_constant: float
-    """[s]."""
+    """Estimate [s]."""
     known: float
-    """What the vehicle has [s]."""
+    """The vehicle file's time constant [s]."""
     half_width: float
-    """Of its 95 % interval, over flights, and half a step of the model [s]."""
+    """Half the 95 % interval over flights, plus half a step of the model [s]."""
     closed: float
     """Share of the rotor speeds' squared error under the vehicle's lag that this lag removes."""
     p_value: float
-    """Of the vehicle's own lag."""
+    """Of the hypothesis that the vehicle file's lag is right."""
 
 
-def another_lag(
+def find_rotor_lag(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> RotorLag | None:
-    """Return the rotors' lag where commands and measured rotor speeds show another one.
+    """Return the rotors' lag where it differs significantly from that of `vehicle`, else None.
 
     Args:
-        logs: flights; those do not count that are without commands or rotor speeds, or in which the
-            nominal rate loop does not explain the speeds: a firmware's filters are no lag.
-        vehicle: what a simulation uses.
-        limits: from where on flights show it.
+        logs: flights. Ignored are those without commands or rotor speeds, and those whose speeds
+            the nominal rate loop does not explain: a firmware's filters are not a lag.
+        vehicle: the one that the simulation uses.
+        limits: significance.
     """
-    if remembers(vehicle):
+    if has_firmware_loop(vehicle):
         return None
-    own = vehicle.effects.get(LAG)
-    known = vehicle.rotors.time_constant if own is None else float(own.time_constant)
+    effect = vehicle.effects.get(LAG)
+    known = vehicle.rotors.time_constant if effect is None else float(effect.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
-    each = [_loop_mismatch(log, vehicle, limits) for log in logs]
-    found = [one for one in each if one is not None and _explains(one, limits)]
-    if len(found) < limits.lag_least_flights:
+    mismatches = []
+    for log in logs:
+        one = _loop_mismatch(log, vehicle, limits)
+        unexplained = 1.0 - limits.lag_followed_share
+        if one is not None and one.rms_fitted**2 <= unexplained * one.spread**2:
+            mismatches.append(one)
+    if len(mismatches) < limits.lag_least_flights:
         return None
-    lags = np.array([one.time_constant for one in found])
-    step = 0.5 * step_s(vehicle)
-    spread = float(lags.std(ddof=1)) / np.sqrt(len(lags))
-    half = float(stats.t.ppf(0.975, len(lags) - 1)) * spread + step
-    away = float(abs(lags.mean() - known))
-    before = sum(one.rms_own**2 for one in found)
-    closed = 1.0 - sum(one.rms_fitted**2 for one in found) / max(before, 1e-12)
-    if away <= half or closed < limits.lag_closed_share:
+    lags = np.array([one.time_constant for one in mismatches])
+    half_step = 0.5 * step_s(vehicle)
+    standard_error = float(lags.std(ddof=1)) / np.sqrt(len(lags))
+    half_width = float(stats.t.ppf(0.975, len(lags) - 1)) * standard_error + half_step
+    difference = float(abs(lags.mean() - known))
+    before = sum(one.rms_own**2 for one in mismatches)
+    closed = 1.0 - sum(one.rms_fitted**2 for one in mismatches) / max(before, 1e-12)
+    if difference <= half_width or closed < limits.lag_closed_share:
         return None
-    beyond = (away - step) / max(spread, 1e-9)
+    t = (difference - half_step) / max(standard_error, 1e-9)
     return RotorLag(
         time_constant=float(lags.mean()),
         known=known,
-        half_width=half,
+        half_width=half_width,
         closed=closed,
-        p_value=float(2.0 * stats.t.sf(beyond, len(lags) - 1)),
+        p_value=float(2.0 * stats.t.sf(t, len(lags) - 1)),
     )
 
 
 def _loop_mismatch(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActuatorMismatch | None:
-    """Return how the rotors follow the nominal rate loop; None where the log does not show it."""
+    """Return the mismatch with the nominal rate loop; None where the log lacks a signal for it."""
     if log.partial or log.rate_cmd_b is None or log.rotor_speed is None:
         return None
-    found = actuator_mismatches([log], vehicle, limits)
-    return next((one for one in found if one.commanded_by == "nominal rate loop"), None)
-
-
-def _explains(one: ActuatorMismatch, limits: Thresholds) -> bool:
-    return one.rms_fitted**2 <= (1.0 - limits.lag_followed_share) * one.spread**2
+    mismatches = actuator_mismatches([log], vehicle, limits)
+    return next((one for one in mismatches if one.commanded_by == "nominal rate loop"), None)

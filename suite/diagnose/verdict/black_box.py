@@ -1,10 +1,11 @@
 """Compares named effects with a black box, on held-out flights and at speeds above the fitted ones.
 
-The black box is a Delta Action Model in the quadrotor that is diagnosed. The paper's network (Su
-et al. 2026, Sec. III-D) takes velocity in body axes, attitude and the net acceleration that the
-command asks for. Its output is added to the body's acceleration, as in the point mass; three more
-outputs turn the body, since these commands contain body rates as well. It is fitted by gradients
-through the rollouts of the windows, to the same errors by which names are judged.
+The black box is a Delta Action Model: a network that adds a correction to the simulated quadrotor.
+The paper's network (Su et al. 2026, Sec. III-D) takes the velocity in body axes, the attitude and
+the commanded net acceleration. Its output is added to the body's linear acceleration. Three further
+outputs are added to the angular acceleration, as these commands contain body rates. The network is
+fitted by gradients through rollouts (simulated stretches of 1 s), to the same errors as the named
+effects.
 """
 
 from __future__ import annotations
@@ -25,14 +26,19 @@ from eval.quadrotor.plant import Motion
 from eval.quadrotor.stepper import Feedback, Inputs
 from policies.networks import delta_network
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import LENGTH_S, STATE, FlightWindows, take
+from suite.diagnose.data.windows import (
+    LENGTH_S,
+    STATE,
+    FlightWindows,
+    take,
+)
 from suite.diagnose.estimate.gauss_newton import fit
 from suite.diagnose.evidence.rollouts import (
     BATCH,
     RolloutModel,
     batches,
+    rollout_evidence,
     start_estimate,
-    weighed_by,
 )
 from suite.diagnose.sources.rollout_source import of_rollouts
 from suite.diagnose.sources.source import Finding
@@ -50,14 +56,14 @@ from tracks.geometry.rotation import to_local
 
 
 class BlackBoxComparison(NamedTuple):
-    """The gap on windows that took no part in any fit."""
+    """The gap (held-out error) on windows that took no part in any fit."""
 
     judged_on: str
-    """For people."""
+    """Which windows these are, for people."""
     fitted: int
-    """How many windows were fitted."""
+    """Number of windows that were fitted."""
     judged: int
-    """How many the gap is of."""
+    """Number of windows of the gap."""
     before: Gap
     named: Gap | None
     """With the named effects, fitted to the same windows as the black box; None without any."""
@@ -66,16 +72,16 @@ class BlackBoxComparison(NamedTuple):
 
 @dataclass(frozen=True)
 class BlackBoxComparisons:
-    """Both comparisons."""
+    """The comparisons on held-out flights and at higher speeds."""
 
     held_out: BlackBoxComparison
-    """On what the diagnosis held out."""
+    """On the flights that the diagnosis held out."""
     outside: BlackBoxComparison | None
     """Fitted to slow windows, judged on fast ones; None where there are too few."""
     split_m_s: float
     """Speed between slow and fast [m/s]."""
     seconds: float
-    """That it all took [s]."""
+    """Duration of all fits [s]."""
 
 
 def compare_black_box(
@@ -84,31 +90,38 @@ def compare_black_box(
     config: BlackBoxConfig,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> BlackBoxComparisons:
-    """Fit the black box twice and compare it with what was named.
+    """Fit the black box twice and compare it with the named effects.
 
-    `finding` is that of the rollouts `flown`; `progress` is called with (share done, words).
+    Args:
+        flown: the flights as rollouts.
+        finding: names and gaps of these rollouts.
+        config: of the fits.
+        progress: called with (share done, words).
+
+    Raises:
+        FloatingPointError: where a fit diverges.
     """
     began = time.monotonic()
     limits, search, model, held = flown.limits, finding.search, flown.model, flown.held
     noise = of_rollouts(search.last).noise
 
-    def show(part: int) -> Callable[[int, str], None]:
-        return lambda step, words: progress(0.5 * (part + step / config.iterations), words)
+    def show(fit_number: int) -> Callable[[int, str], None]:
+        return lambda step, words: progress(0.5 * (fit_number + step / config.iterations), words)
 
-    known = _not_held_out(flown.cut(limits.check_stride_s), held)
-    params = fit_black_box(model, known, noise, config, show(0))
+    training = _not_held_out(flown.cut(limits.check_stride_s), held)
+    params = fit_black_box(model, training, noise, config, show(0))
     held_out = BlackBoxComparison(
         judged_on="flights left out",
-        fitted=len(known.flight),
+        fitted=len(training.flight),
         judged=len(held.flight),
         before=finding.before,
         named=finding.after if search.named else None,
         black_box=black_box_gap(model, params, held, noise, limits),
     )
-    every = flown.cut(LENGTH_S)
-    top, mean = _speeds(flown.logs, every)
+    windows = flown.cut(LENGTH_S)
+    top, mean = _speeds(flown.logs, windows)
     split = float(np.quantile(top, limits.slow_share))
-    slow, fast = take(every, top <= split), take(every, mean > split)
+    slow, fast = take(windows, top <= split), take(windows, mean > split)
     outside = None
     if min(len(slow.flight), len(fast.flight)) >= limits.least_judged:
         params = fit_black_box(model, slow, noise, replace(config, seed=config.seed + 1), show(1))
@@ -116,7 +129,7 @@ def compare_black_box(
         if search.named:
             start = start_estimate(model, slow)
             linear = model.linearise(start.theta, start.free, slow, None)
-            evidence, block = weighed_by(model, slow, linear, limits, noise)
+            evidence, block = rollout_evidence(model, slow, linear, limits, noise)
             best, _ = fit(evidence, start, search.indices, known=block, limits=limits)
             named = measure(model, best.theta, fast, noise, limits)
         outside = BlackBoxComparison(
@@ -131,43 +144,43 @@ def compare_black_box(
 
 
 def _not_held_out(windows: FlightWindows, held: FlightWindows) -> FlightWindows:
-    """Return those of `windows` that do not touch what the diagnosis held out."""
-    apart = ~np.isin(windows.flight, held.flight)
-    if not apart.any():  # of a lone flight the end is left out
-        apart = np.asarray(windows.start_s) + LENGTH_S <= float(np.min(held.start_s)) + 1e-6
-    return take(windows, apart)
+    """Return those of `windows` that do not overlap the held-out ones."""
+    training = ~np.isin(windows.flight, held.flight)
+    if not training.any():  # of a single flight only the end is held out
+        training = np.asarray(windows.start_s) + LENGTH_S <= float(np.min(held.start_s)) + 1e-6
+    return take(windows, training)
 
 
 def _speeds(logs: Sequence[FlightLog], windows: FlightWindows) -> tuple[np.ndarray, np.ndarray]:
     """Return the top and the mean speed in each window (W,) [m/s]."""
-    found = []
+    speeds = []
     for flight, start_s in zip(windows.flight, windows.start_s, strict=True):
         log = logs[int(flight)]
         time_s = log.time_s - log.time_s[0]
         inside = (time_s >= start_s - 1e-6) & (time_s <= start_s + LENGTH_S + 1e-6)
         speed = log.speed[inside]
         speed = speed[np.isfinite(speed)]
-        found.append((speed.max(), speed.mean()))
-    top, mean = np.array(found).T
+        speeds.append((speed.max(), speed.mean()))
+    top, mean = np.array(speeds).T
     return top, mean
 
 
 PERIOD_S = 0.02
-"""The network decides this often, and its correction is held [s]."""
+"""Period at which the network runs; its correction is held in between [s]."""
 OUTPUT_SCALE = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
-"""Brings m/s^2 and rad/s^2 to order one."""
+"""Units of the network's outputs: linear [m/s^2] and angular [rad/s^2] acceleration."""
 
 
 @dataclass(frozen=True)
 class BlackBoxConfig:
-    """The fit of the black box."""
+    """Settings of the fit of the black box."""
 
     iterations: int = 300
-    """Gradient steps, of a dozen windows each."""
+    """Number of gradient steps, with a dozen windows each."""
     rate: float = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
     seed: int = 0
-    """Of the network and of the batches."""
+    """Seed of the network's start and of the batches."""
 
 
 def fit_black_box(
@@ -177,9 +190,14 @@ def fit_black_box(
     config: BlackBoxConfig,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> dict[str, np.ndarray]:
-    """Return the network fitted to `windows`, of such `noise`, at the start numbers.
+    """Return the network's weights, fitted to `windows` with the vehicle file's parameters.
 
-    `show` is called with (iteration, words) as it goes.
+    Args:
+        model: the simulation that the network corrects.
+        windows: W stretches to fit.
+        noise: measurement noise of the channels, by which errors are weighted.
+        config: of the fit.
+        show: called with (iteration, words) after each step.
 
     Raises:
         FloatingPointError: where the fit diverges.
@@ -191,9 +209,9 @@ def fit_black_box(
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, config.iterations))
 
     def loss(params: Any, offset: Any, windows: FlightWindows, weight: Any) -> Any:
-        over = _apart(model, theta, params, offset, windows)[..., :STATE] * weight
-        # Far from the record a square would let one window decide.
-        return (jnp.sqrt(1.0 + over**2) - 1.0).mean()
+        over_noise = _errors(model, theta, params, offset, windows)[..., :STATE] * weight
+        # A pseudo-Huber loss: with squares one diverging window would dominate.
+        return (jnp.sqrt(1.0 + over_noise**2) - 1.0).mean()
 
     @jax.jit
     def update(params: Any, state: Any, *batch: Any) -> tuple[Any, Any, Any]:
@@ -203,7 +221,7 @@ def fit_black_box(
 
     rng = np.random.default_rng(config.seed)
     with jax.enable_x64(True):
-        params = _start(config.seed)
+        params = _initial_weights(config.seed)
         state = optimizer.init(params)
         for iteration in range(config.iterations):
             rows = rng.choice(len(offset), BATCH, replace=len(offset) < BATCH)
@@ -222,47 +240,48 @@ def black_box_gap(
     noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
-    """Return the gap on `windows` that is left with the fitted network."""
+    """Return the gap on `windows` with the network whose fitted weights are `params`."""
     theta = model.space.array("start")
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
-    fly = jax.jit(lambda x, w: _apart(model, theta, params, x, w))
+    fly = jax.jit(lambda x, w: _errors(model, theta, params, x, w))
     with jax.enable_x64(True):
-        parts = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
-    return gap_of(linear._replace(residual=-np.concatenate(parts)), windows, noise, limits)
+        errors = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
+    return gap_of(linear._replace(residual=-np.concatenate(errors)), windows, noise, limits)
 
 
-def _start(seed: int) -> dict[str, Any]:
+def _initial_weights(seed: int) -> dict[str, Any]:
+    """Return random weights whose output is zero."""
     params = {k: jnp.asarray(v, float) for k, v in delta_network.init(jax.random.key(seed)).items()}
     params["output.weight"] = jnp.zeros((delta_network.HIDDEN, len(OUTPUT_SCALE)))
     params["output.bias"] = jnp.zeros(len(OUTPUT_SCALE))
     return params
 
 
-def _apart(
+def _errors(
     model: RolloutModel, theta: Any, params: Any, offset: Any, windows: FlightWindows
 ) -> Any:
-    """Return simulated - measured (B, N, 19) under the network."""
-    count, every = len(offset), max(1, round(PERIOD_S / model.dt))
-    scale, up = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
+    """Return simulated - measured (B, N, 19) with the network's correction."""
+    count, steps = len(offset), max(1, round(PERIOD_S / model.dt))
+    scale, body_z = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
 
-    def act(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
+    def correct(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
         assert inputs.command is not None
         thrust = inputs.command.thrust
-        if inputs.rotor_speed is not None:  # these drive then, and no command may be there
+        if inputs.rotor_speed is not None:  # the input is rotor speeds: there may be no command
             nominal = model.given.nominal
             force = nominal.thrust_coefficient * (inputs.rotor_speed**2).sum(-1)
             thrust = force / nominal.mass
 
-        def decide(_: Any) -> Any:
-            row3 = motion.rot_w[:, 2]
-            action_b = thrust[:, None] * up - GRAVITY * row3
+        def run_network(_: Any) -> Any:
+            up_b = motion.rot_w[:, 2]  # world z in body axes
+            action_b = thrust[:, None] * body_z - GRAVITY * up_b
             vel_b = to_local(motion.rot_w, motion.vel_w)
-            push, hidden = delta_network.step(params, carry[0], vel_b, row3, action_b)
+            push, hidden = delta_network.step(params, carry[0], vel_b, up_b, action_b)
             return hidden, scale * push
 
-        carry = jax.lax.cond(index % every == 0, decide, lambda _: carry, None)
+        carry = jax.lax.cond(index % steps == 0, run_network, lambda _: carry, None)
         return carry, carry[1]
 
     start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
-    return model.fly(theta, offset, windows, None, Feedback(start, act))[0]
+    return model.fly(theta, offset, windows, None, Feedback(start, correct))[0]

@@ -1,14 +1,14 @@
-"""Forces that no fitted parameter reproduces: an oscillating one (a swinging load), random wind.
+"""Detects forces that no fitted parameter reproduces: a swinging load and random wind.
 
-A load on a line causes a narrow peak in the spectrum of the horizontal residual force, at one
-period in all flights. Where a model is wrong, the flight's own motion causes peaks as well, but
-then the residual force is a small share of the acceleration at that period. Spectra are compared
-by their likelihood (Whittle 1953) with and without a peak on a smooth background.
+A load on a line causes a narrow peak in the spectrum of the horizontal residual force (measured
+less simulated), at one period in all flights. A wrong model causes peaks at the periods of the
+flight's own motion, too, but there the residual force is a small share of the acceleration. Spectra
+are compared by their likelihood (Whittle 1953) with and without a peak on a smooth background.
 
-The wind at the knots of a window is normally distributed with the covariance of the effect `gusts`.
-Through the drag of the vehicle it adds a covariance to the residuals. Intensity and length maximise
-the likelihood of the residuals. The alternative hypothesis is a random disturbance along the body
-axes.
+Random wind is normally distributed with the covariance of the effect `gusts`. Through the drag of
+the vehicle it adds a covariance to the residuals of rollouts, at the knots (support points in time)
+of every 1 s window. Intensity and length scale maximise the likelihood of the residuals. The
+alternative hypothesis is a random disturbance along the body axes.
 """
 
 from __future__ import annotations
@@ -35,17 +35,23 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.residual_structure import DisturbanceEquations
 
 STEP_HZ = 0.01
-"""Between the frequencies that are tried [Hz]."""
+"""Step between the tested frequencies [Hz]."""
 BAND_HZ = (0.15, 3.0)
-"""Of the spectra [Hz]."""
+"""Frequency band of the spectra [Hz]."""
 CORNERS_HZ = (0.2, 0.5, 1.2)
-"""Of the smooth backgrounds that fall with frequency [Hz]."""
+"""Corner frequencies of the smooth backgrounds that fall with frequency [Hz]."""
 WIDTHS = (0.03, 0.1)
-"""Half widths of a peak that are tried, over its frequency [1]."""
+"""Tested half widths of a peak, over its frequency [1]."""
 HANN_BINS = 1.5
-"""Width of a Hann window's line, and its correlation length in bins."""
+"""Width of a spectral line under a Hann window, which is also its correlation length [bins]."""
 ROUNDS = 60
-"""Of the fits of a spectrum."""
+"""Number of multiplicative updates in the fit of a spectrum."""
+LEAST_MEANS = 8
+"""Least number of mean accelerations in a flight for a spectrum."""
+LEAST_FILLED = 0.7
+"""Least share of the time grid with a measurement for a spectrum."""
+LEAST_BINS = 12
+"""Least number of frequencies in a spectrum."""
 
 
 class Swing(NamedTuple):
@@ -53,20 +59,20 @@ class Swing(NamedTuple):
 
     period_s: float
     ci95: tuple[float, float]
-    """Of the period [s]."""
+    """95 % interval of the period [s]."""
     share: float
     """Share of the residual force's power within `BAND_HZ` [1]."""
     p_value: float
-    """After Bonferroni over all periods."""
+    """After Bonferroni's correction for all periods."""
 
     @property
     def length_m(self) -> float:
-        """Return the length of a pendulum with this period [m], g T^2 / 4 pi^2."""
+        """Length of a pendulum with this period [m], g T^2 / 4 pi^2."""
         return GRAVITY * self.period_s**2 / (4.0 * np.pi**2)
 
     @property
     def words(self) -> str:
-        """Return what oscillates, and what may cause it."""
+        """Description of the force and of a possible cause, for people."""
         low, high = self.ci95
         return (
             f"a force that oscillates with a period of {self.period_s:.2f} s (95 % {low:.2f} to "
@@ -79,122 +85,132 @@ class Spectrum(NamedTuple):
 
     frequency_hz: np.ndarray
     """(J,)."""
-    left: np.ndarray
-    """(J,) of the force that is left."""
-    moved: np.ndarray
-    """(J,) of the measured acceleration."""
+    residual: np.ndarray
+    """(J,) power of the residual force."""
+    measured: np.ndarray
+    """(J,) power of the measured acceleration."""
     width_hz: float
-    """Of a line."""
+    """Width of a spectral line [Hz]."""
 
 
-def swing_left(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
-    """Return the oscillation in the residual force of `task` at `theta` (P,); None without one."""
+def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
+    """Return the oscillation in the residual force of `task` at the parameters `theta` (P,).
+
+    None where there is none, or where the flights do not show both horizontal axes.
+    """
     if not {0, 1} <= set(task.view.axes):
         return None
-    data = task.left(theta)
-    left_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
-    return find_swing(task.flights, left_b, task.limits)
+    data = task.residuals(theta)
+    residual_b = [data.residual[data.flight == number] for number in range(len(task.flights))]
+    return find_swing(task.flights, residual_b, task.limits)
 
 
 def find_swing(
     flights: Sequence[SmoothedFlight],
-    left_b: Sequence[np.ndarray],
+    residual_b: Sequence[np.ndarray],
     limits: Thresholds = THRESHOLDS,
 ) -> Swing | None:
     """Return the oscillation in the residual force of `flights`; None where there is none.
 
     Args:
         flights: of the force view.
-        left_b: residual force of each flight, (M, 3) body axes [m/s^2].
+        residual_b: residual force of each flight, (M, 3) body axes [m/s^2].
         limits: significance and size.
     """
-    pairs = zip(flights, left_b, strict=True)
-    spectra = [one for flight, left in pairs if (one := _spectrum(flight, left)) is not None]
+    pairs = zip(flights, residual_b, strict=True)
+    spectra = [s for flight, residual in pairs if (s := _spectrum(flight, residual)) is not None]
     if not spectra:
         return None
-    longest, shortest = limits.swing_periods_s[1], limits.swing_periods_s[0]
-    tried = np.arange(1.0 / longest, 1.0 / shortest + STEP_HZ, STEP_HZ)
-    gains, heights = zip(*(_gains(one, tried) for one in spectra), strict=True)
-    each = np.array(gains)  # (F, widths, frequencies)
-    total = each.sum(axis=0)
-    width, at = np.unravel_index(int(total.argmax()), total.shape)
-    if not flights_agree(each[:, width, at]):
+    shortest_s, longest_s = limits.swing_periods_s
+    frequency_hz = np.arange(1.0 / longest_s, 1.0 / shortest_s + STEP_HZ, STEP_HZ)
+    gains, heights = zip(*(_peak_gains(s, frequency_hz) for s in spectra), strict=True)
+    flight_gain = np.array(gains)  # (F, widths, frequencies)
+    gain = flight_gain.sum(axis=0)
+    width, best = np.unravel_index(int(gain.argmax()), gain.shape)
+    if not flights_agree(flight_gain[:, width, best]):
         return None
-    most = float(total[width, at])
-    independent = (tried[-1] - tried[0]) / np.mean([one.width_hz for one in spectra])
-    chance = float(chi2.sf(2.0 * most, 2 * len(spectra))) * independent * len(WIDTHS)
-    centre = float(tried[at])
-    driven, share = _about(spectra, centre, [one[width, at] for one in heights])
-    if chance > limits.swing_p_value or share < limits.swing_share or driven < limits.swing_driven:
+    largest = float(gain[width, best])
+    independent = (frequency_hz[-1] - frequency_hz[0]) / np.mean([s.width_hz for s in spectra])
+    p_value = float(chi2.sf(2.0 * largest, 2 * len(spectra))) * independent * len(WIDTHS)
+    centre_hz = float(frequency_hz[best])
+    driven, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
+    if p_value > limits.swing_p_value or share < limits.swing_share or driven < limits.swing_driven:
         return None
-    near = tried[total[width] >= most - limits.profile_fall]
-    near = near[np.abs(near - centre) < 0.5 * centre]
-    low, high = near.min() - STEP_HZ, near.max() + STEP_HZ
-    return Swing(1.0 / centre, (1.0 / high, 1.0 / low), share, min(chance, 1.0))
+    # 95 % interval by the profile likelihood.
+    likely = frequency_hz[gain[width] >= largest - limits.profile_fall]
+    likely = likely[np.abs(likely - centre_hz) < 0.5 * centre_hz]
+    low, high = likely.min() - STEP_HZ, likely.max() + STEP_HZ
+    return Swing(1.0 / centre_hz, (1.0 / high, 1.0 / low), share, min(p_value, 1.0))
 
 
-def _spectrum(flight: SmoothedFlight, left_b: np.ndarray) -> Spectrum | None:
+def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None:
     """Return the spectrum of one flight; None where it is too short for one."""
-    middle = flight.form.middle_s
-    if len(middle) < 8:
+    middle_s = flight.form.middle_s
+    if len(middle_s) < LEAST_MEANS:
         return None
-    step = float(np.median(np.diff(middle)))
-    place = np.round((middle - middle[0]) / step).astype(int)
+    step_s = float(np.median(np.diff(middle_s)))
+    place = np.round((middle_s - middle_s[0]) / step_s).astype(int)
     count = int(place[-1]) + 1
-    if count * step * BAND_HZ[0] < 1.0 or len(middle) < 0.7 * count:
+    if count * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * count:
         return None
     rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
-    left_w = (rot_w @ left_b[..., None])[..., 0][:, :2]
+    residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
     yaw = np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0])
-    since = np.linspace(-1.0, 1.0, len(middle))
+    time = np.linspace(-1.0, 1.0, len(middle_s))
     # A force that turns with the heading, or drifts, is not an oscillation.
-    zero, one = np.zeros_like(since), np.ones_like(since)
-    steady = np.stack(
+    zero, one = np.zeros_like(time), np.ones_like(time)
+    trend = np.stack(
         [
-            np.stack([one, zero, since, zero, np.cos(yaw), -np.sin(yaw)], axis=1),
-            np.stack([zero, one, zero, since, np.sin(yaw), np.cos(yaw)], axis=1),
+            np.stack([one, zero, time, zero, np.cos(yaw), -np.sin(yaw)], axis=1),
+            np.stack([zero, one, zero, time, np.sin(yaw), np.cos(yaw)], axis=1),
         ],
         axis=1,
     )
+    columns = trend.reshape(-1, trend.shape[-1])
+    window = np.hanning(count)[:, None]
     powers = []
-    for series in (left_w, flight.measured[:, :2]):
-        columns = steady.reshape(-1, steady.shape[-1])
+    for series in (residual_w, flight.measured[:, :2]):
         fit = np.linalg.lstsq(columns, series.reshape(-1), rcond=None)[0]
-        even = np.zeros((count, 2))
-        even[place] = series - steady @ fit
-        window = np.hanning(count)[:, None]
-        lines = np.fft.rfft(even * window, axis=0) / np.sqrt((window**2).sum())
+        detrended = np.zeros((count, 2))
+        detrended[place] = series - trend @ fit
+        lines = np.fft.rfft(detrended * window, axis=0) / np.sqrt((window**2).sum())
         powers.append((np.abs(lines) ** 2).sum(axis=1))
-    frequency = np.fft.rfftfreq(count, step)
-    inside = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
-    if inside.sum() < 12:
+    frequency_hz = np.fft.rfftfreq(count, step_s)
+    in_band = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
+    if in_band.sum() < LEAST_BINS:
         return None
-    left, moved = (power[inside] for power in powers)
-    return Spectrum(frequency[inside], left, moved, HANN_BINS / (count * step))
+    residual, measured = (power[in_band] for power in powers)
+    return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (count * step_s))
 
 
-def _gains(one: Spectrum, tried_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gain in log-likelihood by a peak at each frequency, and its height.
+def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gain in log-likelihood by a peak at each of `centre_hz`, and the peak's height.
 
     Both are (widths, frequencies).
     """
-    frequency = one.frequency_hz
-    smooth = [np.ones_like(frequency), frequency**2]
-    smooth += [1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ]
-    background = np.stack(smooth)
-    without, _ = _fitted(one.left, background[None])
+    frequency = spectrum.frequency_hz
+    background = np.stack(
+        [
+            np.ones_like(frequency),
+            frequency**2,
+            *(1.0 / (1.0 + (frequency / corner) ** 2) ** 2 for corner in CORNERS_HZ),
+        ]
+    )
+    without, _ = _fit_spectrum(spectrum.residual, background[None])
     shapes = []
     for width in WIDTHS:
-        half = np.hypot(width * tried_hz, 0.5 * one.width_hz)[:, None]
-        shapes.append(1.0 / (1.0 + ((frequency - tried_hz[:, None]) / half) ** 2) ** 2)
+        half_hz = np.hypot(width * centre_hz, 0.5 * spectrum.width_hz)[:, None]
+        shapes.append(1.0 / (1.0 + ((frequency - centre_hz[:, None]) / half_hz) ** 2) ** 2)
     peaks = np.concatenate(shapes)[:, None]
-    whole = np.concatenate([np.broadcast_to(background, (len(peaks), *background.shape)), peaks], 1)
-    with_it, weights = _fitted(one.left, whole)
-    shape = (len(WIDTHS), len(tried_hz))
-    return (with_it - without).reshape(shape), weights[:, -1].reshape(shape)
+    backgrounds = np.broadcast_to(background, (len(peaks), *background.shape))
+    with_peak, weights = _fit_spectrum(
+        spectrum.residual, np.concatenate([backgrounds, peaks], axis=1)
+    )
+    shape = (len(WIDTHS), len(centre_hz))
+    return (with_peak - without).reshape(shape), weights[:, -1].reshape(shape)
 
 
-def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the log-likelihood (C,) of sums of `shapes` (C, T, J), and their weights (C, T).
 
     Power (J,) of two axes is chi-square distributed about its mean; the weights are found by
@@ -205,38 +221,38 @@ def _fitted(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarr
     weights = np.full(unit.shape[:2], float(power.mean()) / unit.shape[1])
     for _ in range(ROUNDS):
         model = np.einsum("ct,ctj->cj", weights, unit)
-        up = np.einsum("ctj,cj->ct", unit, power / model**2)
-        weights = weights * np.sqrt(up / np.einsum("ctj,cj->ct", unit, 1.0 / model))
+        numerator = np.einsum("ctj,cj->ct", unit, power / model**2)
+        weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit, 1.0 / model))
     model = np.einsum("ct,ctj->cj", weights, unit)
     likelihood = -(2.0 / HANN_BINS) * (np.log(model) + power / model).sum(axis=1)
     return likelihood, weights / scale[..., 0]
 
 
-def _about(
+def _peak_shares(
     spectra: Sequence[Spectrum], centre_hz: float, heights: Sequence[float]
 ) -> tuple[float, float]:
-    """Return the ratio of residual force to acceleration at a frequency, and the peak's share."""
-    left = moved = peak = whole = 0.0
-    for one, height in zip(spectra, heights, strict=True):
-        inside = np.abs(one.frequency_hz - centre_hz) <= one.width_hz
-        left += float(one.left[inside].sum())
-        moved += float(one.moved[inside].sum())
-        peak += float(np.minimum(height, one.left[inside]).sum())
-        whole += float(one.left.sum())
-    return float(np.sqrt(left / max(moved, 1e-12))), peak / max(whole, 1e-12)
+    """Return the ratio of residual force to acceleration at a peak, and the peak's power share."""
+    residual = measured = peak = total = 0.0
+    for spectrum, height in zip(spectra, heights, strict=True):
+        near = np.abs(spectrum.frequency_hz - centre_hz) <= spectrum.width_hz
+        residual += float(spectrum.residual[near].sum())
+        measured += float(spectrum.measured[near].sum())
+        peak += float(np.minimum(height, spectrum.residual[near]).sum())
+        total += float(spectrum.residual.sum())
+    return float(np.sqrt(residual / max(measured, 1e-12))), peak / max(total, 1e-12)
 
 
 class Turbulence(NamedTuple):
-    """Random wind that was found."""
+    """Estimated random wind."""
 
     intensity: float
-    """[m/s]."""
+    """Standard deviation of its speed [m/s]."""
     intensity_ci95: tuple[float, float]
     length: float
-    """[m]."""
+    """Length scale [m]."""
     length_ci95: tuple[float, float]
     ratio: float
-    """Log-likelihood over that of no wind."""
+    """Log-likelihood ratio to no wind."""
 
     @property
     def effect(self) -> str:
@@ -245,7 +261,7 @@ class Turbulence(NamedTuple):
 
     @property
     def values(self) -> Gusts:
-        """What a vehicle file holds of it."""
+        """Values of the effect in a vehicle file."""
         return Gusts(self.intensity, self.length)
 
 
@@ -255,116 +271,127 @@ def find_turbulence(
     disturbance: DisturbanceEquations,
     limits: Thresholds = THRESHOLDS,
 ) -> Turbulence | None:
-    """Return the random wind that explains the residual of `model` at `theta` (P,), or None."""
-    passed = _passed_on(model, theta, disturbance.knot)
-    if np.abs(passed).max() < 1e-6:
+    """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
+
+    None also where no drag transmits a wind, or where another random force explains more.
+    """
+    transmission = _wind_transmission(model, theta, disturbance.knot)
+    if np.abs(transmission).max() < 1e-6:
         return None
-    tried_m, tried = np.geomspace(*limits.wind_lengths_m), np.geomspace(*limits.wind_intensities)
-    roots = [passed @ _wind_root(disturbance.knot, length) for length in tried_m]
-    table = np.stack([_likelihood(disturbance, root, tried) for root in roots])
+    lengths_m = np.geomspace(*limits.wind_lengths_m)
+    intensities = np.geomspace(*limits.wind_intensities)
+    roots = [transmission @ _wind_root(disturbance.knot, length) for length in lengths_m]
+    table = np.stack([_likelihood(disturbance, root, intensities) for root in roots])
     i, j = np.unravel_index(int(table.argmax()), table.shape)
     ratio = float(table[i, j])
     if ratio < limits.wind_ratio or _free_likelihood(disturbance) > ratio + limits.wind_rival_ratio:
         return None
-    if _has_outliers(disturbance, roots[i], tried[j], limits.wind_tail):
+    if _has_outliers(disturbance, roots[i], intensities[j], limits.wind_tail):
         return None
-    near = table >= ratio - limits.profile_fall
-    lengths, intensities = tried_m[near.any(axis=1)], tried[near.any(axis=0)]
+    likely = table >= ratio - limits.profile_fall  # 95 % by the profile likelihood
+    likely_m, likely_intensity = lengths_m[likely.any(axis=1)], intensities[likely.any(axis=0)]
     return Turbulence(
-        float(tried[j]),
-        (float(intensities[0]), float(intensities[-1])),
-        float(tried_m[i]),
-        (float(lengths[0]), float(lengths[-1])),
+        float(intensities[j]),
+        (float(likely_intensity[0]), float(likely_intensity[-1])),
+        float(lengths_m[i]),
+        (float(likely_m[0]), float(likely_m[-1])),
         ratio,
     )
 
 
-def _passed_on(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
-    """Return (W, 6 KNOTS, 3 KNOTS): the push per m/s of wind in the world at each knot."""
+def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
+    """Return the accelerations per m/s of wind in the world at each knot, (W, 6 KNOTS, 3 KNOTS)."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
-    steady_wind = CONSTANT_WIND.name
-    plain = np.asarray(values[steady_wind].velocity)
+    steady_w = np.asarray(values[CONSTANT_WIND.name].velocity)
     motion = Motion(*(np.asarray(field) for field in knot.track))
     count = len(motion.pos_w)
     state = PlantState(np.asarray(knot.rotor_speed), np.zeros(0), {})
-    still = np.zeros(motion.pos_w.shape[:2])
-    inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=still)
+    zeros = np.zeros(motion.pos_w.shape[:2])
+    inputs = Inputs(rotor_speed=np.asarray(knot.rotor_speed), voltage_drop=zeros)
 
-    def wrench(wind_w: np.ndarray) -> np.ndarray:
-        values[steady_wind] = ConstantWind(plain + wind_w)
+    def accelerations(wind_w: np.ndarray) -> np.ndarray:
+        values[CONSTANT_WIND.name] = ConstantWind(steady_w + wind_w)
         plant = assemble(given.nominal, given.constants, values, model.dt, 0.0)
-        _, out = plant_step(plant, state, motion, inputs, still)
+        _, out = plant_step(plant, state, motion, inputs, zeros)
         mass, inertia = plant.constants.mass, plant.constants.inertia
         return np.concatenate([out.force_b / mass, out.torque_b / inertia], axis=-1)
 
-    slopes = [0.5 * (wrench(axis) - wrench(-axis)) for axis in np.eye(3)]
-    passed = np.zeros((count, KNOTS, 6, KNOTS, 3))
+    slopes = [0.5 * (accelerations(axis) - accelerations(-axis)) for axis in np.eye(3)]
+    transmission = np.zeros((count, KNOTS, 6, KNOTS, 3))
     for k in range(KNOTS):
-        passed[:, k, :, k, :] = np.stack([slope[:, k] for slope in slopes], axis=-1)
-    return passed.reshape(count, KNOTS * 6, KNOTS * 3)
+        transmission[:, k, :, k, :] = np.stack([slope[:, k] for slope in slopes], axis=-1)
+    return transmission.reshape(count, KNOTS * 6, KNOTS * 3)
 
 
 def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
-    """Return a root (W, 3 KNOTS, 3 KNOTS) of the wind's covariance for an intensity of 1 m/s."""
+    """Return a root (W, 3 KNOTS, 3 KNOTS) of the wind's covariance for an intensity of 1 m/s.
+
+    The correlation decays exponentially with the distance flown, over the length scale.
+    """
     speed = np.maximum(np.sqrt((np.asarray(knot.track.vel_w) ** 2).sum(axis=-1)), 1.0)
     step = 0.5 * (speed[:, 1:] + speed[:, :-1]) / (KNOTS - 1) / length_m
-    passed = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
-    colour = np.exp(-np.abs(passed[:, :, None] - passed[:, None, :]))
-    root = np.linalg.cholesky(colour + 1e-9 * np.eye(KNOTS))
+    distance = np.concatenate([np.zeros((len(speed), 1)), np.cumsum(step, axis=1)], axis=1)
+    correlation = np.exp(-np.abs(distance[:, :, None] - distance[:, None, :]))
+    root = np.linalg.cholesky(correlation + 1e-9 * np.eye(KNOTS))
     axes = np.diag([1.0, 1.0, VERTICAL])
-    count = len(root)
-    whole = np.einsum("wkl,ab->wkalb", root, axes)
-    return whole.reshape(count, KNOTS * 3, KNOTS * 3)
+    return np.einsum("wkl,ab->wkalb", root, axes).reshape(len(root), KNOTS * 3, KNOTS * 3)
 
 
-def _pulls(equations: DisturbanceEquations, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return information and gradient (W, J) along independent directions of root @ normal."""
-    turned = np.swapaxes(root, 1, 2)
-    values, vectors = np.linalg.eigh(turned @ equations.hessian @ root)
-    pulls = np.swapaxes(vectors, 1, 2) @ (turned @ equations.gradient[..., None])
-    return values, pulls[..., 0]
+def _diagonalised(
+    equations: DisturbanceEquations, root: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return information and gradient (W, J) along the independent directions of root @ normal."""
+    transposed = np.swapaxes(root, 1, 2)
+    information, vectors = np.linalg.eigh(transposed @ equations.hessian @ root)
+    gradient = np.swapaxes(vectors, 1, 2) @ (transposed @ equations.gradient[..., None])
+    return information, gradient[..., 0]
 
 
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the log-likelihood ratio of disturbances root @ normal to none, for `sizes`."""
-    values, pulls = _pulls(equations, root)
-    values = np.maximum(values, 0.0)
-    raised = sizes[:, None, None] ** 2
-    terms = raised * pulls**2 / (1.0 + raised * values) - np.log1p(raised * values)
+    information, gradient = _diagonalised(equations, root)
+    information = np.maximum(information, 0.0)
+    variance = sizes[:, None, None] ** 2
+    terms = variance * gradient**2 / (1.0 + variance * information)
+    terms = terms - np.log1p(variance * information)
     return 0.5 * terms.sum(axis=(1, 2))
 
 
 def _has_outliers(
     equations: DisturbanceEquations, root: np.ndarray, size: float, tail: float
 ) -> bool:
-    """Return whether the disturbance has heavier tails than a normal wind.
+    """Return whether the disturbance has heavier tails than a normal wind of this `size`.
 
     The fourth power of a normal variable of variance 1 has mean 3 and variance 96; the measured
     mean may exceed 3 by `tail` standard errors. A force at some places or speeds only has a higher
-    one.
+    one. Fewer than eight directions with information are not tested.
     """
-    values, pulls = _pulls(equations, root)
-    heard = size**2 * values > 1.0
-    if heard.sum() < 8:
+    information, gradient = _diagonalised(equations, root)
+    informed = size**2 * information > 1.0
+    if informed.sum() < 8:
         return False
-    power = pulls[heard] ** 2 / values[heard] / (1.0 + size**2 * values[heard])
+    information, gradient = information[informed], gradient[informed]
+    power = gradient**2 / information / (1.0 + size**2 * information)
     fourth = float((power**2).mean() / power.mean() ** 2)
-    return fourth > 3.0 + tail * np.sqrt(96.0 / heard.sum())
+    return fourth > 3.0 + tail * np.sqrt(96.0 / informed.sum())
 
 
 def _free_likelihood(equations: DisturbanceEquations) -> float:
-    """Return the largest log-likelihood of a random disturbance with a size for each body axis."""
+    """Return the largest log-likelihood ratio of a random disturbance along the body axes.
+
+    Free are the logarithms of a size for each of the six axes and of one correlation time.
+    """
     time = np.linspace(0.0, 1.0, KNOTS)
 
     def loss(logs: np.ndarray) -> float:
-        sizes, tau = np.exp(logs[:6]), np.exp(logs[6])
-        colour = np.exp(-np.abs(time[:, None] - time) / tau) + 1e-9 * np.eye(KNOTS)
-        root = np.einsum("kl,ab->kalb", np.linalg.cholesky(colour), np.diag(sizes))
+        sizes, tau_s = np.exp(logs[:6]), np.exp(logs[6])
+        correlation = np.exp(-np.abs(time[:, None] - time) / tau_s) + 1e-9 * np.eye(KNOTS)
+        root = np.einsum("kl,ab->kalb", np.linalg.cholesky(correlation), np.diag(sizes))
         root = root.reshape(1, KNOTS * 6, KNOTS * 6).repeat(len(equations.gradient), axis=0)
         return -float(_likelihood(equations, root, np.ones(1))[0])
 
-    begin = np.log([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.5])
+    start = np.log([0.05, 0.05, 0.05, 0.01, 0.01, 0.01, 0.5])
     bounds = [(-9.0, 3.0)] * 6 + [(np.log(0.05), np.log(5.0))]
-    found = minimize(loss, begin, method="Powell", bounds=bounds, options={"maxiter": 4})
-    return -float(found.fun)
+    best = minimize(loss, start, method="Powell", bounds=bounds, options={"maxiter": 4})
+    return -float(best.fun)

@@ -1,9 +1,10 @@
-"""Structure in the residual: which simple force or torque over the state explains it, if any.
+"""Tests rollout residuals for structure: a force or torque that depends on the state.
 
-A disturbance, which is an additional force and torque at knots along every window, stands for
-whatever the model lacks. Two tests need no effect of the catalogue: whether one simple shape over
-the state (as drag over speed) lowers the error on left-out stretches; and whether the disturbance
-has more energy than noise (a score test of a smooth random disturbance).
+Whatever the model lacks is represented by a disturbance: an additional force and torque, piecewise
+linear in time between the knots (support points) of every 1 s window. Two tests need no effect of
+the catalogue. The first fits shapes, which are simple functions of the state such as the square of
+the speed, and tests whether one lowers the error on left-out windows. The second tests whether the
+disturbance has more energy than noise gives (a score test of a smooth random disturbance).
 """
 
 from __future__ import annotations
@@ -33,26 +34,25 @@ class DisturbanceEquations(NamedTuple):
     gradient: np.ndarray
     """(W, 6 KNOTS)."""
     knot: Flown
-    """(W, KNOTS, ...) the flight at the knots."""
+    """(W, KNOTS, ...) simulated state at the knots."""
     shapes: ShapeLibrary
 
 
 class ShapeScore(NamedTuple):
-    """How much one shape explains of the residual."""
+    """How much of the residual one shape explains; fields as in `permutation.CandidateScore`."""
 
     label: str
     gain: float
     p_value: float
-    """As in `permutation.CandidateScore`."""
 
 
 class ResidualStructure(NamedTuple):
-    """Structure in the residual."""
+    """Results of both tests."""
 
     shapes: list[ShapeScore]
-    """Best first."""
+    """All shapes, the best first."""
     coloured: dict[str, float]
-    """By axis: p-value of the energy of a smooth random disturbance along it, were there none."""
+    """By axis: p-value of a smooth random disturbance along it."""
 
 
 def disturbance_equations(
@@ -62,7 +62,15 @@ def disturbance_equations(
     estimate: Estimate,
     limits: Thresholds = THRESHOLDS,
 ) -> DisturbanceEquations:
-    """Return the normal equations of a disturbance on the residual at `estimate`."""
+    """Return the normal equations of a disturbance that would explain the residual at `estimate`.
+
+    Args:
+        model: the rollout.
+        windows: W stretches of 1 s.
+        whitening: by the noise of these windows.
+        estimate: parameters and start states.
+        limits: size of the shapes.
+    """
     response = model.respond(estimate.theta, estimate.free, windows)
     linear = model.linearise(estimate.theta, estimate.free, windows, [])
     residual = project_out_start(whitening, whitened_residual(whitening, linear))
@@ -77,14 +85,18 @@ def residual_structure(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
-    """Return the structure in the residual; windows of one `fold` (W,) are left out together.
+    """Return the structure in the residual.
 
-    `seed` is of the permutation test's draws.
+    Args:
+        equations: of the disturbance.
+        fold: (W,) cross-validation fold of each window; a fold is left out at a time.
+        seed: of the permutation test.
+        limits: draws and thresholds.
     """
     along, groups = equations.shapes.unit, equations.shapes.groups
-    turned = np.swapaxes(along, 1, 2)
-    hessian = turned @ equations.hessian @ along
-    gradient = (turned @ equations.gradient[..., None])[..., 0]
+    transposed = np.swapaxes(along, 1, 2)
+    hessian = transposed @ equations.hessian @ along
+    gradient = (transposed @ equations.gradient[..., None])[..., 0]
     size = np.sqrt(np.maximum(np.einsum("wjj->j", hessian), 1e-12))
     gains, p_values, _ = permutation_test(
         hessian / np.outer(size, size),
@@ -95,64 +107,70 @@ def residual_structure(
         seed,
         limits=limits,
     )
-    found = [ShapeScore(g.label, *x) for g, *x in zip(groups, gains, p_values, strict=True)]
+    scores = [ShapeScore(g.label, *x) for g, *x in zip(groups, gains, p_values, strict=True)]
     return ResidualStructure(
-        sorted(found, key=lambda shape: -shape.gain),
+        sorted(scores, key=lambda shape: -shape.gain),
         {axis: _energy_p_value(equations, i, limits) for i, axis in enumerate(AXES)},
     )
 
 
 def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
-    """Return the p-value of the energy of a random disturbance along `axis`, over several colours.
+    """Return the p-value of a random disturbance along `axis`, over several correlation times.
 
-    Directions are those in which a disturbance of one correlation time is uncorrelated before and
-    after the data. The squared gradient along each, over its information l, is weighted as in the
-    likelihood of a disturbance of size s, by s^2 l / (1 + s^2 l): a small s weights slow
-    directions, a large one all. The weighted sum is close to a gamma variable (Satterthwaite 1946).
+    For one correlation time, the eigenvectors of the information are directions in which the
+    disturbance is uncorrelated before and after the data. The squared gradient along each, over its
+    information l, is weighted as in the likelihood of a disturbance of size s, by
+    s^2 l / (1 + s^2 l): a small s weights slow directions, a large one all. The weighted sum is
+    approximately gamma distributed (Satterthwaite 1946). The smallest p-value is multiplied by the
+    number of tests (Bonferroni).
     """
-    at = np.arange(KNOTS) * 6 + axis
-    hessian = equations.hessian[:, at][:, :, at]
-    gradient = equations.gradient[:, at, None]
+    entries = np.arange(KNOTS) * 6 + axis
+    hessian = equations.hessian[:, entries][:, :, entries]
+    gradient = equations.gradient[:, entries, None]
     time = np.linspace(0.0, 1.0, KNOTS)
-    found = []
-    for keeps_s in limits.colours_s:
-        root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / keeps_s))
-        values, vectors = np.linalg.eigh(root.T @ hessian @ root)
-        seen = values > limits.informed_share * max(float(values.max()), 1e-12)
-        pulls = (np.swapaxes(vectors, 1, 2) @ (root.T @ gradient))[..., 0]
-        power = pulls[seen] ** 2 / values[seen]
+    p_values = []
+    for correlation_s in limits.colours_s:
+        root = np.linalg.cholesky(np.exp(-np.abs(time[:, None] - time) / correlation_s))
+        information, vectors = np.linalg.eigh(root.T @ hessian @ root)
+        informed = information > limits.informed_share * max(float(information.max()), 1e-12)
+        along = (np.swapaxes(vectors, 1, 2) @ (root.T @ gradient))[..., 0]
+        information, along = information[informed], along[informed]
         for share in limits.disturbance_quantiles:
-            size = 1.0 / np.quantile(values[seen], share)
-            weight = size * values[seen] / (1.0 + size * values[seen])
+            size = 1.0 / np.quantile(information, share)
+            weight = size * information / (1.0 + size * information)
             mean = float(weight.sum())
-            spread = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
-            value = float((weight * power).sum())
-            found.append(float(gamma.sf(value, mean**2 / spread, scale=spread / mean)))
-    return min(1.0, len(found) * min(found)) if found else 1.0
+            variance = 2.0 * float((weight**2).sum()) + (limits.noise_error * mean) ** 2
+            energy = float((weight * (along**2 / information)).sum())
+            p_values.append(float(gamma.sf(energy, mean**2 / variance, scale=variance / mean)))
+    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0
 
 
 class ShapeGroup(NamedTuple):
-    """One shape, as columns of `ShapeLibrary.unit`."""
+    """One shape along several axes, as columns of `ShapeLibrary.unit`."""
 
     label: str
-    """For people: "force that goes with ..."."""
+    """For people, as "force with the speed"."""
     columns: tuple[int, ...]
 
 
 class ShapeLibrary(NamedTuple):
-    """All shapes on the knots of W windows."""
+    """All shapes at the knots of W windows."""
 
     unit: np.ndarray
-    """(W, KNOTS * 6, J) acceleration and angular acceleration in body axes, for 1 of each."""
+    """(W, KNOTS * 6, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes, for a
+    coefficient of 1 of each of J columns."""
     groups: tuple[ShapeGroup, ...]
 
 
 def shape_library(
     knot: Flown, start_s: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> ShapeLibrary:
-    """Return all shapes on windows with the states `knot` (W, KNOTS, ...) at their knots.
+    """Return all shapes at the knots of W windows.
 
-    `start_s` (W,) is since the start of the flight [s].
+    Args:
+        knot: (W, KNOTS, ...) simulated states.
+        start_s: (W,) start of each window, since the start of its flight [s].
+        limits: number of pieces and cells.
     """
     pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.track)
     axes_b = np.swapaxes(rot_w, -1, -2)
@@ -211,15 +229,15 @@ def shape_library(
     add("force with the place", [
         world[..., i] * bump[..., None] for bump in _bumps(pos_w, limits.cells) for i in range(3)
     ])  # fmt: skip
-    middle = pos_w.mean(axis=(0, 1))
-    away = np.einsum("wkij,wkj->wki", axes_b, pos_w - middle)
-    add("force towards a place", [np.concatenate([away, np.zeros_like(away)], axis=-1)])
+    from_centre_b = np.einsum("wkij,wkj->wki", axes_b, pos_w - pos_w.mean(axis=(0, 1)))
+    radial = np.concatenate([from_centre_b, np.zeros_like(from_centre_b)], axis=-1)
+    add("force towards a place", [radial])
     stacked = np.stack(columns, axis=-1)
     return ShapeLibrary(stacked.reshape(len(stacked), KNOTS * 6, -1), tuple(groups))
 
 
 def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
-    """Return hats over what values `scalar` (W, KNOTS) takes, as many between any two."""
+    """Return hat functions over quantiles of `scalar` (W, KNOTS), each (W, KNOTS)."""
     places = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
     if len(places) < 2:
         return [np.ones_like(scalar)]
@@ -227,11 +245,11 @@ def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
 
 
 def _bumps(pos_w: np.ndarray, cells: int) -> list[np.ndarray]:
-    """Return hats over the horizontal places that were flown, each (W, KNOTS)."""
+    """Return Gaussian bumps on a grid over the horizontal positions, each (W, KNOTS)."""
     low, high = pos_w[..., :2].min(axis=(0, 1)), pos_w[..., :2].max(axis=(0, 1))
     width = np.maximum(high - low, 0.5) / (cells - 1)
-    found = []
+    bumps = []
     for cell in np.ndindex(cells, cells):
-        apart = (pos_w[..., :2] - low) / width - cell
-        found.append(np.exp(-0.5 * (apart**2).sum(axis=-1) / 0.5**2))
-    return found
+        distance = (pos_w[..., :2] - low) / width - cell
+        bumps.append(np.exp(-0.5 * (distance**2).sum(axis=-1) / 0.5**2))
+    return bumps

@@ -1,13 +1,15 @@
-"""The gap of rollouts on held-out flights, and the model's own numerical error.
+"""Error of 1 s rollouts on held-out flights (their gap), and the model's own numerical error.
 
-The gap is the slow part of the errors of 1 s rollouts, in units of what noise gives: 1 means noise
-only. The start state of each rollout is free within its measurement noise. Plain rollouts from
-measured states are reported as well, in metres; their error contains the model's error and the
-effect of the start's noise, which follows from the model's Jacobian.
+A rollout is a simulated stretch of a flight from its measured start state. The gap is the slow part
+of the rollouts' errors over that by measurement noise alone, so 1 means noise only; each start
+state is fitted within its measurement noise. The plain errors from the measured start states are
+reported as well, in metres. Their noise floor follows from the start's noise by the model's
+Jacobian.
 
-A rollout with steps of twice the length and every second rotor speed differs from the usual one by
-several times the usual one's error (step doubling; Hairer, Norsett & Wanner 1993, Sec. II.4). The
-part that no free start explains is a lower limit of the noise.
+The numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4): a
+rollout with steps of twice the length and every second rotor speed differs from the usual one by
+several times the usual one's error. The part that no change of the start state explains is a lower
+limit of the noise.
 """
 
 from __future__ import annotations
@@ -41,12 +43,14 @@ from suite.diagnose.data.windows import (
 from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.evidence.rollouts import RolloutModel, block_of
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.gap import Channel, Gap
+from suite.diagnose.verdict.gap import Channel, Gap, rms_length
 
 HORIZONS_S = (0.1, 0.5, 1.0)
 """Lengths of the plain rollouts [s]."""
 SHOWN = 4
-"""Held-out flights in pictures and recordings."""
+"""Number of held-out flights in pictures and recordings."""
+ACC_ROW = 9
+"""Number of the row, among those with a velocity, that gives the acceleration at the start."""
 MEASURE = (
     "RMS of slow errors of 1 s rollouts on held-out data, start free within its noise, over "
     "position, attitude, velocity and rates, in units of what measurement noise gives"
@@ -55,19 +59,19 @@ MEASURE = (
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Flights as rollouts: the model, and what was held out."""
+    """Flights with the model that simulates them as rollouts, and their held-out part."""
 
     model: RolloutModel
-    """Of the nominal vehicle."""
+    """Model of the nominal vehicle."""
     logs: Sequence[FlightLog]
     vehicle: Vehicle
-    """The nominal one."""
+    """The nominal vehicle, which the simulation uses."""
     rotor_input: bool
     """Whether measured rotor speeds are the model's input, not the commands."""
     held: FlightWindows
-    """Overlapping windows over what was held out."""
+    """Overlapping 1 s windows over the held-out part."""
     since_s: float
-    """From when on a flight is held out: more than 0 of a lone one [s]."""
+    """Time from which on a flight is held out [s]; above 0 only for a single flight."""
     limits: Thresholds
 
     @property
@@ -76,16 +80,17 @@ class Rollouts:
         return self.model.space.array("start")
 
     def cut(self, stride_s: float, only: Sequence[int] | None = None) -> FlightWindows:
-        """Return windows of all flights or of `only` some, one every `stride_s` [s]."""
-        how = (self.rotor_input, stride_s, self.limits, self.model.integrator)
-        windows, _ = cut(self.logs, self.vehicle, *how, only=only)
+        """Return windows of all flights, or those numbered in `only`, one every `stride_s` [s]."""
+        settings = (self.rotor_input, stride_s, self.limits, self.model.integrator)
+        windows, _ = cut(self.logs, self.vehicle, *settings, only=only)
         assert windows is not None  # the diagnosis has cut them before
         return windows
 
     def simulated(self, fitted: np.ndarray | None) -> tuple[FlightWindows, dict[str, np.ndarray]]:
-        """Return windows of 1 s over what was held out, and measured - simulated (W, N, 19).
+        """Return windows of 1 s over the held-out part, and measured - simulated (W, N, 19).
 
-        As given and, where parameters (P,) were `fitted`, with them, by what it is called.
+        The latter has one entry with the vehicle file's parameters and, where other parameters (P,)
+        were `fitted`, one with them, each by its label for people.
         """
         windows = self.cut(LENGTH_S, np.unique(self.held.flight)[:SHOWN].tolist())
         windows = take(windows, np.asarray(windows.start_s) >= self.since_s - 1e-6)
@@ -105,7 +110,7 @@ def measure(
     noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
-    """Return the gap of `model` at `theta` (P,) on `windows` with `noise`."""
+    """Return the gap of `model` on `windows` at the parameters `theta` (P,), over `noise`."""
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
     return gap_of(linear, windows, noise, limits)
@@ -117,51 +122,53 @@ def gap_of(
     noise: Noise,
     limits: Thresholds = THRESHOLDS,
 ) -> Gap:
-    """Return the gap of residuals; the slopes in `linear` are those along what is free.
+    """Return the gap of the residuals in `linear`, whose slopes are along the start states.
 
-    The score is of pose, velocity and rates. Models are compared by every channel that is fitted:
-    a bias of the accelerometer moves no other.
+    The score contains pose, velocity and rates only. The energy, by which models are compared,
+    contains every fitted channel: a bias of the accelerometer changes no other channel.
     """
     whitening = make_whitening(linear, noise, windows, limits)
     residual = block_of(whitening, linear, (), windows).residual
     slow = slow_energy(whitening, residual)
     score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
-    free = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
+    free_noise = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
     channels = {}
-    for horizon in HORIZONS_S:
-        at = at_horizon(windows, horizon)
-        error = linear.residual[at][:, :STATE]
-        floor = np.maximum(noise_floor(linear.slope[at][:, :STATE], free), 1e-12)
-        channels[f"{horizon:g} s"] = {
-            name: Channel(_rms(error[:, SLICES[name]]), _rms(floor[:, SLICES[name]]))
+    for horizon_s in HORIZONS_S:
+        rows = rows_at(windows, horizon_s)
+        error = linear.residual[rows][:, :STATE]
+        floor = np.maximum(noise_floor(linear.slope[rows][:, :STATE], free_noise), 1e-12)
+        channels[f"{horizon_s:g} s"] = {
+            name: Channel(*(rms_length(part[:, SLICES[name]]) for part in (error, floor)))
             for name in STATE_GROUPS
         }
     return Gap(score, slow.sum(axis=1), channels)
 
 
 def overlap(limits: Thresholds) -> float:
-    """Return the weight of a row in overlapping windows, so that each row counts once."""
+    """Return the weight with which each row of overlapping windows counts once in a sum [1]."""
     return limits.gap_stride_s / LENGTH_S
 
 
 def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
-    """Return the start states (W, F), relative to the measured ones, under the clock offset."""
-    late = pose_delay(model.space.effects(theta))
+    """Return the true start states (W, F) less the measured ones, by the delay of logged poses.
+
+    The delay is the clock offset among the effects at `theta` (P,).
+    """
+    delay_s = pose_delay(model.space.effects(theta))
     offset = np.zeros((len(windows.flight), model.free))
-    offset[:, :3] = late * windows.vel_w
-    offset[:, 3:6] = late * windows.rate_b
-    moving = np.asarray(windows.seen)[:, :, SLICES["velocity"].start]
-    # The ninth row that has a velocity, or the last where there are fewer.
-    number = np.minimum(9, moving.sum(axis=1))[:, None]
-    rows = (moving & (np.cumsum(moving, axis=1) == number)).argmax(axis=1)
-    at = np.arange(len(rows))
-    span = np.asarray(windows.row_s)[at, rows][:, None]
-    acc_w = (np.asarray(windows.row_vel_w)[at, rows] - windows.vel_w) / np.maximum(span, 1e-3)
-    offset[:, 6:9] = late * np.where(moving.any(axis=1, keepdims=True), acc_w, 0.0)
+    offset[:, :3] = delay_s * windows.vel_w
+    offset[:, 3:6] = delay_s * windows.rate_b
+    has_vel = np.asarray(windows.valid)[:, :, SLICES["velocity"].start]
+    number = np.minimum(ACC_ROW, has_vel.sum(axis=1))[:, None]
+    rows = (has_vel & (np.cumsum(has_vel, axis=1) == number)).argmax(axis=1)
+    each = np.arange(len(rows))
+    span_s = np.asarray(windows.row_s)[each, rows][:, None]
+    acc_w = (np.asarray(windows.row_vel_w)[each, rows] - windows.vel_w) / np.maximum(span_s, 1e-3)
+    offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
     return offset
 
 
-def at_horizon(windows: FlightWindows, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
+def rows_at(windows: FlightWindows, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Return each window's number and its row nearest to `horizon_s` [s], (W,) each."""
     row = np.abs(np.asarray(windows.row_s) - horizon_s).argmin(axis=1)
     return np.arange(len(row)), row
@@ -170,7 +177,10 @@ def at_horizon(windows: FlightWindows, horizon_s: float) -> tuple[np.ndarray, np
 def start_noise(
     sigma: np.ndarray, windows: FlightWindows, free: int, limits: Thresholds = THRESHOLDS
 ) -> np.ndarray:
-    """Return the noise (F,) of the numbers that are free in a window, from the channels' (19,)."""
+    """Return the standard deviation (F,) of a window's `free` start numbers.
+
+    `sigma` (19,) is that of the channels.
+    """
     noise = np.zeros(free)
     noise[:STATE] = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
     if free > STATE:
@@ -179,15 +189,12 @@ def start_noise(
 
 
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return the errors (..., 12) of a perfect model by the noise of start and row.
+    """Return the RMS errors (..., 12) of a perfect model, by noise of the start and of the row.
 
-    `slope` is (..., 12, F) along what is free, `noise` (F,) of it; its first 12 are a row's too.
+    `slope` (..., 12, F) is along the start's F numbers and `noise` (F,) theirs; its first 12 are
+    those of a row's state, too.
     """
     return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).sum(axis=-1).mean()))
 
 
 def with_model_error(
@@ -198,29 +205,28 @@ def with_model_error(
     coarser: FlightWindows,
     limits: Thresholds,
 ) -> Thresholds:
-    """Return `limits` whose least noise of each group of channels is the model's own error or more.
+    """Return `limits` with the least noise of each channel group raised to the numerical error.
 
     Args:
         model: the rollout.
-        at: where `linear` was taken.
-        windows: W of them.
-        linear: residuals and slopes along everything.
-        coarser: the same windows, cut more coarsely.
-        limits: whose least noise is raised.
+        at: estimate at which `linear` was computed.
+        windows: W stretches.
+        linear: residuals and slopes of `windows` along all parameters and start numbers.
+        coarser: the same stretches with longer steps and fewer rotor speeds.
+        limits: those of the diagnosis.
     """
     noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
     whitening = make_whitening(linear, noise, windows, limits)
-    apart = model.residual(at.theta, at.free, coarser) - linear.residual
-    good = np.isfinite(apart).all(axis=(1, 2), keepdims=True)
-    apart = np.where(good, apart, 0.0)
-    left = project_out_start(whitening, whiten(whitening, apart[..., None]))[..., 0]
-    count, rows, channels = apart.shape
-    over = left[:, : rows * channels].reshape(apart.shape)
+    difference = model.residual(at.theta, at.free, coarser) - linear.residual
+    finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
+    difference = np.where(finite, difference, 0.0)
+    unexplained = project_out_start(whitening, whiten(whitening, difference[..., None]))[..., 0]
+    _, rows, channels = difference.shape
+    over_noise = unexplained[:, : rows * channels].reshape(difference.shape)
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
-    seen = np.asarray(windows.seen) & good
-    power = (np.where(seen, over * sigma, 0.0) ** 2).sum(axis=(0, 1)) / np.maximum(
-        seen.sum(axis=(0, 1)), 1
-    )
+    valid = np.asarray(windows.valid) & finite
+    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
+    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
     least = [
         max(floor, float(np.sqrt(power[channel].mean())))
         for floor, channel in zip(limits.least_noise, SLICES.values(), strict=True)

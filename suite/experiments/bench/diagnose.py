@@ -17,7 +17,7 @@ from suite.common.errors import WorkFailed
 from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
-from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate, weighed_by
+from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
 from suite.experiments.bench.compare import Comparison, compared, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
@@ -78,11 +78,11 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
     while True:
         directions = [*indices, *model.starts]
         linear = model.linearise(state.theta, state.free, task.windows, directions)
-        evidence, known = weighed_by(model, task.windows, linear, along=indices)
+        evidence, known = rollout_evidence(model, task.windows, linear, along=indices)
         state, block = fit(evidence, state, indices, known=known)
-        if evidence.trusted.seen.sum() <= seen:
+        if evidence.trusted.valid.sum() <= seen:
             return state.theta[indices], block.equations
-        seen = evidence.trusted.seen.sum()
+        seen = evidence.trusted.valid.sum()
 
 
 def _agreement(

@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from eval.quadrotor.model import BODY, add_quadrotor, rotor_name
 from eval.quadrotor.plant import make_plant
-from suite.diagnose.data.windows import SLICES, step_s
+from suite.diagnose.data.steps import step_s
+from suite.diagnose.data.windows import SLICES
 from suite.diagnose.estimate.block import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
@@ -171,7 +172,7 @@ def _measured(task: Task, w: int) -> Any:
         mujoco.mju_mat2Quat(quat, np.asarray(rot_w).ravel())
     rows = [windows.row_pos_w[w], quats, windows.row_vel_w[w], windows.row_rate_b[w]]
     values = np.concatenate(rows, axis=1)
-    seen = np.asarray(windows.seen[w])[:, :12]
+    seen = np.asarray(windows.valid[w])[:, :12]
     # Three angles are four numbers of a quaternion.
     values[~seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
     # A window with fewer rows is filled with empty rows, whose times must still increase.

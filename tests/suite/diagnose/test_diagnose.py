@@ -214,7 +214,9 @@ def test_what_drives_the_model_must_be_in_every_log():
 
 
 def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch):
-    monkeypatch.setattr("suite.diagnose.sources.rollouts.another_controller", lambda *_: True)
+    monkeypatch.setattr(
+        "suite.diagnose.sources.rollouts.flown_by_other_controller", lambda *_: True
+    )
     logs = [fly(LAGGED, seed, duration_s=2.0, motors=seed > 0) for seed in range(2)]
     without = next(log.name for log in logs if log.rotor_speed is None)
     with pytest.raises(ValueError, match=f"{without} has none as an input: diagnose the other"):

@@ -7,8 +7,8 @@ from suite.diagnose.data.colour import (
     ESTIMATED,
     Noise,
     colour_filter,
-    left_as_noise,
     measured_noise,
+    residual_as_noise,
 )
 from suite.diagnose.data.windows import SLICES, cut
 from tests.support.diagnosis_flights import fly_all
@@ -31,7 +31,7 @@ def measured(residual, windows):
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
     """White noise of 1 in every channel, that of `group` with a Gauss-Markov part."""
-    values = rng.standard_normal(windows.seen.shape)
+    values = rng.standard_normal(windows.valid.shape)
     shape = values[..., SLICES[group]].shape
     slow = np.zeros(shape)
     slow[:, 0] = rng.standard_normal((shape[0], 3))
@@ -41,7 +41,7 @@ def noise_like(windows, share, lasts_s, rng, group=GROUP):
         slow[:, row] = keeps[:, row - 1] * slow[:, row - 1] + fresh
     mixed = np.sqrt(1.0 - share) * values[..., SLICES[group]] + np.sqrt(share) * slow
     values[..., SLICES[group]] = mixed
-    return np.where(windows.seen, values, 0.0)
+    return np.where(windows.valid, values, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_one_estimators_groups_speak_for_each_other(windows):
 def test_white_noise_and_a_slow_error_of_the_model_have_none(windows):
     residual = noise_like(windows, 0.0, 1.0, np.random.default_rng(1))
     assert measured(residual, windows).coloured == {}
-    bent = residual + 5.0 * (windows.row_s**2)[..., None] * windows.seen
+    bent = residual + 5.0 * (windows.row_s**2)[..., None] * windows.valid
     assert measured(bent, windows).coloured == {}
 
 
@@ -96,7 +96,7 @@ def test_all_that_is_left_counts_as_noise_where_the_model_is_off(windows):
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))
     residual[..., SLICES["velocity"]] += 8.0 * swing
     nothing = np.zeros((*residual.shape, 12))
-    noise = left_as_noise(residual, nothing, windows)
+    noise = residual_as_noise(residual, nothing, windows)
     np.testing.assert_allclose(noise.sigma[SLICES["velocity"]], 8.0 / np.sqrt(2.0), rtol=0.3)
     share, lasts_s = noise.coloured["velocity"]
     assert share > 0.95 and lasts_s > 0.1

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.verdict.actuators import another_controller, rotors_are_input
+from suite.diagnose.verdict.actuators import flown_by_other_controller, rotors_are_input
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 
@@ -14,15 +14,15 @@ LAGGED = with_lag(PLAIN, 0.03)
 
 def test_a_moved_centre_of_mass_is_no_other_controller():
     moved = with_effects(LAGGED, com_offset=((0.006, -0.004, 0.0),))
-    assert not another_controller([fly(moved, 0, duration_s=4.0, motors=True)], LAGGED)
+    assert not flown_by_other_controller([fly(moved, 0, duration_s=4.0, motors=True)], LAGGED)
 
 
 def test_speeds_that_the_loop_does_not_ask_for_are_another_controllers():
     log = fly(LAGGED, 0, duration_s=4.0, motors=True)
     assert log.rotor_speed is not None
     other = replace(log, rotor_speed=np.roll(log.rotor_speed, 1, axis=1))
-    assert another_controller([other], LAGGED)
-    assert not another_controller([fly(LAGGED, 0, duration_s=2.0)], LAGGED)
+    assert flown_by_other_controller([other], LAGGED)
+    assert not flown_by_other_controller([fly(LAGGED, 0, duration_s=2.0)], LAGGED)
 
 
 def test_the_columns_decide_what_can_be_the_input():

@@ -15,7 +15,7 @@ def test_the_noise_is_seen_under_a_models_error():
     assert windows is not None
     rng = np.random.default_rng(0)
     time = np.asarray(windows.row_s)[..., None]
-    residual = 0.3 * time**2 + 0.002 * rng.standard_normal(windows.seen.shape)
+    residual = 0.3 * time**2 + 0.002 * rng.standard_normal(windows.valid.shape)
     sigma = noise_of(residual, windows)
     np.testing.assert_allclose(sigma[:12], 0.002, rtol=0.15)
     assert np.isnan(sigma[12:]).all()

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data.sampling import (
-    follow_lag,
-    hold,
-    interpolate,
-    rows_show_torque,
-    torque_between_rows,
-    with_hidden_torque,
-)
+from suite.diagnose.data.sampling import follow_lag, hold, interpolate
+from suite.diagnose.data.steps import rows_show_torque, torque_between_rows, with_hidden_torque
 from tests.support.vehicles import PLAIN, with_lag
 
 TIME = np.array([0.0, 0.1, 0.2, 0.3])

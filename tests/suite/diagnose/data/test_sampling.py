@@ -72,13 +72,13 @@ def test_windows_take_each_signal_by_its_own_rows(log, row, every):
     sparse = replace(log, rate_b=on_rows(log.rate_b, row % every == 1))
     windows, warnings = cut([sparse], PLAIN, True)
     assert windows is not None and not warnings
-    seen = windows.seen.sum(axis=1)
+    seen = windows.valid.sum(axis=1)
     assert (seen[:, SLICES["rates"]] <= 101 // every + 1).all() and (seen[:, 0] > 90).all()
     assert np.isfinite(windows.rate_b).all() and np.isfinite(windows.burn_in_rate_b).all()
     # Rotor speeds have their own rows, whatever those of the rates are.
-    assert windows.rotor_seen.sum(axis=1).min() > 90
+    assert windows.rotor_valid.sum(axis=1).min() > 90
     assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
-    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.seen.shape)
+    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.valid.shape)
     sigma = noise_of(residual, windows)
     assert np.isfinite(sigma[SLICES["rates"]]).all()
     np.testing.assert_allclose(sigma[SLICES["rates"]], 0.01, rtol=0.4)
@@ -87,7 +87,7 @@ def test_windows_take_each_signal_by_its_own_rows(log, row, every):
 def test_a_signal_with_too_few_rows_is_given_a_bound_that_no_noise_exceeds(log, row):
     windows, _ = cut([replace(log, rate_b=on_rows(log.rate_b, row % 25 == 0))], PLAIN, True)
     assert windows is not None
-    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.seen.shape)
+    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.valid.shape)
     np.testing.assert_allclose(noise_of(residual, windows)[SLICES["rates"]], 0.01, rtol=0.5)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from suite.diagnose.data.sampling import padded_grid, step_grid, with_lost_rows
+from suite.diagnose.data.steps import padded_grid, step_grid, with_lost_rows
 
 
 def test_steps_on_a_grid_are_the_loops_periods():

@@ -5,7 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
+from suite.diagnose.data.windows import (
+    BURN_IN_S,
+    LENGTH_S,
+    SLICES,
+    STEPS,
+    cut,
+    take,
+)
 from suite.diagnose.thresholds import Thresholds
 from tests.support.diagnosis_flights import fly
 from tests.support.vehicles import PLAIN
@@ -58,7 +65,7 @@ def test_what_is_an_input_or_derived_is_no_measurement():
     for rotor_input in (False, True):
         windows, _ = cut([log], PLAIN, rotor_input)
         assert windows is not None
-        seen = windows.seen.any(axis=(0, 1))
+        seen = windows.valid.any(axis=(0, 1))
         assert seen[SLICES["rotor speed"]].all() != rotor_input
         assert bool(windows.rotor_speed.any()) == rotor_input
         assert not seen[SLICES["velocity"]].any() and seen[SLICES["position"]].all()

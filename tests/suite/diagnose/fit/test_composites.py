@@ -18,7 +18,7 @@ from suite.diagnose.estimate.composites import (
     usual_size,
 )
 from suite.diagnose.estimate.parameters import candidates, effects_in, make_space
-from suite.diagnose.search.evaluation import Evaluation, wanted_change
+from suite.diagnose.search.evaluation import Evaluation, linear_change
 from tests.support.vehicles import PLAIN
 
 SPACE = make_space(PLAIN)
@@ -47,7 +47,7 @@ def test_a_wind_is_lent_its_slopes_only_where_nothing_passes_it_on():
     assert inactive_at(SPACE, theta, [WIND], acts) is None
     acts[places("constant_wind")] = False
     lent = inactive_at(SPACE, theta, [WIND], acts)
-    assert lent is not None and list(lent.numbers) == places("constant_wind")
+    assert lent is not None and list(lent.indices) == places("constant_wind")
     np.testing.assert_allclose(lent.theta[places("linear_drag")], 0.35)
     assert inactive_at(SPACE, theta, SINGLE, acts) is None
     theta[places("constant_wind")[0]] = 1.0
@@ -88,7 +88,7 @@ def test_lent_columns_come_last_and_are_a_composites_alone():
     assert sorted(made.numbers[c] for c in columns) == list(WIND.indices)
     evidence: Any = SimpleNamespace(space=SPACE)
     at: Any = SimpleNamespace(theta=SPACE.array("start"))
-    change, told = wanted_change(
+    change, told = linear_change(
         Evaluation(evidence, at, SimpleNamespace(equations=made)), [], WIND
     )
     np.testing.assert_allclose(change[list(lent)], [1.0, -2.0, 0.5], atol=1e-3)

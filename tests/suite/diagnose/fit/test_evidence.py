@@ -21,7 +21,7 @@ from suite.diagnose.report.page import page
 from suite.diagnose.search.search import search
 from suite.diagnose.sources.source import Remaining, Source, SourceSet
 from suite.diagnose.thresholds import THRESHOLDS
-from suite.diagnose.verdict.gap import Channel, Gap, share_left
+from suite.diagnose.verdict.gap import Channel, Gap, remaining_share
 from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 
@@ -57,7 +57,7 @@ class Thermometer(Evidence):
         rows = (left[:, None] / self.sigma, slope[:, None] / self.sigma)
         return without_nuisance(*rows, along, stretch, self.flight[first], 1.0 * first)
 
-    def weighed(self, at: Estimate) -> tuple[Evidence, Block]:
+    def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
         found = replace(self, sigma=float(self.sigma * self.linearise(at).residual.std()))
         return found, found.linearise(at)
 
@@ -100,7 +100,7 @@ class ThermometerSource(Source):
         return Gap(power, power, {self.name: {"air": Channel(rms, 1.0)}}, 1.0)
 
     def remaining(self, found, gaps, seed):
-        return Remaining(gaps[1].rms > 1.5, share_left(*gaps), "the air's temperature")
+        return Remaining(gaps[1].rms > 1.5, remaining_share(*gaps), "the air's temperature")
 
 
 # The catalogue has no weather: its names stand for the toy's.
@@ -137,7 +137,7 @@ def as_sources(made):
     fitted = part(made.flight < 3)
     source = ThermometerSource(
         name="air", about="temperatures", subject="temperature", unit="K off", measure="RMS [K]",
-        horizon_s=1.0, weighed=fitted.weighed(start), start=start,
+        horizon_s=1.0, weighed=fitted.estimate_noise(start), start=start,
         candidates=[Candidate(name, (p,), name) for name, p in zip(KNOWN, places, strict=True)],
         limits=THRESHOLDS, held=part(made.flight == 3),
     )  # fmt: skip

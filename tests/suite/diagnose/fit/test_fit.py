@@ -20,8 +20,8 @@ from suite.diagnose.evidence.rollouts import (
     DIRECTIONS,
     batches,
     block_of,
+    rollout_evidence,
     start_estimate,
-    weighed_by,
 )
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.search.search import search
@@ -98,7 +98,7 @@ def test_batches_are_of_one_size_and_whole(linearised):
 
 def test_what_the_start_explains_is_projected_out(linearised):
     model, windows, linear = linearised
-    sigma = np.where(windows.seen.any(axis=(0, 1)), 0.01, np.nan)
+    sigma = np.where(windows.valid.any(axis=(0, 1)), 0.01, np.nan)
     whitening = make_whitening(linear, Noise(sigma, {}), windows)
     moved = np.random.default_rng(0).standard_normal((len(windows.flight), STATE))
     slope = linear.start_slope
@@ -135,7 +135,7 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
     residual = np.zeros_like(linear.residual)
     residual[0, np.asarray(windows.row_s)[0] > 0.4, 0] = 1.0
     view = trusted(windows, residual)
-    last = [np.asarray(windows.row_s)[w][view.seen[w].any(axis=1)].max() for w in (0, 1)]
+    last = [np.asarray(windows.row_s)[w][view.valid[w].any(axis=1)].max() for w in (0, 1)]
     assert last == pytest.approx([0.25, 1.0], abs=0.011)
 
 
@@ -146,7 +146,7 @@ def test_a_search_names_the_drag_and_leaves_its_result_alone(linearised):
         c for c in candidates(SPACE, False, NEEDED[1:]) if c.name in ("linear_drag", "gyro_bias")
     ]
     said = []
-    known = weighed_by(model, windows, linear)
+    known = rollout_evidence(model, windows, linear)
     begin = start_estimate(model, windows)
     found = search(known[0], begin, among, said.append, known=known)
     assert [candidate.name for candidate in found.candidates] == ["linear_drag"]

@@ -4,10 +4,10 @@ import numpy as np
 
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.gauss_newton import chi2_by_part, chi2_fall
+from suite.diagnose.estimate.gauss_newton import chi2_by_group, chi2_fall
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.evidence import flights_agree
-from suite.diagnose.search.search import could_be_best, without_idle
+from suite.diagnose.search.search import could_be_best, needs_all_parts
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.vehicles import PLAIN
 
@@ -33,7 +33,7 @@ def gains_of(sizes):
     assert chi2_fall(made, theta, space, [0]) > 10.0
     assert chi2_fall(made, theta, space, []) == 0.0
     without, with_it = (
-        chi2_by_part(made.along_numbers(at), theta, space, FLIGHT) for at in ([1], [0, 1])
+        chi2_by_group(made.along_numbers(at), theta, space, FLIGHT) for at in ([1], [0, 1])
     )
     return without - with_it
 
@@ -54,9 +54,9 @@ def test_several_effects_have_to_explain_more_than_each_of_them_alone():
     single = candidates(make_space(PLAIN), False, ())
     payload = next(one for one in composites(single) if "mass_offset" in one.effects)
     mass, com = payload.parts
-    tried = [(100.0, payload, None), (105.0, mass, None), (300.0, com, None)]
-    assert [one for _, one, _ in without_idle(tried, THRESHOLDS)] == [mass, com]
-    assert len(without_idle([(90.0, payload, None), *tried[1:]], THRESHOLDS)) == 3
+    costs = {payload: 100.0, mass: 105.0, com: 300.0}
+    assert [one for one in costs if needs_all_parts(costs, one, THRESHOLDS)] == [mass, com]
+    assert needs_all_parts({**costs, payload: 90.0}, payload, THRESHOLDS)
     fallen = {payload: 100.0, mass: 95.0, com: 10.0}
     assert not could_be_best(fallen, payload, THRESHOLDS)
     assert could_be_best({**fallen, mass: 50.0}, payload, THRESHOLDS)

@@ -49,10 +49,10 @@ def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_re
     # As if the rest were so large that the gap without the drag is a fifth larger only.
     raised = found_drag.without["linear_drag"].energy.sum() / 1.2 / after.energy.sum()
     after = after._replace(score=raised * after.score, energy=raised * after.energy)
-    misfit = replace(of_rollouts(found.judged), off=True)
+    misfit = replace(of_rollouts(found.judged), misfit_is_noise=True)
     off = replace(found, judged=found.judged._replace(evidence=misfit))
     gone = {
-        one.judged.evidence.off: confirmed(found_drag.source, one, (before, after))[3]
+        one.judged.evidence.misfit_is_noise: confirmed(found_drag.source, one, (before, after))[3]
         for one in (found, off)
     }
     assert gone == {False: [], True: ["linear_drag"]}

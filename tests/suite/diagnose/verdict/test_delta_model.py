@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import CHANNELS, KNOTS, cut, take
+from suite.diagnose.data.windows import (
+    CHANNELS,
+    KNOTS,
+    cut,
+    take,
+)
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import BATCH, RolloutModel

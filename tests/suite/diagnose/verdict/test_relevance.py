@@ -21,7 +21,7 @@ def windows(until_s=1.0, without=()):
     seen = np.ones((3, 101, 19), bool) & (row_s <= until_s)[..., None]
     for group in without:
         seen[..., SLICES[group]] = False
-    found: Any = SimpleNamespace(row_s=row_s, seen=seen)
+    found: Any = SimpleNamespace(row_s=row_s, valid=seen)
     return found
 
 

@@ -12,7 +12,7 @@ from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict import black_box
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
-from suite.diagnose.verdict.gap import Gap, share_left
+from suite.diagnose.verdict.gap import Gap, remaining_share
 from suite.diagnose.verdict.residual_structure import (
     AXES,
     DisturbanceEquations,
@@ -92,8 +92,8 @@ def test_structure_goes_with_a_shape_a_colour_or_the_loudest_channel():
 def test_the_share_that_is_left_is_that_of_the_gaps():
     before, after = scores(24.0, 6.0)
     assert (before.rms, after.rms) == (5.0, pytest.approx(np.sqrt(7.0)))
-    assert share_left(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
-    assert share_left(after, before) == 1.0 and share_left(*scores(3.0, -0.1)) == 0.0
+    assert remaining_share(before, after) == pytest.approx((7**0.5 - 1.0) / 4.0)
+    assert remaining_share(after, before) == 1.0 and remaining_share(*scores(3.0, -0.1)) == 0.0
 
 
 def test_rotor_speeds_as_input_may_be_noisier():
@@ -109,10 +109,10 @@ def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     low, high = before.ci95(0)
     assert low < before.rms < high and high - low < 0.3
     assert before.ci95(0) == before.ci95(0) != before.ci95(1)
-    assert after.above(before, 0.25, 0, THRESHOLDS)
-    assert not before.above(after, 0.25, 0, THRESHOLDS)
-    assert not before.above(before, 0.25, 0, THRESHOLDS)
-    assert not after.above(before, 0.25, 0, Thresholds(refuting_chi2=1e6))
+    assert after.exceeds(before, 0.25, 0, THRESHOLDS)
+    assert not before.exceeds(after, 0.25, 0, THRESHOLDS)
+    assert not before.exceeds(before, 0.25, 0, THRESHOLDS)
+    assert not after.exceeds(before, 0.25, 0, Thresholds(refuting_chi2=1e6))
 
 
 def test_the_noise_floor_is_what_start_and_row_make():

@@ -7,7 +7,7 @@ import pytest
 
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
-from suite.diagnose.verdict.actuators import another_lag
+from suite.diagnose.verdict.actuators import find_rotor_lag
 from tests.support.diagnosis_flights import fly_all
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 
@@ -38,18 +38,20 @@ def test_slow_rotors_are_named_beside_what_the_views_name(slow):
 
 
 def test_a_lag_that_the_vehicle_has_is_not_named(slow):
-    assert another_lag(logged(GIVEN), GIVEN) is None
-    assert another_lag(slow, with_effects(GIVEN, motor_lag=(0.06,))) is None
-    assert another_lag(slow, with_lag(GIVEN, 0.06)) is None
+    assert find_rotor_lag(logged(GIVEN), GIVEN) is None
+    assert find_rotor_lag(slow, with_effects(GIVEN, motor_lag=(0.06,))) is None
+    assert find_rotor_lag(slow, with_lag(GIVEN, 0.06)) is None
 
 
 def test_flights_that_cannot_tell_are_left_alone(slow):
-    assert another_lag(slow, GIVEN) is not None
-    assert another_lag(slow[:2], GIVEN) is None, "two flights"
+    assert find_rotor_lag(slow, GIVEN) is not None
+    assert find_rotor_lag(slow[:2], GIVEN) is None, "two flights"
     calm = fly_all([GIVEN], [7], duration_s=3.0, speed=0.3, motors=True)
-    assert another_lag([*slow, *calm], GIVEN) == another_lag(slow, GIVEN), "speeds hardly change"
-    assert another_lag([replace(log, rotor_speed=None) for log in slow], GIVEN) is None
-    assert another_lag(slow, with_lag(REMEMBERING, 0.03)) is None, "a loop that remembers"
+    assert find_rotor_lag([*slow, *calm], GIVEN) == find_rotor_lag(slow, GIVEN), (
+        "speeds hardly change"
+    )
+    assert find_rotor_lag([replace(log, rotor_speed=None) for log in slow], GIVEN) is None
+    assert find_rotor_lag(slow, with_lag(REMEMBERING, 0.03)) is None, "a loop that remembers"
     rng = np.random.default_rng(0)
     other = [
         replace(
@@ -57,4 +59,4 @@ def test_flights_that_cannot_tell_are_left_alone(slow):
         )
         for log in slow
     ]
-    assert another_lag(other, GIVEN) is None, "speeds that the commands do not explain"
+    assert find_rotor_lag(other, GIVEN) is None, "speeds that the commands do not explain"

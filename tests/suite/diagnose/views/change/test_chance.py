@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from suite.diagnose.evidence.moments import ViewData, Weights, whitened
-from suite.diagnose.search.chance import chance_of
+from suite.diagnose.search.chance import corrected_p_values
 
 FREEDOM = 12
 SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM
@@ -24,7 +24,7 @@ def told(slope, groups, truth=0.0, beside=(), seed=0):
 
     without = fall(beside)
     gains = [fall([*beside, *group]) - without for group in groups]
-    return chance_of(gains, slope, groups, beside, SIZES, np.random.default_rng(1)), gains
+    return corrected_p_values(gains, slope, groups, beside, SIZES, np.random.default_rng(1)), gains
 
 
 def names_by_chance(slope, groups, **asked):
@@ -54,10 +54,12 @@ def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
 def test_what_is_fitted_anyhow_counts_no_more():
     slope = np.random.default_rng(8).standard_normal((6, 3, 3)) * [1e6, 1.0, 1e-6]
     slope[..., 2] = 0.3 * slope[..., 0]
-    same, apart = chance_of([1.0, 1.0], slope, [(2,), (1,)], (0,), SIZES, np.random.default_rng(1))
-    assert (
-        same == apart == chance_of([1.0], slope, [(1,)], (0,), SIZES, np.random.default_rng(1))[0]
-    )
+
+    def p_values(gains, groups):
+        return corrected_p_values(gains, slope, groups, (0,), SIZES, np.random.default_rng(1))
+
+    same, apart = p_values([1.0, 1.0], [(2,), (1,)])
+    assert same == apart == p_values([1.0], [(1,)])[0]
 
 
 def test_what_all_flights_are_judged_from_is_off_for_all_alike():

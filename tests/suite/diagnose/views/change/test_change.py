@@ -11,7 +11,7 @@ from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
-from suite.diagnose.search.change import changed
+from suite.diagnose.search.change import change_evidence
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
@@ -31,8 +31,8 @@ def changes(logs, references):
     after = [task_of(logs, view) for view in (FORCE, TORQUE)]
     spread = rotor_spread([*before, *after])
     for reference, task in zip(before, after, strict=True):
-        evidence, start = changed(reference, task.flights, spread)
-        known = evidence.again(start)
+        evidence, start = change_evidence(reference, task.flights, spread)
+        known = evidence.relinearise(start)
         result = search(evidence, start, view_candidates(among, known[1]), known=known)
         found[task.view.name] = [name.candidate.label for name in result.named]
     return found
@@ -53,7 +53,7 @@ def test_only_what_comes_near_the_best_stands_in_its_place():
     """Otherwise a more usual effect replaces the right one, and held-out flights refute it."""
     weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),))
     before, after = (task_of(logs, TORQUE) for logs in (flights(3, seed=5, speed=1.0), weak))
-    evidence, start = changed(before, after.flights, rotor_spread([before, after]))
+    evidence, start = change_evidence(before, after.flights, rotor_spread([before, after]))
     block = evidence.linearise(start)
     among = view_candidates(candidates(SPACE, False, ()), block)
     found = evidence.scores(block, block.equations, start.theta, [], among, 0)
@@ -83,7 +83,8 @@ def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_othe
 def test_sizes_are_drawn_as_the_spread_is_estimated():
     spread = RotorSpread(0.01, 8, {}, {"force": np.array([0, 0, 2]), "torque": np.full(3, 2)}, 4)
     sizes = {
-        view: spread.sizes(view, 20000, np.random.default_rng(1)) for view in ("force", "torque")
+        view: spread.variance_ratios(view, 20000, np.random.default_rng(1))
+        for view in ("force", "torque")
     }
     assert sizes["force"].mean(axis=0) == pytest.approx(np.ones(3), rel=0.02)
     # Axes that nothing is told of have the spread of all: a chi-square of 8 degrees over 8.

@@ -8,7 +8,7 @@ from suite.diagnose.data.view import FORCE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel, ViewData
 from suite.diagnose.evidence.views import ViewEvidence
-from suite.diagnose.search.change import own_changes, search_motion_change, within_flights
+from suite.diagnose.search.change import fit_each_flight, search_motion_change, within_flights
 from tests.support.real_flights import VEHICLE, flights
 
 SPACE = make_space(VEHICLE)
@@ -47,5 +47,5 @@ def test_each_flights_own_number_knows_no_trim():
     true, trim = np.array([[0.5, -1.0], [0.7, 0.0]]), np.array([3.0, -2.0])
     residual = np.einsum("mak,mk->ma", slope, true[flight]) + trim[flight, None]
     data = ViewData(flight, np.arange(400.0), residual, residual, slope, np.zeros((400, 3, 0)))
-    found = own_changes(within_flights(data), [0, 1], np.ones(3))
+    found = fit_each_flight(within_flights(data), [0, 1], np.ones(3))
     np.testing.assert_allclose(found, true, atol=1e-9)

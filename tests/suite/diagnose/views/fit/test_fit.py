@@ -6,7 +6,7 @@ import pytest
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.gauss_newton import chi2_by_part
+from suite.diagnose.estimate.gauss_newton import chi2_by_group
 from suite.diagnose.estimate.parameters import (
     Candidate,
     at_bound,
@@ -23,8 +23,8 @@ from suite.diagnose.evidence.moments import (
     centred,
     compare,
     means_of,
-    stretch_of,
-    units_of,
+    stretch_numbers,
+    validation_groups,
     weights_of,
     whitened,
 )
@@ -49,7 +49,7 @@ def dragged():
 
 
 def names_of(task):
-    known = task.weighed(task.start)
+    known = task.estimate_noise(task.start)
     among = view_candidates(candidates(SPACE, False, ()), known[1])
     return search(known[0], task.start, among, known=known)
 
@@ -108,7 +108,7 @@ def test_weighed_moments_of_flights_with_trims_are_independent_units():
 
 def test_blocks_stand_apart_and_a_flight_has_one_mean():
     data = made(np.random.default_rng(3), count=2, moments=60)
-    stretch = stretch_of(data)
+    stretch = stretch_numbers(data)
     assert stretch.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
     weights = weights_of(data)
     assert block_of(data, weights, stretch, [0]).slope.shape == (6, 60, 1)
@@ -118,8 +118,8 @@ def test_flights_have_means_and_a_lone_one_has_thirds():
     flight, values = np.array([2, 2, 5, 5, 5]), np.array([[1.0], [3.0], [0.0], [3.0], [6.0]])
     assert means_of(values, flight).ravel().tolist() == [2.0, 3.0]
     assert centred(values, flight).ravel().tolist() == [-1.0, 1.0, -3.0, 0.0, 3.0]
-    assert units_of(flight).tolist() == flight.tolist()
-    assert units_of(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
+    assert validation_groups(flight).tolist() == flight.tolist()
+    assert validation_groups(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
@@ -141,10 +141,10 @@ def test_trims_that_differ_from_flight_to_flight_are_no_effect():
 def test_a_flight_is_judged_by_what_the_others_say(dragged):
     task = task_of(dragged)
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
-    evidence, block = task.weighed(task.start)
-    equations, theta, part = block.equations, task.start.theta, evidence.parts(block)
+    evidence, block = task.estimate_noise(task.start)
+    equations, theta, part = block.equations, task.start.theta, evidence.groups(block)
     without, with_it = (
-        chi2_by_part(equations.along_numbers(at), theta, SPACE, part) for at in ([], drag)
+        chi2_by_group(equations.along_numbers(at), theta, SPACE, part) for at in ([], drag)
     )
     gains = without - with_it
     assert gains.shape == (4,) and (gains > 0.0).all()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from suite.diagnose.evidence.moments import ViewData, changes_of, fast_share
-from suite.diagnose.evidence.views import holds_at_any_speed
+from suite.diagnose.evidence.moments import ViewData, fast_share, successive_changes
+from suite.diagnose.evidence.views import fast_changes_agree
 from suite.diagnose.thresholds import THRESHOLDS
 
 ROWS, STEP_S = 1200, 0.05
@@ -42,7 +42,7 @@ def test_what_motors_answer_is_no_weak_thrust(slow):
     assert away[0] < -0.3, "it does look like less thrust"
     share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
     assert share + half_width < 0.3
-    assert not holds_at_any_speed(found, [0], away, THRESHOLDS)
+    assert not fast_changes_agree(found, [0], away, THRESHOLDS)
 
 
 def test_less_thrust_is_so_for_slow_and_fast_changes():
@@ -50,14 +50,14 @@ def test_less_thrust_is_so_for_slow_and_fast_changes():
     assert away[0] == pytest.approx(-0.4, abs=0.02)
     share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
     assert share == pytest.approx(1.0, abs=3.0 * half_width) and half_width < 0.1
-    assert holds_at_any_speed(found, [0], away, THRESHOLDS)
+    assert fast_changes_agree(found, [0], away, THRESHOLDS)
 
 
 def test_changes_reach_across_no_hole_and_no_two_flights():
     data = data_of(np.cumsum(np.ones((ROWS, 3)), axis=0), np.ones((ROWS, 3)))
     kept = np.ones(ROWS, bool)
     kept[100:110] = False
-    found = changes_of(ViewData(*(field[kept] for field in data)))
+    found = successive_changes(ViewData(*(field[kept] for field in data)))
     assert len(found.flight) == ROWS - 10 - 1 - 2
     np.testing.assert_array_equal(found.residual, 1.0)
     np.testing.assert_array_equal(found.slope, 0.0)
@@ -67,4 +67,4 @@ def test_means_of_flights_have_no_changes():
     found, away = fitted(1.0, closed_loop=True)
     few = ViewData(*(field[[0, -1]] for field in found.data))
     found: Any = SimpleNamespace(along=(0,), data=few)
-    assert holds_at_any_speed(found, [0], away, THRESHOLDS)
+    assert fast_changes_agree(found, [0], away, THRESHOLDS)
