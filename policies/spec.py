@@ -214,7 +214,7 @@ class PolicyError(ValueError):
 
 
 class NeedsTrust(PolicyError):
-    """A file is refused because loading it can run its author's code, and `trust` was not given."""
+    """A file is refused because loading it can run its author's code, and `trust` is false."""
 
 
 class NoAnswer(PolicyError):

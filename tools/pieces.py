@@ -28,8 +28,8 @@ import psutil
 
 from suite.common.work import Silent
 from tracks.common.work import Workers, read_workers, run_pieces
+from tracks.common.work.pickling import pack
 from tracks.common.work.threads import set_threads
-from tracks.common.work.travel import pack
 
 if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult

@@ -124,11 +124,11 @@ class Filtered:
         for pending in self._pending:
             pending.due[slot] = -1
 
-    def see(self, seen: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-        """Return `seen` with position, velocity and attitude replaced by the estimates.
+    def see(self, view: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
+        """Return `view` with position, velocity and attitude replaced by the estimates.
 
         Args:
-            seen: (N, ...) the view after the other sensor models.
+            view: (N, ...) the view after the other sensor models.
             truth: (N, ...) the true view; its depth is not used.
             fresh: (N,) bool, slots whose trial starts now.
             flying: (N,) bool, slots in flight.
@@ -139,8 +139,8 @@ class Filtered:
             self._detect(new)
         assert self.filters is not None
         state = present(self.filters)
-        estimate = View(state.pos_w, state.rot_w, state.vel_w, *seen[3:])
-        return select(flying, estimate, seen)
+        estimate = View(state.pos_w, state.rot_w, state.vel_w, *view[3:])
+        return select(flying, estimate, view)
 
     def _begin(self, truth: View, new: np.ndarray) -> None:
         """Start the filters and the IMU's state in the slots `new`."""

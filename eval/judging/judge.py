@@ -310,14 +310,14 @@ class _Slots:
     def _decide_and_fly(self) -> None:
         """Call the policy once, and fly its actions, except late ones, until the next decision."""
         spec, flying = self._policy.spec, self._index >= 0
-        seen = truth = self._current_view(flying)
+        view = truth = self._current_view(flying)
         if self._delays:
-            seen = self._delays.see(seen, self._fresh, flying)
+            view = self._delays.see(view, self._fresh, flying)
         if self._sensors:
-            seen = self._sensors.see(seen, self._fresh, flying)
+            view = self._sensors.see(view, self._fresh, flying)
         if self._filtered:
-            seen = self._filtered.see(seen, truth, self._fresh, flying)
-        state, image = observe(spec, seen, self._action_b)
+            view = self._filtered.see(view, truth, self._fresh, flying)
+        state, image = observe(spec, view, self._action_b)
         state = np.where(flying[:, None], state, 0).astype(np.float32)
         image = image.astype(np.float32)
         guarded, self._hidden = call_policy(
@@ -331,7 +331,7 @@ class _Slots:
         flying = flying & ~guarded.late
         self._fresh[:] = False
         if self._recorder:
-            self._recorder.decided(np.flatnonzero(flying), self._action_b, seen.depth_m)
+            self._recorder.decided(np.flatnonzero(flying), self._action_b, view.depth_m)
         steps = steps_to_next(self._decision, self._steps_a_decision)
         self._decision += 1
         self._fly_steps(np.where(flying, steps, 0), flying)

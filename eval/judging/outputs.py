@@ -109,23 +109,23 @@ def _warnings(
     results: Sequence[TrialResult], action: ActionSpec, limited: float, bad: float
 ) -> list[Note]:
     """Return warnings about the outputs in flight."""
-    found, plain = [], action.kind == "acceleration" and action.is_plain
+    notes, plain = [], action.kind == "acceleration" and action.is_plain
     largest = [row.output_max for row in results]
     if limited > LIMITED_MOST:
-        seen = f"{limited:.0%} of its actions were limited"
-        found.append(Note("action_limited", seen, UNIT_FIX + _scale_advice(action)))
+        text = f"{limited:.0%} of its actions were limited"
+        notes.append(Note("action_limited", text, UNIT_FIX + _scale_advice(action)))
     if bad:
-        seen = f"{bad:.1%} of its actions were not finite; the last valid one was used"
-        found.append(Note("action_not_finite", seen, "check its weights and its normalisation"))
+        text = f"{bad:.1%} of its actions were not finite; the last valid one was used"
+        notes.append(Note("action_not_finite", text, "check its weights and its normalisation"))
     if plain and 0.0 < max(largest) <= UNIT:
-        seen = "all its outputs are within -1 to 1 m/s^2 and are probably unscaled"
-        found.append(Note("action_scale", seen, SCALE_FIX))
+        text = "all its outputs are within -1 to 1 m/s^2 and are probably unscaled"
+        notes.append(Note("action_scale", text, SCALE_FIX))
     up = float(np.median([row.action_up for row in results]))
     if plain and up > UP_MOST:
-        seen = f"its outputs contain gravity: {up:.1f} m/s^2 upwards while it climbs"
+        text = f"its outputs contain gravity: {up:.1f} m/s^2 upwards while it climbs"
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        found.append(Note("action_gravity", seen, fix))
-    return found
+        notes.append(Note("action_gravity", text, fix))
+    return notes
 
 
 @runtime_checkable
@@ -149,37 +149,37 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
     action, output = probe(policy)
     left, right, above, below, _ = action
     if not np.isfinite(action).all():
-        seen = f"{name}: outputs NaN or infinity in level flight towards a gate"
-        return (Note("action_not_finite", seen, "check its weights and its normalisation"),)
+        text = f"{name}: outputs NaN or infinity in level flight towards a gate"
+        return (Note("action_not_finite", text, "check its weights and its normalisation"),)
     largest = float(np.linalg.norm(action, axis=-1).max())
     if largest > ActionLimits().size:
-        seen = f"{name}: commands up to {largest:.0f} m/s^2 in level flight, more than the limit"
-        return (Note("action_limited", seen, UNIT_FIX + _scale_advice(policy.spec.action)),)
-    found = []
-    aside, up = left[1] - right[1], above[2] - below[2]
-    if aside < -CLEAR and up < -CLEAR:
-        seen = (
+        text = f"{name}: commands up to {largest:.0f} m/s^2 in level flight, more than the limit"
+        return (Note("action_limited", text, UNIT_FIX + _scale_advice(policy.spec.action)),)
+    notes = []
+    sideways, up = left[1] - right[1], above[2] - below[2]
+    if sideways < -CLEAR and up < -CLEAR:
+        text = (
             f"{name}: accelerates away from gates to the left and above, as if its action were FRD"
         )
-        found.append(Note("action_frame", seen, "the suite uses FLU: negate y and z"))
-    elif min(aside, up) < -CLEAR:
-        axis, side = ("y", "left") if aside < up else ("z", "up")
-        seen = f"{name}: accelerates away from gates offset in {axis}, as if {axis} were negated"
-        found.append(Note("action_frame", seen, f"the suite's {axis} points {side}: negate it"))
+        notes.append(Note("action_frame", text, "the suite uses FLU: negate y and z"))
+    elif min(sideways, up) < -CLEAR:
+        axis, side = ("y", "left") if sideways < up else ("z", "up")
+        text = f"{name}: accelerates away from gates offset in {axis}, as if {axis} were negated"
+        notes.append(Note("action_frame", text, f"the suite's {axis} points {side}: negate it"))
     if action[:, 2].min() > LIFT:
-        seen = (
+        text = (
             f"{name}: commands at least {action[:, 2].min():.1f} m/s^2 up in level flight, as if "
         )
         fix = "an action is the net acceleration: subtract 9.81 along the state's world_z"
-        found.append(Note("action_gravity", seen + "its action contained gravity", fix))
+        notes.append(Note("action_gravity", text + "its action contained gravity", fix))
     if policy.spec.action.is_plain and np.abs(output).max() <= UNIT:
-        seen = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
-        found.append(Note("action_scale", seen, SCALE_FIX))
+        text = f"{name}: outputs only -1 to 1 m/s^2 for gates far to the side, as if unscaled"
+        notes.append(Note("action_scale", text, SCALE_FIX))
     if _divides_images(policy):
-        seen = f"{name}: has the same output for an image and for {IMAGE_FACTOR:g} times that image"
+        text = f"{name}: has the same output for an image and for {IMAGE_FACTOR:g} times that image"
         fix = "an image without scale contains no distances: do not divide it by its maximum"
-        found.append(Note("image_scale", seen, fix))
-    return tuple(found)
+        notes.append(Note("image_scale", text, fix))
+    return tuple(notes)
 
 
 def _divides_images(policy: Policy) -> bool:

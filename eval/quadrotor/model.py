@@ -49,7 +49,7 @@ def add_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     body.add_freejoint(name=BODY)
     body.explicitinertial = True
     body.mass = float(constants.mass)
-    body.inertia = _possible(constants.inertia)
+    body.inertia = _limited_inertia(constants.inertia)
     # Geometry refers to the nominal centre of mass, the body's frame to the true one.
     origin = -constants.com_offset_b
     body.add_geom(
@@ -93,10 +93,10 @@ def compile_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle, dt: float) -> mujoc
     return model
 
 
-def _possible(inertia: np.ndarray) -> np.ndarray:
+def _limited_inertia(inertia: np.ndarray) -> np.ndarray:
     """Return `inertia` (3,) with its largest moment cut to the sum of the other two."""
-    others = inertia.sum() - inertia
-    return np.minimum(inertia, others * (1.0 - 1e-9))
+    sum_of_others = inertia.sum() - inertia
+    return np.minimum(inertia, sum_of_others * (1.0 - 1e-9))
 
 
 def _add_visuals(

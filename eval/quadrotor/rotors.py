@@ -103,8 +103,8 @@ def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
     """Return `delay` (...,) [s] as whole steps of `dt` [s] and the remaining share of a step."""
     steps = delay / dt
     # With rounding, 0.043 / 0.001 may be a little less than 43.
-    whole = steps.__array_namespace__().floor(steps + 1e-9)
-    return whole, steps - whole
+    full = steps.__array_namespace__().floor(steps + 1e-9)
+    return full, steps - full
 
 
 def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
@@ -118,8 +118,8 @@ def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
     xp = delay.__array_namespace__()
     length = math.ceil(max_delay / dt - 1e-9) + 1 if max_delay > 0.0 else 0
     age = np.arange(length)
-    whole, part = (steps[..., None] for steps in whole_steps(delay, dt))
-    return xp.where(age == whole, 1.0 - part, 0.0) + xp.where(age == whole + 1.0, part, 0.0)
+    full, fraction = (steps[..., None] for steps in whole_steps(delay, dt))
+    return xp.where(age == full, 1.0 - fraction, 0.0) + xp.where(age == full + 1.0, fraction, 0.0)
 
 
 def delayed(weight: Array, past: Array, command: Array) -> tuple[Array, Array]:

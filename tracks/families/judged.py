@@ -2,7 +2,7 @@
 
 Each is a function that draws a track of 8 gates with obstacles from a difficulty and a random
 generator, after the baseline (Yu et al. 2025). A stretch is the part of a track between two
-successive gates; obstacles stand along it.
+successive gates, along which obstacles are placed.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ PASSING_M = 1.6
 MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
-"""The same for tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
+"""Largest such angle on tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
 """Most plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8

@@ -56,7 +56,7 @@ def crossing(
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
     crosses = (before[..., 0] < 0) & (after[..., 0] >= 0)
     if nowhere(crosses):
-        return crosses, crosses  # the usual case: saves the rest of the work
+        return crosses, crosses  # the usual case, in which nothing more is to compute
     travel = after[..., 0] - before[..., 0]
     share = -before[..., 0] / xp.where(crosses, travel, 1.0)
     point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]

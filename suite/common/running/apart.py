@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from suite.common.running.lock import one_writer
 from suite.common.startup import keep_compiled
 from tracks.common.files import replacing_folder, user_cache
-from tracks.common.work.travel import pack
+from tracks.common.work.pickling import pack
 
 Result = TypeVar("Result")
 Content = dict[str, bytes]

@@ -131,7 +131,7 @@ def agree(what: Mapping[str, Any]) -> None:
     import numpy as np
     from jax.experimental import multihost_utils
 
-    from tracks.common.work.travel import software
+    from tracks.common.work.pickling import software
 
     asked = [to_json(what[key]) for key in what] + [to_json(software())]
     sums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in asked]

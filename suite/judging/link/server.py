@@ -14,7 +14,7 @@ from suite.common.errors import WorkFailed
 from suite.judging.link.messages import Wire
 from suite.judging.link.simulated import SimulatedVehicle
 from suite.judging.link.udp import UdpLink
-from tracks.common.work.travel import register_dict_views
+from tracks.common.work.pickling import register_dict_views
 from tracks.geometry.camera import Camera
 from tracks.track import Track
 

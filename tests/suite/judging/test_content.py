@@ -7,7 +7,7 @@ from policies import shipped
 from policies.policy import load_policy
 from policies.spec import PolicyError
 from suite.judging.content import PolicyContent, policy_digest
-from tracks.common.work.travel import pack, unpack
+from tracks.common.work.pickling import pack, unpack
 
 
 def answers(policy):

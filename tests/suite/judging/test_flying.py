@@ -29,7 +29,7 @@ from suite.judging.flying import (
 from suite.judging.requests import Collection, Evaluation, Manner, manners
 from tests.support.engines import STAND_IN
 from tests.support.vehicles import with_effects
-from tracks.common.work.travel import pack
+from tracks.common.work.pickling import pack
 
 ROOT = Path(__file__).resolve().parents[3]
 

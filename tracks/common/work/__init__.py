@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
+from tracks.common.work.pickling import WorkerDied
 from tracks.common.work.threads import core_shares, usable_cores
-from tracks.common.work.travel import WorkerDied
 
 __all__ = [
     "MOST", "WorkerDied", "Workers", "core_shares", "worker_count", "read_workers", "usable_cores",

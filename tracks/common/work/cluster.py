@@ -1,7 +1,7 @@
 """Run pieces of work on a Dask cluster, whose scheduler distributes them.
 
 Work (the function) and pieces (its arguments) are sent as bytes, so a machine needs the same
-version of the suite but no files. The function is sent as the result of a task of its own, which
+version of the suite but no files. The function is sent as the result of a separate task, which
 every machine fetches once. If a machine dies, the scheduler repeats its tasks.
 
 Security: Dask's messages contain pickles, which its client unpacks, so the scheduler and the
@@ -23,8 +23,7 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from tracks.common.work.threads import set_threads
-from tracks.common.work.travel import (
+from tracks.common.work.pickling import (
     Failure,
     WorkerDied,
     differences,
@@ -34,6 +33,7 @@ from tracks.common.work.travel import (
     software,
     unpack,
 )
+from tracks.common.work.threads import set_threads
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from tracks.common.files import naming
-from tracks.common.work.threads import core_shares, usable_cores
-from tracks.common.work.travel import (
+from tracks.common.work.pickling import (
     Failure,
     WorkerDied,
     failure,
@@ -28,6 +27,7 @@ from tracks.common.work.travel import (
     remote_error,
     unpack,
 )
+from tracks.common.work.threads import core_shares, usable_cores
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")

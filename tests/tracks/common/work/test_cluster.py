@@ -16,7 +16,7 @@ import pytest
 from tests.support.cluster import cluster
 from tracks.common.work import WorkerDied, read_workers, run_pieces, worker_count
 from tracks.common.work.cluster import UnusableCluster
-from tracks.common.work.travel import software
+from tracks.common.work.pickling import software
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,7 @@ import pytest
 from suite.cli import main
 from suite.common.errors import explain
 from tracks.common.work import MOST, core_shares, processes, read_workers, threads, worker_count
-from tracks.common.work.threads import (
-    one_thread_a_product,
-    set_threads,
-    share_threads,
-    usable_cores,
-)
-from tracks.common.work.travel import (
+from tracks.common.work.pickling import (
     PACKAGES,
     differences,
     failure,
@@ -25,6 +19,12 @@ from tracks.common.work.travel import (
     remote_error,
     software,
     unpack,
+)
+from tracks.common.work.threads import (
+    one_thread_a_product,
+    set_threads,
+    share_threads,
+    usable_cores,
 )
 
 

@@ -1,4 +1,4 @@
-"""Serialise work, its pieces, results and errors for other processes and machines (with pickle).
+"""Pickle work, its pieces, results and errors, to send them to other processes and machines.
 
 `software` lists the versions that must be equal on two machines for results equal to the bit.
 """
