@@ -16,7 +16,7 @@ from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import BATCH, RolloutModel
 from suite.diagnose.verdict.black_box import (
     BlackBoxConfig,
-    _start,
+    _initial_weights,
     black_box_gap,
     compare_black_box,
     fit_black_box,
@@ -52,7 +52,7 @@ def test_where_measured_rotors_drive_it_sees_their_thrust():
     assert windows is not None and np.asarray(windows.rotor_speed).any()
     windows = take(windows, np.arange(BATCH))
     model = RolloutModel(LAGGED, make_space(LAGGED), True, False)
-    params = {name: np.asarray(value) for name, value in _start(0).items()}
+    params = {name: np.asarray(value) for name, value in _initial_weights(0).items()}
     params["output.weight"] = 0.1 * np.random.default_rng(0).normal(
         size=params["output.weight"].shape
     )
@@ -67,7 +67,7 @@ def test_its_output_pushes_the_body(few):
     model, windows = few
     theta = model.space.array("start")
     push = np.array([0.3, -0.2, 0.5, 0.0, 0.0, 0.0])
-    params = {name: np.asarray(value) for name, value in _start(0).items()}
+    params = {name: np.asarray(value) for name, value in _initial_weights(0).items()}
     params["output.bias"] = push
     offset = true_starts(model, theta, windows)
     same = np.broadcast_to(push, (BATCH, KNOTS, 6))
