@@ -1,12 +1,15 @@
-"""How often do the intervals of `suite identify` contain the true value, number by number?
+"""Measure how often the 95 % intervals of `suite identify` contain the true value.
 
     python tools/coverage.py COUNT [SEED] [CASES] [OUT.json]
 
-Identifies COUNT simulated fleets of drawn numbers (`tests/support/fleets.py`) by each of
-CASES (with commas between; else all). Prints, for every number of a vehicle file: for how many
-fleets it was estimated, in how many of these the 95 % interval contains the true value (with
-Wilson's interval), the median half-width over the true value, and the pulls (errors in
-half-widths): mean and root mean square, 0 and 0.51 for exact intervals.
+It identifies COUNT simulated vehicles with random numbers (`tests/support/fleets.py`) from the logs
+of each of CASES (separated by commas; default all). For every number of a vehicle file it prints:
+
+- for how many vehicles it was estimated,
+- for how many of these the 95 % interval contains the true value, with Wilson's interval,
+- the median half-width of the interval, relative to the true value,
+- mean and root mean square of the pulls, which are errors divided by half-widths; 0 and 0.51 for
+  exact intervals.
 """
 
 from __future__ import annotations
@@ -44,34 +47,43 @@ CASES = {
     "pwm without attitude": ("pwm", ("quat_wxyz",)),
     "pwm without rates": ("pwm", ("rate_b",)),
 }
-"""What drives the flights, and what their logs lack."""
+"""Case -> the logged input of the flights, and the signals that are removed from their logs."""
 
 
 def pulls(
     fleet: Fleet, recordings: Sequence[Recording], case: str, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
-    """Return (error over half-width, half-width over truth) of every estimated number."""
-    drive, lacks = CASES[case]
+    """Return the pull and the relative half-width of every estimated number, by name.
+
+    Args:
+        fleet: the true vehicle.
+        recordings: its flights.
+        case: a key of `CASES`.
+        rng: random generator of the logs' noise.
+    """
+    drive, removed = CASES[case]
     logs = [
-        replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in lacks})
+        replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in removed})
         for log in logs_of(fleet, recordings, drive, rng, Slow())
     ]
     numbers = identify(logs, start()).numbers
-    spans = {entry.key: entry.ci95 for entry in numbers}
-    turned = [axis for axis, span in zip("xyz", spans.get("inertia", ()), strict=False) if span]
-    true, off = truths(fleet, drive, "".join(turned)), {}
+    intervals = {entry.key: entry.ci95 for entry in numbers}
+    inertia = zip("xyz", intervals.get("inertia", ()), strict=False)
+    identified_axes = "".join(axis for axis, interval in inertia if interval)
+    true, results = truths(fleet, drive, identified_axes), {}
     for entry in numbers:
-        for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
-            part = f"[{k}]" if len(entry.value) > 1 else ""
-            if span is not None:
-                half = 0.5 * (span[1] - span[0])
-                size = true[entry.key][k]
-                off[f"{entry.key}{part}"] = ((value - size) / half, half / abs(size))
-    return off
+        for k, (value, interval) in enumerate(zip(entry.value, entry.ci95, strict=True)):
+            index = f"[{k}]" if len(entry.value) > 1 else ""
+            if interval is not None:
+                half_width = 0.5 * (interval[1] - interval[0])
+                truth = true[entry.key][k]
+                pull = (value - truth) / half_width
+                results[f"{entry.key}{index}"] = (pull, half_width / abs(truth))
+    return results
 
 
-def flown(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
-    """Return a fleet and its flights; None where they cannot be flown."""
+def fly_fleet(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
+    """Return a random vehicle and its flights; None where these fail."""
     fleet = drawn(np.random.default_rng((seed, number)))
     try:
         return fleet, recordings_of(fleet)
@@ -79,13 +91,16 @@ def flown(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
         return None
 
 
-def found(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[str, str], list]:
-    """Return (number of the fleet, pull, half-width over truth) by case and number."""
+def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[str, str], list]:
+    """Return (case, name of a number) -> rows of vehicle, pull and relative half-width.
+
+    Rows are also written to the JSON file `out`, if it is not empty.
+    """
     rows: dict[tuple[str, str], list] = defaultdict(list)
-    begun, number, done = time.monotonic(), 0, 0
+    start_s, number, done = time.monotonic(), 0, 0
     while done < count:
         number += 1
-        fleet = flown(seed, number)
+        fleet = fly_fleet(seed, number)
         if fleet is None:
             continue
         done += 1
@@ -94,27 +109,27 @@ def found(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[s
                 rng = np.random.default_rng((seed, number, index))
                 for key, pull in pulls(*fleet, case, rng).items():
                     rows[case, key].append((number, *pull))
-        print(f"{done}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+        print(f"{done}: {time.monotonic() - start_s:.0f} s", file=sys.stderr, flush=True)
         if out:
             Path(out).write_text(json.dumps({f"{c} {k}": v for (c, k), v in rows.items()}))
     return rows
 
 
 def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
-    """Identify, and print the table."""
-    print("| log | number | estimated | held | 95 % interval of that | half-width | pulls |")
+    """Identify `count` vehicles, and print the table; arguments as in `measure`."""
+    print("| log | number | estimated | covered | 95 % interval of that | half-width | pulls |")
     print("|---|---|---|---|---|---|---|")
-    for (case, key), rows in sorted(found(count, seed, cases, out).items()):
+    for (case, key), rows in sorted(measure(count, seed, cases, out).items()):
         pull, width = (np.array([row[k] for row in rows]) for k in (1, 2))
-        held = int((np.abs(pull) < 1.0).sum())
-        low, high = wilson(held, len(rows))[1:]
+        covered = int((np.abs(pull) < 1.0).sum())
+        low, high = wilson(covered, len(rows))[1:]
         print(
-            f"| {case} | `{key}` | {len(rows)} of {count} | {100 * held / len(rows):.0f} % "
+            f"| {case} | `{key}` | {len(rows)} of {count} | {100 * covered / len(rows):.0f} % "
             f"| {100 * low:.0f} to {100 * high:.0f} % | {100 * np.median(width):.1f} % "
             f"| {pull.mean():.2f}, {np.sqrt((pull**2).mean()):.2f} |"
         )
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:] + ["0", "", ""][len(sys.argv) - 2 :]
-    main(int(given[0]), int(given[1]), given[2].split(",") if given[2] else list(CASES), given[3])
+    words = sys.argv[1:] + ["0", "", ""][len(sys.argv) - 2 :]
+    main(int(words[0]), int(words[1]), words[2].split(",") if words[2] else list(CASES), words[3])

@@ -1,14 +1,15 @@
-"""Digests of what the suite computes, to hold a rebuilding to the same bits.
+"""Compute digests of the suite's results, to check that a refactoring keeps them equal to the bit.
 
-Run it before and after a change, on one machine, and compare the two files:
+Run it before and after a change, on the same machine, and compare the two files:
 
     python tools/fingerprint.py --out before.json --work runs/fingerprint-before
     python tools/fingerprint.py --out after.json --work runs/fingerprint-after
     python tools/fingerprint.py --compare before.json after.json
 
-It goes through commands alone, so that it runs on any layout of the code: trials of the shipped
-policies (levels 0 and 9), gradient steps of every recipe and of both dynamics, a Delta Action Model
-in each, `suite identify` on simulated flights, and the diagnosis of 20 blind cases.
+It uses commands only, so that it does not depend on the layout of the code. The digests are of
+trials of the shipped policies (levels 0 and 9), gradient steps of every recipe and of both
+dynamics, a Delta Action Model (a network that corrects actions) in each, `suite identify` on
+simulated flights, and the diagnosis of 20 blind cases (flights with hidden effects).
 """
 
 from __future__ import annotations
@@ -28,23 +29,23 @@ import numpy as np
 POLICIES = ("race", "race-small", "race-paper")
 RECIPES = ("race", "race-small", "race-paper", "paper")
 MJX_POLICIES = ("race-paper", "race")
-"""MJX takes longer: two of them show that its arithmetic stays."""
+"""Policies that fly in MJX too, which takes longer."""
 STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
-"""Keys that may differ between two versions of the code that compute the same."""
+"""Keys that may differ between two versions of the code with equal results."""
 
 
 def suite(*args: str | Path) -> None:
     """Run a command of the suite that is installed next to this Python.
 
     Raises:
-        subprocess.CalledProcessError: where it fails.
+        subprocess.CalledProcessError: if the command fails.
     """
     program = Path(sys.executable).with_name("suite")
     subprocess.run([program, *map(str, args)], check=True, stdout=subprocess.DEVNULL)
 
 
 def array_digest(arrays: dict[str, np.ndarray]) -> str:
-    """Return the SHA-256 of named arrays: names, types, shapes and bytes."""
+    """Return the SHA-256 of the arrays' names, types, shapes and bytes."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -53,7 +54,7 @@ def array_digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def parquet_digest(path: Path) -> str:
-    """Return the digest of a table's columns, whatever its metadata."""
+    """Return the digest of a table's columns, without its metadata."""
     import pyarrow.parquet as pq
 
     table = pq.read_table(path)
@@ -72,19 +73,19 @@ def weights_digest(folder: Path) -> str:
 def json_digest(path: Path) -> str:
     """Return the digest of a JSON file without the keys of `STAMPS`."""
 
-    def bare(value: Any) -> Any:
+    def without_stamps(value: Any) -> Any:
         if isinstance(value, dict):
-            return {k: bare(v) for k, v in value.items() if k not in STAMPS}
+            return {k: without_stamps(v) for k, v in value.items() if k not in STAMPS}
         if isinstance(value, str) and "/" in value:  # a path in the folder of the run
             return value.rsplit("/", 1)[1]
-        return [bare(v) for v in value] if isinstance(value, list) else value
+        return [without_stamps(v) for v in value] if isinstance(value, list) else value
 
-    text = json.dumps(bare(json.loads(path.read_text())), sort_keys=True)
+    text = json.dumps(without_stamps(json.loads(path.read_text())), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def trials(work: Path) -> dict[str, str]:
-    """Return digests of 30 trials a policy and simulator."""
+    """Return the digests of 30 trials for each policy and simulator."""
     digests = {}
     for world, policies in (("mujoco", POLICIES), ("mjx", MJX_POLICIES)):
         for policy in policies:
@@ -96,7 +97,7 @@ def trials(work: Path) -> dict[str, str]:
 
 
 def training(work: Path) -> dict[str, str]:
-    """Return digests of the weights after a few gradient steps."""
+    """Return the digests of the weights after a few gradient steps, for each recipe and model."""
     digests = {}
     for recipe in RECIPES:
         out = work / f"train-{recipe}"
@@ -114,7 +115,7 @@ def training(work: Path) -> dict[str, str]:
 
 
 def delta(work: Path) -> dict[str, str]:
-    """Return digests of flights and of a Delta Action Model in each of the two dynamics."""
+    """Return the digests of flights, and of a Delta Action Model in each of the two dynamics."""
     flights = work / "flights"
     suite("collect", "--policy", "race-paper", "--trials", "2", "--out", flights)
     digests = {"flights": "".join(parquet_digest(f)[:8] for f in sorted(flights.glob("*.parquet")))}
@@ -128,7 +129,7 @@ def delta(work: Path) -> dict[str, str]:
 
 
 def diagnosis(work: Path) -> dict[str, str]:
-    """Return digests of the logs and of the diagnosis of some 20 blind cases."""
+    """Return the digests of the logs and of the diagnosis of about 20 blind cases."""
     out = work / "blind"
     suite("blind", "make", "--seed", "424242", "--count", "20", "--out", out)
     digests = {
@@ -141,8 +142,8 @@ def diagnosis(work: Path) -> dict[str, str]:
     return digests
 
 
-def identified(work: Path) -> dict[str, str]:
-    """Return digests of the vehicle that `suite identify` estimates from four flights."""
+def identify(work: Path) -> dict[str, str]:
+    """Return the digest of the vehicle file that `suite identify` estimates from four flights."""
     flights, out = work / "identify-flights", work / "identified.toml"
     suite("collect", "--policy", "race-paper", "--trials", "4", "--vehicle", "reference",
           "--out", flights)  # fmt: skip
@@ -155,19 +156,20 @@ PARTS: dict[str, Callable[[Path], dict[str, str]]] = {
     "trials": trials,
     "training": training,
     "delta": delta,
-    "identify": identified,
+    "identify": identify,
     "diagnosis": diagnosis,
 }
+"""Name of a part of the suite -> function of a working folder that returns name -> digest."""
 
 
 def compare(before: Path, after: Path) -> int:
-    """Print what differs between two files of digests; return 1 where something does."""
+    """Print the names that differ between two files of digests, and return 1 if there are any."""
     old, new = (json.loads(path.read_text()) for path in (before, after))
-    apart = [name for name in sorted(old | new) if old.get(name) != new.get(name)]
-    for name in apart:
+    different = [name for name in sorted(old | new) if old.get(name) != new.get(name)]
+    for name in different:
         print(f"differs: {name}")
-    print(f"{len(old | new) - len(apart)} of {len(old | new)} the same to the bit")
-    return int(bool(apart))
+    print(f"{len(old | new) - len(different)} of {len(old | new)} the same to the bit")
+    return int(bool(different))
 
 
 def main() -> int:

@@ -1,15 +1,17 @@
-"""kill -9 at random moments: does the same command go on, and come to the same bits?
+"""Test that commands continue after kill -9 at random times, and give the same bits.
 
     python tools/kills.py COUNT [COMMAND ...] [--seed N]
     python tools/kills.py COUNT --signals [--seed N]
 
-Every command of the table below runs without a disturbance; then COUNT times it is killed at a
-random moment of the time that took, and up to five times more, sooner, after it was called again,
-and then left to end. What it wrote must be equal to the undisturbed run's, but for times and
-stamps. Prints a line a run and fails where one differs. Only what was killed while it ran counts.
+Every command of the table below first runs undisturbed. Then it is run COUNT times. Each of these
+runs is killed at a random time of the command's duration and started again, up to six times, and
+then runs to its end. Its files must equal those of the undisturbed run, except for times and
+stamps. The tool prints a line for each run, and fails if one differs. It counts only kills of a
+command that was still running.
 
-With --signals a training without compiled code is sent Ctrl-C or SIGTERM instead, COUNT times at a
-random moment of its first 20 s. It fails where one does not end with 130 within 5 s.
+With --signals a training without stored compiled code gets Ctrl-C or SIGTERM instead, COUNT times
+at a random time of its first 20 s. The tool fails if one does not end with exit code 130 within
+5 s.
 """
 
 from __future__ import annotations
@@ -38,25 +40,26 @@ COMMANDS = {
     "loop": f"loop --recipe quick --iterations 6 --finetune-iterations 3 --fit-iterations 10 "
     f"--trials 2 --flights 2 {EASY} --set {WORLDS}",
 }
-"""What is killed, without its --out; FLIGHTS is a folder of recorded ones."""
+"""Name -> command without --out; FLIGHTS stands for the folder of the recorded flights."""
 COMPARED = ("*.safetensors", "*.parquet", "metrics.jsonl", "diagnosis.json", "flights.json")
+"""Files of a run that are compared."""
 SHARES = (1.0, 0.5, 0.5, 0.5, 0.5, 0.5)
-"""Up to which share of a whole run's time each of its kills comes."""
-TIMES = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
-"""Keys that differ between runs that are alike: times, and the folders of what a loop made."""
+"""Latest time of each kill of a run, as a share of the duration of an undisturbed run."""
+IGNORED_KEYS = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
+"""Keys of JSON files that differ between equal runs: times and folders."""
 WITHIN_S = 5.0
-"""A signal is answered in this time [s]."""
+"""Longest time from a signal to the end of the command [s]."""
 
 
 def start(command: str, out: Path) -> subprocess.Popen[bytes]:
-    """Start a command with its files in `out`, two folders below that of all."""
+    """Start a command that writes to `out`, a folder `COMMAND/RUN` in the temporary folder."""
     words = COMMANDS[command].replace("FLIGHTS", str(out.parents[1] / "collect" / "plain")).split()
     args = [sys.executable, "-m", "suite.cli", *words, "--out", str(out)]
     return subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
 def digest(out: Path) -> str:
-    """Return what a run came to, as one number."""
+    """Return the SHA-256 of a run's compared files, 16 digits, or "nothing" without files."""
     sums = hashlib.sha256()
     paths = {path for pattern in COMPARED for path in out.rglob(pattern)}
     for path in sorted(paths):
@@ -65,36 +68,43 @@ def digest(out: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
+    """Return the contents of a file without metadata and ignored keys."""
     if path.suffix == ".parquet":
         import pyarrow.parquet
 
         return repr(pyarrow.parquet.ParquetFile(path).read().to_pydict()).encode()
     if path.suffix == ".json":
-        return json.dumps(_timeless(json.loads(path.read_text()))).encode()
+        return json.dumps(_without_ignored(json.loads(path.read_text()))).encode()
     if path.suffix == ".jsonl":
         rows = path.read_text().splitlines()
-        return json.dumps([_timeless(json.loads(row)) for row in rows]).encode()
+        return json.dumps([_without_ignored(json.loads(row)) for row in rows]).encode()
     return path.read_bytes()
 
 
-def _timeless(value: Any) -> Any:
+def _without_ignored(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _timeless(entry) for key, entry in value.items() if key not in TIMES}
-    return [_timeless(entry) for entry in value] if isinstance(value, list) else value
+        return {
+            key: _without_ignored(entry) for key, entry in value.items() if key not in IGNORED_KEYS
+        }
+    return [_without_ignored(entry) for entry in value] if isinstance(value, list) else value
 
 
 def finish(command: str, out: Path) -> float:
-    """Run a command to its end and return how long it took [s]."""
-    began = time.monotonic()
+    """Run a command to its end and return its duration [s].
+
+    Raises:
+        SystemExit: if the command fails.
+    """
+    start_s = time.monotonic()
     process = start(command, out)
-    _, said = process.communicate()
+    _, output = process.communicate()
     if process.returncode:
-        raise SystemExit(f"{command} ended with {process.returncode}: {said.decode()[-500:]}")
-    return time.monotonic() - began
+        raise SystemExit(f"{command} ended with {process.returncode}: {output.decode()[-500:]}")
+    return time.monotonic() - start_s
 
 
-def killed(command: str, out: Path, after_s: float) -> bool:
-    """Start a command, kill it after a time and say whether it still ran."""
+def start_and_kill(command: str, out: Path, after_s: float) -> bool:
+    """Start a command, kill it after a time, and return whether it was still running."""
     process = start(command, out)
     try:
         process.communicate(timeout=after_s)
@@ -105,71 +115,80 @@ def killed(command: str, out: Path, after_s: float) -> bool:
     return False
 
 
-def signalled(number: signal.Signals, after_s: float) -> tuple[int, float]:
-    """Return the exit code of a training that gets a signal, and how long after [s]."""
+def start_and_signal(number: signal.Signals, after_s: float) -> tuple[int, float]:
+    """Send a signal to a training after a time.
+
+    Returns:
+        The exit code of the training, and the time from the signal to its end [s].
+    """
     with tempfile.TemporaryDirectory() as folder:
         training = subprocess.Popen(
             [sys.executable, "-m", "suite.cli", *COMMANDS["train"].split(), "--out", folder],
             env={**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            # A shell has background jobs ignore Ctrl-C, and what ignores it ends by nothing else.
+            # Background jobs of a shell ignore Ctrl-C, and a child process inherits that.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
         time.sleep(after_s)
-        sent = time.monotonic()
+        sent_s = time.monotonic()
         training.send_signal(number)
-        return training.wait(), time.monotonic() - sent
+        return training.wait(), time.monotonic() - sent_s
 
 
-def send_signals(count: int, draw: random.Random) -> int:
-    """Send so many signals and return the exit code."""
-    bad = 0
+def send_signals(count: int, rng: random.Random) -> int:
+    """Test `count` signals, and return the tool's exit code."""
+    failures = 0
     for _ in range(count):
-        number, after_s = draw.choice([signal.SIGINT, signal.SIGTERM]), draw.uniform(1.5, 20.0)
-        code, took_s = signalled(number, after_s)
-        bad += code != 130 or took_s > WITHIN_S
-        print(f"{number.name} after {after_s:.1f} s: {code}, {took_s:.1f} s later", flush=True)
-    print(f"{count - bad} of {count} ended with 130 within {WITHIN_S:g} s")
-    return min(bad, 1)
+        number, after_s = rng.choice([signal.SIGINT, signal.SIGTERM]), rng.uniform(1.5, 20.0)
+        code, duration_s = start_and_signal(number, after_s)
+        failures += code != 130 or duration_s > WITHIN_S
+        print(f"{number.name} after {after_s:.1f} s: {code}, {duration_s:.1f} s later", flush=True)
+    print(f"{count - failures} of {count} ended with 130 within {WITHIN_S:g} s")
+    return min(failures, 1)
 
 
 def main() -> int:
-    """Kill or interrupt what the command line names."""
+    """Test the commands of the command line, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
     parser.add_argument("commands", nargs="*", default=list(COMMANDS), metavar="COMMAND")
     parser.add_argument("--signals", action="store_true", help="Ctrl-C and SIGTERM instead")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    draw, bad, tried = random.Random(args.seed), 0, 0
+    rng, failures, kills = random.Random(args.seed), 0, 0
     if args.signals:
-        return send_signals(args.count, draw)
+        return send_signals(args.count, rng)
     with tempfile.TemporaryDirectory() as folder:
         if "delta" in args.commands and "collect" not in args.commands:
             finish("collect", Path(folder, "collect", "plain"))
-        # Flights first: what is fitted to them finds them.
+        # In the order of the table, as `delta` needs the flights of `collect`.
         for command in sorted(args.commands, key=list(COMMANDS).index):
             plain = Path(folder, command, "plain")
             finish(command, plain)
-            took_s, wanted = finish(command, Path(folder, command, "warm")), digest(plain)
+            # The duration is that of a second run, whose compiled code is stored.
+            duration_s = finish(command, Path(folder, command, "warm"))
+            expected = digest(plain)
             for number in range(args.count):
-                out, moments = Path(folder, command, str(number)), []
+                out, times_s = Path(folder, command, str(number)), []
                 for share in SHARES:
-                    moment = draw.uniform(0.3, share * took_s)
-                    if not killed(command, out, moment):
+                    time_s = rng.uniform(0.3, share * duration_s)
+                    if not start_and_kill(command, out, time_s):
                         break
-                    moments.append(moment)
-                tried += len(moments)
+                    times_s.append(time_s)
+                kills += len(times_s)
                 finish(command, out)
-                same = digest(out) == wanted
-                left = sorted(path.name for path in out.rglob(".*"))
-                bad += not same or bool(left)
-                when = ", ".join(f"{moment:.1f}" for moment in moments)
-                said = ("same bits" if same else "OTHER BITS") + (f", left {left}" if left else "")
-                print(f"{command}, killed after {when} of {took_s:.1f} s: {said}", flush=True)
-    print(f"{tried} kills, {bad} runs that differ")
-    return min(bad, 1)
+                same = digest(out) == expected
+                temporary = sorted(path.name for path in out.rglob(".*"))
+                failures += not same or bool(temporary)
+                times = ", ".join(f"{time_s:.1f}" for time_s in times_s)
+                result = "same bits" if same else "OTHER BITS"
+                result += f", temporary files {temporary}" if temporary else ""
+                print(
+                    f"{command}, killed after {times} of {duration_s:.1f} s: {result}", flush=True
+                )
+    print(f"{kills} kills, {failures} runs that differ")
+    return min(failures, 1)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Print requirements.lock: what pyproject.toml asks for, at the versions installed here.
+"""Print requirements.lock: the installed version of each package that pyproject.toml requires.
 
-Run by `make lock`. Only the project's requirements, its dev extra and what those need are
-locked. Local version suffixes are dropped, so that the lock resolves against any package index.
+`make lock` runs it. The lock has the project's requirements, its extra `dev`, and the requirements
+of those. Local version suffixes are removed, so that every package index has the versions.
 """
 
 from __future__ import annotations
@@ -21,40 +21,43 @@ HEADER = """\
 
 
 def closure(requirements: list[str]) -> dict[str, str]:
-    """Return name -> installed public version of `requirements` and all they need.
+    """Return package -> installed public version, for `requirements` and all that they require.
 
     Raises:
-        ValueError: where something needed is not installed, or not at an allowed version.
+        ValueError: where a package is not installed, or not at an allowed version.
     """
-    found: dict[str, str] = {}
-    seen: set[tuple[str, str]] = set()
-    todo = [(Requirement(text), "") for text in requirements]
-    while todo:
-        wanted, extra = todo.pop()
-        if wanted.marker and not wanted.marker.evaluate({"extra": extra}):
+    versions: dict[str, str] = {}
+    visited: set[tuple[str, str]] = set()
+    pending = [(Requirement(text), "") for text in requirements]
+    while pending:
+        requirement, extra = pending.pop()
+        if requirement.marker and not requirement.marker.evaluate({"extra": extra}):
             continue
-        name = canonicalize_name(wanted.name)
+        name = canonicalize_name(requirement.name)
         try:
             package = metadata.distribution(name)
         except metadata.PackageNotFoundError:
-            raise ValueError(f"{wanted} is not installed: run make env first") from None
-        if not wanted.specifier.contains(package.version, prereleases=True):
-            raise ValueError(f"{name} {package.version} is installed, {wanted} is asked for")
-        found[name] = Version(package.version).public
-        for chosen in ["", *wanted.extras]:
-            if (name, chosen) not in seen:
-                seen.add((name, chosen))
-                todo += [(Requirement(text), chosen) for text in package.requires or []]
-    return found
+            raise ValueError(f"{requirement} is not installed: run make env first") from None
+        if not requirement.specifier.contains(package.version, prereleases=True):
+            raise ValueError(
+                f"{name} {package.version} is installed, but {requirement} is required: "
+                "run make env first"
+            )
+        versions[name] = Version(package.version).public
+        for package_extra in ["", *requirement.extras]:
+            if (name, package_extra) not in visited:
+                visited.add((name, package_extra))
+                pending += [(Requirement(text), package_extra) for text in package.requires or []]
+    return versions
 
 
 def main() -> None:
     """Print the lock of the checkout that this script is in."""
     root = Path(__file__).resolve().parent.parent
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = project["dependencies"] + project["optional-dependencies"]["dev"]
+    requirements = project["dependencies"] + project["optional-dependencies"]["dev"]
     print(HEADER, end="")
-    for name, version in sorted(closure(wanted).items()):
+    for name, version in sorted(closure(requirements).items()):
         print(f"{name}=={version}")
 
 

@@ -1,11 +1,12 @@
-"""A model that is wrong by design: is what the diagnosis names still true?
+"""Measure whether the diagnosis stays correct if its model is wrong by design.
 
     python tools/misfit.py COUNT [SEED]
 
-Every case hides a linear drag and a force over the place that no effect describes. The force is so
-strong that a model with the right drag is off by 20 times the noise.
-Prints a line a case, one process a core, then how many 95 % intervals of the drag hold the truth
-and how many cases have a false name.
+The diagnosis names physical effects that explain flights. Every case here has a hidden linear drag,
+and a force field that no effect describes. The field is so strong that the error of a model with
+the true drag is 20 times the noise. The tool runs one process for each core and prints a line for
+each case, then how many 95 % intervals of the drag contain the truth and how many cases have a
+false name.
 """
 
 from __future__ import annotations
@@ -37,39 +38,45 @@ from suite.diagnose.verdict.rollout_gap import gap_of
 from tracks.common.work import run_pieces, usable_cores
 from tracks.common.work.threads import one_thread_a_product
 
-OFF = 20.0
-"""How far flights are off a model that has the drag, in units of noise."""
+TARGET_ERROR = 20.0
+"""Rollout error of a model with the true drag, in units of the noise."""
 DRAG = "linear_drag"
 WAVES = 3
-"""Of the force along each axis of the world."""
+"""Number of sine waves in the force field along each axis."""
 LENGTH_M = (3.0, 10.0)
-"""Shortest and longest of them [m]."""
-FIRST = 0.3
-"""The force's root mean square that is tried first [m/s^2]."""
+"""Shortest and longest wavelength [m]."""
+FIRST_STRENGTH = 0.3
+"""Root mean square of the force field along each axis in the first trial [m/s^2]."""
 TRIES = 8
-"""Draws until one can be flown."""
+"""Largest number of draws until the flights succeed."""
+
+Outcome = tuple[list[bool], list[str], str]
+"""Whether each interval of the drag contains the truth, the false names, and a line to print."""
 
 
 def force_law(rng: np.random.Generator) -> Law:
-    """Return a smooth force over the place with a root mean square of `strength` an axis."""
-    way = rng.standard_normal((3, WAVES, 3))
+    """Return a smooth force field of the position; `strength` is its RMS along each axis."""
+    wave_vector = rng.standard_normal((3, WAVES, 3))
     length_m = rng.uniform(*LENGTH_M, (3, WAVES, 1))
-    way *= 2.0 * np.pi / length_m / np.linalg.norm(way, axis=-1, keepdims=True)
+    wave_vector *= 2.0 * np.pi / length_m / np.linalg.norm(wave_vector, axis=-1, keepdims=True)
     phase = rng.uniform(0.0, 2.0 * np.pi, (3, WAVES))
-    size = rng.standard_normal((3, WAVES))
-    size *= np.sqrt(2.0 / (size**2).sum(axis=1, keepdims=True))
+    amplitude = rng.standard_normal((3, WAVES))
+    amplitude *= np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
 
     def law(strength: float, mass: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-        along = np.einsum("akw,nw->nak", way, motion.pos_w)
-        return strength * (size * np.sin(along + phase)).sum(axis=-1)
+        angle = np.einsum("akw,nw->nak", wave_vector, motion.pos_w)
+        return strength * (amplitude * np.sin(angle + phase)).sum(axis=-1)
 
     return law
 
 
-def gap_with(
+def rollout_error(
     logs: Sequence[FlightLog], vehicle: Vehicle, noise: Noise | None
 ) -> tuple[float, Noise]:
-    """Return how far `logs` are off `vehicle`, in units of `noise` or else their own; and it."""
+    """Return the rollout error of `vehicle` along `logs` in units of the noise, and the noise.
+
+    With `noise` None, it is measured on these logs.
+    """
     windows, _ = cut(logs, vehicle, rotor_input=False)
     assert windows is not None
     model = RolloutModel(vehicle, make_space(vehicle), rotor_input=False, voltage=False)
@@ -79,67 +86,68 @@ def gap_with(
     return gap_of(linear, windows, noise).rms, noise
 
 
-def one(seed: list[int]) -> tuple[list[bool], list[str], str]:
-    """Return whether the drag's intervals hold it, the false names, and a line for people.
+def run_case(seed: list[int]) -> Outcome:
+    """Fly and diagnose one case.
 
     Raises:
-        FlightFailed: where this draw cannot be flown.
+        FlightFailed: if a flight of this draw fails.
     """
     rng = np.random.default_rng(seed)
     case = Case("outside", (), 0.0, "bare", "capture", (0, 0), simulator=CONTINUOUS)
     simulator = simulator_for(case, rng)
     drag = rng.uniform(0.15, 0.6, 3) * [1.0, 1.0, 0.5]
-    truth = with_effects(simulator.given, {DRAG: EFFECTS[DRAG].values(tuple(drag.tolist()))})
-    ways, law, chance = ordinary_flights(rng), force_law(rng), int(rng.integers(2**32))
+    truth = with_effects(simulator.nominal, {DRAG: EFFECTS[DRAG].values(tuple(drag.tolist()))})
+    trajectories, law = ordinary_flights(rng), force_law(rng)
+    flight_seed = int(rng.integers(2**32))
 
-    def logs(strength: float) -> tuple[FlightLog, ...]:
-        again = np.random.default_rng(chance)
+    def fly_logs(strength: float) -> tuple[FlightLog, ...]:
+        flight_rng = np.random.default_rng(flight_seed)
         extra = Push(strength, truth.mass, law)
-        return simulator.fly(truth, ways, again, extra)(again)
+        return simulator.fly(truth, trajectories, flight_rng, extra)(flight_rng)
 
-    _, noise = gap_with(logs(0.0), truth, None)
-    strength = FIRST * OFF / gap_with(logs(FIRST), truth, noise)[0]
-    flown = logs(strength)
-    off, _ = gap_with(flown, truth, noise)
-    found = diagnosis_json(diagnose(flown, simulator.given))
-    held, false = list[bool](), list[str]()
-    for effect in found["effects"]:
+    _, noise = rollout_error(fly_logs(0.0), truth, None)
+    first_error, _ = rollout_error(fly_logs(FIRST_STRENGTH), truth, noise)
+    logs = fly_logs(FIRST_STRENGTH * TARGET_ERROR / first_error)
+    error, _ = rollout_error(logs, truth, noise)
+    diagnosis = diagnosis_json(diagnose(logs, simulator.nominal))
+    covered, false = list[bool](), list[str]()
+    for effect in diagnosis["effects"]:
         if DRAG not in (effect["name"], *effect["alternatives"]):
             false.append(effect["name"])
         if effect["name"] == DRAG:
             bounds = effect["parameters"]["coefficient"]["ci95"]
-            held = [bool(b and b[0] <= x <= b[1]) for b, x in zip(bounds, drag, strict=True)]
-    names = [effect["name"] for effect in found["effects"]]
-    gap = found["gap"]
-    line = f"{found['verdict']} {names}, drag held {held}, off by {off:.1f}"
-    return held, false, f"{line}, gap {gap['before']:.1f} -> {gap['after']:.1f}"
+            covered = [bool(b and b[0] <= x <= b[1]) for b, x in zip(bounds, drag, strict=True)]
+    names = [effect["name"] for effect in diagnosis["effects"]]
+    gap = diagnosis["gap"]
+    line = f"{diagnosis['verdict']} {names}, drag covered {covered}, error {error:.1f}"
+    return covered, false, f"{line}, gap {gap['before']:.1f} -> {gap['after']:.1f}"
 
 
-def flyable(seed: list[int]) -> Iterator[tuple[list[bool], list[str], str]]:
-    """Yield what `one` says of the first draw of this case that can be flown, if any."""
+def first_valid_draw(seed: list[int]) -> Iterator[Outcome]:
+    """Yield the outcome of the first draw of a case whose flights succeed, if any."""
     keep_compiled()
     for attempt in range(TRIES):
         with contextlib.suppress(FlightFailed):
-            yield one([*seed, attempt])
+            yield run_case([*seed, attempt])
             return
 
 
 def main(count: int, seed: int) -> int:
-    """Try `count` cases, one a core, and return the exit code."""
-    found = dict[int, tuple[list[bool], list[str], str]]()
+    """Run `count` cases, one process for each core, and return the exit code."""
+    outcomes = dict[int, Outcome]()
 
-    def keep(number: int, one: tuple[list[bool], list[str], str]) -> None:
-        found[number] = one
-        print(f"{number}: {one[-1]}", flush=True)
+    def keep(number: int, outcome: Outcome) -> None:
+        outcomes[number] = outcome
+        print(f"{number}: {outcome[-1]}", flush=True)
 
     cases = [[seed, number] for number in range(count)]
-    run_pieces(flyable, cases, usable_cores(), keep, pinned=True)
-    held = [hold for inside, _, _ in found.values() for hold in inside]
-    flown, false = len(found), sum(bool(wrong) for _, wrong, _ in found.values())
-    print(f"intervals of a named drag that hold it: {sum(held)} of {len(held)}", end=" ")
-    print(f"({wilson(sum(held), max(len(held), 1))})" if held else "")
-    print(f"cases with a false name: {false} of {flown} ({wilson(false, max(flown, 1))})")
-    return 0 if sum(held) >= 0.85 * len(held) and false <= 0.1 * flown else 1
+    run_pieces(first_valid_draw, cases, usable_cores(), keep, pinned=True)
+    covered = [inside for intervals, _, _ in outcomes.values() for inside in intervals]
+    total, false = len(outcomes), sum(bool(names) for _, names, _ in outcomes.values())
+    print(f"intervals of a named drag that contain it: {sum(covered)} of {len(covered)}", end=" ")
+    print(f"({wilson(sum(covered), max(len(covered), 1))})" if covered else "")
+    print(f"cases with a false name: {false} of {total} ({wilson(false, max(total, 1))})")
+    return 0 if sum(covered) >= 0.85 * len(covered) and false <= 0.1 * total else 1
 
 
 if __name__ == "__main__":

@@ -1,14 +1,16 @@
-"""Change the core's code at random places, one at a time, and count the changes that tests notice.
+"""Mutation testing: change the code at random places, and count the changes that tests detect.
 
     python tools/mutants.py COUNT [--seed N] [--out FILE.json] [--again]
 
-A mutant has another operator (+ and -, * and /, < and <=, == and !=, and/or, & and |), a sign or
-a `not` less, or another number. Messages, annotations and ranges stay, and what has no right value:
-defaults of settings, the catalogue's bounds and usual sizes, and tolerances below 1e-6. AREAS says
-which files are changed and which tests run, in a copy of the files that git tracks, up to the first
-that fails. The same command goes on where it was stopped, also after the code has changed: mutants
-in FILE.json come first, then others. With --again those that survived run once more. Prints those
-that survive; exit 1 where they are more than 5 %.
+A mutant is a copy of the code with one change: another operator (+ and -, * and /, < and <=, == and
+!=, and/or, & and |), a sign or a `not` less, or another number. It survives if no test fails. Not
+changed are messages, annotations and subscripts, and numbers that are a choice: defaults of
+settings, the catalogue's bounds and usual sizes, and tolerances below 1e-6. AREAS lists the files
+and their tests, which run up to the first failure.
+
+The same command continues after an interruption, also with changed code: mutants in FILE.json come
+first, then others. With --again those that survived are tested again. The tool prints the
+survivors; the exit code is 1 if they are more than 5 %.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from plant_faults import LONGEST_S, ROOT, copied, run_tests
+from plant_faults import LONGEST_S, ROOT, copy_tree, run_tests
 
 IMPORTERS = (
     "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
@@ -48,11 +50,14 @@ AREAS = (
 )  # fmt: skip
 """Files, and the beginnings of the paths of their tests (eval/ where no package is named)."""
 PAIRS = "+ - * / < <= > >= == != and or & |".split()
-OTHER = {one: PAIRS[k ^ 1] for k, one in enumerate(PAIRS)} | {"**": "*"}
+OTHER = {operator: PAIRS[k ^ 1] for k, operator in enumerate(PAIRS)} | {"**": "*"}
+"""Operator -> the operator that replaces it, its neighbour in `PAIRS`."""
 CHOICE = re.compile(r"\w+: [^#]* = |(.*\W)?(low|high|typical)=[^=]*$")
-"""What stands before a default, a bound or a usual size in its line."""
+"""The text before a default, a bound or a usual size in its line."""
 TOLERANCE = re.compile(r"\d+(\.\d*)?e-([7-9]|[1-9]\d)f?")
+"""A number below 1e-6."""
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
+"""An operator or a number in C code."""
 
 
 class Mutant(NamedTuple):
@@ -63,16 +68,17 @@ class Mutant(NamedTuple):
     last: int
     new: str
     tests: str
+    """Beginnings of the paths of the tests, as in `AREAS`."""
 
 
 def other_number(text: str) -> str:
-    """Return another number than that of `text`, written alike."""
+    """Return a text with another number than that of `text`, of the same type."""
     value = ast.literal_eval(text.rstrip("f"))
     return f"({value + 1 if isinstance(value, int) else 1.25 * value or 1.0!r})"
 
 
 def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
-    """Yield (first, last, new text) of every change of a Python file."""
+    """Yield first byte, last byte and new text of every possible change of a Python file."""
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -110,10 +116,10 @@ def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
 
 
 def mutants(copy: Path) -> list[list[Mutant]]:
-    """Return every mutant of each area."""
-    found = []
+    """Return all mutants of each area in `AREAS`."""
+    areas = []
     for pattern, tests in AREAS:
-        found.append([])
+        areas.append([])
         for path in sorted(copy.glob(pattern)):
             source, file = path.read_bytes(), str(path.relative_to(copy))
             if path.suffix == ".py":
@@ -122,87 +128,93 @@ def mutants(copy: Path) -> list[list[Mutant]]:
                 text = C_TOKEN.finditer(source.decode("ascii"))
                 spots = [(m.start(), m.end(), OTHER.get(m[0]) or other_number(m[0].strip("&")))
                          for m in text if m[0] != "&&"]  # fmt: skip
-            found[-1] += [Mutant(file, *spot, tests) for spot in spots]
-    return found
+            areas[-1] += [Mutant(file, *spot, tests) for spot in spots]
+    return areas
 
 
-def named(copy: Path, mutant: Mutant) -> tuple[str, bool]:
-    """Return a name that other lines do not change, and whether the change has a right value."""
+def describe(copy: Path, mutant: Mutant) -> tuple[str, bool]:
+    """Return a mutant's name, and whether a test should detect it.
+
+    The name does not depend on other lines of the file. A test cannot detect a change of a number
+    that is a choice, such as a default.
+    """
     source = (copy / mutant.file).read_bytes()
     lines, row = source.splitlines(), source[: mutant.first].count(b"\n")
-    text, twin = lines[row].decode().strip(), lines[:row].count(lines[row])
+    text, equal_before = lines[row].decode().strip(), lines[:row].count(lines[row])
     before = source[: mutant.first].splitlines()[-1].decode().lstrip()
     old = source[mutant.first : mutant.last].decode()
     choice = CHOICE.match(before) or TOLERANCE.fullmatch(old)
     name = (
         f"{mutant.file}: {old!r} -> {mutant.new!r} at {len(before)} in {text!r}"
-        + f" {twin + 1}" * bool(twin)
+        + f" {equal_before + 1}" * bool(equal_before)
     )
     return name, not choice
 
 
-def fail(copy: Path, tests: str, cpu_s: float = LONGEST_S) -> bool:
-    """Say whether tests fail, or take more than `cpu_s` of processor time.
+def tests_fail(copy: Path, tests: str, cpu_s: float = LONGEST_S) -> bool:
+    """Return whether tests fail, or need more than `cpu_s` of processor time [s].
 
     Raises:
-        SystemExit: where they did not run.
+        SystemExit: if they did not run.
     """
     names = [part if part.startswith(("suite", "tracks", "policies", "eval")) else f"eval/{part}"
              for part in tests.split()]  # fmt: skip
     paths = [f"tests/{name}" if (copy / "tests" / name).is_dir() else f"tests/{name}.py"
              for name in names]  # fmt: skip
-    code, said = run_tests(copy, paths, cpu_s)
+    code, message = run_tests(copy, paths, cpu_s)
     if code > 2:
-        raise SystemExit(f"{tests}: pytest ended with {code} ({said})")
-    return code != 0  # 2: with this mutant nothing can be imported
+        raise SystemExit(f"{tests}: pytest ended with {code} ({message})")
+    return code != 0  # 2: the mutant cannot be imported
 
 
 def children_s() -> float:
-    """Return the processor time of processes that have ended [s]."""
+    """Return the processor time of all child processes that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def main() -> int:
-    """Make mutants, an equal share of each area, in an order drawn by the seed."""
+    """Test mutants, an equal share of each area in random order, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/mutants.json"))
-    parser.add_argument("--again", action="store_true", help="run those that survived once more")
-    asked = parser.parse_args()
-    done = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
-    known = {name: killed or not asked.again for name, killed in done.items() if " -> " in name}
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    draw, survive = random.Random(asked.seed), []
+    parser.add_argument("--again", action="store_true", help="test survivors again")
+    args = parser.parse_args()
+    detected = json.loads(args.out.read_text("utf-8")) if args.out.is_file() else {}
+    known = {name: killed or not args.again for name, killed in detected.items() if " -> " in name}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    rng, survivors = random.Random(args.seed), []
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
-        copied(ROOT, copy)
-        areas = [draw.sample(area, len(area)) for area in mutants(copy)]
-        most = max(map(len, areas))
-        order = [area[k] for k in range(most) for area in areas if k < len(area)]
-        named_order = [(*named(copy, mutant), mutant) for mutant in order]
-        # First those with a result: a line changed elsewhere draws no other ones.
-        queue = sorted((one for one in named_order if one[1]), key=lambda one: one[0] not in known)
-        most_s: dict[str, float] = {}
-        for name, _, mutant in queue[: asked.count]:
+        copy_tree(ROOT, copy)
+        areas = [rng.sample(area, len(area)) for area in mutants(copy)]
+        longest = max(map(len, areas))
+        order = [area[k] for k in range(longest) for area in areas if k < len(area)]
+        described = [(*describe(copy, mutant), mutant) for mutant in order]
+        candidates = [(name, mutant) for name, is_detectable, mutant in described if is_detectable]
+        # Mutants with a result come first, so that a change of the code selects no new ones.
+        candidates.sort(key=lambda candidate: candidate[0] not in known)
+        limit_s: dict[str, float] = {}
+        for name, mutant in candidates[: args.count]:
             if not known.get(name):
-                if mutant.tests not in most_s:
+                if mutant.tests not in limit_s:
                     before = children_s()
-                    if fail(copy, mutant.tests):
+                    if tests_fail(copy, mutant.tests):
                         raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
-                    most_s[mutant.tests] = 20.0 + 3.0 * (children_s() - before)
+                    limit_s[mutant.tests] = 20.0 + 3.0 * (children_s() - before)
                 path = copy / mutant.file
-                right = path.read_bytes()
-                path.write_bytes(right[: mutant.first] + mutant.new.encode() + right[mutant.last :])
-                done[name] = fail(copy, mutant.tests, most_s[mutant.tests])
-                path.write_bytes(right)
-                asked.out.write_text(json.dumps(done, indent=1), "utf-8")
-            if not done[name]:
-                survive.append(name)
+                source = path.read_bytes()
+                changed = source[: mutant.first] + mutant.new.encode() + source[mutant.last :]
+                path.write_bytes(changed)
+                detected[name] = tests_fail(copy, mutant.tests, limit_s[mutant.tests])
+                path.write_bytes(source)
+                args.out.write_text(json.dumps(detected, indent=1), "utf-8")
+            if not detected[name]:
+                survivors.append(name)
                 print(name, flush=True)
-    print(f"{len(survive)} of {min(asked.count, len(queue))} survive")
-    return int(len(survive) > 0.05 * asked.count)
+    print(f"{len(survivors)} of {min(args.count, len(candidates))} survive")
+    return int(len(survivors) > 0.05 * args.count)
 
 
 if __name__ == "__main__":

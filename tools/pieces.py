@@ -1,14 +1,15 @@
-"""What a piece costs, and what a driver can take: docs/scaling.md's figures.
+"""Measure the cost of a piece of work, and the load of the driver: the figures of docs/scaling.md.
 
     python tools/pieces.py costs                          one piece of each kind, in this process
-    python tools/pieces.py engine --count 100000          a cluster of two workers, made for it
+    python tools/pieces.py engine --count 100000          a local cluster of two workers
     python tools/pieces.py engine --workers 2             processes here, or a cluster's address
     python tools/pieces.py journal --count 1000000
     python tools/pieces.py sweep --count 10000
 
-Only `costs` works in earnest. The pieces of `engine` do nothing and the trials of `journal` and
-`sweep` are copies of one: what is measured is what the driver does for each. Seconds are those of
-the processor where not said otherwise.
+A piece is independent work, such as a trial, a training or a blind case. The driver is the process
+that sends pieces to workers and keeps the results. Only `costs` computes real pieces. The pieces of
+`engine` do nothing, and the trials of `journal` and `sweep` are copies of one, so that only the
+driver's work is measured. Seconds are processor time, unless "wall" is printed.
 """
 
 from __future__ import annotations
@@ -35,66 +36,69 @@ if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult
 
 MB = 1e6
-SHOWN = 10_000
+PROGRESS_EVERY = 10_000
+"""Number of pieces between two lines of progress."""
 
 
 class Clock:
-    """Time since its last line."""
+    """A clock that prints the time since its last line."""
 
     def __init__(self) -> None:
-        self.wall, self.busy = time.monotonic(), _spent_s()
+        """Start the clock."""
+        self.wall, self.busy = time.monotonic(), _processor_s()
 
     def say(self, what: str, count: int = 1) -> None:
-        """Print what was done `count` times since, and what it took."""
-        wall, busy = time.monotonic() - self.wall, _spent_s() - self.busy
+        """Print the time since the last line, for work `what` that was done `count` times."""
+        wall, busy = time.monotonic() - self.wall, _processor_s() - self.busy
         each = f", {1e6 * busy / count:.0f} us each" if count > 1 else ""
         print(f"{what}: {busy:.1f} s ({wall:.1f} s wall){each}; {memory_mb():.0f} MB", flush=True)
-        self.wall, self.busy = time.monotonic(), _spent_s()
+        self.wall, self.busy = time.monotonic(), _processor_s()
 
 
-def _spent_s() -> float:
+def _processor_s() -> float:
+    """Return the processor time of this process and its ended children [s]."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 
 
 def memory_mb() -> float:
-    """Return what this process holds [MB]."""
+    """Return the memory of this process [MB]."""
     return psutil.Process().memory_info().rss / MB
 
 
-def nothing(size: int, piece: int) -> Iterator[bytes]:
-    """Yield so many bytes for a piece."""
+def empty_piece(size: int, piece: int) -> Iterator[bytes]:
+    """Yield `size` bytes as the result of a piece."""
     yield bytes(size)
 
 
 @contextlib.contextmanager
 def workers_of(text: str | None) -> Iterator[Workers]:
-    """Yield the workers asked for, or those of a cluster on this machine while it is used."""
+    """Yield the workers of a text as in --workers, or the address of a new local cluster."""
     if text:
         yield read_workers(text) or 1
         return
     from distributed import LocalCluster
 
-    made: Any = LocalCluster
-    with made(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    make_cluster: Any = LocalCluster
+    with make_cluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         print(f"scheduler and two workers on {os.cpu_count()} cores")
         yield cluster.scheduler_address
 
 
 def engine(count: int, args: argparse.Namespace) -> None:
-    """Send pieces that do nothing."""
+    """Measure the driver with `count` pieces that do nothing."""
     with workers_of(args.workers) as workers:
         done, clock, started = 0, Clock(), time.monotonic()
 
         def keep(number: int, result: bytes) -> None:
             nonlocal done
             done += 1
-            if done % SHOWN == 0:
+            if done % PROGRESS_EVERY == 0:
                 rate = done / (time.monotonic() - started)
                 print(f"{done}: {rate:.0f} a second, {memory_mb():.0f} MB", flush=True)
 
-        run_pieces(partial(nothing, args.size), range(count), workers, keep)
-        clock.say(f"{done} pieces of {args.size} bytes, of the driver", done)
+        run_pieces(partial(empty_piece, args.size), range(count), workers, keep)
+        clock.say(f"{done} pieces of {args.size} bytes, time of the driver", done)
         for process in psutil.Process().children(recursive=True):
             with contextlib.suppress(psutil.Error):
                 spent = sum(process.cpu_times()[:2])
@@ -102,7 +106,7 @@ def engine(count: int, args: argparse.Namespace) -> None:
 
 
 def some_trial(number: int) -> TrialResult:
-    """Return a trial that was never flown."""
+    """Return an invented trial with the given number."""
     from eval.worlds.trial import TrialResult
 
     rest = dict.fromkeys(TrialResult._fields[-5:], 0)
@@ -113,28 +117,28 @@ def some_trial(number: int) -> TrialResult:
 
 
 def journal(count: int, args: argparse.Namespace) -> None:
-    """Keep trials, read them again, write the table's files."""
+    """Measure how long the driver needs to store, read and summarise `count` trials."""
     from eval.judging.results import Journal, write_trials
     from eval.judging.tables import summarise
 
     with tempfile.TemporaryDirectory() as folder:
         path, clock = Path(folder, "journal.jsonl"), Clock()
-        with Journal(path, {"policy": "p"}) as kept:
+        with Journal(path, {"policy": "p"}) as written:
             for number in range(count):
-                kept.append(some_trial(number))
-        del kept
-        clock.say(f"{count} trials kept, {path.stat().st_size / MB:.0f} MB on the disk", count)
-        with Journal(path, {"policy": "p"}) as again:
-            results = list(again.done.values())
+                written.append(some_trial(number))
+        del written
+        clock.say(f"{count} trials stored, {path.stat().st_size / MB:.0f} MB on disk", count)
+        with Journal(path, {"policy": "p"}) as stored:
+            results = list(stored.done.values())
         clock.say("read again", count)
         write_trials(Path(folder, "trials.parquet"), results, {})
         clock.say("written as Parquet", count)
         summarise(results)
-        clock.say("summed up, with bootstrap intervals", count)
+        clock.say("summarised, with bootstrap intervals", count)
 
 
 def sweep(count: int, args: argparse.Namespace) -> None:
-    """Order a trial of each of many vehicles, and keep what came."""
+    """Measure the driver in a study with one trial of each of `count` vehicles."""
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import TrialSpec
     from suite.experiments.study import judging
@@ -153,20 +157,20 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     )
     orders = {k: judging.Order(setup, [trial]) for k, setup in enumerate(setups)}
     with tempfile.TemporaryDirectory() as folder:
-        for what in ("ordered and kept", "found again"):
+        for action in ("flown and stored", "read from the store"):
             judging.flown(orders, Place(Path(folder), Path(folder), 1), Silent(), "flying")
-            clock.say(f"{count} vehicles {what}", count)
+            clock.say(f"{count} vehicles {action}", count)
 
 
 def costs(count: int, args: argparse.Namespace) -> None:
-    """Work a piece of each kind off, and say what goes there and comes back."""
+    """Measure one piece of each kind: its time, and the data sent to and from a worker."""
     set_threads()
     from eval.judging.judge import Record, Task, fly_share
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import TrialSpec
     from suite.blind.build import build
     from suite.blind.cases import DRAWERS
-    from suite.blind.run import by_command
+    from suite.blind.run import diagnose_by_command
     from suite.judging.content import PolicyContent
     from suite.train.recipes import named_recipe, with_iterations
     from suite.train.run import train
@@ -175,20 +179,20 @@ def costs(count: int, args: argparse.Namespace) -> None:
     task = Task(content(), load_vehicle("reference"), record=Record())
     list(fly_share(task, [(0, TrialSpec("zigzag", 0, 0))]))
     clock.say("a worker's start: imports, policy, first trial")
-    levels = [TrialSpec(t, n % 10, n) for t in ("zigzag", "circular") for n in range(count // 2)]
-    ended = list(fly_share(task, list(enumerate(levels))))
-    clock.say(f"{len(ended)} trials, recorded", len(ended))
-    there, back = len(pack(content)), len(pack([entry[:2] for entry in ended])) / len(ended)
-    flight = len(pack(ended)) / len(ended)
-    print(f"  {there / MB:.2f} MB there once; back {back:.0f} bytes a trial, "
-          f"{flight / MB:.3f} MB with its flight")  # fmt: skip
+    trials = [TrialSpec(t, n % 10, n) for t in ("zigzag", "circular") for n in range(count // 2)]
+    flown = list(fly_share(task, list(enumerate(trials))))
+    clock.say(f"{len(flown)} trials, recorded", len(flown))
+    sent, received = len(pack(content)), len(pack([entry[:2] for entry in flown])) / len(flown)
+    with_flight = len(pack(flown)) / len(flown)
+    print(f"  {sent / MB:.2f} MB sent once; received {received:.0f} bytes a trial, "
+          f"{with_flight / MB:.3f} MB with its flight")  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = with_iterations(named_recipe("race"), 10)
         train(config, folder / "run", Silent())
         clock.say("a training of race: start and 10 of 2,000 iterations")
         sizes = [path.stat().st_size for path in (folder / "run").rglob("*") if path.is_file()]
-        print(f"  {sum(sizes) / MB:.1f} MB back")
+        print(f"  {sum(sizes) / MB:.1f} MB received")
         train(with_iterations(named_recipe("race"), 30), folder / "longer", Silent())
         clock.say("the same with 30 iterations")
         case = next(iter(DRAWERS["mujoco"](0, 12).values()))
@@ -200,14 +204,16 @@ def costs(count: int, args: argparse.Namespace) -> None:
         save_vehicle(built.nominal, folder / "vehicle.toml")
         logs = [write_flight(folder / f"{log.name}.parquet", log) for log in built.logs]
         print(f"  {sum(path.stat().st_size for path in map(Path, logs)) / MB:.1f} MB of flights")
-        by_command([Path(log) for log in logs], folder / "vehicle.toml", folder / "diagnosis")
+        diagnose_by_command(
+            [Path(log) for log in logs], folder / "vehicle.toml", folder / "diagnosis"
+        )
         clock.say("a blind case diagnosed")
         sizes = [path.stat().st_size for path in (folder / "diagnosis").rglob("*")]
-        print(f"  {sum(sizes) / MB:.1f} MB back")
+        print(f"  {sum(sizes) / MB:.1f} MB received")
 
 
 def main() -> None:
-    """Run one measurement."""
+    """Run one measurement of the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -216,12 +222,12 @@ def main() -> None:
         "sweep": (sweep, 10_000),
     }  # fmt: skip
     parser.add_argument("what", choices=kinds)
-    parser.add_argument("--count", type=int, help="pieces, trials or vehicles")
-    parser.add_argument("--size", type=int, default=0, help="of a result of engine [bytes]")
-    parser.add_argument("--workers", help="of engine: N processes of this machine, or ADDRESS")
+    parser.add_argument("--count", type=int, help="number of pieces, trials or vehicles")
+    parser.add_argument("--size", type=int, default=0, help="engine: size of a result [bytes]")
+    parser.add_argument("--workers", help="engine: N processes of this machine, or ADDRESS")
     args = parser.parse_args()
-    do, count = kinds[args.what]
-    do(args.count or count, args)
+    measure, count = kinds[args.what]
+    measure(args.count or count, args)
 
 
 if __name__ == "__main__":

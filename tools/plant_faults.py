@@ -2,11 +2,10 @@
 
     python tools/plant_faults.py [--tree DIR] [--out FILE.json] [--only NUMBER ...] [--list]
 
-A fault is a text of the code, found exactly once below its folder, and what stands there instead:
-a sign, an axis, a row, a term, a unit or a threshold that is wrong. The tests named with it run
-first without any fault, then with each in turn, in a copy of the files that git tracks in DIR. A
-fault is caught where a test fails. The same command goes on where it was stopped. Exit 1: some
-survived.
+A fault replaces a text that occurs exactly once below its folder by a wrong one: a sign, an axis, a
+row, a term, a unit or a threshold. The tests named with it run without the fault first, then with
+it, in a copy of the files that git tracks in DIR. The fault is caught if a test fails. The same
+command continues after an interruption. The exit code is 1 if a fault was not caught.
 """
 
 from __future__ import annotations
@@ -24,20 +23,22 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 LONGEST_S = 300.0
-"""A fault that makes the tests run for longer than this is caught: they hang."""
+"""Longest duration of the tests [s]; a fault with which they run for longer is caught."""
 FAILED = 1
-"""Exit code of pytest."""
+"""Exit code of pytest if a test fails."""
 
 
 class Fault(NamedTuple):
     """One fault."""
 
     folder: str
-    """Below which the text is found exactly once."""
+    """Folder of the code with the text."""
     old: str
+    """Text of the code."""
     new: str
+    """Wrong text that replaces it."""
     tests: str
-    """Ends of the names of the test files that should catch it; any that are there count."""
+    """Ends of the names of the test files that should catch the fault; not all must exist."""
 
 
 FAULTS = (
@@ -125,7 +126,7 @@ FAULTS = (
     # suite: blind cases, link
     Fault("suite/blind", "return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]",
           "return vector[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]", "test_air"),
-    Fault("suite/blind", "yield bool(span[0] <= one <= span[1])", "yield bool(one <= span[1])",
+    Fault("suite/blind", "yield bool(span[0] <= true <= span[1])", "yield bool(true <= span[1])",
           "test_score"),
     Fault("suite/judging/link", "np.asarray(quat_wxyz, float) * QUAT_HALF_TURN",
           "np.asarray(quat_wxyz, float) * [1.0, -1.0, 1.0, -1.0]", "test_link"),
@@ -135,7 +136,7 @@ FAULTS = (
 """Forty: 6 of tracks, 6 of policies, 14 of eval, 14 of suite."""
 
 
-def copied(tree: Path, place: Path) -> list[str]:
+def copy_tree(tree: Path, place: Path) -> list[str]:
     """Copy the files that git tracks in `tree` to `place`, and return their names."""
     listed = subprocess.run(
         ["git", "-C", str(tree), "ls-files", "-z"], check=True, capture_output=True, text=True
@@ -148,10 +149,15 @@ def copied(tree: Path, place: Path) -> list[str]:
 
 
 def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
-    """Return the file that holds the fault's text.
+    """Return the file that has the fault's text.
+
+    Args:
+        fault: the fault.
+        names: names of all files.
+        copy: folder of their copies.
 
     Raises:
-        SystemExit: where it is not found exactly once.
+        SystemExit: if the text does not occur exactly once.
     """
     inside = [copy / name for name in names if name.startswith(f"{fault.folder}/")]
     inside = [path for path in inside if path.suffix in (".py", ".c")]
@@ -166,31 +172,32 @@ def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
 
 
 def tests_of(fault: Fault, names: list[str]) -> list[str]:
-    """Return the test files of a fault that there are.
+    """Return the existing test files of a fault, from the `names` of all files.
 
     Raises:
-        SystemExit: where there is none.
+        SystemExit: if none exists.
     """
     ends = tuple(f"/{name}.py" for name in fault.tests.split())
-    found = [n for n in names if n.startswith(f"tests/{fault.folder.split('/')[0]}/")]
-    found = [n for n in found if n.endswith(ends)]
-    if not found:
-        raise SystemExit(f"{fault.old!r}: no test file is called {fault.tests}; name those that do")
-    return found
+    folder = f"tests/{fault.folder.split('/')[0]}/"
+    tests = [name for name in names if name.startswith(folder) and name.endswith(ends)]
+    if not tests:
+        raise SystemExit(f"{fault.old!r}: no test file is called {fault.tests}; name existing ones")
+    return tests
 
 
 def run_tests(copy: Path, tests: list[str], cpu_s: float = LONGEST_S) -> tuple[int, str]:
-    """Return pytest's exit code on `tests` in `copy`, and what failed or its last line.
+    """Run `tests` in the folder `copy`, for at most `cpu_s` of processor time [s].
 
-    They end after `cpu_s` of processor time, and after `LONGEST_S` in all.
+    Returns:
+        pytest's exit code, and its last failed test or else its last line.
     """
-    most = (int(cpu_s), int(cpu_s) + 5)
+    limits = (int(cpu_s), int(cpu_s) + 5)
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
     try:
         ended = subprocess.run(
             [sys.executable, "-m", "pytest", *options, *tests],
             cwd=copy, capture_output=True, text=True, timeout=LONGEST_S,
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, most),
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, limits),
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return FAILED, f"not done after {LONGEST_S:g} s"
@@ -200,35 +207,35 @@ def run_tests(copy: Path, tests: list[str], cpu_s: float = LONGEST_S) -> tuple[i
 
 
 class Work:
-    """A copy of a tree, and what came of faults in it."""
+    """A copy of a checkout in which faults are planted, and the stored results."""
 
     def __init__(self, tree: Path, copy: Path, out: Path) -> None:
-        """Copy `tree` to `copy`; results are kept in `out`."""
-        self.names, self.copy, self._out = copied(tree, copy), copy, out
+        """Copy the checkout `tree` to `copy`; results are stored in the file `out`."""
+        self.names, self.copy, self._out = copy_tree(tree, copy), copy, out
         self._done = json.loads(out.read_text("utf-8")) if out.is_file() else {}
 
     def result(self, number: int) -> dict[str, Any]:
-        """Return what the tests make of a fault: caught, and what they said.
+        """Return whether the tests catch fault `number`, and their message.
 
         Raises:
-            SystemExit: where they fail without it.
+            SystemExit: if they fail without the fault.
         """
         fault = FAULTS[number - 1]
         place, tests = place_of(fault, self.names, self.copy), tests_of(fault, self.names)
-        right = place.read_text("utf-8")
-        code, said = self._run(tests, place)
+        original = place.read_text("utf-8")
+        code, message = self._run(tests, place)
         if code:
-            raise SystemExit(f"{' '.join(tests)}: fail without any fault ({said}); repair them")
-        place.write_text(right.replace(fault.old, fault.new), "utf-8")
+            raise SystemExit(f"{' '.join(tests)}: fail without any fault ({message}); repair them")
+        place.write_text(original.replace(fault.old, fault.new), "utf-8")
         try:
-            code, said = self._run(tests, place)
+            code, message = self._run(tests, place)
         finally:
-            place.write_text(right, "utf-8")
+            place.write_text(original, "utf-8")
         file = str(place.relative_to(self.copy))
-        return {"number": number, "file": file, "caught": code != 0, "said": said}
+        return {"number": number, "file": file, "caught": code != 0, "said": message}
 
     def _run(self, tests: list[str], place: Path) -> tuple[int, str]:
-        """Run tests, unless that was done with the same bits of them and of `place`."""
+        """Run tests, or return the stored result for the same contents of them and of `place`."""
         sums = hashlib.sha256()
         for path in (place, *(self.copy / test for test in tests)):
             sums.update(path.read_bytes())
@@ -243,7 +250,7 @@ class Work:
 
 
 def main() -> int:
-    """Plant the faults."""
+    """Plant the faults, print the results, and return the exit code."""
     parser = argparse.ArgumentParser(description="plant faults, and count those that tests catch")
     parser.add_argument("--tree", type=Path, default=ROOT, help="checkout whose code is changed")
     parser.add_argument("--out", type=Path, default=Path("runs/faults.json"), help="results, JSON")

@@ -1,13 +1,15 @@
-"""Flights without a pose: which effects are named by gyro, accelerometer and motors?
+"""Measure which effects the diagnosis names from logs without position and attitude.
 
     python tools/poseless.py [CASES [SEED [FIRST]]]
 
-Every case hides one effect of usual size, or none, in a vehicle that flies six trajectories in
-MuJoCo, 8 s each. Its logs hold gyro, accelerometer, set points, rotor speeds and voltage alone,
-with noise and constant biases as a small board's sensors have them. Prints a line a case, with the
-errors of the named numbers over half their intervals; then how many effects are named alone, how
-many clean vehicles get a name (false alarms), and how many 95 % intervals hold the truth, each with
-its 95 % interval (Clopper and Pearson). 60 cases take about 6 minutes on two cores.
+An effect is a physical cause of a mismatch between vehicle file and flights. Every case has one
+hidden effect of usual size, or none, in a vehicle that flies six trajectories of 8 s in MuJoCo. Its
+logs have only gyro, accelerometer, set points, rotor speeds and voltage, with noise and constant
+biases of a small board's sensors. The tool prints a line for each case, with the errors of the
+named parameters divided by half their intervals. Then it prints how often the only name is right,
+how often a vehicle without an effect gets a name (false alarm), and how many 95 % intervals contain
+the truth, each with its 95 % interval (Clopper and Pearson). 60 cases take about 6 minutes on two
+cores.
 """
 
 from __future__ import annotations
@@ -35,52 +37,58 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 
 NOMINAL = "reference"
-SEEN = (
+IDENTIFIABLE = (
     *("thrust_scale", "weak_motor", "linear_drag", "rotor_drag", "quadratic_drag", "thrust_tilt"),
     *("com_offset", "torque_trim", "inertia_scale", "inflow"),
 )
-"""Effects that rates or the specific force show on such flights."""
-CLEAN_EACH = 4
-"""Every so many cases hide nothing."""
+"""Effects that change body rates or specific force on such flights."""
+CLEAN_EVERY = 4
+"""Every case with a number divisible by this has no hidden effect."""
 BOARD = Sensors("board", 100.0, pos=0.0, attitude=0.0, gyro=0.03, acc=0.3, rotor=3.0, voltage=0.05)
 GYRO_BIAS, ACC_BIAS = 0.005, 0.05
-"""Standard deviation of each axis's constant error in a flight [rad/s], [m/s^2]."""
+"""Standard deviations of the constant errors of each axis in a flight [rad/s], [m/s^2]."""
 FLIGHTS, FLIGHT_S = 6, 8.0
+"""Number of flights of a case, and their duration [s]."""
 
 
 def hidden_values(name: str, vehicle: Vehicle, rng: np.random.Generator) -> Any:
-    """Return an effect's values, each as far as is usual from what the vehicle file has."""
+    """Return an effect's values, which differ from the vehicle file's by a usual size."""
     effect, values = EFFECTS[name], []
     for k, p in enumerate(effect.parameters):
-        away = np.full(p.size or 1, rng.uniform(*p.typical) * rng.choice(p.signs))
+        change = np.full(p.size or 1, rng.uniform(*p.typical) * rng.choice(p.signs))
         if p.direction:
-            away *= np.asarray(p.direction)
+            change *= np.asarray(p.direction)
         if p.one_at_a_time:
-            away = np.roll(away, rng.integers(len(away)))
-        known = vehicle.effects.get(name)
-        each = (bound_value(p.neutral, vehicle) if known is None else np.asarray(known[k])) + away
-        values.append(tuple(map(float, each)) if p.size else float(each[0]))
+            change = np.roll(change, rng.integers(len(change)))
+        nominal = vehicle.effects.get(name)
+        value = (
+            bound_value(p.neutral, vehicle) if nominal is None else np.asarray(nominal[k])
+        ) + change
+        values.append(tuple(map(float, value)) if p.size else float(value[0]))
     return effect.values(*values)
 
 
-def flown(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[FlightLog]:
-    """Return what a board without a position logs of flights of the vehicle `true`."""
+def fly_logs(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[FlightLog]:
+    """Return logs without a pose of flights of the vehicle `true`.
+
+    The tracking controller uses the vehicle file `nominal`.
+    """
     while True:
-        ways = [one for _ in range(2) for one in ordinary_flights(rng, FLIGHT_S)]
-        ways = [one for one in ways if one.kind != "low"][:FLIGHTS]
+        trajectories = [t for _ in range(2) for t in ordinary_flights(rng, FLIGHT_S)]
+        trajectories = [t for t in trajectories if t.kind != "low"][:FLIGHTS]
         try:
-            recordings = fly(nominal, true, ways, BOARD.rate_hz)
-        except FlightFailed:  # too fast for what is hidden: others are drawn
+            recordings = fly(nominal, true, trajectories, BOARD.rate_hz)
+        except FlightFailed:  # a trajectory is too fast for this effect: draw others
             continue
         break
     logs = []
     for number, recording in enumerate(recordings):
         log = log_of(recording, true, BOARD, rng, f"flight {number}")
         assert log.acc_b is not None
-        lost = np.full_like(log.quat_wxyz, np.nan)
+        nan = np.full_like(log.quat_wxyz, np.nan)
         logs.append(
             replace(
-                log, pos_w=lost[:, :3], vel_w=lost[:, :3], quat_wxyz=lost, velocity_derived=True,
+                log, pos_w=nan[:, :3], vel_w=nan[:, :3], quat_wxyz=nan, velocity_derived=True,
                 rate_b=log.rate_b + GYRO_BIAS * rng.normal(size=3),
                 acc_b=log.acc_b + ACC_BIAS * rng.normal(size=3), about={"partial": ["pos", "quat"]},
             )
@@ -89,19 +97,21 @@ def flown(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[Fli
 
 
 def run(cases: int, seed: int, first: int) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Yield the name of what was hidden, its values and what was found, case by case."""
+    """Yield the hidden effect's name and values, and the diagnosis, case by case."""
     nominal = load_vehicle(NOMINAL)
     for number in range(first, first + cases):
         rng = np.random.default_rng([seed, number])
-        name = "" if number % CLEAN_EACH == 0 else SEEN[int(rng.integers(len(SEEN)))]
+        name = (
+            "" if number % CLEAN_EVERY == 0 else IDENTIFIABLE[int(rng.integers(len(IDENTIFIABLE)))]
+        )
         truth = hidden_values(name, nominal, rng) if name else None
         true = with_effects(nominal, {name: truth} if name else {})
-        found = diagnose(flown(nominal, true, rng), nominal, by="views", seed=number)
-        yield name, truth, diagnosis_json(found)
+        diagnosis = diagnose(fly_logs(nominal, true, rng), nominal, by="views", seed=number)
+        yield name, truth, diagnosis_json(diagnosis)
 
 
 def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
-    """Yield by what the numbers of a named effect are off, over half their 95 % intervals."""
+    """Yield the errors of a named effect's parameters, divided by half their 95 % intervals."""
     parameters = effect["parameters"]
     rotor = parameters.get("index", {}).get("value")
     for key, entry in parameters.items():
@@ -109,50 +119,51 @@ def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
             continue
         true = np.atleast_1d(getattr(truth, key))
         true = true[[int(rotor) - 1]] if rotor is not None else true
-        pairs = entry["ci95"] if isinstance(entry["value"], list) else [entry["ci95"]]
-        for value, pair in zip(true, pairs, strict=False):
-            if pair is not None and None not in pair and pair[1] > pair[0]:
-                yield float((sum(pair) - 2.0 * value) / (pair[1] - pair[0]))
+        intervals = entry["ci95"] if isinstance(entry["value"], list) else [entry["ci95"]]
+        for value, interval in zip(true, intervals, strict=False):
+            if interval is not None and None not in interval and interval[1] > interval[0]:
+                yield float((sum(interval) - 2.0 * value) / (interval[1] - interval[0]))
 
 
 def outcome_of(name: str, effects: list[dict[str, Any]]) -> str:
-    """Return how what is named compares with what was hidden, `name`, in words."""
-    alike = [{e["name"], *e["alternatives"]} for e in effects]
+    """Return the outcome as text; `name` is the hidden effect, "" for none."""
+    name_sets = [{e["name"], *e["alternatives"]} for e in effects]
     if not name:
         return "false alarm" if effects else "clean"
-    if len(effects) == 1 and name in alike[0]:
+    if len(effects) == 1 and name in name_sets[0]:
         return "named alone"
-    if any(name in group for group in alike):
+    if any(name in names for names in name_sets):
         return "named with another"
     return "another name" if effects else "not named"
 
 
-def share(words: str, count: int, of: int) -> str:
-    """Return a line with a share and its interval."""
+def share_line(label: str, count: int, of: int) -> str:
+    """Return a line with a share and its 95 % interval."""
     low, high = binomtest(count, of).proportion_ci() if of else (0.0, 1.0)
-    return f"{words}: {count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
+    return f"{label}: {count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def main() -> None:
     """Run the cases and print their table."""
-    given = sys.argv[1:]
-    cases, seed, first = (int(v) for v in (*given, *("60", "5600000", "0")[len(given) :]))
+    words = sys.argv[1:]
+    cases, seed, first = (int(v) for v in (*words, *("60", "5600000", "0")[len(words) :]))
     keep_compiled()
-    outcomes, off = Counter[str](), list[float]()
-    for number, (name, truth, found) in enumerate(run(cases, seed, first), first):
-        effects = found["effects"]
+    outcomes, all_errors = Counter[str](), list[float]()
+    for number, (name, truth, diagnosis) in enumerate(run(cases, seed, first), first):
+        effects = diagnosis["effects"]
         outcome = outcome_of(name, effects)
         outcomes[outcome] += 1
-        words = [" or ".join([e["name"], *e["alternatives"]]) for e in effects]
-        own = [e for e in effects if e["name"] == name]
-        scaled = list(errors(truth, own[0])) if own else []
-        off += scaled
-        print(f"{number:3d} {name or 'nothing':16} {outcome:18} {'; '.join(words)}  "
-              f"{' '.join(f'{e:+.2f}' for e in scaled)}", flush=True)  # fmt: skip
+        names = [" or ".join([e["name"], *e["alternatives"]]) for e in effects]
+        right = [e for e in effects if e["name"] == name]
+        case_errors = list(errors(truth, right[0])) if right else []
+        all_errors += case_errors
+        print(f"{number:3d} {name or 'nothing':16} {outcome:18} {'; '.join(names)}  "
+              f"{' '.join(f'{e:+.2f}' for e in case_errors)}", flush=True)  # fmt: skip
     clean = outcomes["clean"] + outcomes["false alarm"]
-    print(share("named, and nothing else", outcomes["named alone"], cases - clean))
-    print(share("clean vehicles with a false alarm", outcomes["false alarm"], clean))
-    print(share("intervals that hold the truth", sum(abs(e) <= 1.0 for e in off), len(off)))
+    covered = sum(abs(e) <= 1.0 for e in all_errors)
+    print(share_line("named, and nothing else", outcomes["named alone"], cases - clean))
+    print(share_line("clean vehicles with a false alarm", outcomes["false alarm"], clean))
+    print(share_line("intervals that contain the truth", covered, len(all_errors)))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Real flights of three laboratories: what identify and diagnose make of them, as a page.
+"""Identify and diagnose real flights of three laboratories, and write the results as a page.
 
     python tools/real.py LOGS OUT
 
-LOGS holds `nanobench`, `crazypad` and `crazyswarm2` with the authors' files (docs/results/real.md
-says where they come from). Flights, vehicle files and diagnoses go to OUT, and `OUT/real.md`.
+`suite identify` estimates the numbers of a vehicle file from flights; `suite diagnose` names the
+physical effects that it lacks. LOGS has the folders `nanobench`, `crazypad` and `crazyswarm2` with
+the authors' files (sources in docs/results/real.md). OUT gets flights, vehicle files, diagnoses and
+the page `real.md`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from suite.cli import main
 
 FITTED = ("B10_lissajous_fast_rep1", "B2_circle_fast_rep2", "B3_figure8_fast_rep1",
           "B3_figure8_slow_rep2")  # fmt: skip
-"""Flights of nanobench that make the vehicle file; the others are diagnosed."""
+"""Flights of nanobench from which the vehicle file is identified; the others are diagnosed."""
 MASSES = {
     "upgraded": (
         ("log10", "log12"),
@@ -31,39 +33,45 @@ MASSES = {
     ),
     "standard": (("log150", "log155"), ("log160", "log170", "log180")),
 }
-"""Flights of crazyswarm2 by motors: reference, and those compared with them."""
+"""Motors of crazyswarm2 -> reference flights, and the flights compared with them."""
 
 
 def suite(*words: Any) -> dict[str, Any]:
-    """Run a command with `--json` and return what it says.
+    """Run a command with `--json` and return its output.
 
     Raises:
-        RuntimeError: where it does not end well, with what it said.
+        RuntimeError: if the command fails, with its error message.
     """
-    said, wrong = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(wrong):
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
         code = main([*map(str, words), "--json"])
     if code:
-        raise RuntimeError(f"suite {' '.join(map(str, words))}: {wrong.getvalue()[-500:]}")
-    return json.loads(said.getvalue())
+        raise RuntimeError(f"suite {' '.join(map(str, words))}: {errors.getvalue()[-500:]}")
+    return json.loads(output.getvalue())
 
 
-def imported(files: Iterable[Path], folder: Path, *options: Any) -> dict[str, Path]:
-    """Return the flights of `files` in `folder` by name, imported where they are not there yet."""
-    found = {}
+def import_flights(files: Iterable[Path], folder: Path, *options: Any) -> dict[str, Path]:
+    """Import logs that `folder` lacks, and return name -> path of all flights.
+
+    Args:
+        files: the authors' logs.
+        folder: folder of the flights.
+        options: options of `suite import`.
+    """
+    flights = {}
     for file in sorted(files):
-        found[file.stem] = folder / f"{file.stem}.parquet"
-        if not found[file.stem].is_file():
+        flights[file.stem] = folder / f"{file.stem}.parquet"
+        if not flights[file.stem].is_file():
             folder.mkdir(parents=True, exist_ok=True)
-            options_of = (*options, "--vehicle", "crazyflie21", "--rate", 100)
-            suite("import", file, "--out", found[file.stem], *options_of)
-    return found
+            all_options = (*options, "--vehicle", "crazyflie21", "--rate", 100)
+            suite("import", file, "--out", flights[file.stem], *all_options)
+    return flights
 
 
-def names_of(found: dict[str, Any]) -> str:
-    """Return the names of a diagnosis with their numbers, in a line."""
+def names_line(diagnosis: dict[str, Any]) -> str:
+    """Return the named effects of a diagnosis with their parameters, in a line."""
     named = []
-    for effect in found["effects"]:
+    for effect in diagnosis["effects"]:
         sizes = []
         for key, entry in effect["parameters"].items():
             values = entry["value"] if isinstance(entry["value"], list) else [entry["value"]]
@@ -75,15 +83,16 @@ def names_of(found: dict[str, Any]) -> str:
 
 
 def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
-    """Return the lines on nanobench: what is diagnosed with and without the drag it shows."""
-    flights = imported(logs.glob("*.csv"), out / "flights", "--map", "nanobench", *options)
-    given = [flights[name] for name in FITTED]
+    """Return the lines on nanobench: the diagnosis with and without the identified drag."""
+    flights = import_flights(logs.glob("*.csv"), out / "flights", "--map", "nanobench", *options)
+    fitted = [flights[name] for name in FITTED]
     others = [path for name, path in flights.items() if name not in FITTED]
-    vehicle, bare = out / "identified.toml", out / "without_drag.toml"
-    numbers = suite("identify", *given, "--vehicle", "crazyflie21", "--out", vehicle)["parameters"]
-    whole = load_vehicle(str(vehicle))
-    effects = {name: values for name, values in whole.effects.items() if "drag" not in name}
-    save_vehicle(replace(whole, effects=MappingProxyType(effects)), bare, "without its drag")
+    vehicle, without_drag = out / "identified.toml", out / "without_drag.toml"
+    numbers = suite("identify", *fitted, "--vehicle", "crazyflie21", "--out", vehicle)["parameters"]
+    identified = load_vehicle(str(vehicle))
+    effects = {name: values for name, values in identified.effects.items() if "drag" not in name}
+    reduced = replace(identified, effects=MappingProxyType(effects))
+    save_vehicle(reduced, without_drag, "without its drag")
     lines = [
         f"Vehicle file from {', '.join(FITTED)}; diagnosed: "
         f"{', '.join(sorted(path.stem for path in others))}.",
@@ -92,17 +101,17 @@ def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
         "force x, y: share of variance explained (black box) | seconds |",
         "|---|---|---|---|---|",
     ]
-    for label, file in (("identified, its drag left out", bare), ("identified", vehicle)):
-        found = suite("diagnose", *others, "--vehicle", file, "--out", out / file.stem)
-        force = found["gap"]["channels"].get("force", {})
+    for label, file in (("identified, its drag left out", without_drag), ("identified", vehicle)):
+        diagnosis = suite("diagnose", *others, "--vehicle", file, "--out", out / file.stem)
+        force = diagnosis["gap"]["channels"].get("force", {})
         shares = ", ".join(
             f"{100 * force[a]['closed']:.0f} ({100 * force[a]['explainable']:.0f}) %"
             for a in "xy"
             if a in force
         )
         lines.append(
-            f"| {label} | {names_of(found)} | {found['verdict']} | {shares or '–'} "
-            f"| {found['seconds']:.0f} |"
+            f"| {label} | {names_line(diagnosis)} | {diagnosis['verdict']} | {shares or '–'} "
+            f"| {diagnosis['seconds']:.0f} |"
         )
     lines += ["", "| identified | value | 95 % interval | unit |", "|---|---|---|---|"]
     for key, entry in numbers.items():
@@ -114,20 +123,20 @@ def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
     return lines
 
 
-def changed(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> str:
-    """Return what is named of `flights`, compared with `references`, in a line."""
-    before = [one for one in references if one not in flights]
-    if len(before) < 2:
+def named_change(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> str:
+    """Return the effects that `flights` have in comparison with `references`, in a line."""
+    other_references = [path for path in references if path not in flights]
+    if len(other_references) < 2:
         return "too few references"
-    found = suite("diagnose", *flights, "--reference", *before, "--vehicle", "crazyflie21",
-                  "--out", out)  # fmt: skip
-    return names_of(found)
+    diagnosis = suite("diagnose", *flights, "--reference", *other_references,
+                      "--vehicle", "crazyflie21", "--out", out)  # fmt: skip
+    return names_line(diagnosis)
 
 
 def crazypad(logs: Path, out: Path, *options: Any) -> list[str]:
     """Return the lines on crazypad: each condition's flights together, and each flight alone.
 
-    Without a pose only the controller logs hold something to diagnose: the rates.
+    With `options`, which remove the pose, only the controller logs are used: they have body rates.
     """
     lines = [
         "| logs, vehicle | condition | all flights together | each alone |",
@@ -135,24 +144,25 @@ def crazypad(logs: Path, out: Path, *options: Any) -> list[str]:
     ]
     for kind in ("controller",) if options else ("motor", "controller"):
         folder = out / kind
-        flights = imported((logs / kind).iterdir(), folder / "flights", "--map", "crazypad",
+        flights = import_flights((logs / kind).iterdir(), folder / "flights", "--map", "crazypad",
                            "--partial", *options)  # fmt: skip
         for vehicle in ("E8", "E9"):
-            own = {n: path for n, path in flights.items() if f"__{vehicle}_" in n}
-            normal = [path for name, path in own.items() if name.startswith("normal")]
-            for condition in sorted({name.split("__")[0] for name in own}):
-                there = [path for name, path in own.items() if name.startswith(f"{condition}__")]
-                whole = "–" if condition == "normal_flight" else changed(
-                    folder / f"{condition}__{vehicle}", normal, there)  # fmt: skip
-                alone = [changed(folder / path.stem, normal, [path]) for path in there]
+            of_vehicle = {n: path for n, path in flights.items() if f"__{vehicle}_" in n}
+            normal = [path for name, path in of_vehicle.items() if name.startswith("normal")]
+            for condition in sorted({name.split("__")[0] for name in of_vehicle}):
+                start = f"{condition}__"
+                paths = [path for name, path in of_vehicle.items() if name.startswith(start)]
+                together = "–" if condition == "normal_flight" else named_change(
+                    folder / f"{condition}__{vehicle}", normal, paths)  # fmt: skip
+                each = [named_change(folder / path.stem, normal, [path]) for path in paths]
                 lines.append(
-                    f"| {kind}, {vehicle} | {condition} | {whole} | {'<br>'.join(alone)} |"
+                    f"| {kind}, {vehicle} | {condition} | {together} | {'<br>'.join(each)} |"
                 )
     return lines
 
 
 def crazyswarm2(logs: Path, out: Path) -> list[str]:
-    """Return the lines on crazyswarm2: flights of one mass together."""
+    """Return the lines on crazyswarm2, where flights with the same mass are diagnosed together."""
     masses = {
         file.stem.replace("info", "log"): float(line.split(":")[1])
         for file in logs.glob("info*.yaml")
@@ -163,20 +173,23 @@ def crazyswarm2(logs: Path, out: Path) -> list[str]:
     for motors, (before, after) in MASSES.items():
         nominal, folder = masses[before[0]], out / motors
         files = [logs / name for name in (*before, *after)]
-        flights = imported(files, folder / "flights", "--map", "crazyswarm2", "--mass", nominal)
+        flights = import_flights(
+            files, folder / "flights", "--map", "crazyswarm2", "--mass", nominal
+        )
         references = [flights[name] for name in before]
         for mass in sorted({masses[name] for name in after}):
             names = [name for name in after if masses[name] == mass]
-            said = changed(folder / f"{mass}", references, [flights[name] for name in names])
+            paths = [flights[name] for name in names]
+            named = named_change(folder / f"{mass}", references, paths)
             lines.append(
                 f"| {motors} | {', '.join(before)} ({nominal}) | {', '.join(names)} | {mass} "
-                f"| {said} |"
+                f"| {named} |"
             )
     return lines
 
 
 def write_page(logs: Path, out: Path) -> None:
-    """Diagnose all three sets, two of them also without a pose, and write the page."""
+    """Diagnose the flights of all three laboratories, two also without a pose; write the page."""
     no_pose = [word for name in ("pos", "quat", "vel") for word in ("--read", f"{name}=drop")]
     parts = {
         "nanobench": lambda: nanobench(logs / "nanobench", out / "nanobench"),
@@ -190,8 +203,8 @@ def write_page(logs: Path, out: Path) -> None:
         "crazyswarm2": lambda: crazyswarm2(logs / "crazyswarm2", out / "crazyswarm2"),
     }
     page = []
-    for name, of in parts.items():
-        page += [f"## {name}", "", *of(), ""]
+    for name, lines_of in parts.items():
+        page += [f"## {name}", "", *lines_of(), ""]
         (out / "real.md").write_text("\n".join(page), encoding="utf-8")
 
 

@@ -1,7 +1,8 @@
-"""Write docs/reference: commands, Python names, settings, effects and sensors, from the code.
+"""Generate docs/reference from the code: commands, Python names, settings, effects and sensors.
 
-Run: python tools/reference.py [--check]; with --check it writes nothing and ends with 1 where a
-page is not what the code says.
+    python tools/reference.py [--check]
+
+With --check it writes nothing, and the exit code is 1 if a page differs from the generated one.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from suite.common.usage import EXAMPLES, GROUPS
 from suite.train.recipes import named_recipe
 
 HEADS = Path(__file__).with_name("heads")
-"""The text above the made part of each page."""
+"""Folder of the text above the generated part of each page."""
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
 HEAD = "<!-- Made by tools/reference.py; change the code, not this page. -->\n"
-
-WHOLE = {
+"""First line of each page."""
+WITHOUT_AXIS = {
     "velocity_scale": "k: relative error of the velocity.",
     "position_drift": "c: drift of the position over the root of the distance.",
 }
-"""Parameters of `measured_state` that have no axis, and their meanings."""
+"""Parameter of the sensor model `measured_state` that has no axis -> its meaning."""
 SETTING_GROUPS = {
     "spec": "The policy: rate, camera, inputs, network (`spec`)",
     "physics": "The point mass, and the images of all trainings (`physics`)",
@@ -53,7 +54,7 @@ def head(page: str) -> str:
 
 
 def cell(text: Any) -> str:
-    """Return a text for a cell of a table."""
+    """Return a text in one line, with escaped bars, for a cell of a table."""
     return " ".join(str(text).split()).replace("|", "\\|")
 
 
@@ -66,10 +67,10 @@ def commands() -> str:
             module = importlib.import_module(f"suite.commands.{name}")
             parts.append(f"### suite {name}\n\n{summary[0].upper()}{summary[1:]}.\n")
             parts.append("```sh\n" + "\n".join(EXAMPLES[name]) + "\n```\n")
-            found = [one for one in options(module.Config) if one.flag != "--json"]
+            listed = [option for option in options(module.Config) if option.flag != "--json"]
             rows = [
-                f"| `{one.flag}` | {_default(one)} | {cell(one.about)} |"
-                for one in sorted(found, key=lambda one: one.advanced)
+                f"| `{option.flag}` | {_default(option)} | {cell(option.about)} |"
+                for option in sorted(listed, key=lambda option: option.advanced)
             ]
             if rows:
                 parts.append("\n".join(["| option | default | meaning |", "|---|---|---|", *rows]))
@@ -93,18 +94,19 @@ class _Plain(str):
 
 
 def _signature(function: Any) -> str:
-    """Return a function's parameters, a line each, and what it returns."""
-    known = inspect.signature(function)
+    """Return a function's signature, with one parameter in a line."""
+    signature = inspect.signature(function)
     parameters = [
-        one.replace(annotation=_Plain(one.annotation)) for one in known.parameters.values()
+        parameter.replace(annotation=_Plain(parameter.annotation))
+        for parameter in signature.parameters.values()
     ]
-    # A bare `*` stands before the first parameter that is given by name only.
-    lines = [str(one) for one in parameters]
-    named = [one.kind is inspect.Parameter.KEYWORD_ONLY for one in parameters]
-    if True in named:
-        lines.insert(named.index(True), "*")
+    # A bare `*` precedes the keyword-only parameters.
+    lines = [str(parameter) for parameter in parameters]
+    is_keyword_only = [p.kind is inspect.Parameter.KEYWORD_ONLY for p in parameters]
+    if True in is_keyword_only:
+        lines.insert(is_keyword_only.index(True), "*")
     body = "\n".join(f"    {line}," for line in lines)
-    return f"suite.{function.__name__}(\n{body}\n) -> {known.return_annotation}"
+    return f"suite.{function.__name__}(\n{body}\n) -> {signature.return_annotation}"
 
 
 def python() -> str:
@@ -126,10 +128,12 @@ def _value(value: Any) -> str:
 def training() -> str:
     """Return the page of the settings of a training: a table for each group of settings."""
     groups = dict[str, list[str]]()
-    for one in settings(named_recipe("race")):
-        if not one.path.startswith("quadrotor.vehicle."):
-            group = one.path.split(".")[0] if "." in one.path else ""
-            row = f"| `{one.path}` | {_value(one.default)} | {one.allowed} | {cell(one.about)} |"
+    for setting in settings(named_recipe("race")):
+        path = setting.path
+        if not path.startswith("quadrotor.vehicle."):
+            group = path.split(".")[0] if "." in path else ""
+            default, about = _value(setting.default), cell(setting.about)
+            row = f"| `{path}` | {default} | {setting.allowed} | {about} |"
             groups.setdefault(group, []).append(row)
     titles = "| setting | in `race`, first phase | allowed | meaning |\n|---|---|---|---|\n"
     parts = [head("settings")]
@@ -143,7 +147,7 @@ def _meaning(entry: Any, parameter: str) -> str:
     """Return the text below a parameter's field, without its shape and unit."""
     if entry.values is MeasuredState:
         suffix = re.sub(r"^[a-z]+_[xyz]_?", "", parameter)
-        text = WHOLE.get(parameter) or field_texts(Axis)[suffix or "noise"]
+        text = WITHOUT_AXIS.get(parameter) or field_texts(Axis)[suffix or "noise"]
     else:
         text = field_texts(entry.values)[parameter]
     text = re.sub(r"^\([^)]*\),? ?| \[[^]]*\](?=[.;]|$)", "", text)
@@ -171,20 +175,20 @@ def catalogue(page: str, entries: Iterable[Any]) -> str:
     return "\n".join(parts)
 
 
-MADE = {
+GENERATORS = {
     "commands": commands,
     "python": python,
     "settings": training,
     "effects": lambda: catalogue("effects", EFFECTS.values()),
     "sensors": lambda: catalogue("sensors", SENSORS.values()),
 }
-"""Page -> what returns its text."""
+"""Name of a page -> function that returns its text."""
 
 
 def main(check: bool) -> int:
-    """Write the pages, or compare them with what would be written."""
+    """Write the pages, or with `check` compare them with the generated text."""
     stale = 0
-    for name, make in MADE.items():
+    for name, make in GENERATORS.items():
         path, text = PAGES / f"{name}.md", f"{HEAD}{make().rstrip()}\n"
         if path.is_file() and path.read_text(encoding="utf-8") == text:
             continue

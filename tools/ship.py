@@ -1,9 +1,10 @@
-"""Make a training run and its judgement a shipped policy with its card.
+"""Make a shipped policy with its card from a training run and its evaluation.
 
     python tools/ship.py RUN --eval EVAL [--name race] [--speed 0.8]
 
-RUN is a folder of `suite train`. EVAL is a folder of `suite eval`; without it the card has no table
-yet. A policy whose speed is an input flies at --speed where nothing else is given.
+RUN is a folder of `suite train`, EVAL one of `suite eval`; without it the card has no table yet. A
+policy whose speed is an input flies at --speed by default. The card is a page that says how the
+policy was made and how well it flies.
 """
 
 from __future__ import annotations
@@ -26,28 +27,35 @@ SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
 
 
 def card(name: str, run: Path, judged: Path | None) -> str:
-    """Return the card as Markdown: how it was made, its curve, its table."""
-    made, rows = json.loads((run / "run.json").read_text(encoding="utf-8")), curve.read(run)
+    """Return the card as Markdown.
+
+    Args:
+        name: name of the shipped policy.
+        run: folder of the training.
+        judged: folder of the evaluation; None: no table.
+    """
+    training, rows = json.loads((run / "run.json").read_text(encoding="utf-8")), curve.read(run)
     seconds = sum(row["seconds"] for row in rows)
-    line = (
-        f"| `{shlex.join(made['command'])}` | {made['seed']} | {made['git_commit']} "
+    row = (
+        f"| `{shlex.join(training['command'])}` | {training['seed']} | {training['git_commit']} "
         f"| {len(rows)} | {duration(seconds)} |"
     )
-    machine = made["machine"]
-    stored = load_policy_checkpoint(run / "policy")
-    size = sum(array.size for array in stored.params.values())
-    flown = made["config"]["quadrotor"]
-    where = f"quadrotors around `{flown['vehicle']['name']}`" if flown else "the point mass"
+    machine = training["machine"]
+    checkpoint = load_policy_checkpoint(run / "policy")
+    size = sum(array.size for array in checkpoint.params.values())
+    quadrotor = training["config"]["quadrotor"]
+    name_of_vehicle = quadrotor["vehicle"]["name"] if quadrotor else ""
+    dynamics = f"quadrotors around `{name_of_vehicle}`" if quadrotor else "the point mass"
     text = f"""# {name}
 
-CNN-GRU of Su et al. 2026 ({stored.spec.state_size} numbers and a depth image, {size / 1000:.0f}k
-parameters), trained through {where} on the `random` tracks only; it has seen neither the judged
-families nor the vehicle of the tables. The recipe's numbers were chosen by looking at flights of
-earlier recipes on the judged tracks and vehicle, at other seeds.
+CNN-GRU of Su et al. 2026 ({checkpoint.spec.state_size} numbers and a depth image,
+{size / 1000:.0f}k parameters), trained through {dynamics} on the `random` tracks only. The training
+had neither the judged families nor the vehicle of the tables. The recipe's numbers were chosen by
+flights of earlier recipes on the judged tracks and vehicle, at other seeds.
 
 | made by | seed | commit | iterations | time |
 |---|---|---|---|---|
-{line}
+{row}
 
 On {machine["processor"]}, {machine["cores"]} cores.
 
@@ -55,13 +63,13 @@ On {machine["processor"]}, {machine["cores"]} cores.
 """
     if judged is None:
         return text
-    flown = json.loads((judged / "run.json").read_text(encoding="utf-8"))
+    evaluation = json.loads((judged / "run.json").read_text(encoding="utf-8"))
     table = (judged / "table.md").read_text(encoding="utf-8")
     return f"""{text}
 ## Judged
 
-By `{shlex.join(flown["command"])}`, which gives this table again, number for
-number. The trials' seeds were not flown while the recipe was made.
+By `{shlex.join(evaluation["command"])}`, which reproduces this table exactly. The
+trials' seeds were not flown while the recipe was made.
 
 {table}"""
 
@@ -72,7 +80,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="folder of suite train")
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the run's policy")
     parser.add_argument("--name", default="race", help="the shipped policy's name")
-    parser.add_argument("--speed", type=float, help="spec.speed, in the place of the run's own")
+    parser.add_argument("--speed", type=float, help="spec.speed, instead of the run's")
     options = parser.parse_args()
     with replacing_folder(SHELF / options.name) as new:
         policy = options.run / "policy"

@@ -1,9 +1,9 @@
-"""What `make docs` changes: links that lead out of docs/, pages from the root, and the search.
+"""Hooks of mkdocs for `make docs`: links that lead out of docs/, two added pages, and the search.
 
-On a page read in the repository such a link opens a file. The site holds no such files, so their
-path within the repository stands there instead. A link to a file that does not exist ends the
-build. CONTRIBUTING.md and CHANGELOG.md become pages, so that the navigation has them. The search
-leaves out docs/archive, whose pages are of removed policies and experiments.
+In the repository a link out of docs/ opens a file. The site has no such files, so the hook replaces
+the link by the file's path. A link to a file that does not exist ends the build. CONTRIBUTING.md
+and CHANGELOG.md become pages of the site. The search excludes docs/archive, whose pages describe
+removed policies and experiments.
 """
 
 from __future__ import annotations
@@ -18,28 +18,33 @@ from mkdocs.structure.files import File
 ROOT = {"contributing.md": "CONTRIBUTING.md", "releases.md": "CHANGELOG.md"}
 """Page of the site -> file of the repository's root."""
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
-"""A link, not a picture, that climbs at least one folder."""
+"""A link, not a picture, whose path begins with at least one `../`."""
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
-    """Return a page's text with links out of docs/ as paths within the repository."""
-    docs = Path(config["docs_dir"]).resolve()
-    here = (docs / page.file.src_uri).parent
+    """Return a page's text, with links out of docs/ replaced by paths in the repository.
 
-    def named(match: re.Match[str]) -> str:
-        text, target = match[1], (here / match[2]).resolve()
+    Raises:
+        FileNotFoundError: for a link to a file that does not exist.
+    """
+    docs = Path(config["docs_dir"]).resolve()
+    folder = (docs / page.file.src_uri).parent
+
+    def as_path(match: re.Match[str]) -> str:
+        text, target = match[1], (folder / match[2]).resolve()
         if target.is_relative_to(docs):
             return match[0]
         if not target.exists():
-            raise FileNotFoundError(f"{page.file.src_uri}: links to {match[2]}, which is not there")
+            reason = f"links to {match[2]}, which does not exist"
+            raise FileNotFoundError(f"{page.file.src_uri}: {reason}")
         path = f"`{target.relative_to(docs.parent)}`"
         return path if text.strip("`") in (target.name, path.strip("`")) else f"{text} ({path})"
 
-    return OUTSIDE.sub(named, markdown)
+    return OUTSIDE.sub(as_path, markdown)
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages of `ROOT`, with links as they are within docs/."""
+    """Add the pages of `ROOT`, with links that are relative to docs/."""
     root = Path(config["docs_dir"]).resolve().parent
     for page, name in ROOT.items():
         text = (root / name).read_text(encoding="utf-8")
@@ -49,8 +54,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_post_build(config: Any, **_: Any) -> None:
-    """Take the pages of docs/archive out of the search."""
+    """Remove the pages of docs/archive from the search index."""
     path = Path(config["site_dir"], "search", "search_index.json")
     index = json.loads(path.read_text(encoding="utf-8"))
-    index["docs"] = [one for one in index["docs"] if not one["location"].startswith("archive/")]
+    index["docs"] = [page for page in index["docs"] if not page["location"].startswith("archive/")]
     path.write_text(json.dumps(index), encoding="utf-8")

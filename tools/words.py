@@ -1,7 +1,9 @@
 """Check the pages of docs/ for words that docs/conventions.md replaces, and for long sentences.
 
-Run: python tools/words.py [--count]; it ends with 1 where a page breaks a rule. Tables, code and
-docs/archive are left out, generated pages too. --count lists words and mean sentence a page.
+    python tools/words.py [--count]
+
+The exit code is 1 if a page breaks a rule. Tables, code, docs/archive and generated pages are not
+checked. With --count it also prints each page's number of words and mean length of a sentence.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST, MEAN, MOST = 35, 17.0, 25_000
-"""Most words of a sentence, of the mean sentence, and of all pages together."""
+"""Largest number of words in a sentence, in the mean sentence, and in all pages together."""
 REPLACED = {
     r"\bbeside\b": "next to, compared with",
     r"\bnot to be told\b|\bcannot be told\b|\bno flight can tell\b": "not identifiable",
@@ -27,11 +29,11 @@ REPLACED = {
     r"\bdoubted\b|\blent\b": "held fixed",
     r"\bnobody here\b|\bno real vehicle has\b": "not yet validated on hardware",
 }
-"""Expression -> what to write."""
+"""Regular expression of a word -> its replacement."""
 
 
 def pages() -> Iterator[Path]:
-    """Yield README and the pages of docs/ that people write."""
+    """Yield the paths of README and the pages of docs/ that are not generated."""
     yield ROOT / "README.md"
     for page in sorted((ROOT / "docs").rglob("*.md")):
         if page.relative_to(ROOT / "docs").parts[0] not in ("archive", "reference"):
@@ -39,12 +41,12 @@ def pages() -> Iterator[Path]:
 
 
 def prose(text: str) -> str:
-    """Return a page's sentences: no code, tables, headings, comments, links and made parts."""
+    """Return a page's text without code, tables, headings, comments, links and generated parts."""
     text = re.sub(r"<!-- made by.*?<!-- end of.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"```.*?```|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"^\s*(\||#|!\[).*$", "", text, flags=re.MULTILINE)
     text = re.sub(r"\]\([^)]*\)|`[^`]*`", "]", text)
-    # A list's entry ends a sentence, whether or not it has a full stop.
+    # An entry of a list ends a sentence, with or without a full stop.
     return re.sub(r"^\s*([-*]|\d+\.)\s", ". ", text, flags=re.MULTILINE)
 
 
@@ -52,29 +54,29 @@ def sentences(text: str) -> list[list[str]]:
     """Return the words of each sentence."""
     parts = re.split(r"[.!?](?=[\s\])])|:\n|\n\s*\n", prose(text))
     words = [re.findall(r"[^\W_][\w'’.-]*|\]", part) for part in parts]
-    return [one for one in words if one]
+    return [sentence for sentence in words if sentence]
 
 
 def main(count: bool) -> int:
-    """Print what breaks a rule, and the counts if asked."""
-    found, total, every = 0, 0, list[int]()
+    """Print the broken rules, and with `count` the counts; return the exit code."""
+    broken, total, all_lengths = 0, 0, list[int]()
     for page in pages():
         text, name = page.read_text(encoding="utf-8"), page.relative_to(ROOT)
-        lengths = [len(one) for one in sentences(text)]
-        total, every = total + sum(lengths), every + lengths
+        lengths = [len(sentence) for sentence in sentences(text)]
+        total, all_lengths = total + sum(lengths), all_lengths + lengths
         if count:
             mean = sum(lengths) / max(len(lengths), 1)
             print(f"{sum(lengths):6} words, {mean:4.1f} a sentence  {name}")
-        for words in (one for one in sentences(text) if len(one) > LONGEST):
-            found += 1
+        for words in (sentence for sentence in sentences(text) if len(sentence) > LONGEST):
+            broken += 1
             print(f"{name}: {len(words)} words (allowed {LONGEST}): {' '.join(words[:9])} …")
         for pattern, instead in REPLACED.items():
             for match in re.finditer(pattern, prose(text), re.IGNORECASE):
-                found += 1
+                broken += 1
                 print(f"{name}: {match[0]!r}: write {instead}")
-    mean = sum(every) / len(every)
+    mean = sum(all_lengths) / len(all_lengths)
     print(f"{total} words (allowed {MOST}), mean sentence {mean:.1f} words (allowed {MEAN:g})")
-    return int(found > 0 or total > MOST or mean > MEAN)
+    return int(broken > 0 or total > MOST or mean > MEAN)
 
 
 if __name__ == "__main__":

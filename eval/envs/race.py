@@ -14,8 +14,8 @@ from eval.judging.guard import ActionLimits, guard_action
 from eval.quadrotor.autopilot import AutopilotState, autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import uses_noise
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import Eye, compile_model, motion_of, start_state
-from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.engine import DepthCamera, compile_model, motion_of, start_state
+from eval.worlds.slots import gust_draws, layout_of
 from eval.worlds.trial import (
     ENDINGS,
     FLYING,
@@ -66,8 +66,8 @@ class Race:
         if uses_noise(self.autopilot.plant):
             trial = TrialSpec(track.family, track.level, track.seed)
             steps = round(rules.time_limit_s / self.autopilot.dt)
-            self._noise = noise_of(trial, steps + math.ceil(self._period) + 2)
-        self._eye = Eye(spec.camera)
+            self._noise = gust_draws(trial, steps + math.ceil(self._period) + 2)
+        self._eye = DepthCamera(spec.camera)
         self._loops: AutopilotState
         self.progress: Progress
         self.action_b = np.zeros((1, 3))

@@ -1,10 +1,10 @@
-"""Import flight logs of other programs: one file for each format.
+"""Import flight logs of autopilots and other programs as flight logs of this suite.
 
     imported = import_log("log.ulg")
     write_flight("flight.parquet", imported.log)
 
-A format is a module with `SUMMARY`, `detect` and `read` (`eval.importers.formats.Format`);
-docs/import.md describes each.
+Each log format is one module with `SUMMARY`, `detect` and `read`
+(`eval.importers.formats.Format`); docs/import.md describes the formats.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 class ImportedLog(NamedTuple):
-    """The result of an import."""
+    """A converted log, and the results of its checks."""
 
     log: FlightLog
-    """With the columns, units and frames of a flight log."""
+    """The flight in this suite's columns, units and frames."""
     findings: tuple[Finding, ...]
     """Results of all checks and corrections."""
 
@@ -38,8 +38,11 @@ def import_log(
 
     Args:
         path: the file.
-        format: a name of `eval.importers.formats.FORMATS`; None: detected by the first bytes.
-        options: see `eval.importers.options`.
+        format: a name of `eval.importers.formats.FORMATS`; None: detect it by the first bytes.
+        options: how to read the log; None: the defaults of `ImportOptions`.
+
+    Returns:
+        The flight log and the findings of its checks.
 
     Raises:
         FlightLogError: for a file that cannot be used; it names the file and the reason.
@@ -55,14 +58,14 @@ def import_log(
     reader = FORMATS.find(name)
     if options.map is not None and not getattr(reader, "TAKES_MAP", True):
         raise ValueError(
-            f"{file} is read as {name!r}, whose names are known: leave --map out, or give "
+            f"{file} is read as {name!r}, which has fixed names: leave --map out, or give "
             "--format table if it is a table that --map describes"
         )
-    # `source` selects the pose within the file that holds it.
-    own = options if options.pose is None else replace(options, source="")
-    if own.source and not getattr(reader, "TAKES_SOURCE", True):
+    # With a pose file, `source` selects the pose in that file, not in this one.
+    reader_options = options if options.pose is None else replace(options, source="")
+    if reader_options.source and not getattr(reader, "TAKES_SOURCE", True):
         raise ValueError(
-            f"{file} is read as {name!r}, whose pose is of one source: leave --source "
-            f"{own.source} out"
+            f"{file} is read as {name!r}, which has one source of the pose: leave --source "
+            f"{reader_options.source} out"
         )
-    return ImportedLog(*assemble(reader.read(file, own), name, options))
+    return ImportedLog(*assemble(reader.read(file, reader_options), name, options))

@@ -1,4 +1,9 @@
-"""Convert a recording to a checked flight log: the steps that all formats share."""
+"""Convert a recording to a checked flight log: the steps that all formats share.
+
+A recording holds the signals that a format's reader found in a file, each at its own rate. The
+steps are: add a pose from another file, check clock and frames, cut the time on the ground,
+resample to common rows, convert the commands, and check these. Each check returns findings.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from eval.importers.checks.late import check_delay
 from eval.importers.commands import order_motors, rates_wanted, thrust_command
 from eval.importers.mapping import KEPT
 from eval.importers.options import ImportOptions
-from eval.importers.rows import HOLE_S, HOLE_STEPS, own_rows, row_times, rows_at, slowest
+from eval.importers.rows import GAP_S, GAP_STEPS, row_times, rows_at, sampled_rows, slowest
 from eval.importers.signals import NEEDED, Recording, median_step, with_readings
 from eval.logs.columns import COMMANDS, GROUPS, FlightLogError
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, run_checks
@@ -22,7 +27,7 @@ COARSE_HZ = 100.0
 """Largest row rate for the checks of the pose."""
 SLOW_HZ = 40.0
 """A signal below this rate gets a note."""
-TEXTS = {
+SIGNAL_TEXTS = {
     "pos": "position",
     "quat": "attitude",
     "rate": "gyro",
@@ -30,10 +35,10 @@ TEXTS = {
     "motor": "motors",
 }
 """Signals that need a high rate, and their names in messages."""
-NAMES = {"pos": "position", "quat": "attitude", "rate": "body rates", "command": "commands"}
-"""Groups that a partial log may lack, and their names in messages."""
+GROUP_TEXTS = {"pos": "position", "quat": "attitude", "rate": "body rates", "command": "commands"}
+"""Groups of columns that a partial log may lack, and their names in messages."""
 _ROTORS = ("motor", "pwm")
-QUESTIONS = (
+QUANTITIES = (
     ("the force on the body (thrust, mass, drag)", ("pos", "quat"), (*_ROTORS, "cmd_thrust")),
     ("its torque (inertia, rotors, centre of mass)", ("rate",), (*_ROTORS, "cmd_torque")),
     ("the weight and the balance of the rotors in hover", ("pos",), (*_ROTORS, "cmd_torque")),
@@ -46,19 +51,24 @@ QUESTIONS = (
     ("the rate loop (gains, delay)", ("rate", "cmd_rate"), ("rate",)),
     ("the rotors' lag", ("motor",), ("pwm", "motor_cmd")),
 )
-"""Quantity, required signals, and alternative signals of which one is required."""
-UNSEEN = {
+"""Identifiable quantity, required signals, and alternative signals of which one is required."""
+UNIDENTIFIABLE_WITHOUT = {
     "pos": ("the path", "wind", "faults of position and velocity"),
     "quat": ("faults of the attitude", "the gyro's scale and axes against it"),
     "acc": ("thrust over mass", "drag"),
 }
-"""Signal -> quantities that are not identifiable without it and without a pose."""
+"""Signal -> quantities that a log without a pose does not identify where it lacks the signal."""
 
 
 def assemble(
     recording: Recording, format: str, options: ImportOptions
 ) -> tuple[FlightLog, tuple[Finding, ...]]:
     """Return `recording` as a flight log, and the findings of all checks.
+
+    Args:
+        recording: the signals of the file.
+        format: name of the file's format, for the log's metadata.
+        options: settings of the import.
 
     Raises:
         FlightLogError: where a required signal is missing or breaks a rule.
@@ -69,18 +79,20 @@ def assemble(
 
         recording, more = with_pose(recording, options)
         findings += more
-    # Orders of motors are relative to the vehicle's order, which `order_motors` makes.
-    orders = tuple(one for one in options.read if one[0] in MOTORS and "," in one[1])
+    # An order of motors refers to the vehicle's order, so it is applied after `order_motors`.
+    orders = tuple(
+        (signal, steps) for signal, steps in options.read if signal in MOTORS and "," in steps
+    )
     recording = with_readings(recording, tuple(r for r in options.read if r not in orders))
-    _need(recording, options.partial, findings)
-    against = CheckContext(options.vehicle)
+    _require_signals(recording, options.partial, findings)
+    context = CheckContext(options.vehicle)
     more, readings, _ = run_checks(
-        {"time": recording.signals[slowest(recording)].time_s}, CLOCK, against, options.fix
+        {"time": recording.signals[slowest(recording)].time_s}, CLOCK, context, options.fix
     )
     findings += more
     recording = with_readings(recording, readings)  # rows need the time in seconds
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
-    more, readings, _ = run_checks(rows_at(recording, coarse), POSE, against, options.fix)
+    more, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
     findings += more
     if options.fix:
         recording = with_readings(recording, readings)
@@ -89,29 +101,31 @@ def assemble(
     if {"quat", "rate"} <= recording.signals.keys() and options.pose is None:
         recording, more = check_delay(recording, options.fix)
         findings += more
-    within, more = _flight(recording, options)
-    findings += more
-    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, within)
-    findings += _rates(recording, time_s)
+    flight_span_s = (-np.inf, np.inf)
+    if options.trim:
+        flight_span_s, more = airborne(recording)
+        findings += more
+    time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, flight_span_s)
+    findings += _rate_notes(recording, time_s)
     rows = rows_at(recording, time_s)
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
-    more, readings, right = run_checks(rows, DRIVE, against, options.fix)
+    more, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix)
     findings += more
-    rows = right if options.fix else rows
-    unsure = {f.signal for f in findings if f.status == "doubt"}
-    findings += thrust_command(rows, options, "accelerometer" not in unsure)
-    findings += _pair(rows, options.partial)
-    for name, own in own_rows(recording, time_s).items():
-        rows[name] = np.where(own[:, None], rows[name], np.nan)
+    rows = corrected_rows if options.fix else rows
+    doubtful = {f.signal for f in findings if f.status == "doubt"}
+    findings += thrust_command(rows, options, "accelerometer" not in doubtful)
+    findings += _drop_half_commands(rows, options.partial)
+    for name, is_sample in sampled_rows(recording, time_s).items():
+        rows[name] = np.where(is_sample[:, None], rows[name], np.nan)
     columns = _columns(rows)
-    lacks = _lacks(rows)
-    if lacks == ["command"] and not options.partial:
+    missing = _missing_groups(rows)
+    if missing == ["command"] and not options.partial:
         lines = "".join(f"\n{line}" for line in finding_lines(tuple(findings)))
         reason = (
             "neither a thrust and rate command nor motor speeds nor motor commands could be read; "
-            f"--partial keeps the rest{lines}"
+            f"--partial keeps the other signals{lines}"
         )
         raise FlightLogError(recording.name, None, None, reason)
     about = {
@@ -122,36 +136,30 @@ def assemble(
     }
     if options.vehicle is not None:
         about["vehicle"] = options.vehicle.name
-    if lacks:
-        findings.append(usable_for(rows, lacks))
-        about["partial"] = lacks
+    if missing:
+        findings.append(usable_for(rows, missing))
+        about["partial"] = missing
         about["findings"] = [finding._asdict() for finding in findings]
     log = log_from_columns(columns, about, recording.name)
     return log, tuple(findings)
 
 
-def _need(recording: Recording, partial: bool, findings: list[Finding]) -> None:
-    missing = [TEXTS[name] for name in NEEDED if name not in recording.signals]
+def _require_signals(recording: Recording, partial: bool, findings: list[Finding]) -> None:
+    """Reject a recording without position, attitude or gyro; a partial log needs one of them."""
+    missing = [SIGNAL_TEXTS[name] for name in NEEDED if name not in recording.signals]
     if missing and not (partial and len(missing) < len(NEEDED)):
         why = "".join(f" ({f.evidence})" for f in findings if f.signal in missing)
-        hint = "" if missing == ["gyro"] else "; --pose FILE brings position and attitude"
+        hint = "" if missing == ["gyro"] else "; --pose FILE adds position and attitude"
         reason = f"holds no {' and no '.join(missing)}{why}{hint}; --partial keeps what is there"
         raise FlightLogError(recording.name, None, None, reason)
 
 
-def _flight(
-    recording: Recording, options: ImportOptions
-) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in the air [s]; infinite where nothing is trimmed."""
-    return airborne(recording) if options.trim else ((-np.inf, np.inf), [])
-
-
-def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
+def _rate_notes(recording: Recording, time_s: np.ndarray) -> list[Finding]:
     """Return notes on the row rate, slow signals and gaps."""
     name = slowest(recording)
-    every = f"at {1.0 / median_step(time_s):.3g} Hz, by the {TEXTS[name]}"
-    findings = [Finding("note", "rows", every)]
-    for name, subject in TEXTS.items():
+    row_rate = f"at {1.0 / median_step(time_s):.3g} Hz, by the {SIGNAL_TEXTS[name]}"
+    findings = [Finding("note", "rows", row_rate)]
+    for name, subject in SIGNAL_TEXTS.items():
         if name not in recording.signals:
             continue
         times = recording.signals[name].time_s
@@ -159,39 +167,40 @@ def _rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
         if step > 1.0 / SLOW_HZ:
             text = f"comes at {1 / step:.3g} Hz only; log it faster where you can"
             findings.append(Finding("note", subject, text))
-        holes = int(np.sum(np.diff(times) > max(HOLE_S, HOLE_STEPS * step)))
-        if holes:
+        gaps = int(np.sum(np.diff(times) > max(GAP_S, GAP_STEPS * step)))
+        if gaps:
             longest = float(np.max(np.diff(times)))
-            text = f"{holes} holes, the longest {longest:.2g} s: left empty"
+            text = f"{gaps} gaps, the longest {longest:.2g} s: left empty"
             findings.append(Finding("note", subject, text))
     return findings
 
 
-def _pair(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
+def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
     """Remove half a command in place: a thrust without rates or torques, or these without it.
 
-    A partial log keeps a thrust alone.
+    A partial log keeps a thrust without rates.
     """
-    left = []
+    dropped = []
     if "cmd_thrust" in rows and not ({"cmd_rate", "cmd_torque"} & rows.keys()) and not partial:
-        left.append("cmd_thrust")
+        dropped.append("cmd_thrust")
     for name in ("cmd_rate", "cmd_torque"):
         if name in rows and "cmd_thrust" not in rows:
-            left.append(name)
-    for name in left:
+            dropped.append(name)
+    for name in dropped:
         del rows[name]
-    text = f"{' and '.join(left)} left out, as the other half of the command is not there"
-    return [Finding("note", "command", text)] if left else []
+    text = f"{' and '.join(dropped)} left out, as the other half of the command is missing"
+    return [Finding("note", "command", text)] if dropped else []
 
 
-def _lacks(rows: dict[str, np.ndarray]) -> list[str]:
-    """Return the required groups that `rows` lack; `command` stands for any of `COMMANDS`."""
-    lacks = [name for name in NEEDED if name not in rows]
-    driven = any(all(group in rows for group in groups) for groups in COMMANDS)
-    return lacks if driven else [*lacks, "command"]
+def _missing_groups(rows: dict[str, np.ndarray]) -> list[str]:
+    """Return the required groups that `rows` lack; `command` means any of `COMMANDS`."""
+    missing = [name for name in NEEDED if name not in rows]
+    has_command = any(all(group in rows for group in groups) for groups in COMMANDS)
+    return missing if has_command else [*missing, "command"]
 
 
 def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the flight log's columns, and the columns that are kept unchanged."""
     columns = {"time": rows["time"]}
     for group, names in GROUPS.items():
         if group != "time" and group in rows:
@@ -204,19 +213,27 @@ def _columns(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def usable_for(rows: dict[str, np.ndarray], lacks: list[str]) -> Finding:
-    """Return the finding that lists what a log without the groups `lacks` is usable for."""
-    no_pose = "pos" in lacks and "quat" in lacks
-    can = [
-        question
-        for question, needs, driven_by in QUESTIONS
-        if all(name in rows for name in needs) and any(name in rows for name in driven_by)
+def usable_for(rows: dict[str, np.ndarray], missing: list[str]) -> Finding:
+    """Return the finding that lists what a log without the groups `missing` identifies.
+
+    Args:
+        rows: the log's signals, as `rows_at` returns them.
+        missing: required groups that the log lacks, keys of `GROUP_TEXTS`.
+    """
+    no_pose = "pos" in missing and "quat" in missing
+    identifiable = [
+        quantity
+        for quantity, needed, inputs in QUANTITIES
+        if all(name in rows for name in needed) and any(name in rows for name in inputs)
     ]
-    without = " and no ".join(NAMES[name] for name in lacks)
-    text = f"no {without}; what can be asked of it: {'; '.join(can) or 'nothing but its path'}"
+    without = " and no ".join(GROUP_TEXTS[name] for name in missing)
+    text = f"no {without}; identifiable from it: {'; '.join(identifiable) or 'only its path'}"
     if no_pose:
         text = f"this log has no pose: {text}; not identifiable from it: "
         text += ", ".join(
-            what for name, whats in UNSEEN.items() if name not in rows for what in whats
+            quantity
+            for name, quantities in UNIDENTIFIABLE_WITHOUT.items()
+            if name not in rows
+            for quantity in quantities
         )
     return Finding("note", "partial", text)

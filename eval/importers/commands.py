@@ -1,10 +1,10 @@
 """Convert a log's commands to those of a flight log.
 
-Motors are sorted into the vehicle file's order by their positions. Attitude set points become rates
-by the vehicle file's attitude loop. Normalised thrust (0 to 1) becomes thrust per mass. Its value
-at full throttle is an option, or comes from the vehicle file (from its `[motors]` with the battery
-voltage, if present), or is fitted to the accelerometer. Such a fit hides a wrong thrust scale from
-a diagnosis, and a finding reports that.
+Motors are sorted into the vehicle file's order by their positions. Attitude set points become rate
+commands by the vehicle file's attitude loop. Normalised thrust (0 to 1) becomes thrust per mass.
+The thrust at full throttle is an option, or comes from the vehicle file (from its `[motors]` with
+the battery voltage, if present), or is fitted to the accelerometer. Such a fit hides a wrong thrust
+scale from a diagnosis, and a finding reports that.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ import numpy as np
 
 from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.importers.options import ImportOptions
+from eval.importers.signals import MAD_TO_SD
 from eval.logs.faults.finding import Finding
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 SHIPPED_ORDER = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Front right, rear right, rear left, front left: the order of the shipped vehicles."""
-FULL = (8.0, 200.0)
+"""Motor positions (x forward, y left) in the order of the shipped vehicles: front right, rear
+right, rear left, front left."""
+FULL_THRUST_RANGE = (8.0, 200.0)
 """Possible thrust per mass of a multirotor at full throttle [m/s^2]."""
-SIDES = ("front right", "rear right", "rear left", "front left")
 
 
 def order_motors(
@@ -41,17 +42,18 @@ def order_motors(
     if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
     hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
-    have, wanted = _directions(motor_side), _directions(hubs)
-    order = max(permutations(range(4)), key=lambda p: float(np.sum(have[list(p)] * wanted)))
+    file_hubs, wanted_hubs = _directions(motor_side), _directions(hubs)
+    order = max(permutations(range(4)), key=lambda p: np.sum(file_hubs[list(p)] * wanted_hubs))
     for name in ("motor", "motor_cmd", "pwm"):
         if name in rows:
             rows[name] = rows[name][:, list(order)]
     numbers = ", ".join(str(k + 1) for k in order)
-    whose = "the shipped vehicles" if vehicle is None else f"vehicle {vehicle.name!r}"
-    return [Finding("note", "motors", f"put in the order of {whose}: the file's {numbers}")]
+    owner = "the shipped vehicles" if vehicle is None else f"vehicle {vehicle.name!r}"
+    return [Finding("note", "motors", f"put in the order of {owner}: the file's {numbers}")]
 
 
 def _directions(hubs: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return unit vectors (4, 2) from the centre to the hubs."""
     array = np.asarray(hubs, dtype=np.float64)
     return array / np.linalg.norm(array, axis=1, keepdims=True)
 
@@ -63,8 +65,9 @@ def thrust_command(
 
     Args:
         rows: see `eval.importers.rows`.
-        options: the vehicle, and thrust per mass at full throttle.
-        by_acc: otherwise fit it to the accelerometer; False for a suspicious accelerometer.
+        options: settings of the import, of which `vehicle` and `full_thrust` are used.
+        by_acc: fit the thrust to the accelerometer where neither is given; False where the
+            accelerometer is in doubt.
     """
     if "cmd_thrust" in rows or "throttle" not in rows:
         return []
@@ -85,78 +88,85 @@ def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) 
     rows["cmd_thrust"] = thrust[:, None]
     with_battery = "with the battery's voltage" if voltage is not None else "without a voltage"
     text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
-    return [Finding("note", "thrust", text), *_hover(rows, thrust)]
+    return [Finding("note", "thrust", text), *_check_mean_thrust(rows, thrust)]
 
 
 def _full_thrust(
     rows: dict[str, np.ndarray], throttle: np.ndarray, options: ImportOptions, by_acc: bool
 ) -> tuple[float | None, list[Finding]]:
-    linear = "taking thrust as proportional to it"
+    """Return thrust per mass at full throttle [m/s^2] (None if unknown), and findings."""
+    linear = "taking thrust as proportional to throttle"
     if options.full_thrust is not None:
         text = f"normalised; full throttle is {options.full_thrust:g} m/s^2 as given, {linear}"
         return options.full_thrust, [Finding("note", "thrust", text)]
     if options.vehicle is not None:
         full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
-        return full, [Finding("note", "thrust", text), *_hover(rows, full * throttle)]
+        return full, [Finding("note", "thrust", text), *_check_mean_thrust(rows, full * throttle)]
     if "acc" in rows and by_acc:
-        full, rest = _fitted_full(throttle, rows["acc"][:, 2])
-        if FULL[0] <= full <= FULL[1]:
+        full, residual = _fit_full_thrust(throttle, rows["acc"][:, 2])
+        low, high = FULL_THRUST_RANGE
+        if low <= full <= high:
             text = (
-                f"normalised; full throttle is {full:.4g} m/s^2 by the accelerometer "
-                f"({rest:.2g} m/s^2 are left), {linear}. A wrong thrust scale cannot be seen "
-                "in this log; with --vehicle it can"
+                f"normalised; full throttle is {full:.4g} m/s^2 by the accelerometer (residual "
+                f"{residual:.2g} m/s^2), {linear}. A wrong thrust scale is not identifiable from "
+                "this log; with --vehicle it is"
             )
             return full, [Finding("note", "thrust", text)]
         if np.isfinite(full):
             text = (
                 f"normalised; full throttle would be {full:.3g} m/s^2 by the accelerometer, and "
-                f"{FULL[0]:g} to {FULL[1]:g} is possible: left out; give --vehicle FILE or "
+                f"{low:g} to {high:g} is possible: left out; give --vehicle FILE or "
                 "--full-thrust M/S^2"
             )
             return None, [Finding("doubt", "thrust", text, "thrust_scale", full, 0.95,
                                   "--full-thrust M/S^2")]  # fmt: skip
     text = (
-        "normalised, and nothing says what full throttle gives: left out; "
+        "normalised, and the thrust at full throttle is unknown: left out; "
         "give --vehicle FILE or --full-thrust M/S^2"
     )
     return None, [Finding("doubt", "thrust", text)]
 
 
-def _fitted_full(throttle: np.ndarray, acc: np.ndarray) -> tuple[float, float]:
-    """Return thrust per mass at full throttle from an accelerometer's z, and the residual [m/s^2].
+def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, float]:
+    """Return thrust per mass at full throttle, and the standard deviation of the residual [m/s^2].
 
-    Uses the median of their ratios, which is robust against outliers. NaN for too few samples.
+    The fit is the median of the ratios of the accelerometer's z to the throttle, and the deviation
+    comes from the median too, so outliers do not count. NaN for too few samples.
     """
-    good = np.isfinite(acc) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
+    good = np.isfinite(acc_z) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
     if np.sum(good) <= 100:
         return np.nan, np.nan
-    full = float(np.median(acc[good] / throttle[good]))
-    off = acc[good] - full * throttle[good]
-    return full, 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    full = float(np.median(acc_z[good] / throttle[good]))
+    residual = acc_z[good] - full * throttle[good]
+    return full, MAD_TO_SD * float(np.median(np.abs(residual - np.median(residual))))
 
 
-def _hover(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
-    """Return a doubt where the mean commanded thrust differs from the measured one."""
+def _check_mean_thrust(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
+    """Return a doubt where the mean of `thrust` (T,) [m/s^2] differs from the accelerometer's."""
     if "acc" not in rows:
         return []
     good = np.isfinite(thrust) & np.isfinite(rows["acc"][:, 2])
-    needed = float(np.mean(rows["acc"][good, 2])) if good.any() else 0.0
-    ratio = float(np.mean(thrust[good])) / needed if needed > 1.0 else 1.0
+    measured = float(np.mean(rows["acc"][good, 2])) if good.any() else 0.0
+    ratio = float(np.mean(thrust[good])) / measured if measured > 1.0 else 1.0
     if 0.7 < ratio < 1.4:
         return []
     text = (
-        f"the mean command is {ratio:.2f} times what the accelerometer felt; the vehicle's mass, "
-        "thrust coefficient or speed_max, or a curved throttle"
+        f"the mean command is {ratio:.2f} times the accelerometer's mean; possible causes are the "
+        "vehicle's mass, thrust coefficient or speed_max, or a nonlinear throttle"
     )
     return [Finding("doubt", "thrust", text)]
 
 
 def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:
-    """Replace `cmd_quat` of `rows` by `cmd_rate` in place, where the log has no rate command.
+    """Replace `cmd_quat` of `rows` by `cmd_rate` [rad/s] in place, unless they have a rate command.
 
     The rate is the attitude gain times the rotation vector from the attitude to the set point,
-    within the vehicle's `rate_max`.
+    clipped to the vehicle's `rate_max`.
+
+    Args:
+        rows: see `eval.importers.rows`.
+        vehicle: with the attitude loop's gains; None: the set points are dropped, with a doubt.
     """
     if "cmd_quat" not in rows:
         return []
@@ -164,7 +174,7 @@ def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[F
     if "cmd_rate" in rows or "quat" not in rows:
         return []
     if vehicle is None:
-        text = "are attitudes, and nothing says the attitude loop's gains: left out; give --vehicle"
+        text = "are attitudes, and the attitude loop's gains are unknown: left out; give --vehicle"
         return [Finding("doubt", "set points", text)]
     norm = np.linalg.norm(wanted, axis=1, keepdims=True)
     error = rotation_vector(multiply(conjugate(rows["quat"]), wanted / norm))

@@ -1,4 +1,8 @@
-"""Convert a file's columns to signals in the flight log's units and frames, by a mapping."""
+"""Convert a file's columns to signals in the flight log's units and frames, by a mapping.
+
+A mapping (`eval.importers.mapping_file`) names the columns, units and frames of each signal. The
+readers of tables and of Crazyflie logs use it.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +18,20 @@ from eval.importers.frames import (
     body_vector,
     conjugate,
     from_euler,
-    turn,
+    rotate,
     world_vector,
 )
 from eval.importers.mapping_file import MIXERS, Column, LogMap
 from eval.importers.options import ImportOptions
-from eval.importers.rows import continuous, measured
+from eval.importers.rows import continuous, in_world, measured
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.faults.finding import Finding
 
 Part = tuple[np.ndarray, np.ndarray]
+"""Times (N,) [s] and values (N, C)."""
 Find = Callable[[tuple[str, ...]], Part | None]
-"""Returns time [s] and values (N, C) of columns, or None where one is missing."""
+"""Function that returns the times and values of named columns, or None where one is missing."""
 KEPT = "kept:"
 """Prefix of the name of a column that is kept unchanged."""
 ESTIMATED = ("pos", "quat", "vel")
@@ -39,17 +44,17 @@ def recording_of(
     """Return the signals of the file at `path` by `mapping`.
 
     Args:
-        path: the file.
+        path: the file, for messages and to locate the text file of the mapping.
         mapping: the columns of each signal.
-        find: returns the values of columns.
+        find: returns the times and values of columns.
         missing: returns the error text for a missing column.
-        options: `source` and the mass are used.
+        options: settings of the import, of which `source`, `mass` and `vehicle` are used.
 
     Raises:
         FlightLogError: for a column that the mapping needs and the file lacks.
         ValueError: for `options.source` where the mapping has no sources.
     """
-    name, parts, taken = str(path), {}, {}
+    name, parts, used_columns = str(path), {}, {}
     if options.source and not any(c.source for each in mapping.columns.values() for c in each):
         raise ValueError(
             f"--source {options.source}: the mapping of {name} names no source of any signal; "
@@ -62,25 +67,28 @@ def recording_of(
                 continue
             first = next(c for c in alternatives[0].names if find((c,)) is None)
             raise FlightLogError(name, first, None, missing(first))
-        taken[signal], parts[signal] = column, _values(part, column, name)
+        used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
     about, findings = _text_file(path, mapping)
     parts.pop("time", None)
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
         if angles in parts:
             time_s, value = parts.pop(angles)
             parts.setdefault(quat, (time_s, from_euler(value)))
-            taken.setdefault(quat, Column((), ()))
-    parts = {signal: _turned(signal, *part, taken, mapping) for signal, part in parts.items()}
-    parts |= _estimates(mapping, taken, find, name)
+            used_columns.setdefault(quat, Column((), ()))
+    parts = {
+        signal: _in_log_frame(signal, *part, used_columns[signal], mapping)
+        for signal, part in parts.items()
+    }
+    parts |= _estimates(mapping, used_columns, find, name)
     for column in mapping.keep:
         part = find((column,))
         if part is not None:
             parts[KEPT + column] = part
     signals, more = collect(parts, name)
     for signal in ("vel", "rate", "acc"):
-        if signal in signals and taken[signal].other_axes:
-            _change_axes(signals, signal, taken[signal])
-    if "cmd_thrust" in signals and not taken["cmd_thrust"].per_mass:
+        if signal in signals and used_columns[signal].other_axes:
+            _change_axes(signals, signal, used_columns[signal])
+    if "cmd_thrust" in signals and not used_columns["cmd_thrust"].per_mass:
         findings += _per_mass(signals, about.get("mass"), options)
     return Recording(name, signals, (*findings, *more), mapping.motor_side, about)
 
@@ -88,68 +96,69 @@ def recording_of(
 def _first(
     signal: str, alternatives: tuple[Column, ...], find: Find, source: str, name: str
 ) -> tuple[Column, Part | None]:
-    """Return the first alternative in the file; those from `source` come before the others."""
+    """Return the first alternative in the file, with its samples; those of `source` come first."""
     preferred = [c for c in alternatives if source and c.source == source]
     for column in (*preferred, *(c for c in alternatives if c not in preferred)):
         part = find(column.names)
         if part is not None:
             if source and signal == "pos" and column.source and column.source != source:
-                reason = f"holds no position of the {source}; --source {column.source} is there"
+                reason = f"has no position of the {source}; it has --source {column.source}"
                 raise FlightLogError(name, None, None, reason)
             return column, part
     return alternatives[0], None
 
 
 def _estimates(
-    mapping: LogMap, taken: Mapping[str, Column], find: Find, name: str
+    mapping: LogMap, used_columns: Mapping[str, Column], find: Find, name: str
 ) -> dict[str, Part]:
     """Return the on-board estimates of signals taken from motion capture, as columns to keep."""
-    kept = {}
+    estimates = {}
     for signal in ESTIMATED:
-        if signal not in taken or taken[signal].source != "mocap":
+        if signal not in used_columns or used_columns[signal].source != "mocap":
             continue
         for column in mapping.columns[signal]:
             part = find(column.names) if column.source == "estimate" else None
             if part is None or _is_world(signal, column) != (signal == "vel"):
                 continue
-            alone = {signal: column}
-            time_s, value = _turned(signal, *_values(part, column, name), alone, mapping)
+            part = _in_log_unit(part, column, name)
+            time_s, value = _in_log_frame(signal, *part, column, mapping)
             value = continuous(value) if signal == "quat" else value
-            for k, group in enumerate(GROUPS[signal]):
-                kept[f"{KEPT}{ESTIMATE}{group}"] = (time_s, value[:, k : k + 1])
+            for k, log_column in enumerate(GROUPS[signal]):
+                estimates[f"{KEPT}{ESTIMATE}{log_column}"] = (time_s, value[:, k : k + 1])
             break
-    return kept
+    return estimates
 
 
-def _values(part: Part, column: Column, name: str) -> Part:
+def _in_log_unit(part: Part, column: Column, name: str) -> Part:
+    """Return a signal in the flight log's unit, with the motor mixer applied."""
     time_s, value = part
     if value.shape[1] != len(column.factor):
         wanted = f"give {len(column.factor)} columns, or one whose cells hold as many"
         reason = f"{value.shape[1]} a row for a signal of {len(column.factor)} numbers; {wanted}"
         raise FlightLogError(name, column.names[0], None, reason)
+    value = value * np.asarray(column.factor)
     if column.mixer:
-        mixed = (value * np.asarray(column.factor)) @ MIXERS[column.mixer].T
-        return time_s, np.clip(mixed, 0.0, 1.0)  # as the motor drivers do
-    return time_s, value * np.asarray(column.factor)
+        value = np.clip(value @ MIXERS[column.mixer].T, 0.0, 1.0)  # motor drivers clip as well
+    return time_s, value
 
 
-def _turned(
-    signal: str, time_s: np.ndarray, value: np.ndarray, taken: Mapping[str, Column], by: LogMap
+def _in_log_frame(
+    signal: str, time_s: np.ndarray, value: np.ndarray, column: Column, mapping: LogMap
 ) -> Part:
-    """Return a signal with z up and y left; a world or body vector remains one."""
-    column = taken[signal]
-    in_world = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
+    """Return a signal with z up and y left; vectors in world or body axes remain in these."""
+    world_axes = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
     if signal in ("quat", "cmd_quat"):
         quat = conjugate(value) if column.inverse else value
-        return time_s, attitude(quat, by.world, by.body)
-    if in_world:
-        return time_s, world_vector(value, by.world)
+        return time_s, attitude(quat, mapping.world, mapping.body)
+    if world_axes:
+        return time_s, world_vector(value, mapping.world)
     if signal in ("vel", "rate", "acc", "cmd_rate", "cmd_torque"):
-        return time_s, body_vector(value, by.body)
+        return time_s, body_vector(value, mapping.body)
     return time_s, value
 
 
 def _is_world(signal: str, column: Column) -> bool:
+    """Return whether a velocity, rate or acceleration is in world axes."""
     return column.other_axes != (signal == "vel")
 
 
@@ -168,48 +177,52 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
                 kept = (value - [0.0, 0.0, GRAVITY])[:, k : k + 1]
                 signals[f"{KEPT}acc_w_{axis}"] = Signal(samples.time_s, kept)
         return
+    if signal == "vel":
+        signals["vel"] = in_world(samples, signals["quat"])
+        return
     quat = measured(signals["quat"], samples.time_s, smooth=True)
     known = np.isfinite(quat).all(axis=1)
     unit = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
-    to_world = signal == "vel"
-    turned = turn(unit if to_world else conjugate(unit), value[known])
-    signals[signal] = Signal(samples.time_s[known], turned)
+    signals[signal] = Signal(samples.time_s[known], rotate(conjugate(unit), value[known]))
 
 
-def _per_mass(signals: dict[str, Signal], given: Any, options: ImportOptions) -> list[Finding]:
+def _per_mass(signals: dict[str, Signal], file_mass: Any, options: ImportOptions) -> list[Finding]:
     """Divide a thrust in N by the nominal mass in place, and keep it as `cmd_force` too."""
     thrust = signals.pop("cmd_thrust")
     signals[KEPT + "cmd_force"] = thrust
-    mass, whose = options.mass, "by --mass"
+    mass, mass_source = options.mass, "by --mass"
     if mass is None and options.vehicle is not None:
-        mass, whose = options.vehicle.mass, f"by the vehicle {options.vehicle.name!r}"
-    if mass is None and isinstance(given, float):
-        mass, whose = given, "by its text file"
+        mass, mass_source = options.vehicle.mass, f"by the vehicle {options.vehicle.name!r}"
+    if mass is None and isinstance(file_mass, float):
+        mass, mass_source = file_mass, "by its text file"
     if mass is None:
         text = "is in N, and the mass is unknown: kept as cmd_force; give --mass or --vehicle"
         return [Finding("doubt", "thrust", text)]
     signals["cmd_thrust"] = Signal(thrust.time_s, thrust.value / mass)
-    return [Finding("note", "thrust", f"in N; divided by a mass of {mass:g} kg, {whose}")]
+    return [Finding("note", "thrust", f"in N; divided by a mass of {mass:g} kg, {mass_source}")]
 
 
 def _text_file(path: Path, mapping: LogMap) -> tuple[dict[str, Any], list[Finding]]:
-    """Return the numbers and texts of the log's text file by key, and a note."""
+    """Return metadata from the text file next to the log (`LogMap.text_file`), and a note.
+
+    The metadata has the file's entries under `beside`, and the vehicle's `mass` [kg] if present.
+    """
     if not mapping.text_file:
         return {}, []
     number = "".join(c for c in path.stem if c.isdigit())
     file = path.parent / mapping.text_file.format(stem=path.stem, number=number)
     if not file.is_file():
         return {}, [Finding("note", "file", f"no {file.name} in its folder")]
-    about: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for line in file.read_text(encoding="utf-8", errors="replace").splitlines()[:1000]:
         key, colon, value = line.partition(":")
         if colon and value.strip():
-            about[key.strip()] = _number_or_text(value.strip())
-    found: dict[str, Any] = {"beside": about}
-    mass = about.get(mapping.mass_key) if mapping.mass_key else None
+            entries[key.strip()] = _number_or_text(value.strip())
+    about: dict[str, Any] = {"beside": entries}
+    mass = entries.get(mapping.mass_key) if mapping.mass_key else None
     if isinstance(mass, float) and mass > 0.0:
-        found["mass"] = mass
-    return found, [Finding("note", "file", f"{file.name} of its folder is read as well")]
+        about["mass"] = mass
+    return about, [Finding("note", "file", f"{file.name} of its folder is read as well")]
 
 
 def _number_or_text(text: str) -> float | str:

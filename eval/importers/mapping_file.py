@@ -1,8 +1,8 @@
-"""Mapping files (TOML): the columns, units and frames of each signal in a file.
+"""Read mapping files (TOML), which name the columns, units and frames of each signal of a log.
 
-Each table describes a signal. Several tables of one name, such as `[[pos]]`, are alternatives; the
-first one found in the file is used. docs/import.md shows a mapping with every key. Shipped mappings
-are selected by name.
+Each table describes a signal. Several tables of one name, such as `[[pos]]`, are alternatives: the
+first one whose columns the log has is used. docs/import.md shows a mapping with every key.
+Mappings that come with the suite are selected by name.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ SHIPPED = Path(__file__).resolve().parent / "mappings"
 DEG = float(np.pi / 180.0)
 RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
-_TURN = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
+_BODY_RATE = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
 _ANGLE = {"rad": 1.0, "deg": DEG}
-_FORCE = {"m/s^2": 1.0, "g": GRAVITY}
-_SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
+_ACCELERATION = {"m/s^2": 1.0, "g": GRAVITY}
+_ROTOR_SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
 _SHARE = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
 PER_MASS = "N"
 """Unit of a `cmd_thrust` that is divided by the mass."""
@@ -38,16 +38,16 @@ UNITS: dict[str, dict[str, float]] = {
     "quat": {"1": 1.0},
     "euler": _ANGLE,
     "vel": {f"{unit}/s": factor for unit, factor in _LENGTH.items()},
-    "rate": _TURN,
-    "cmd_rate": _TURN,
+    "rate": _BODY_RATE,
+    "cmd_rate": _BODY_RATE,
     "cmd_quat": {"1": 1.0},
     "cmd_euler": _ANGLE,
-    "cmd_thrust": _FORCE | {PER_MASS: 1.0},
+    "cmd_thrust": _ACCELERATION | {PER_MASS: 1.0},
     "cmd_torque": {"N m": 1.0},
     "throttle": _SHARE,
-    "acc": _FORCE,
-    "motor": _SPEED,
-    "motor_cmd": _SPEED,
+    "acc": _ACCELERATION,
+    "motor": _ROTOR_SPEED,
+    "motor_cmd": _ROTOR_SPEED,
     "pwm": _SHARE,
     "voltage": {"V": 1.0, "mV": 1e-3},
 }
@@ -56,6 +56,7 @@ WIDTHS = {name: len(GROUPS[name]) if name in GROUPS else 3 for name in UNITS} | 
     "throttle": 1,
     "cmd_quat": 4,
 }
+"""Number of columns of each signal."""
 AXES = {
     "vel": ("world", "body"),
     "rate": ("body", "world"),
@@ -72,8 +73,8 @@ MIXERS: dict[str, np.ndarray] = {
         ]
     )
 }
-"""Motor command of each motor from thrust, roll, pitch and yaw (4, 4). Crazyflie: the firmware's
-legacy power distribution, in which roll and pitch count half."""
+"""Mixer matrices (4, 4): rows are motors, columns thrust, roll, pitch and yaw. Crazyflie: the
+firmware's legacy power distribution, in which roll and pitch have a weight of one half."""
 SOURCES = ("mocap", "estimate")
 """Sources of a pose in a file that holds both: raw motion capture, or a state estimator."""
 
@@ -89,15 +90,16 @@ class Column:
     other_axes: bool = False
     """Whether the signal has the second choice of `AXES`."""
     gravity: bool = True
-    """An acceleration in world axes is a specific force; False: the velocity's derivative."""
+    """Whether an acceleration in world axes is a specific force; False: the velocity's
+    derivative."""
     inverse: bool = False
-    """A quaternion from world to body."""
+    """Whether a quaternion maps world to body."""
     per_mass: bool = True
-    """False: a thrust in N."""
+    """Whether a thrust is divided by the mass; False: it is in N."""
     mixer: str = ""
-    """One of `MIXERS`: the columns are thrust, roll, pitch and yaw."""
+    """One of `MIXERS` where the columns are thrust, roll, pitch and yaw; empty: one per motor."""
     source: str = ""
-    """One of `SOURCES`, or empty."""
+    """One of `SOURCES`, or empty where the mapping does not name the source."""
 
 
 @dataclass(frozen=True)
@@ -105,25 +107,26 @@ class LogMap:
     """The contents of a mapping file."""
 
     columns: Mapping[str, tuple[Column, ...]] = field(default_factory=dict)
-    """Alternatives by signal."""
+    """Signal -> its alternatives, the preferred one first."""
     world: str = "z-up"
-    """One of `frames.WORLDS`."""
+    """World frame of the log, one of `frames.WORLDS`."""
     body: str = "flu"
-    """One of `frames.BODIES`."""
+    """Body frame of the log, one of `frames.BODIES`."""
     motor_side: tuple[tuple[float, float], ...] | None = None
-    """Where the file's motors 1 to 4 are (x forward, y left), in any unit."""
+    """Positions of the file's motors 1 to 4 (x forward, y left), in any unit; None: unknown."""
     optional: bool = False
     """Whether missing signals are left out; otherwise they are an error."""
     keep: tuple[str, ...] = ()
     """Columns that are kept unchanged, if present."""
     text_file: str = ""
-    """A text file of `key: value` in the log's folder; {stem} and {number} are the log's."""
+    """Name of a text file in the log's folder with lines `key: value`. {stem} in it is the log's
+    name without its ending, {number} the digits of that."""
     mass_key: str = ""
     """Key of the mass [kg] in that file."""
 
 
 def shipped_maps() -> list[str]:
-    """Return the names of the mappings that come with the suite."""
+    """Return the names of the mapping files that come with the suite."""
     return shipped_names(SHIPPED)
 
 
@@ -131,7 +134,7 @@ def map_file(path: Path) -> Path:
     """Return the mapping file that `path` names: a file, or a shipped one by its name.
 
     Raises:
-        ValueError: for a name that is neither.
+        ValueError: for a name that is neither a file nor a shipped mapping.
     """
     if path.suffix or len(path.parts) > 1 or path.is_file():
         return path
@@ -167,20 +170,20 @@ def read_map(path: Path) -> LogMap:
         about.close()
     optional = top.has("optional") and top.choice("optional", ("no", "yes")) == "yes"
     keep = tuple(top.texts("keep")) if top.has("keep") else ()
-    ours = [name for name in keep if name in KNOWN or name in ("throttle", METADATA)]
-    if ours:
-        allowed = f"columns whose names are not a flight log's own, as {ours[0]!r} is"
+    reserved = [name for name in keep if name in KNOWN or name in ("throttle", METADATA)]
+    if reserved:
+        allowed = f"columns whose names are not a flight log's own, as {reserved[0]!r} is"
         raise top.error("keep", list(keep), allowed)
-    top.has("topics")  # of MCAP files; see mcap.py
+    top.has("topics")  # allow the table, which the MCAP reader uses (mcap.py)
     top.close()
     return LogMap(columns, world, body, side, optional, keep, text_file, mass_key)
 
 
 def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
-    """Return the positions of the file's motors 1 to 4 in the table `[frames]`; None if absent.
+    """Return the positions of the file's motors 1 to 4 from the table `[frames]`; None if absent.
 
     Raises:
-        ValueError: where that is no four points.
+        ValueError: where the entry is not four points apart from the centre.
     """
     if not frames.has("motors"):
         return None
@@ -192,24 +195,26 @@ def motor_side_of(frames: Table) -> tuple[tuple[float, float], ...] | None:
 
 def own_map(columns: Mapping[str, np.ndarray]) -> LogMap:
     """Return the mapping of a table whose columns are named as in a flight log."""
-    there = {
+    present = {
         group: (Column(names, (1.0,) * len(names)),)
         for group, names in GROUPS.items()
         if all(name in columns for name in names)
     }
     if "throttle" in columns:
-        there["throttle"] = (Column(("throttle",), (1.0,)),)
-    return LogMap(there)
+        present["throttle"] = (Column(("throttle",), (1.0,)),)
+    return LogMap(present)
 
 
 def _check_placeholders(about: Table, name: str) -> None:
+    """Reject a file name with placeholders other than {stem} and {number}."""
     try:
         name.format(stem="", number="")
     except (KeyError, IndexError, ValueError, AttributeError):
-        raise about.error("file", name, "a name with {stem} and {number} alone in braces") from None
+        raise about.error("file", name, "a name with no braces but {stem} and {number}") from None
 
 
 def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:
+    """Return the alternatives of one signal: its list of tables, or its only table."""
     try:
         tables = top.tables(signal)
     except ValueError:
@@ -221,6 +226,7 @@ def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:
 
 
 def _column(signal: str, table: Table) -> Column:
+    """Read one table of a mapping: columns, unit, sign and scale, and the keys of its signal."""
     width = WIDTHS[signal]
     in_cells = width == 1 or table.has("column")
     names = [table.text("column")] if in_cells else _strings(table, width)

@@ -1,4 +1,4 @@
-"""Options of an import."""
+"""Settings of an import of a flight log: files, units and corrections (`suite import`)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ImportOptions:
     """Mapping file (TOML), or a shipped one's name: columns, units and frames of a table or of a
     Crazyflie's log; topics of an MCAP file."""
     vehicle: Vehicle | None = None
-    """Sets the order of the motors, and scales normalised thrust to its full thrust."""
+    """The vehicle file: order of the motors, mass, and thrust at full throttle."""
     full_thrust: float | None = None
     """Thrust per mass at full throttle [m/s^2]; overrides the vehicle's."""
     motor_poles: int = 14
@@ -29,9 +29,9 @@ class ImportOptions:
     rate_hz: float = 250.0
     """At most this many rows a second; faster signals are smoothed over a row's period."""
     start_s: float = 0.0
-    """Leave out rows before this time after the file's first sample, on the ground or not [s]."""
+    """Leave out rows before this time, counted from the file's first sample [s]."""
     end_s: float | None = None
-    """Leave out rows after this time after the file's first sample, on the ground or not [s]."""
+    """Leave out rows after this time, counted from the file's first sample [s]."""
     source: str = ""
     """`mocap` or `estimate` where a file holds both poses; empty: the mapping's order."""
     mass: float | None = None
@@ -41,6 +41,7 @@ class ImportOptions:
     partial: bool = False
     """Accept a log without position, attitude, rates or commands."""
     read: Readings = ()
-    """Readings to apply before any check: see `eval.logs.faults.reading`."""
+    """Conversions of signals before any check, such as a changed sign: see
+    `eval.logs.faults.reading`."""
     fix: bool = True
     """Correct faults with overwhelming evidence; False: only report them."""

@@ -1,9 +1,9 @@
-"""Signals of different rates brought onto the rows of one flight log.
+"""Resample signals of different rates to the rows of one flight log.
 
-Row times are the samples of the slowest of position, attitude and gyro (every n-th where it exceeds
-the wanted rate). So each measurement is in one row only, and rows have independent noise, as a
-diagnosis assumes. Faster signals are smoothed over a row's period, so that vibration does not
-alias. A command is its mean until the next row.
+The rows' times are the samples of the slowest of position, attitude and gyro (every n-th sample
+where it exceeds the wanted rate). So each measurement is in one row only, and the noise of
+different rows is independent, as a diagnosis assumes. Faster signals are smoothed over a row's
+period, so that vibration does not alias. A command is its mean until the next row.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from eval.importers.frames import turn
+from eval.importers.frames import rotate
 from eval.importers.signals import NEEDED, Recording, Signal, median_step
 from eval.logs.columns import FlightLogError
 from eval.logs.files import MOST_ROWS
@@ -28,23 +28,23 @@ HELD = (
     "kept:cmd_force",
 )
 """Signals that hold their value until the next sample."""
-HOLE_S = 0.1
-HOLE_STEPS = 5.0
-"""A gap exceeds both: in seconds, and in median steps."""
+GAP_S = 0.1
+GAP_STEPS = 5.0
+"""A pause between two samples is a gap where it exceeds both: in seconds, and in median steps."""
 HOLD_S = 0.5
 """Longest time for which a command is held, unless ten of its steps are longer [s]."""
-FAR_FASTER = 0.6
-"""Signals whose step is below this share of a row's are smoothed."""
+FASTER = 0.6
+"""A signal is smoothed where its step is below this share of a row's period."""
 LOST = 0.8
-"""A row further than this many steps from any velocity sample gets none."""
+"""A row further than this many steps from any velocity sample gets no velocity."""
 SLOWER = 1.5
-"""Signals whose step exceeds this many rows' are slower than the rows."""
+"""A signal is slower than the rows where its step exceeds this many row periods."""
 
 
 def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Return the rows: `time` (T,) from 0 [s] and every signal as (T, C), NaN where unknown.
 
-    Signals slower than the rows are interpolated here; `own_rows` returns their measured rows.
+    Signals slower than the rows are interpolated; `sampled_rows` returns which rows are samples.
 
     Args:
         recording: holds at least one of pos, quat and rate.
@@ -64,9 +64,9 @@ def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def slowest(recording: Recording) -> str:
-    """Return the slowest available signal of `NEEDED`; its samples define the rows."""
-    there = [name for name in NEEDED if name in recording.signals]
-    return max(there, key=lambda name: median_step(recording.signals[name].time_s))
+    """Return the slowest signal of `NEEDED` in the recording; its samples define the rows."""
+    present = [name for name in NEEDED if name in recording.signals]
+    return max(present, key=lambda name: median_step(recording.signals[name].time_s))
 
 
 def row_times(
@@ -81,15 +81,15 @@ def row_times(
     Args:
         recording: holds at least one of pos, quat and rate.
         rate_hz: at most this many rows a second.
-        start_s: first row, counted from where pos, quat and rate are all there [s].
-        end_s: last row, in the same count, or None.
-        within: first and last time on the recording's clock [s].
+        start_s: least time of the first row after the first common time of pos, quat and rate [s].
+        end_s: largest time of the last row, counted in the same way [s]; None: no limit.
+        within: first and last allowed time on the recording's clock [s].
 
     Raises:
-        FlightLogError: where pos, quat and rate share less than two samples of time.
+        FlightLogError: where fewer than two samples are left.
     """
-    there = [name for name in NEEDED if name in recording.signals]
-    needed = [recording.signals[name] for name in there]
+    present = [name for name in NEEDED if name in recording.signals]
+    needed = [recording.signals[name] for name in present]
     first = max(s.time_s[0] for s in needed)
     last = min(s.time_s[-1] for s in needed)
     stop = last if end_s is None else min(last, first + end_s)
@@ -100,15 +100,15 @@ def row_times(
         parts = int(np.ceil(step * LEAST_HZ - 1e-9))
         if (rows := (len(base) - 1) * parts) > MOST_ROWS:
             reason = (
-                f"{' and '.join(there)} are {step:.3g} s apart, which makes {rows:,} rows; "
+                f"{' and '.join(present)} are {step:.3g} s apart, which makes {rows:,} rows; "
                 f"at most {MOST_ROWS:,}: is its clock damaged, or its unit another one?"
             )
             raise FlightLogError(recording.name, "time", None, reason)
         share = np.arange(parts) / parts
         between = base[:-1, None] + share * np.diff(base)[:, None]
-        # A gap stays empty.
-        near = np.diff(base)[:, None] < HOLE_STEPS * step
-        base = np.append(between[near | (share == 0.0)], base[-1])
+        # No rows are added within a gap.
+        no_gap = np.diff(base)[:, None] < GAP_STEPS * step
+        base = np.append(between[no_gap | (share == 0.0)], base[-1])
         step /= parts
     every = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
     inside = (base >= within[0]) & (base <= within[1])
@@ -116,31 +116,31 @@ def row_times(
     if len(time_s) < 2:
         if inside.any():
             reason = (
-                f"--start and --end leave nothing of {base[inside][0] - first:.1f} to "
-                f"{base[inside][-1] - first:.1f} s; they count from the file's first sample"
+                f"no row between --start and --end; rows are from {base[inside][0] - first:.1f} to "
+                f"{base[inside][-1] - first:.1f} s, counted from the file's first sample"
             )
         else:
             spans = ", ".join(
                 f"{name} from {s.time_s[0]:.3f} to {s.time_s[-1]:.3f} s"
-                for name, s in zip(there, needed, strict=True)
+                for name, s in zip(present, needed, strict=True)
             )
-            reason = f"no time at which {' and '.join(there)} are there ({spans})"
+            reason = f"{' and '.join(present)} have no common time ({spans})"
         raise FlightLogError(recording.name, "time", None, reason)
     return time_s
 
 
-def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Return the measured rows (T,) bool of each signal that is slower than the rows.
+def sampled_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Return which rows (T,) bool hold a sample, for each signal that is slower than the rows.
 
-    A sample is for the row nearest to it, and for that of the slowest signal where one is within
-    half of its own step, so that there are rows in which nothing is missing.
+    A sample belongs to the row nearest to it. Where a sample of the slowest signal is within half
+    a step, it belongs to that sample's row instead, so that some rows are complete.
 
     Args:
         recording: the signals on their own times.
         time_s: (T,) of the rows, on the recording's clock [s].
     """
-    row_step, found = median_step(time_s), {}
-    anchor = nearest(time_s, recording.signals[slowest(recording)].time_s)
+    row_step, is_sample = median_step(time_s), {}
+    slowest_rows = nearest(time_s, recording.signals[slowest(recording)].time_s)
     for name in SPARSE:
         samples = recording.signals.get(name)
         if samples is None:
@@ -149,61 +149,69 @@ def own_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarra
         if step <= SLOWER * row_step:
             far = np.abs(samples.time_s[nearest(samples.time_s, time_s)] - time_s) > LOST * step
             if name == "vel" and far.any():
-                found[name] = ~far
+                is_sample[name] = ~far
             continue
         row = nearest(time_s, samples.time_s)
-        close = anchor[nearest(time_s[anchor], samples.time_s)]
-        near = np.abs(time_s[close] - samples.time_s) <= 0.5 * median_step(samples.time_s)
+        shared_row = slowest_rows[nearest(time_s[slowest_rows], samples.time_s)]
+        near = np.abs(time_s[shared_row] - samples.time_s) <= 0.5 * step
         inside = np.abs(time_s[row] - samples.time_s) <= row_step
-        found[name] = np.zeros(len(time_s), dtype=bool)
-        found[name][np.where(near, close, row)[near | inside]] = True
-    return found
+        is_sample[name] = np.zeros(len(time_s), dtype=bool)
+        is_sample[name][np.where(near, shared_row, row)[near | inside]] = True
+    return is_sample
 
 
 def nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the places in increasing `times` that are nearest to `wanted`, the earlier of two."""
+    """Return the indices into increasing `times` nearest to `wanted`; of two, the earlier one."""
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     return np.where(wanted - times[after - 1] <= times[after] - wanted, after - 1, after)
 
 
 def measured(samples: Signal, time_s: np.ndarray, smooth: bool) -> np.ndarray:
-    """Return a measured signal at `time_s` (T,) as (T, C), NaN in holes and beyond the ends."""
+    """Return a measured signal at `time_s` (T,) as (T, C), NaN in gaps and beyond the ends.
+
+    Args:
+        samples: the signal on its own times.
+        time_s: (T,) on the same clock [s].
+        smooth: interpolate by a cubic spline; otherwise linearly, or averaged over a row's period
+            where the signal is faster than the rows.
+    """
     value = continuous(samples.value) if smooth and samples.value.shape[1] == 4 else samples.value
     step, row_step = median_step(samples.time_s), median_step(time_s)
-    hole = max(HOLE_S, HOLE_STEPS * step)
+    gap_s = max(GAP_S, GAP_STEPS * step)
     out = np.full((len(time_s), value.shape[1]), np.nan)
-    cuts = np.flatnonzero(np.diff(samples.time_s) > hole) + 1
+    cuts = np.flatnonzero(np.diff(samples.time_s) > gap_s) + 1
     edges = [0, *cuts.tolist(), len(samples.time_s)]
     for first, stop in zip(edges[:-1], edges[1:], strict=True):
         t, v = samples.time_s[first:stop], value[first:stop]
-        at = np.flatnonzero((time_s >= t[0]) & (time_s <= t[-1]))
-        if not len(at):
+        rows = np.flatnonzero((time_s >= t[0]) & (time_s <= t[-1]))
+        if not len(rows):
             continue
         if smooth and len(t) >= 4:
-            out[at] = _spline(t, v, time_s[at])
-        elif not smooth and step < FAR_FASTER * row_step and len(t) > 1:
-            out[at] = smoothed(t, v, time_s[at], row_step)
+            out[rows] = _spline(t, v, time_s[rows])
+        elif not smooth and step < FASTER * row_step and len(t) > 1:
+            out[rows] = smoothed(t, v, time_s[rows], row_step)
         else:
-            out[at] = _linear(t, v, time_s[at])
+            out[rows] = _linear(t, v, time_s[rows])
     return out
 
 
 def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
-    """Return a command for rows at `time_s` (T,) as (T, C).
+    """Return a command, which holds its value between samples, for rows at `time_s` (T,) as (T, C).
 
-    Where the command changes inside a row's period, its mean over that period is returned, which
-    is what acts; before the first sample and long after the last, NaN.
+    Where the command changes within a row's period, the row gets its mean over that period. Rows
+    before the first sample and long after the last one are NaN.
     """
     t, v = samples.time_s, samples.value
     index = np.searchsorted(t, time_s, side="right") - 1
     out = v[np.clip(index, 0, None)]
     ends = np.append(time_s[1:], time_s[-1])
     changes = np.searchsorted(t, ends, side="left") - 1 > index
-    full = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(np.diff(t)[:, None] * v[:-1], 0)])
+    area = np.diff(t)[:, None] * v[:-1]
+    integral_at_t = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(area, 0)])
 
-    def integral(at: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, None)
-        return full[k] + (at - t[k])[:, None] * v[k]
+    def integral(until_s: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(t, until_s, side="right") - 1, 0, None)
+        return integral_at_t[k] + (until_s - t[k])[:, None] * v[k]
 
     rows = np.flatnonzero(changes & (index >= 0))
     if len(rows):
@@ -216,68 +224,87 @@ def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
 
 
 def in_world(vel_b: Signal, quat: Signal) -> Signal:
-    """Return a velocity in body axes as one in world axes, where the attitude is known."""
+    """Rotate a velocity from body to world axes; samples without an attitude are left out."""
     attitude = measured(quat, vel_b.time_s, smooth=True)
     known = np.isfinite(attitude).all(axis=1)
     unit = attitude[known] / np.linalg.norm(attitude[known], axis=1, keepdims=True)
-    return Signal(vel_b.time_s[known], turn(unit, vel_b.value[known]))
+    return Signal(vel_b.time_s[known], rotate(unit, vel_b.value[known]))
 
 
 def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return quaternions (T, 4) with signs such that neighbours are near each other."""
+    """Return quaternions (T, 4) with signs chosen so that they change continuously."""
     flips = np.sum(quat_wxyz[1:] * quat_wxyz[:-1], axis=1) < 0
     sign = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
     return quat_wxyz * sign[:, None]
 
 
-def _spline(t: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _spline(t: np.ndarray, v: np.ndarray, query_s: np.ndarray) -> np.ndarray:
     from scipy.interpolate import CubicSpline
 
-    return CubicSpline(t, v)(at)
+    return CubicSpline(t, v)(query_s)
 
 
-def _linear(t: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, t, column) for column in v.T], axis=1)
+def _linear(t: np.ndarray, v: np.ndarray, query_s: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(query_s, t, column) for column in v.T], axis=1)
 
 
-def smoothed(t: np.ndarray, v: np.ndarray, at: np.ndarray, width_s: float) -> np.ndarray:
-    """Return the value (M, C) at each `at` of a parabola through the samples within `width_s`.
+def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) -> np.ndarray:
+    """Return samples smoothed by a local parabola (Savitzky and Golay 1964).
 
-    A mean would flatten what is curved; a parabola keeps it and averages the noise alike
-    (Savitzky and Golay 1964). Where fewer than three samples are near, lines join them.
+    A mean would flatten a curved signal; a parabola follows it and averages the noise as well.
+    Where fewer than three samples are in the window, the samples are interpolated linearly.
+
+    Args:
+        t: (N,) increasing times of the samples [s].
+        v: (N, C) samples.
+        query_s: (M,) times of the results [s].
+        width_s: width of the window around each of these times [s].
+
+    Returns:
+        The values of the parabolas, (M, C).
     """
-    first = np.searchsorted(t, at - 0.5 * width_s)
-    count = np.searchsorted(t, at + 0.5 * width_s, side="right") - first
-    moment, right = np.zeros((len(at), 5)), np.zeros((len(at), 3, v.shape[1]))
+    first = np.searchsorted(t, query_s - 0.5 * width_s)
+    count = np.searchsorted(t, query_s + 0.5 * width_s, side="right") - first
+    # Least squares: sums of u^0 ... u^4, and of u^0 ... u^2 times the samples.
+    moment, right = np.zeros((len(query_s), 5)), np.zeros((len(query_s), 3, v.shape[1]))
     for offset in range(int(count.max(initial=0))):
         k = np.minimum(first + offset, len(t) - 1)
-        u = (t[k] - at) / (0.5 * width_s)
+        u = (t[k] - query_s) / (0.5 * width_s)
         powers = np.where((offset < count)[:, None], u[:, None] ** np.arange(5), 0.0)
         moment += powers
         right += powers[:, :3, None] * v[k][:, None, :]
-    out = _linear(t, v, at)
+    out = _linear(t, v, query_s)
     enough = np.flatnonzero(count >= 3)
     normal = moment[enough][:, np.arange(3)[:, None] + np.arange(3)]
     out[enough] = np.linalg.solve(normal, right[enough])[:, 0]
     return out
 
 
-def averaged(t: np.ndarray, v: np.ndarray, at: np.ndarray, width_s: float) -> np.ndarray:
-    """Return the mean (M, C) of samples `v` (N, C) at `t`, joined by lines, around each `at`.
+def averaged(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) -> np.ndarray:
+    """Return moving averages of linearly interpolated samples.
 
-    Near the ends of the samples the width shrinks so that it stays around `at`.
+    Near the ends of the samples the window shrinks so that it stays centred.
+
+    Args:
+        t: (N,) increasing times of the samples [s].
+        v: (N, C) samples.
+        query_s: (M,) centres of the windows [s].
+        width_s: width of the windows [s].
+
+    Returns:
+        The means over the windows, (M, C).
     """
     area = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-    full = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(area, axis=0)])
-    half = np.minimum(0.5 * width_s, np.minimum(at - t[0], t[-1] - at))
+    integral_at_t = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(area, axis=0)])
+    half = np.minimum(0.5 * width_s, np.minimum(query_s - t[0], t[-1] - query_s))
 
-    def integral(where: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(t, where, side="right") - 1, 0, len(t) - 2)
-        part = (where - t[k])[:, None]
+    def integral(until_s: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(t, until_s, side="right") - 1, 0, len(t) - 2)
+        since = (until_s - t[k])[:, None]
         slope = (v[k + 1] - v[k]) / (t[k + 1] - t[k])[:, None]
-        return full[k] + part * (v[k] + 0.5 * part * slope)
+        return integral_at_t[k] + since * (v[k] + 0.5 * since * slope)
 
-    # A window that has no width at an end of the data: the value itself.
+    # A window of no width, at an end of the samples, takes the value itself.
     width = np.where(half > 0, 2.0 * half, 1.0)[:, None]
-    mean = (integral(at + half) - integral(at - half)) / width
-    return np.where(half[:, None] > 0, mean, _linear(t, v, at))
+    mean = (integral(query_s + half) - integral(query_s - half)) / width
+    return np.where(half[:, None] > 0, mean, _linear(t, v, query_s))

@@ -1,8 +1,8 @@
-"""Signals of an imported file, in the flight log's units and frames, each at its own rate.
+"""Containers for the signals of an imported file, each at its own rate, and their first cleaning.
 
-Signals are named as the groups of columns in `eval/logs/columns.py` (pos, quat, vel, rate,
-cmd_thrust, cmd_rate, motor, motor_cmd, acc, voltage), and besides `throttle`: normalised
-collective thrust from 0 to 1.
+Signals have the flight log's units and frames. They are named as the groups of columns in
+`eval/logs/columns.py` (pos, quat, vel, rate, cmd_thrust, cmd_rate, motor, motor_cmd, acc,
+voltage). One more is `throttle`, the normalised collective thrust from 0 to 1.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from eval.logs.faults.finding import Finding
 from eval.logs.faults.reading import TIMES, Readings, option, read_as
 
 NEEDED = ("pos", "quat", "rate")
-"""What a flight cannot do without."""
+"""Signals that a flight log must have; a partial log lacks some of them."""
 BACKWARDS_MAX = 0.05
 """Largest share of rows with non-increasing time in an accepted signal."""
+MAD_TO_SD = 1.4826
+"""Factor from a median absolute deviation to the standard deviation of normal noise."""
 LEAST_STEP = 1e-15
 """Least step of increasing times, so that a division by it does not overflow."""
 
@@ -30,41 +32,42 @@ class Signal(NamedTuple):
     """Samples of one signal."""
 
     time_s: np.ndarray
-    """(N,) increasing [s]."""
+    """(N,) increasing times [s]."""
     value: np.ndarray
-    """(N, C) in the flight log's unit and frame."""
+    """(N, C) samples in the flight log's unit and frame."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a file holds."""
+    """The signals of a file, before they are resampled to the rows of a flight log."""
 
     name: str
-    """The file, for messages."""
+    """Name of the file, for messages."""
     signals: Mapping[str, Signal]
-    """By name; see the head of this file."""
+    """Signals by name; the module's docstring lists the names."""
     findings: tuple[Finding, ...] = ()
-    """What was noticed while reading."""
+    """Results of the checks while reading."""
     motor_side: tuple[tuple[float, float], ...] | None = None
-    """For the file's motors 1 to 4: where they are, (x forward, y left), in any length unit."""
+    """Positions of the file's motors 1 to 4, (x forward, y left), in any length unit; None: the
+    motors have the vehicle's order."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of the file: firmware, airframe, start."""
 
 
-def signal(
-    time_s: np.ndarray, value: np.ndarray, name: str, what: str
+def make_signal(
+    time_s: np.ndarray, value: np.ndarray, file: str, name: str
 ) -> tuple[Signal | None, Finding | None]:
-    """Return the finite samples of increasing time, and a finding on the others.
+    """Return the finite samples with increasing time (None without any), and a note on the others.
 
     Args:
         time_s: (N,) [s], NaN where unknown.
         value: (N,) or (N, C); rows with a NaN are left out.
-        name: the file, for messages.
-        what: the signal, for messages.
+        file: name of the file, for messages.
+        name: the signal, for messages.
 
     Raises:
-        FlightLogError: where time goes back too often: two flights in one file, or a wrong column;
-            where numbers are so large that they are damage.
+        FlightLogError: where time decreases too often (two flights in one file, or a wrong
+            column), or numbers are too large to be measurements.
     """
     time_s = np.asarray(time_s, dtype=np.float64)
     if not len(time_s):
@@ -74,53 +77,64 @@ def signal(
     time_s, value = time_s[known], value[known]
     if not len(time_s):
         return None, None
-    _refuse_damage(time_s, value, name, what)
-    forward = np.ones(len(time_s), dtype=bool)
-    forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
-    back = int(np.sum(~forward))
-    if back > BACKWARDS_MAX * len(time_s):
-        row = int(np.argmin(forward)) + 1
-        reason = (
-            f"time does not increase in {back} of {len(time_s)} samples of {what!r}; "
-            "cut the file to one flight, and check which column is the time"
-        )
-        raise FlightLogError(name, "time", row, reason)
-    note = f"{back} samples of {what!r} whose time does not increase are left out"
-    finding = Finding("note", "time", note) if back else None
-    return Signal(time_s[forward], value[forward]), finding
-
-
-def _refuse_damage(time_s: np.ndarray, value: np.ndarray, name: str, what: str) -> None:
     largest = max(np.abs(time_s).max(), np.abs(value).max(initial=0.0))
     if largest > LARGEST:
         reason = f"holds numbers up to {largest:.3g}, allowed are {LARGEST:g}; log or copy it again"
-        raise FlightLogError(name, what, None, reason)
+        raise FlightLogError(file, name, None, reason)
+    forward = np.ones(len(time_s), dtype=bool)
+    forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
+    backwards = int(np.sum(~forward))
+    if backwards > BACKWARDS_MAX * len(time_s):
+        row = int(np.argmin(forward)) + 1
+        reason = (
+            f"time does not increase in {backwards} of {len(time_s)} samples of {name!r}; "
+            "cut the file to one flight, and check which column is the time"
+        )
+        raise FlightLogError(file, "time", row, reason)
+    note = f"{backwards} samples of {name!r} whose time does not increase are left out"
+    finding = Finding("note", "time", note) if backwards else None
+    return Signal(time_s[forward], value[forward]), finding
 
 
 def collect(
-    parts: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str
+    parts: Mapping[str, tuple[np.ndarray, np.ndarray]], file: str
 ) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
-    """Return the signals of `parts` (name to time and values) that hold samples, and findings."""
+    """Return the signals that have samples, and findings on samples that were left out.
+
+    Args:
+        parts: signal's name -> times (N,) [s] and values (N,) or (N, C).
+        file: name of the file, for messages.
+
+    Raises:
+        FlightLogError: where a signal of `NEEDED` is unusable; another unusable signal is dropped.
+    """
     signals, findings = {}, []
-    for what, (time_s, value) in parts.items():
+    for name, (time_s, value) in parts.items():
         try:
-            made, finding = signal(time_s, value, name, what)
+            samples, finding = make_signal(time_s, value, file, name)
         except FlightLogError as error:
-            if what in NEEDED:
+            if name in NEEDED:
                 raise
-            # What a flight can do without is left out, and the rest is read.
-            text = f"{what!r} is left out: {error.reason}"
-            about = ("time_stamps", None, 0.95, option((what, "drop")))
-            made, finding = None, Finding("corrected", what, text, *about)
-        if made is not None:
-            signals[what] = made
+            text = f"{name!r} is left out: {error.reason}"
+            about = ("time_stamps", None, 0.95, option((name, "drop")))
+            samples, finding = None, Finding("corrected", name, text, *about)
+        if samples is not None:
+            signals[name] = samples
         if finding is not None:
             findings.append(finding)
     return signals, tuple(findings)
 
 
 def with_readings(recording: Recording, readings: Readings) -> Recording:
-    """Return a recording whose signals are read in another way; see `eval.logs.faults.reading`."""
+    """Return the recording with its signals converted, such as by a changed sign or order.
+
+    Args:
+        recording: the signals of a file.
+        readings: the conversions of each signal: see `eval.logs.faults.reading`.
+
+    Raises:
+        ValueError: for a conversion that needs an attitude, where the recording has none.
+    """
     signals = dict(recording.signals)
     for name, steps in readings:
         if name == "time":
@@ -130,18 +144,19 @@ def with_readings(recording: Recording, readings: Readings) -> Recording:
             signals.pop(name, None)
         elif name in signals:
             samples = signals[name]
-            attitude = partial(_nearest_attitude, signals.get("quat"), samples.time_s)
+            attitude = partial(_next_attitude, signals.get("quat"), samples.time_s)
             signals[name] = samples._replace(value=read_as(name, samples.value, steps, attitude))
     return replace(recording, signals=signals)
 
 
-def _nearest_attitude(quat: Signal | None, at: np.ndarray) -> np.ndarray:
+def _next_attitude(quat: Signal | None, time_s: np.ndarray) -> np.ndarray:
+    """Return the unit quaternions wxyz (T, 4) of the first attitudes from `time_s` (T,) on."""
     if quat is None:
         raise ValueError("--read from-body, from-world and plus-gravity need an attitude")
-    near = np.clip(np.searchsorted(quat.time_s, at), 0, len(quat.time_s) - 1)
-    return quat.value[near] / np.linalg.norm(quat.value[near], axis=1, keepdims=True)
+    index = np.clip(np.searchsorted(quat.time_s, time_s), 0, len(quat.time_s) - 1)
+    return quat.value[index] / np.linalg.norm(quat.value[index], axis=1, keepdims=True)
 
 
 def median_step(time_s: np.ndarray) -> float:
-    """Return the median distance of samples [s]; infinite for fewer than two."""
+    """Return the median time between samples [s]; infinite for fewer than two."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf

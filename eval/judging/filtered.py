@@ -14,8 +14,8 @@ import numpy as np
 
 from eval.effects.interface import as_arrays
 from eval.sensors import SENSORS
-from eval.sensors.draws import blank_of_each, draw
-from eval.sensors.filter.delayed import Delayed, present, step, wait
+from eval.sensors.draws import blank_model_draws, draw
+from eval.sensors.filter.delayed import Delayed, current_state, start_delayed, step
 from eval.sensors.filter.kalman import (
     GRAVITY,
     SIZE,
@@ -26,7 +26,7 @@ from eval.sensors.filter.kalman import (
     start,
     update_gate,
 )
-from eval.sensors.interface import Inertial, Moment, sticky, turned_by
+from eval.sensors.interface import Inertial, Moment, markov_step, rotation_since
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
@@ -82,7 +82,7 @@ class Filtered:
             if SENSORS[name].measure
         }
         used = (SENSORS[name] for name in self._imu)
-        self._trial, self._sample = blank_of_each(used, slots, camera)
+        self._trial, self._sample = blank_model_draws(used, slots, camera)
         self._delay_steps = round(settings.delay_s / dt)
         self._period = 1.0 / (settings.frame_hz * dt)
         self._half_view = np.tan(np.deg2rad(np.asarray(camera.fov_deg)) / 2.0)
@@ -138,7 +138,7 @@ class Filtered:
             self._begin(truth, new)
             self._detect(new)
         assert self.filters is not None
-        state = present(self.filters)
+        state = current_state(self.filters)
         estimate = View(state.pos_w, state.rot_w, state.vel_w, *view[3:])
         return select(flying, estimate, view)
 
@@ -155,7 +155,7 @@ class Filtered:
             np.matmul(pose.rot_w, exp_rot(-error[:, 6:9])),
             sigma,
         )
-        started = wait(initial, self._delay_steps)
+        started = start_delayed(initial, self._delay_steps)
         filters = started if self.filters is None else select(new, started, self.filters)
         self.filters = make_contiguous(filters)
         memory = {
@@ -209,7 +209,7 @@ class Filtered:
             rng, count = self._frame_rngs[slot], int(self._exists[slot].sum())
             chance[k], noise[k, :count] = rng.random(), rng.standard_normal((count, 2))
         share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_s)
-        lost = sticky(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
+        lost = markov_step(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
         self._lost[rows] = lost
         # Frames are stored in turn in the entries of `_pending`.
         entry = self._frame[rows] % len(self._pending)
@@ -264,7 +264,7 @@ def corners_of(gates: Gates) -> np.ndarray:
 def inertial(before: View, after: View, dt: float) -> Inertial:
     """Return the measurements of an ideal IMU, means over a step, in body axes at its middle."""
     # The axis of the rotation times the sine of its angle, and from it the rotation vector.
-    sine_b = turned_by(after.rot_w, before.rot_w)
+    sine_b = rotation_since(after.rot_w, before.rot_w)
     sine = np.sqrt((sine_b**2).sum(-1))[..., None]
     turn_b = sine_b * np.where(sine > 1e-9, np.arcsin(np.minimum(sine, 1.0)) / (sine + 1e-300), 1.0)
     acc_w = (after.vel_w - before.vel_w) / dt + [0.0, 0.0, GRAVITY]

@@ -23,11 +23,11 @@ from eval.judging.outputs import Outputs
 from eval.judging.recorder import Recorder
 from eval.judging.sensors import Sensors
 from eval.logs.flight import Flight
-from eval.sensors import sensing
+from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds import REFERENCE, World, compiles, flown_by, world_class
-from eval.worlds.slots import fitting, layout_of
+from eval.worlds import REFERENCE, World, action_argument, compiles, world_class
+from eval.worlds.slots import layout_of, slot_groups
 from eval.worlds.trial import (
     DIVERGED,
     ENDINGS,
@@ -148,7 +148,7 @@ def fly(
     workers = _workers(task, len(trials))
     most = len(trials) if compiles(world) else MOST_A_PIECE
     count = worker_count(workers)
-    groups = ([(index, trials[index]) for index in group] for group in fitting(trials, tracks))
+    groups = ([(index, trials[index]) for index in group] for group in slot_groups(trials, tracks))
     shares = [share for group in groups for share in pieces_of(group, count, most)]
     run_pieces(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
@@ -212,7 +212,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
     slots = min(options.slots, block * max(1, math.ceil(len(share) / block)))
     world = world_class(task.world)(
         task.vehicle, policy.spec.camera, layout_of(task.tracks.values()), options.rules,
-        slots=slots, threads=options.threads, **flown_by(task.world, policy.spec.action),
+        slots=slots, threads=options.threads, **action_argument(task.world, policy.spec.action),
     )  # fmt: skip
     yield from _Slots(task, policy, world).run(share)
 
@@ -261,9 +261,9 @@ class _Slots:
             layout = layout_of(task.tracks.values())
             corners = layout.gates * layout.corners
             self._filtered = Filtered(sensors, n, world.dt, policy.spec.camera, corners)
-        if sensing(sensors.models):
+        if view_models(sensors.models):
             self._sensors = Sensors(sensors, n, rate, policy.spec.camera)
-        if sensors.is_late:
+        if sensors.has_delay:
             self._delays = Delays(sensors.ages, n, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from eval import sensors
 from eval.sensors import SENSORS
-from eval.sensors.draws import blank_of_each, draw
+from eval.sensors.draws import blank_model_draws, draw
 from eval.sensors.sensors_file import SensorSet
 from eval.worlds.slots import SENSED, generator_of
 from eval.worlds.trial import TrialSpec
@@ -35,9 +35,10 @@ class Sensors:
             rate_hz: rate of the observations [Hz].
             camera: the policy's camera.
         """
-        self._models, self._dt_s, self._camera = sensors.sensing(wanted.models), 1 / rate_hz, camera
+        self._models = sensors.view_models(wanted.models)
+        self._dt_s, self._camera = 1 / rate_hz, camera
         used = (SENSORS[name] for name in self._models)
-        self._trial, self._draws = blank_of_each(used, slots, camera)
+        self._trial, self._draws = blank_model_draws(used, slots, camera)
         unused = np.random.default_rng(0)
         self._generators = {name: [unused] * slots for name in self._models}
         self._memory: dict[str, Any] | None = None

@@ -1,7 +1,11 @@
 """The catalogue of sensor models: errors of state estimates, gate positions, depth images and IMU.
 
+A model turns a drone's true view (pose, next gates, depth image) into the view that its policy
+gets. The trainer and the judge, which flies policies in simulation and scores them, apply models
+with the functions here.
+
 To add a model, write its `Sensor` and list it here. Another package adds one with an entry point of
-the group `diffracing_suite.sensors`; a program adds one for its own process with
+the group `diffracing_suite.sensors`. A program adds one for its own process with
 `SENSORS.register(sensor.name, sensor)`.
 """
 
@@ -27,7 +31,8 @@ from tracks.common.names import Registry
 from tracks.geometry.camera import Camera
 
 
-def _wrong(name: str, sensor: Any) -> str | None:
+def _registration_error(name: str, sensor: Any) -> str | None:
+    """Return why `sensor` cannot be registered as `name`, or None."""
     if not isinstance(sensor, Sensor):
         return f"a {type(sensor).__name__}; must be an eval.sensors.interface.Sensor"
     if sensor.name != name:
@@ -41,7 +46,7 @@ def _wrong(name: str, sensor: Any) -> str | None:
     return None
 
 
-_OWN = (
+_BUILT_IN = (
     state_errors.DELAY,
     gate_map.SENSOR,
     state_errors.STATE_DRIFT,
@@ -59,17 +64,20 @@ _OWN = (
     imu.SENSOR,
     gate_filter.SENSOR,
 )
-"""In the order of application; each model gets the output of those before it."""
+"""The models in their order of application: each gets the output of those before it."""
 SENSORS: Registry[Sensor] = Registry(
-    "sensor model", "diffracing_suite.sensors", {sensor.name: sensor for sensor in _OWN}, _wrong
+    "sensor model",
+    "diffracing_suite.sensors",
+    {sensor.name: sensor for sensor in _BUILT_IN},
+    _registration_error,
 )
 
 Models = Mapping[str, Any]
-"""Values (the model's NamedTuple) by the model's name."""
+"""Name of a model -> its values (the model's NamedTuple)."""
 
 
-def sensing(models: Models) -> dict[str, Any]:
-    """Return those of `models` that change a view, as arrays, in the order of application."""
+def view_models(models: Models) -> dict[str, Any]:
+    """Return the models that change a view, with arrays as values, in the order of application."""
     return {
         name: as_arrays(models[name])
         for name, sensor in SENSORS.items()
@@ -77,43 +85,44 @@ def sensing(models: Models) -> dict[str, Any]:
     }
 
 
-def scaled(name: str, values: Any, magnitude: Any) -> Any:
+def scale_model(name: str, values: Any, magnitude: Any) -> Any:
     """Return a model's values with their errors scaled by `magnitude`, within the bounds.
 
     Args:
-        name: of the model.
-        values: its NamedTuple of numbers.
-        magnitude: 0: no errors; 1: `values`; a number, or an array (N,) for N rows.
+        name: name of the model.
+        values: the model's NamedTuple of numbers.
+        magnitude: factor of the errors, a number or an array (N,) for N drones. 0: no errors;
+            1: the given values.
     """
-    sensor, grown = SENSORS.find(name), {}
+    sensor, changed = SENSORS.find(name), {}
     for parameter in sensor.parameters:
         if parameter.name in sensor.grows:
             neutral, value = float(parameter.neutral), getattr(values, parameter.name)  # pyright: ignore[reportArgumentType]
-            changed = neutral + magnitude * (value - neutral)
-            if hasattr(changed, "__array_namespace__"):
-                changed = changed.clip(parameter.low, parameter.high)
+            scaled = neutral + magnitude * (value - neutral)
+            if hasattr(scaled, "__array_namespace__"):
+                scaled = scaled.clip(parameter.low, parameter.high)
             else:
-                changed = min(max(changed, parameter.low), parameter.high)
-            grown[parameter.name] = changed
-    return values._replace(**grown)
+                scaled = min(max(scaled, parameter.low), parameter.high)
+            changed[parameter.name] = scaled
+    return values._replace(**changed)
 
 
-def magnified(models: Models, magnitude: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `models`, each scaled by its own magnitude with `scaled`."""
-    return {name: scaled(name, values, magnitude[name]) for name, values in models.items()}
+def scale_models(models: Models, magnitude: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `models`, each scaled by its own magnitude; see `scale_model`."""
+    return {name: scale_model(name, values, magnitude[name]) for name, values in models.items()}
 
 
 def start(
     models: Models, truth: View, draws: Mapping[str, Draws], dt_s: Any, camera: Camera
 ) -> dict[str, Any]:
-    """Return the state of each of `models` (of `sensing`) at the first observation.
+    """Return the state of each model at the first observation, by name.
 
     Args:
-        models: values by name.
-        truth: (N, ...) the true view.
-        draws: of the trials, by model.
+        models: models that change a view; see `view_models`.
+        truth: the true views of N drones.
+        draws: the random numbers of the trials, by model.
         dt_s: time between observations [s].
-        camera: the policy's.
+        camera: the policy's camera.
     """
     return {
         name: begin(values, Moment(truth, draws[name], dt_s, camera))
@@ -131,12 +140,24 @@ def sense(
     dt_s: Any,
     camera: Camera,
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view after all of `models`, and their states; arguments as in `start`."""
-    seen, kept = truth, dict[str, Any]()
+    """Apply all models to the true view.
+
+    Args:
+        models: models that change a view; see `view_models`.
+        memory: state of each model, from `start` or the observation before.
+        truth: the true views of N drones.
+        draws: the random numbers of this observation, by model.
+        dt_s: time between observations [s].
+        camera: the policy's camera.
+
+    Returns:
+        The view with all errors, and the states of the models.
+    """
+    view, states = truth, dict[str, Any]()
     for name, values in models.items():
         apply = SENSORS[name].sense
         assert apply is not None
-        seen, kept[name] = apply(
-            values, memory[name], seen, Moment(truth, draws[name], dt_s, camera)
+        view, states[name] = apply(
+            values, memory[name], view, Moment(truth, draws[name], dt_s, camera)
         )
-    return seen, kept
+    return view, states

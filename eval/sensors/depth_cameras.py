@@ -1,8 +1,8 @@
-"""Depth cameras: stereo (disparity errors, holes) and time of flight (noise, mixed pixels).
+"""Sensor models `stereo` and `tof`: the errors of stereo and time-of-flight depth cameras.
 
-Stereo disparity refers to a camera of focal length `focal` [pixel], from whose image the policy's
-24 x 32 pixels are made. A hole, or a pixel without a return within the camera's range, has the
-value of the range, as in deployed drivers.
+Stereo disparity refers to a camera of focal length `focal` [pixel], whose image is reduced to the
+policy's 24 x 32 pixels. A hole, which is a pixel without a depth, gets the value of the camera's
+range, and so does a pixel with nothing within the range. Drivers of real cameras do the same.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ EDGE = 1.25
 
 
 class Stereo(NamedTuple):
-    """Values of `stereo`."""
+    """Parameters of `stereo`; units in `STEREO`."""
 
     noise: Array
     """n: standard deviation of the disparity (shift between the two images)."""
@@ -49,7 +49,7 @@ def stereo_start(values: Stereo, moment: Moment) -> Array:
 
 
 def stereo_sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with a stereo camera's image."""
+    """Return the view with the depth image of a stereo camera."""
     depth_m, grain, chance = seen.depth_m, moment.draws.grain, moment.draws.chance
     xp, range_m = depth_m.__array_namespace__(), moment.camera.range_m
     left, right = neighbour(depth_m, -1), neighbour(depth_m, 1)
@@ -58,15 +58,15 @@ def stereo_sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> t
     thin = EDGE * depth_m < xp.minimum(left, right)
     smeared = edge & (chance[..., 0, :, :] < over_image(values.smear))
     hole = edge & (chance[..., 1, :, :] < over_image(values.edge_holes)) & ~smeared
-    gone = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
-    true_m = xp.where(smeared, nearer, xp.where(gone, further, depth_m))
-    found_m = in_disparity(values, memory, true_m, grain[..., 0, :, :], moment.camera)
-    found_m = xp.where(hole | (true_m < over_image(values.near)), range_m, found_m)
-    return seen._replace(depth_m=found_m), memory
+    missed = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
+    matched_m = xp.where(smeared, nearer, xp.where(missed, further, depth_m))
+    measured_m = in_disparity(values, memory, matched_m, grain[..., 0, :, :], moment.camera)
+    measured_m = xp.where(hole | (matched_m < over_image(values.near)), range_m, measured_m)
+    return seen._replace(depth_m=measured_m), memory
 
 
 def neighbour(depth_m: Array, side: int) -> Array:
-    """Return each pixel's left (-1) or right (1) neighbour; at the border the pixel itself."""
+    """Return the depth of each pixel's left (-1) or right (1) neighbour; at the border its own."""
     xp = depth_m.__array_namespace__()
     if side < 0:
         return xp.concatenate([depth_m[..., :1], depth_m[..., :-1]], axis=-1)
@@ -76,25 +76,33 @@ def neighbour(depth_m: Array, side: int) -> Array:
 def in_disparity(
     values: Stereo, offset: Array, depth_m: Array, grain: Array, camera: Camera
 ) -> Array:
-    """Return depths [m] whose disparity has noise, an offset and steps."""
+    """Return depths (..., H, W) [m] measured by a disparity with noise, an offset and steps.
+
+    Args:
+        values: parameters of the model.
+        offset: (...,) the trial's offset of the disparity [pixel].
+        depth_m: (..., H, W) true depths [m].
+        grain: (..., H, W) standard normal draws.
+        camera: the policy's camera.
+    """
     xp = depth_m.__array_namespace__()
-    strength = over_image(values.focal * values.baseline)
-    disparity = strength / xp.maximum(depth_m, NEAREST_M)
+    focal_baseline = over_image(values.focal * values.baseline)
+    disparity = focal_baseline / xp.maximum(depth_m, NEAREST_M)
     disparity = disparity + over_image(values.noise) * grain + over_image(offset)
     step = over_image(values.step)
     stepped = step * xp.rint(disparity / xp.where(step > 0.0, step, 1.0))
     disparity = xp.where(step > 0.0, stepped, disparity)
-    least = xp.maximum(over_image(values.least), strength / camera.range_m)
-    found_m = strength / xp.maximum(disparity, least)
-    return xp.where(disparity < least, camera.range_m, found_m)
+    least = xp.maximum(over_image(values.least), focal_baseline / camera.range_m)
+    measured_m = focal_baseline / xp.maximum(disparity, least)
+    return xp.where(disparity < least, camera.range_m, measured_m)
 
 
 STEREO = Sensor(
     name="stereo",
     stage="depth",
     summary="Depth by stereo: noise and steps of disparity, holes, smearing, limits of the range",
-    equation="d = f b / z + n + o, in steps; z = f b / d; the range where d < least, z < near or a "
-    "hole is",
+    equation="d = f b / z + n + o, in steps; z = f b / d; the range where d < least or z < near, "
+    "and in holes",
     source="Grunnet-Jepsen et al., tuning guide of RealSense D400: 0.08 pixel RMS, steps of 1/32, "
     "D435 at 848 x 480: f = 424, b = 0.05 m, nearest 0.17 m; shares at edges are our estimate",
     values=Stereo,
@@ -123,7 +131,7 @@ LIGHT = 299_792_458.0
 
 
 class TimeOfFlight(NamedTuple):
-    """Values of `tof`."""
+    """Parameters of `tof`."""
 
     noise: Array
     """s: standard deviation, as a share of the depth."""
@@ -139,36 +147,37 @@ class TimeOfFlight(NamedTuple):
 
 
 def tof_start(values: TimeOfFlight, moment: Moment) -> Array:
-    """Return the trial's bias by multipath as a share of the range (...,), never negative."""
+    """Return the trial's bias by multipath as a share of the depth (...,), never negative."""
     return values.bias * abs(moment.draws.normal[..., 0])
 
 
 def tof_sense(
     values: TimeOfFlight, memory: Array, seen: View, moment: Moment
 ) -> tuple[View, Array]:
-    """Return the view with a time-of-flight camera's image."""
+    """Return the view with the depth image of a time-of-flight camera."""
     depth_m, draws, range_m = seen.depth_m, moment.draws, moment.camera.range_m
     xp, chance = depth_m.__array_namespace__(), draws.chance
     neighbours = [neighbour(depth_m, side) for side in (-1, 1)]
     nearer = xp.minimum(*neighbours)
     mixed = (EDGE * nearer < depth_m) & (chance[..., 0, :, :] < over_image(values.mixing))
     share = chance[..., 1, :, :]
-    found_m = xp.where(mixed, share * nearer + (1.0 - share) * depth_m, depth_m)
+    measured_m = xp.where(mixed, share * nearer + (1.0 - share) * depth_m, depth_m)
     noise = over_image(values.noise) * draws.grain[..., 0, :, :]
-    found_m = found_m * (1.0 + over_image(memory) + noise)
-    # Ranges are ambiguous by half a wavelength of the modulation.
-    half_m = over_image(LIGHT / (2.0 * xp.maximum(values.modulation, 1.0)))
-    wrong = chance[..., 2, :, :] < over_image(values.wrapped)
-    found_m = xp.where(wrong, found_m - half_m * xp.floor(found_m / half_m), found_m)
-    found_m = xp.where((depth_m >= range_m) & ~mixed, range_m, found_m)
-    return seen._replace(depth_m=found_m.clip(NEAREST_M, range_m)), memory
+    measured_m = measured_m * (1.0 + over_image(memory) + noise)
+    # Depths are ambiguous by half a wavelength of the modulation.
+    half_wave_m = over_image(LIGHT / (2.0 * xp.maximum(values.modulation, 1.0)))
+    wrapped = chance[..., 2, :, :] < over_image(values.wrapped)
+    wrapped_m = measured_m - half_wave_m * xp.floor(measured_m / half_wave_m)
+    measured_m = xp.where(wrapped, wrapped_m, measured_m)
+    measured_m = xp.where((depth_m >= range_m) & ~mixed, range_m, measured_m)
+    return seen._replace(depth_m=measured_m.clip(NEAREST_M, range_m)), memory
 
 
 TOF = Sensor(
     name="tof",
     stage="depth",
     summary="Depth by time of flight: noise, multipath, mixed pixels at edges, wrapped ranges",
-    equation="z (1 + b + s n); at edges u z_near + (1 - u) z, u even; some z mod c / (2 f)",
+    equation="z (1 + b + s n); at edges u z_near + (1 - u) z, u uniform; some z mod c / (2 f)",
     source="Hansard et al. 2012 (time-of-flight cameras); data sheets of the Flexx2 and Azure "
     "Kinect: 0.2 to 1 % noise, 1 % systematic; shares are our estimate",
     values=TimeOfFlight,

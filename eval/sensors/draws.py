@@ -1,4 +1,8 @@
-"""Random numbers for sensor models: with NumPy from a trial's generator, with JAX from a key."""
+"""Random numbers for sensor models, from a NumPy generator or a JAX key.
+
+The judge, which flies and scores policies, draws with NumPy from each trial's seed, into arrays
+that it allocates once. The trainer draws with JAX.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
-    """Return empty arrays for the draws `needs` of `rows` rows."""
+    """Return arrays of zeros for the draws `needs` of `rows` drones."""
     shape = camera.height, camera.width
     return Draws(
         np.zeros((rows, needs.normal)),
@@ -25,25 +29,31 @@ def blank_draws(needs: Needs, rows: int, camera: Camera) -> Draws:
     )
 
 
-def blank_of_each(
+def blank_model_draws(
     models: Iterable[Sensor], rows: int, camera: Camera
 ) -> tuple[dict[str, Draws], dict[str, Draws]]:
-    """Return empty arrays for the draws of a trial and of an observation, by model."""
-    each = list(models)
-    trial = {one.name: blank_draws(one.trial, rows, camera) for one in each}
-    return trial, {one.name: blank_draws(one.observation, rows, camera) for one in each}
+    """Return arrays of zeros for the draws of a trial and of an observation, by model."""
+    models = list(models)
+    trial = {model.name: blank_draws(model.trial, rows, camera) for model in models}
+    observation = {model.name: blank_draws(model.observation, rows, camera) for model in models}
+    return trial, observation
 
 
 def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
-    """Draw one row's numbers of one observation."""
-    for numbers, normal in zip(into, (True, False, True, False), strict=True):
+    """Draw the random numbers of drone `row`, in place."""
+    fills = {
+        "normal": generator.standard_normal,
+        "uniform": generator.random,
+        "grain": generator.standard_normal,
+        "chance": generator.random,
+    }
+    for field, numbers in into._asdict().items():
         if numbers[row].size:
-            fill = generator.standard_normal if normal else generator.random
-            fill(out=numbers[row])
+            fills[field](out=numbers[row])
 
 
 def keyed_draws(needs: Needs, key: jax.Array, camera: Camera) -> Draws:
-    """Return one row's numbers of one observation from a JAX `key`."""
+    """Return the random numbers of one drone from a JAX `key`."""
     import jax
 
     shape = camera.height, camera.width

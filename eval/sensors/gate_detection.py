@@ -1,9 +1,11 @@
-"""The next two gates as a detector sees them: pose by PnP from four corners, with gaps.
+"""Sensor model `gate_detection`: a detector measures the poses of the next two gates.
 
-First-order covariance of the pose of a square of half side a, met face on at range r, from corners
-with noise of s pixels at a focal length of f pixels: across s r / (sqrt(2) f), along the view
-s r^2 / (sqrt(8) f a), tilt s r^2 / (2 f a^2). Out of view, or in a gap, the last estimate stands
-where it stood in the estimator's own world; of a gate not seen yet, that is the map's place.
+The pose is from four corners by PnP (perspective-n-point). Its standard deviations are the first
+order ones of a square of half side a, seen frontally at range r, from corners with noise of s
+pixels at a focal length of f pixels: across the view s r / (sqrt(2) f), along it
+s r^2 / (sqrt(8) f a), tilt s r^2 / (2 f a^2). While a gate is out of view or not detected, the last
+estimate in the estimator's world frame is used. Before the first detection, it is the position in
+the map.
 """
 
 from __future__ import annotations
@@ -13,18 +15,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, sticky
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Needs,
+    Parameter,
+    Sensor,
+    View,
+    column,
+    markov_step,
+)
 from tracks.geometry.camera import Camera, optical_axis_b
 from tracks.geometry.rotation import exp_rot, to_local, to_world
 
 NEAREST_M = 0.3
-"""Nearer than this along the camera's axis, a gate's corners are out of its image [m]."""
+"""Nearer than this along the camera's axis, a gate's corners are out of the image [m]."""
 ACROSS = 640
-"""Pixels across the image that corners are found in."""
+"""Width of the image in which corners are detected [pixel]."""
 
 
 class GateDetection(NamedTuple):
-    """Values of `gate_detection`."""
+    """Parameters of `gate_detection`."""
 
     pixels: Array
     """s: standard deviation of a corner in an image of 640 pixels across."""
@@ -41,7 +52,7 @@ class GateDetection(NamedTuple):
 
 
 def start(values: GateDetection, moment: Moment) -> dict[str, Any]:
-    """Return that no gate is held yet."""
+    """Return the state at the start, in which no gate has been detected."""
     xp, truth = moment.truth.pos_w.__array_namespace__(), moment.truth
     gates_w = xp.stack([truth.gate_w, truth.second_w], axis=-2)
     missed = moment.draws.uniform < 0.0
@@ -51,35 +62,36 @@ def start(values: GateDetection, moment: Moment) -> dict[str, Any]:
 def sense(
     values: GateDetection, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the gates where the detector has them, relative to the drone."""
+    """Return the view with the gates at their estimated poses, relative to the drone."""
     xp, truth, draws = seen.pos_w.__array_namespace__(), moment.truth, moment.draws
     map_w = xp.stack([seen.gate_w, seen.second_w], axis=-2)
     axes_w = xp.stack([seen.axis_w, seen.second_axis_w], axis=-2)
     true_w = xp.stack([truth.gate_w, truth.second_w], axis=-2)
-    # After a gate the second one becomes the next, with its stored estimate.
+    # When a gate is passed, the second one becomes the next, with its stored estimate.
     passed = column(truth.gate_number > memory["number"])
-    moved_w = xp.concatenate([memory["gates_w"][..., 1:, :], map_w[..., 1:, :]], axis=-2)
-    moved = xp.concatenate([memory["held"][..., 1:], memory["held"][..., 1:] & False], axis=-1)
-    kept_w = xp.where(column(passed), moved_w, memory["gates_w"])
-    held = xp.where(passed, moved, memory["held"])
-    kept_w = xp.where(column(held), kept_w, map_w)
+    next_w = xp.concatenate([memory["gates_w"][..., 1:, :], map_w[..., 1:, :]], axis=-2)
+    next_held = xp.concatenate([memory["held"][..., 1:], memory["held"][..., 1:] & False], axis=-1)
+    stored_w = xp.where(column(passed), next_w, memory["gates_w"])
+    held = xp.where(passed, next_held, memory["held"])  # whether a gate has an estimate
+    stored_w = xp.where(column(held), stored_w, map_w)
 
-    there_b = to_local(truth.rot_w[..., None, :, :], true_w - truth.pos_w[..., None, :])
-    share, gap = column(values.missed), column(values.length)
-    missed = sticky(memory["missed"], draws.uniform, share, gap, moment.dt_s)
-    found = in_view(there_b, moment.camera) & ~missed
-    range_m = xp.sqrt((there_b**2).sum(-1) + 1e-6)
+    gates_b = to_local(truth.rot_w[..., None, :, :], true_w - truth.pos_w[..., None, :])
+    share, gap_s = column(values.missed), column(values.length)
+    missed = markov_step(memory["missed"], draws.uniform, share, gap_s, moment.dt_s)
+    detected = in_view(gates_b, moment.camera) & ~missed
+    range_m = xp.sqrt((gates_b**2).sum(-1) + 1e-6)
     across, along, tilt = spreads(values, range_m, moment.camera)
     normal = draws.normal.reshape(*draws.normal.shape[:-1], 2, 6)
-    ray_b = there_b / column(range_m)
-    depth = column((ray_b * normal[..., :3]).sum(-1)) * ray_b
-    error_b = column(across) * (normal[..., :3] - depth) + column(along) * depth
-    measured_w = seen.pos_w[..., None, :] + to_world(seen.rot_w[..., None, :, :], there_b + error_b)
-    fresh = -xp.expm1(-moment.dt_s / xp.maximum(values.smoothing, 1e-9))
-    fresh = xp.where(held, column(fresh), 1.0)
-    gates_w = xp.where(column(found), kept_w + column(fresh) * (measured_w - kept_w), kept_w)
+    ray_b = gates_b / column(range_m)
+    along_ray = column((ray_b * normal[..., :3]).sum(-1)) * ray_b
+    error_b = column(across) * (normal[..., :3] - along_ray) + column(along) * along_ray
+    measured_w = seen.pos_w[..., None, :] + to_world(seen.rot_w[..., None, :, :], gates_b + error_b)
+    weight = -xp.expm1(-moment.dt_s / xp.maximum(values.smoothing, 1e-9))
+    weight = xp.where(held, column(weight), 1.0)
+    filtered_w = stored_w + column(weight) * (measured_w - stored_w)
+    gates_w = xp.where(column(detected), filtered_w, stored_w)
     tilted_w = to_world(exp_rot(column(tilt) * normal[..., 3:]), axes_w)
-    axes_w = xp.where(column(found), tilted_w, axes_w)
+    axes_w = xp.where(column(detected), tilted_w, axes_w)
     seen = seen._replace(
         gate_w=gates_w[..., 0, :],
         second_w=gates_w[..., 1, :],
@@ -87,47 +99,46 @@ def sense(
         second_axis_w=axes_w[..., 1, :],
     )
     number = truth.gate_number
-    return seen, {"gates_w": gates_w, "held": held | found, "missed": missed, "number": number}
+    return seen, {"gates_w": gates_w, "held": held | detected, "missed": missed, "number": number}
 
 
 def spreads(values: GateDetection, range_m: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """Return standard deviations across the view [m], along it [m] and of the tilt [rad].
+    """Return standard deviations across the view [m], along it [m] and of the tilt [rad], (..., 2).
 
-    What is known of gates' tilt before, as that they stand upright where the map has them, bounds
-    the tilt's.
+    The tilt combines the measured one with `known_tilt`, as gates stand upright in the map.
 
     Args:
-        values: the model's.
-        range_m: (..., 2) of the two gates.
-        camera: whose horizontal field of view `ACROSS` pixels cover.
+        values: parameters of the model.
+        range_m: (..., 2) distances of the two gates [m].
+        camera: the policy's camera, whose horizontal field of view `ACROSS` pixels cover.
     """
     xp = range_m.__array_namespace__()
-    focal = ACROSS / 2 / math.tan(math.radians(camera.fov_deg[0]) / 2)
-    angle, half, known = column(values.pixels) / focal, column(values.half_side), values.known_tilt
-    half, known = xp.maximum(half, 1e-3), column(known)
-    tilt = angle * range_m**2 / (2.0 * half**2)
+    focal_px = ACROSS / 2 / math.tan(math.radians(camera.fov_deg[0]) / 2)
+    angle, known = column(values.pixels) / focal_px, column(values.known_tilt)
+    half_side = xp.maximum(column(values.half_side), 1e-3)
+    tilt = angle * range_m**2 / (2.0 * half_side**2)
     tilt = tilt * known / xp.sqrt(tilt**2 + known**2 + 1e-12)
-    return angle * range_m / math.sqrt(2), angle * range_m**2 / (math.sqrt(8) * half), tilt
+    return angle * range_m / math.sqrt(2), angle * range_m**2 / (math.sqrt(8) * half_side), tilt
 
 
-def in_view(there_b: Array, camera: Camera) -> Array:
-    """Return whether points (..., 3) in body axes are in the camera's image."""
+def in_view(point_b: Array, camera: Camera) -> Array:
+    """Return whether points (..., 3) in body axes [m] are in the camera's image, bool (...,)."""
     forward = optical_axis_b(camera)
     up = np.array([-forward[2], 0.0, forward[0]])
-    ahead = there_b[..., 0] * forward[0] + there_b[..., 2] * forward[2]
-    above = there_b[..., 0] * up[0] + there_b[..., 2] * up[2]
+    ahead = point_b[..., 0] * forward[0] + point_b[..., 2] * forward[2]
+    above = point_b[..., 0] * up[0] + point_b[..., 2] * up[2]
     wide, high = (math.tan(math.radians(angle) / 2) for angle in camera.fov_deg)
-    inside = (abs(there_b[..., 1]) < wide * ahead) & (abs(above) < high * ahead)
+    inside = (abs(point_b[..., 1]) < wide * ahead) & (abs(above) < high * ahead)
     return inside & (ahead > NEAREST_M)
 
 
 SENSOR = Sensor(
     name="gate_detection",
     stage="gates",
-    summary="The next gates are detected: noise of corners as PnP gives it, gaps, out of view",
+    summary="A detector measures the next gates: errors of PnP from corners, gaps, limited view",
     equation="p = p_true + e, e normal: s r / (sqrt(2) f) across, s r^2 / (sqrt(8) f a) along the "
     "view; gaps: Markov chain, `missed` of the observations, `length` at a time",
-    source="first-order covariance of PnP, gate face on; Foehn et al. 2022 (AlphaPilot), Kaufmann "
+    source="first-order covariance of PnP, frontal gate; Foehn et al. 2022 (AlphaPilot), Kaufmann "
     "et al. 2023 (Swift): corners within 1 to 3 pixels; gaps are our estimate",
     values=GateDetection,
     parameters=(

@@ -1,8 +1,8 @@
-"""A state estimator in the loop: a Kalman filter on the IMU and the corners of known gates.
+"""Sensor model `gate_filter`: a Kalman filter estimates the state from IMU and gate corners.
 
-The policy gets the state that the filter (`eval/sensors/filter/`) estimates, never the true state.
-The filter's map of the gates is exact. A corner is detected if it is in the field of view and in
-range; obstacles do not hide it.
+The policy gets the state that the filter (`eval/sensors/filter/`) estimates, not the true state.
+The filter's map of the gates is exact. A gate's corner is detected if it is in the field of view
+and in range; obstacles do not hide it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from eval.sensors.interface import Array, Parameter, Sensor
 
 
 class GateFilter(NamedTuple):
-    """Values of `gate_filter`."""
+    """Parameters of `gate_filter`; units in `SENSOR` where a line has none."""
 
     pixel: Array
     """Noise of a corner in the image, standard deviation [pixels]."""

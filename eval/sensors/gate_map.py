@@ -1,13 +1,14 @@
-"""Errors of the map of the gates: shift, rotation and scale of all, and displacement of each.
+"""Sensor model `gate_map`: the drone's map of the gates is wrong.
 
-The errors are constant in a trial. The centre of rotation and scaling is the start of the trial.
+The whole map is shifted, rotated about z and scaled, and each gate is displaced and rotated. The
+errors are constant in a trial. The centre of rotation and scaling is the trial's start position.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, yawed
+from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View, column, yaw_matrix
 from tracks.geometry.rotation import to_world
 
 GATES = 32
@@ -15,7 +16,7 @@ GATES = 32
 
 
 class GateMap(NamedTuple):
-    """Values of `gate_map`."""
+    """Parameters of `gate_map`, all standard deviations over trials; units in `SENSOR`."""
 
     shift: Array
     """t: standard deviation of the shift of all gates, for each axis."""
@@ -30,7 +31,7 @@ class GateMap(NamedTuple):
 
 
 def start(values: GateMap, moment: Moment) -> dict[str, Any]:
-    """Return the map's origin and errors."""
+    """Return the centre of the map's errors, and the errors of the trial."""
     draws, pos_w = moment.draws.normal, moment.truth.pos_w
     moved = draws[..., 5 : 5 + 3 * GATES].reshape(*draws.shape[:-1], GATES, 3)
     return {
@@ -46,36 +47,37 @@ def start(values: GateMap, moment: Moment) -> dict[str, Any]:
 def sense(
     values: GateMap, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with both gates at their mapped positions."""
+    """Return the view with both gates at their poses in the map."""
     number = moment.truth.gate_number % GATES
-    # The last gate is its own next one.
+    # After the last gate, the view repeats it as the second gate.
     last = (moment.truth.second_w == moment.truth.gate_w).all(-1)
     second = (number + (~last).astype(number.dtype)) % GATES
-    gate_w, axis_w = _mapped(memory, seen.gate_w, seen.axis_w, number)
-    second_w, second_axis_w = _mapped(memory, seen.second_w, seen.second_axis_w, second)
+    gate_w, axis_w = _in_map(memory, seen.gate_w, seen.axis_w, number)
+    second_w, second_axis_w = _in_map(memory, seen.second_w, seen.second_axis_w, second)
     seen = seen._replace(
         gate_w=gate_w, axis_w=axis_w, second_w=second_w, second_axis_w=second_axis_w
     )
     return seen, memory
 
 
-def _mapped(
+def _in_map(
     memory: dict[str, Any], gate_w: Array, axis_w: Array, number: Array
 ) -> tuple[Array, Array]:
+    """Return the position and axis (..., 3) of gate `number` (...,) in the map."""
     xp = gate_w.__array_namespace__()
     moved_w = xp.take_along_axis(memory["moved_w"], number[..., None, None], axis=-2)[..., 0, :]
     turned = xp.take_along_axis(memory["turned"], number[..., None], axis=-1)[..., 0]
-    away_w = to_world(yawed(memory["yaw"]), gate_w - memory["origin_w"])
-    mapped_w = memory["origin_w"] + column(memory["scale"]) * away_w + memory["shift_w"] + moved_w
-    return mapped_w, to_world(yawed(memory["yaw"] + turned), axis_w)
+    offset_w = to_world(yaw_matrix(memory["yaw"]), gate_w - memory["origin_w"])
+    mapped_w = memory["origin_w"] + column(memory["scale"]) * offset_w + memory["shift_w"] + moved_w
+    return mapped_w, to_world(yaw_matrix(memory["yaw"] + turned), axis_w)
 
 
 SENSOR = Sensor(
     name="gate_map",
     stage="gates",
-    summary="The map of the gates is off, and gates were moved after it was made",
+    summary="The map of the gates has errors, and gates were moved after it was made",
     equation="p = o + (1 + k) Rz(psi) (p_true - o) + t + m_i, normal k, psi, t, m_i of the trial",
-    source="Foehn et al. 2022 (AlphaPilot): gates up to decimetres from their surveyed places; "
+    source="Foehn et al. 2022 (AlphaPilot): gates up to decimetres from their surveyed positions; "
     "usual sizes are our estimate",
     values=GateMap,
     parameters=(

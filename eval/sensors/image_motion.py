@@ -1,7 +1,8 @@
-"""Motion within an image: blur over the exposure, and rolling shutter.
+"""Sensor model `image_motion`: blur over the exposure time, and rolling shutter.
 
-As far as the policy's few pixels show it: turning moves all of an image alike, by the rate times
-the time over a pixel's angle. The rate is the mean one since the observation before.
+At the policy's low resolution, a rotation of the camera shifts all pixels of an image equally: by
+the body rate times the time, divided by a pixel's angle. The rate is the mean since the observation
+before.
 """
 
 from __future__ import annotations
@@ -11,11 +12,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.sensors.interface import Array, Moment, Parameter, Sensor, View, over_image, turned_by
+from eval.sensors.interface import (
+    Array,
+    Moment,
+    Parameter,
+    Sensor,
+    View,
+    over_image,
+    rotation_since,
+)
 
 
 class ImageMotion(NamedTuple):
-    """Values of `image_motion`."""
+    """Parameters of `image_motion`."""
 
     exposure: Array
     """Exposure time of a row."""
@@ -24,7 +33,7 @@ class ImageMotion(NamedTuple):
 
 
 def start(values: ImageMotion, moment: Moment) -> Array:
-    """Return the body's attitude."""
+    """Return the body's attitude (..., 3, 3) at the first observation."""
     return moment.truth.rot_w
 
 
@@ -32,42 +41,41 @@ def sense(values: ImageMotion, memory: Array, seen: View, moment: Moment) -> tup
     """Return the view with a blurred and sheared image."""
     camera, depth_m = moment.camera, seen.depth_m
     xp = depth_m.__array_namespace__()
-    rate_b = turned_by(moment.truth.rot_w, memory) / moment.dt_s
+    rate_b = rotation_since(moment.truth.rot_w, memory) / moment.dt_s
     wide, high = (2.0 * math.tan(math.radians(angle) / 2) for angle in camera.fov_deg)
     # A yaw to the left moves the image to the right, a pitch down (about y) moves it up.
-    rate = (
-        over_image(rate_b[..., 2]) * camera.width / wide,
-        -over_image(rate_b[..., 1]) * camera.height / high,
-    )
+    right_px_per_s = over_image(rate_b[..., 2]) * camera.width / wide
+    down_px_per_s = -over_image(rate_b[..., 1]) * camera.height / high
     row_s = over_image(values.readout) * (np.arange(camera.height)[:, None] / camera.height - 0.5)
+    # The mean of inverse depth at the start and the end of the exposure.
     inverse: Any = 0.0
-    for part in (-0.5, 0.5):
-        time_s = row_s + part * over_image(values.exposure)
-        found = shifted(1.0 / xp.maximum(depth_m, 1e-3), rate[0] * time_s, -1)
-        inverse = inverse + 0.5 * shifted(found, rate[1] * time_s, -2)
+    for fraction in (-0.5, 0.5):
+        time_s = row_s + fraction * over_image(values.exposure)
+        image = shift(1.0 / xp.maximum(depth_m, 1e-3), right_px_per_s * time_s, -1)
+        inverse = inverse + 0.5 * shift(image, down_px_per_s * time_s, -2)
     return seen._replace(depth_m=1.0 / inverse), moment.truth.rot_w
 
 
-def shifted(image: Array, pixels: Array, axis: int) -> Array:
-    """Return images (..., H, W) moved by `pixels` (..., H, 1) along `axis`, -1 or -2.
+def shift(image: Array, pixels: Array, axis: int) -> Array:
+    """Return images (..., H, W) shifted by `pixels` (..., H, 1) along `axis`, -1 or -2.
 
-    Values between pixels are interpolated; beyond the border the last pixel is repeated.
+    Values between pixels are interpolated linearly; beyond the border the last pixel is repeated.
     """
     xp, count = image.__array_namespace__(), image.shape[axis]
-    places = np.arange(count) if axis == -1 else np.arange(count)[:, None]
-    at = (places - pixels).clip(0.0, count - 1.0) + 0.0 * image
-    low = xp.floor(at)
-    share, first = at - low, low.astype(int)
+    index = np.arange(count) if axis == -1 else np.arange(count)[:, None]
+    source = (index - pixels).clip(0.0, count - 1.0) + 0.0 * image
+    low = xp.floor(source)
+    share, first = source - low, low.astype(int)
     second = (first + 1).clip(0, count - 1)
-    one, two = (xp.take_along_axis(image, index, axis=axis) for index in (first, second))
-    return (1.0 - share) * one + share * two
+    low_value, high_value = (xp.take_along_axis(image, k, axis=axis) for k in (first, second))
+    return (1.0 - share) * low_value + share * high_value
 
 
 SENSOR = Sensor(
     name="image_motion",
     stage="depth",
-    summary="Turning blurs the image over the exposure and shears it over the readout",
-    equation="1/z at (u - w t): mean of t = row time -+ exposure / 2; w: pixels a second",
+    summary="Rotation blurs the image over the exposure and shears it over the readout",
+    equation="1/z at (u - w t): mean of t = row time -+ exposure / 2; w: pixels per second",
     source="geometry of a pinhole; usual times are those of data sheets of such cameras",
     values=ImageMotion,
     parameters=(

@@ -1,7 +1,7 @@
-"""An inertial measurement unit: bias, noise, vibration that grows with thrust, saturation.
+"""Sensor model `imu`: an inertial measurement unit with bias, noise, vibration and saturation.
 
-It changes samples of a gyroscope and an accelerometer, which an estimator uses, instead of the
-policy's observation.
+It changes the samples of gyroscope and accelerometer that a state estimator uses. It does not
+change the policy's observation directly.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 from eval.sensors.interface import Array, Draws, Inertial, Moment, Needs, Parameter, Sensor, column
 
 UNLIMITED = 1e6
-"""Limit of a sensor without saturation."""
+"""Limit of a sensor that does not saturate."""
 
 
 class Imu(NamedTuple):
-    """Values of `imu`."""
+    """Parameters of `imu`; units in `SENSOR`."""
 
     gyro_noise: Array
     """s_w: noise density of the gyroscope."""
@@ -40,7 +40,7 @@ class Imu(NamedTuple):
 
 
 def start(values: Imu, moment: Moment) -> dict[str, Any]:
-    """Return the trial's biases and its error of the accelerometer per thrust (..., 3)."""
+    """Return the trial's biases, and its error of the accelerometer per thrust, each (..., 3)."""
     draws = moment.draws.normal
     return {
         "gyro": column(values.gyro_bias) * draws[..., :3],
@@ -55,13 +55,13 @@ def measure(
     """Return the measurement of a true sample, and the biases after a step of their random walk."""
     normal = draws.normal
     xp = normal.__array_namespace__()
-    root = dt_s**0.5
-    gyro = memory["gyro"] + column(values.gyro_walk) * root * normal[..., 6:9]
-    acc = memory["acc"] + column(values.acc_walk) * root * normal[..., 9:12]
+    root_dt = dt_s**0.5
+    gyro = memory["gyro"] + column(values.gyro_walk) * root_dt * normal[..., 6:9]
+    acc = memory["acc"] + column(values.acc_walk) * root_dt * normal[..., 9:12]
     thrust = column(abs(truth.acc_b[..., 2]))
-    rate_b = truth.rate_b + gyro + column(values.gyro_noise) / root * normal[..., :3]
-    grain = column(values.acc_noise) / root + column(values.vibration) * thrust
-    acc_b = truth.acc_b + acc + memory["per_thrust"] * thrust + grain * normal[..., 3:6]
+    rate_b = truth.rate_b + gyro + column(values.gyro_noise) / root_dt * normal[..., :3]
+    acc_sd = column(values.acc_noise) / root_dt + column(values.vibration) * thrust
+    acc_b = truth.acc_b + acc + memory["per_thrust"] * thrust + acc_sd * normal[..., 3:6]
     limits = column(values.gyro_limit), column(values.acc_limit)
     rate_b, acc_b = (xp.clip(v, -m, m) for v, m in zip((rate_b, acc_b), limits, strict=True))
     return Inertial(rate_b, acc_b), memory | {"gyro": gyro, "acc": acc}
@@ -72,7 +72,7 @@ SENSOR = Sensor(
     stage="imu",
     summary="Gyroscope and accelerometer: bias, noise, vibration with thrust, saturation",
     equation="w + b_w + s_w n / sqrt(dt); a + b_a + k |a_z| + (s_a / sqrt(dt) + v |a_z|) n; "
-    "db = walk sqrt(dt) n; held to the limits",
+    "db = walk sqrt(dt) n; clipped to the limits",
     source="data sheets of BMI270, BMI088 and ICM-42688-P: 0.003 to 0.014 deg/s/sqrt(Hz), 65 to "
     "230 ug/sqrt(Hz), 2000 deg/s, 16 to 24 g; biases, walks and vibration are our estimate",
     values=Imu,

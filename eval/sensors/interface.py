@@ -1,8 +1,9 @@
-"""The `Sensor` dataclass: its parameters, and the functions that change a drone's observations.
+"""The interface of a sensor model: the `Sensor` dataclass, its inputs, and shared functions.
 
-A model is written once, for rows of NumPy or JAX arrays. The judge calls it with draws from each
-trial's own seed, the trainer with draws from JAX keys. Random numbers are passed in as arrays whose
-number does not depend on the magnitude, so that two magnitudes of one model use the same draws.
+A model is written once, for NumPy and JAX arrays whose rows are drones. The judge, which flies and
+scores policies, passes random numbers from each trial's seed; the trainer passes numbers from JAX
+keys. How many numbers a model needs does not depend on the magnitude of its errors, so two
+magnitudes of one model use the same numbers.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from policies.observation import View
 from tracks.geometry.camera import Camera
 from tracks.geometry.scene import Array
 
-Values = Any  # the model's own NamedTuple of floats or arrays (...,)
-Memory = Any  # arrays (..., K), or nested tuples and dicts of them
-
-
+Values = Any
+"""The parameters of a model: its NamedTuple of floats or arrays (...,)."""
+Memory = Any
+"""The state of a model between observations: arrays (..., K), or tuples and dicts of them."""
 STAGES = ("state", "gates", "depth", "imu")
 """What a model changes: estimated state, gates, depth image, inertial sensor."""
 
@@ -32,67 +33,67 @@ class Needs(NamedTuple):
     uniform: int = 0
     """Uniform numbers from 0 to 1."""
     grain: int = 0
-    """Images of standard normal numbers."""
+    """Images of standard normal numbers, one number a pixel."""
     chance: int = 0
-    """Images of uniform numbers from 0 to 1."""
+    """Images of uniform numbers from 0 to 1, one number a pixel."""
 
 
 class Draws(NamedTuple):
-    """Random numbers of N rows, with the numbers of `Needs`."""
+    """Random numbers of a model; K is the count in the field of `Needs` with the same name."""
 
     normal: Array
-    """(..., K)."""
+    """(..., K) standard normal."""
     uniform: Array
-    """(..., K)."""
+    """(..., K) uniform from 0 to 1."""
     grain: Array
-    """(..., K, H, W)."""
+    """(..., K, H, W) standard normal, for each pixel."""
     chance: Array
-    """(..., K, H, W)."""
+    """(..., K, H, W) uniform from 0 to 1, for each pixel."""
 
 
 class Moment(NamedTuple):
-    """Inputs of a model for one observation, besides the output of the models before it."""
+    """Inputs of a model for one observation, in addition to the view."""
 
     truth: View
     """The true view, at the time of the observation."""
     draws: Draws
-    """Of this observation; for `start`, of the trial."""
+    """Random numbers of this observation; for `start`, of the trial."""
     dt_s: Any
     """Time since the observation before [s]."""
     camera: Camera
-    """The policy's."""
+    """The policy's camera."""
 
 
 class Ages(NamedTuple):
-    """Ages of an observation at a decision."""
+    """Ages of an observation when the policy uses it."""
 
     state_s: float = 0.0
     """Mean age of the state [s]."""
     image_s: float = 0.0
     """Mean age of the image [s]."""
     jitter: float = 0.0
-    """Largest relative deviation of a decision's age from the mean, uniformly distributed [1]."""
+    """Largest relative deviation of an age from its mean, uniformly distributed [1]."""
 
 
 class Inertial(NamedTuple):
     """A sample of an inertial measurement unit in body axes."""
 
     rate_b: Array
-    """(..., 3) [rad/s]."""
+    """(..., 3) body rates [rad/s]."""
     acc_b: Array
     """(..., 3) specific force [m/s^2]."""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor or estimator model; unused functions are None."""
+    """A sensor or estimator model; functions that it does not need are None."""
 
     name: str
-    """The `kind` of its table in a sensors file."""
+    """Name of the model, the `kind` of its table in a sensors file."""
     stage: str
-    """Its table in a sensors file, one of `STAGES`."""
+    """Name of the table in a sensors file, one of `STAGES`."""
     summary: str
-    """One sentence for people."""
+    """One sentence for help texts and the documentation."""
     equation: str
     """The observation as a function of the truth."""
     source: str
@@ -100,53 +101,56 @@ class Sensor:
     values: type
     """NamedTuple class with a field for each parameter, in order."""
     parameters: tuple[Parameter, ...]
-    """All plain numbers; the neutral values give no errors."""
+    """Bounds, unit and usual size of each parameter; the neutral values give no errors."""
     grows: tuple[str, ...]
-    """Parameters that scale with the magnitude; the others are constant."""
+    """Parameters that scale with the magnitude of the errors; the others are constant."""
     trial: Needs = Needs()
-    """Draws at the start of a trial."""
+    """Random numbers at the start of a trial."""
     observation: Needs = Needs()
-    """Draws of an observation; of an inertial model, of a sample."""
+    """Random numbers of one observation; for an inertial sensor, of one sample."""
     start: Callable[[Values, Moment], Memory] | None = None
     """Returns the model's state at the first observation, from the trial's draws."""
     sense: Callable[[Values, Memory, View, Moment], tuple[View, Memory]] | None = None
-    """Takes the view of the models before it; returns the changed view, and the state."""
+    """Takes the view after the models before it; returns the changed view, and the new state."""
     ages: Callable[[Values], Ages] | None = None
     """For a delay: the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
-    """For an estimator in the loop: its `eval.sensors.filter.kalman.FilterSettings`."""
+    """For a state estimator: returns its `eval.sensors.filter.kalman.FilterSettings`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
     """For an inertial sensor: (values, state, truth, draws, dt_s) -> measurement, state."""
 
 
 def column(value: Array) -> Array:
-    """Return numbers (...,) as (..., 1), to multiply vectors."""
+    """Return numbers (...,) as (..., 1), for products with vectors."""
     return value[..., None]
 
 
 def over_image(value: Array) -> Array:
-    """Return numbers (...,) as (..., 1, 1), to multiply images."""
+    """Return numbers (...,) as (..., 1, 1), for products with images."""
     return value[..., None, None]
 
 
-def absent(values: Values, moment: Moment) -> Array:
-    """Return the start of an intermittent fault with one uniform draw: absent (...,)."""
+def starts_absent(values: Values, moment: Moment) -> Array:
+    """Return the state of an intermittent fault at the start, absent: False (...,).
+
+    The model must have one uniform draw in a trial, whose shape the result gets.
+    """
     del values
     return moment.draws.uniform[..., 0] < 0.0
 
 
-def sticky(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -> Array:
-    """Return whether an intermittent fault is present, bool (...,).
+def markov_step(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -> Array:
+    """Return whether an intermittent fault is present at the next observation, bool (...,).
 
-    A two-state Markov chain: in the long run the fault is present in `share` of the observations
-    and lasts `length_s` on average. If that is shorter than for independent observations, they are
-    independent.
+    The fault is a two-state Markov chain: in the long run it is present in `share` of the
+    observations and lasts `length_s` on average. Observations are independent where `length_s` is
+    shorter than independent observations give.
 
     Args:
-        on: (...,) bool, whether it was present before.
+        on: (...,) bool, whether the fault was present at the observation before.
         chance: (...,) uniform draws from 0 to 1.
-        share: of the observations, below 1 [1].
-        length_s: mean length [s].
+        share: share of the observations with the fault, below 1 [1].
+        length_s: mean duration of the fault [s].
         dt_s: time between observations [s].
     """
     xp = chance.__array_namespace__()
@@ -155,42 +159,51 @@ def sticky(on: Array, chance: Array, share: Array, length_s: Array, dt_s: Any) -
     return xp.where(on, chance >= ends, chance < begins)
 
 
-def remembered(kept: Array) -> Array:
-    """Return the noise factor of a first-order process, for its decay factor exp(-dt / tau)."""
-    xp = kept.__array_namespace__()
-    return xp.sqrt(xp.maximum(1.0 - kept**2, 0.0))
+def noise_factor(decay: Array) -> Array:
+    """Return the factor of the white noise that keeps a first-order process at unit variance.
+
+    Args:
+        decay: factor exp(-dt / tau) of the process's value over a step.
+    """
+    xp = decay.__array_namespace__()
+    return xp.sqrt(xp.maximum(1.0 - decay**2, 0.0))
 
 
 def length(vector: Array) -> Array:
-    """Return |vector| (...,) with a finite slope at zero, exact to a micrometre."""
+    """Return the norm (...,) of vectors, with a finite slope at zero and an error below 1e-6."""
     xp = vector.__array_namespace__()
     return xp.sqrt((vector**2).sum(-1) + 1e-12)
 
 
-def turned_by(rot_w: Array, before_w: Array) -> Array:
+def rotation_since(rot_w: Array, before_w: Array) -> Array:
     """Return the rotation of a body since `before_w`, as a vector in its axes (..., 3) [rad].
 
-    It is the sine of the angle along the axis: exact to 1 % below a quarter of a radian.
+    The vector is the axis times the sine of the angle, within 1 % of the rotation vector below
+    0.25 rad.
+
+    Args:
+        rot_w: (..., 3, 3) attitude now, body to world.
+        before_w: (..., 3, 3) attitude before, body to world.
     """
     xp = rot_w.__array_namespace__()
-    turn = (before_w[..., :, :, None] * rot_w[..., :, None, :]).sum(-3)
+    relative = (before_w[..., :, :, None] * rot_w[..., :, None, :]).sum(-3)
     return 0.5 * xp.stack(
         [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
         ],
         axis=-1,
     )
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the matrices a b (..., 3, 3), with the same rounding at every batch size."""
+    """Return the matrix products a b (..., 3, 3), with the same rounding at every batch size."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
-def yawed(angle: Array) -> Array:
-    """Return rotations about z (..., 3, 3) by `angle` (...,) [rad]."""
+def yaw_matrix(angle: Array) -> Array:
+    """Return rotation matrices (..., 3, 3) about z by `angle` (...,) [rad]."""
     xp = angle.__array_namespace__()
     cos, sin, zero = xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)
     rows = ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0))

@@ -1,7 +1,7 @@
-"""Intermittent faults: lost track, a wrong gate, a blind camera, lost images.
+"""Sensor models of intermittent faults: lost track, a wrong gate, a blind camera, lost images.
 
-Each is a two-state Markov chain (`sticky`): present for `share` of the observations, for `length`
-at a time.
+Each is a two-state Markov chain (`markov_step`): in the long run the fault is present in `share` of
+the observations, for `length` seconds at a time on average.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from eval.sensors.interface import (
     Parameter,
     Sensor,
     View,
-    absent,
     column,
+    markov_step,
     over_image,
-    sticky,
+    starts_absent,
 )
 
 
 class StateLoss(NamedTuple):
-    """Values of `state_loss`."""
+    """Parameters of `state_loss`."""
 
     share: Array
     """Share of the observations without track."""
@@ -37,9 +37,9 @@ class StateLoss(NamedTuple):
 
 def state_loss_start(values: StateLoss, moment: Moment) -> dict[str, Any]:
     """Return the state at the start: on track, without errors."""
-    none_w = 0.0 * moment.truth.pos_w
-    lost = absent(values, moment)
-    return {"lost": lost, "acc_w": none_w, "vel_w": none_w, "pos_w": none_w, "jump_w": none_w}
+    zero_w = 0.0 * moment.truth.pos_w
+    lost = starts_absent(values, moment)
+    return {"lost": lost, "acc_w": zero_w, "vel_w": zero_w, "pos_w": zero_w, "jump_w": zero_w}
 
 
 def state_loss_sense(
@@ -47,16 +47,14 @@ def state_loss_sense(
 ) -> tuple[View, dict[str, Any]]:
     """Return the view with the estimator's state; each loss of track leaves a jump."""
     xp, draws, dt_s = seen.pos_w.__array_namespace__(), moment.draws, moment.dt_s
-    was = column(memory["lost"])
-    chance = draws.uniform[..., 0]
-    lost = sticky(memory["lost"], chance, values.share, values.length, dt_s)
-    now = column(lost)
-    fresh_w = column(values.acceleration) * draws.normal[..., :3]
-    acc_w = xp.where(was, memory["acc_w"], fresh_w)
-    vel_w = xp.where(now, memory["vel_w"] + acc_w * dt_s, 0.0)
-    pos_w = xp.where(now, memory["pos_w"] + vel_w * dt_s, 0.0)
-    jumped_w = memory["jump_w"] + column(values.jump) * draws.normal[..., 3:]
-    jump_w = xp.where(was & ~now, jumped_w, memory["jump_w"])
+    lost = markov_step(memory["lost"], draws.uniform[..., 0], values.share, values.length, dt_s)
+    lost_before, lost_now = column(memory["lost"]), column(lost)
+    new_acc_w = column(values.acceleration) * draws.normal[..., :3]
+    acc_w = xp.where(lost_before, memory["acc_w"], new_acc_w)
+    vel_w = xp.where(lost_now, memory["vel_w"] + acc_w * dt_s, 0.0)
+    pos_w = xp.where(lost_now, memory["pos_w"] + vel_w * dt_s, 0.0)
+    new_jump_w = memory["jump_w"] + column(values.jump) * draws.normal[..., 3:]
+    jump_w = xp.where(lost_before & ~lost_now, new_jump_w, memory["jump_w"])
     seen = seen._replace(pos_w=seen.pos_w + pos_w + jump_w, vel_w=seen.vel_w + vel_w)
     return seen, {"lost": lost, "acc_w": acc_w, "vel_w": vel_w, "pos_w": pos_w, "jump_w": jump_w}
 
@@ -64,7 +62,7 @@ def state_loss_sense(
 STATE_LOSS = Sensor(
     name="state_loss",
     stage="state",
-    summary="The estimator loses track for a while, runs away, and is reset with a jump",
+    summary="The estimator loses track for a while, diverges, and is reset with a jump",
     equation="Markov chain; lost: v + a t, p + a t^2 / 2, normal a; found again: p + normal jump",
     source="our estimate: the acceleration is that of 2 deg of tilt and an accelerometer's bias",
     values=StateLoss,
@@ -83,7 +81,7 @@ STATE_LOSS = Sensor(
 
 
 class Fault(NamedTuple):
-    """Values of the faults below."""
+    """Parameters of `wrong_gate`, `exposure` and `frame_loss`."""
 
     share: Array
     """Share of the observations with the fault."""
@@ -91,8 +89,8 @@ class Fault(NamedTuple):
     """Mean duration of the fault."""
 
 
-def _fault(usual_share: tuple[float, float], **others: Any) -> Sensor:
-    """Return a sensor model with the parameters `share` and `length` alone."""
+def _fault(usual_share: tuple[float, float], **fields: Any) -> Sensor:
+    """Return a sensor model with the parameters of `Fault`, and the other `fields` of `Sensor`."""
     return Sensor(
         source="our estimate",
         values=Fault,
@@ -103,16 +101,16 @@ def _fault(usual_share: tuple[float, float], **others: Any) -> Sensor:
         grows=("share",),
         trial=Needs(uniform=1),
         observation=Needs(uniform=1),
-        **others,
+        **fields,
     )
 
 
 def wrong_gate_sense(
     values: Fault, memory: Array, seen: View, moment: Moment
 ) -> tuple[View, Array]:
-    """Return the view with the second gate in place of the first during the fault."""
+    """Return the view with the second gate in place of the first one during the fault."""
     xp, chance = seen.pos_w.__array_namespace__(), moment.draws.uniform[..., 0]
-    wrong = sticky(memory, chance, values.share, values.length, moment.dt_s)
+    wrong = markov_step(memory, chance, values.share, values.length, moment.dt_s)
     gate_w = xp.where(column(wrong), seen.second_w, seen.gate_w)
     axis_w = xp.where(column(wrong), seen.second_axis_w, seen.axis_w)
     return seen._replace(gate_w=gate_w, axis_w=axis_w), wrong
@@ -124,15 +122,15 @@ WRONG_GATE = _fault(
     stage="gates",
     summary="The gate after the next one is taken for the next, for a while",
     equation="Markov chain: wrong for `share` of the observations, `length` at a time",
-    start=absent,
+    start=starts_absent,
     sense=wrong_gate_sense,
 )
 
 
 def exposure_sense(values: Fault, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with an image at full range where the camera is blind."""
+    """Return the view with an image that is at full range everywhere during the fault."""
     xp, chance = seen.depth_m.__array_namespace__(), moment.draws.uniform[..., 0]
-    blind = sticky(memory, chance, values.share, values.length, moment.dt_s)
+    blind = markov_step(memory, chance, values.share, values.length, moment.dt_s)
     depth_m = xp.where(over_image(blind), moment.camera.range_m, seen.depth_m)
     return seen._replace(depth_m=depth_m), blind
 
@@ -143,14 +141,14 @@ EXPOSURE = _fault(
     stage="depth",
     summary="The camera is blind for a while; its image reads as the range everywhere",
     equation="Markov chain: blind for `share` of the images, `length` at a time; z = range",
-    start=absent,
+    start=starts_absent,
     sense=exposure_sense,
 )
 
 
 def frame_loss_start(values: Fault, moment: Moment) -> dict[str, Any]:
-    """Return the state at the start: no image is lost."""
-    return {"lost": absent(values, moment), "shown_m": moment.truth.depth_m}
+    """Return the state at the start: no image is lost, and the last one is the true image."""
+    return {"lost": starts_absent(values, moment), "shown_m": moment.truth.depth_m}
 
 
 def frame_loss_sense(
@@ -159,7 +157,7 @@ def frame_loss_sense(
     """Return the view with the last image that was not lost."""
     xp = seen.depth_m.__array_namespace__()
     chance = moment.draws.uniform[..., 0]
-    lost = sticky(memory["lost"], chance, values.share, values.length, moment.dt_s)
+    lost = markov_step(memory["lost"], chance, values.share, values.length, moment.dt_s)
     shown_m = xp.where(over_image(lost), memory["shown_m"], seen.depth_m)
     return seen._replace(depth_m=shown_m), {"lost": lost, "shown_m": shown_m}
 
@@ -168,7 +166,7 @@ FRAME_LOSS = _fault(
     usual_share=(0.01, 0.1),
     name="frame_loss",
     stage="depth",
-    summary="Images are lost, alone or in bursts, and the one before is seen again",
+    summary="Images are lost, singly or in bursts, and the last image is repeated",
     equation="Markov chain: lost for `share` of the images, `length` at a time; z = z of the last",
     start=frame_loss_start,
     sense=frame_loss_sense,

@@ -1,6 +1,7 @@
-"""Errors of an estimated state for each axis, as estimated by `suite identify --sensors`.
+"""Sensor model `measured_state`: errors of an estimated state, with own parameters for each axis.
 
-Position errors are along world axes, velocity and attitude errors along body axes.
+`suite identify --sensors` fits these parameters to flights with motion capture. Position errors are
+along world axes, velocity and attitude errors along body axes.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from eval.sensors.interface import (
     View,
     column,
     length,
+    noise_factor,
     product,
-    remembered,
 )
 from tracks.geometry.rotation import exp_rot, to_world
 
 GROUPS = {"position": ("m", 10.0), "velocity": ("m/s", 10.0), "attitude": ("rad", 0.5)}
-"""Parts of the state: the unit of their errors, and the largest."""
+"""Part of the state -> unit of its errors, and the largest standard deviation."""
 AXES = tuple(f"{group}_{axis}" for group in GROUPS for axis in "xyz")
-"""The nine errors, in order."""
+"""Names of the nine errors, in the order of all arrays (..., 9) here."""
 LASTS_S = 0.5
 """Default correlation time [s]."""
 
 
 class Axis(NamedTuple):
-    """Errors along one axis; the parameters are `position_x`, `position_x_bias`, ..."""
+    """Parameters of the error along one axis, named `position_x`, `position_x_bias`, ..."""
 
     noise: Array
     """Standard deviation of the varying error."""
@@ -44,19 +45,20 @@ class Axis(NamedTuple):
     """Correlation time of the remaining variance [s]."""
 
 
-def _named(axis: str) -> tuple[str, ...]:
+def _keys(axis: str) -> tuple[str, ...]:
+    """Return the names of the parameters of one axis, in the order of `Axis`."""
     return (axis, *(f"{axis}_{name}" for name in Axis._fields[1:]))
 
 
-_FIELDS = [*(name for axis in AXES for name in _named(axis)), "velocity_scale", "position_drift"]
+_FIELDS = [*(name for axis in AXES for name in _keys(axis)), "velocity_scale", "position_drift"]
 MeasuredState: Any = NamedTuple("MeasuredState", [(name, Array) for name in _FIELDS])  # pyright: ignore
-MeasuredState.__doc__ = "Values of `measured_state`."
+MeasuredState.__doc__ = "Parameters of `measured_state`: `Axis` for each axis, and two more."
 
 
 def axes_of(values: Any) -> Axis:
-    """Return the values of all axes, each (..., 9)."""
+    """Return the parameters of all axes; each field is (..., 9), in the order of `AXES`."""
     xp = values.velocity_scale.__array_namespace__()
-    columns = zip(*([getattr(values, name) for name in _named(axis)] for axis in AXES), strict=True)
+    columns = zip(*([getattr(values, name) for name in _keys(axis)] for axis in AXES), strict=True)
     return Axis(*(xp.stack(list(column), axis=-1) for column in columns))
 
 
@@ -77,36 +79,37 @@ def sense(
 ) -> tuple[View, dict[str, Any]]:
     """Return the view with an estimated position, velocity and attitude."""
     xp, axes, draws = seen.pos_w.__array_namespace__(), axes_of(values), moment.draws.normal
-    slow = _later(memory["slow"], axes.lasts, draws[..., :9], moment.dt_s)
-    fast = _later(memory["fast"], axes.fast_lasts, draws[..., 9:18], moment.dt_s)
+    slow = _next_error(memory["slow"], axes.lasts, draws[..., :9], moment.dt_s)
+    fast = _next_error(memory["fast"], axes.fast_lasts, draws[..., 9:18], moment.dt_s)
     unit = xp.sqrt(1.0 - axes.fast) * slow + xp.sqrt(axes.fast) * fast
-    off = axes.noise * unit + axes.bias * memory["bias"]
+    error = axes.noise * unit + axes.bias * memory["bias"]
     flown_m = length(moment.truth.pos_w - memory["pos_w"])
     drift_w = memory["drift_w"] + column(values.position_drift * xp.sqrt(flown_m)) * draws[..., 18:]
     scaled_w = column(1.0 + values.velocity_scale) * seen.vel_w
     seen = seen._replace(
-        pos_w=seen.pos_w + off[..., :3] + drift_w,
-        vel_w=scaled_w + to_world(seen.rot_w, off[..., 3:6]),
-        rot_w=product(seen.rot_w, exp_rot(off[..., 6:])),
+        pos_w=seen.pos_w + error[..., :3] + drift_w,
+        vel_w=scaled_w + to_world(seen.rot_w, error[..., 3:6]),
+        rot_w=product(seen.rot_w, exp_rot(error[..., 6:])),
     )
     now = {"slow": slow, "fast": fast, "drift_w": drift_w, "pos_w": moment.truth.pos_w}
     return seen, memory | now
 
 
-def _later(error: Array, lasts_s: Array, draws: Array, dt_s: Any) -> Array:
-    """Return unit errors one observation later."""
+def _next_error(error: Array, correlation_s: Array, draws: Array, dt_s: Any) -> Array:
+    """Return first-order Gauss-Markov errors of unit variance after a step of `dt_s`."""
     xp = error.__array_namespace__()
-    kept = xp.exp(-dt_s / xp.maximum(lasts_s, 1e-9))
-    return kept * error + remembered(kept) * draws
+    decay = xp.exp(-dt_s / xp.maximum(correlation_s, 1e-9))
+    return decay * error + noise_factor(decay) * draws
 
 
 def _parameters() -> tuple[Parameter, ...]:
-    found = []
+    """Return the parameters of all axes, and the two that belong to no axis."""
+    of_axes = []
     for group, (unit, most) in GROUPS.items():
         usual = {"position": (0.01, 0.1), "velocity": (0.05, 0.3), "attitude": (0.005, 0.03)}[group]
         for axis in "xyz":
-            noise, bias, fast, fast_lasts, lasts = _named(f"{group}_{axis}")
-            found += [
+            noise, bias, fast, fast_lasts, lasts = _keys(f"{group}_{axis}")
+            of_axes += [
                 Parameter(noise, unit, 0.0, 0.0, most, usual),
                 Parameter(bias, unit, 0.0, 0.0, most, usual),
                 Parameter(fast, "1", 0.0, 0.0, 1.0, (0.05, 0.5), required=False),
@@ -114,7 +117,7 @@ def _parameters() -> tuple[Parameter, ...]:
                 Parameter(lasts, "s", LASTS_S, 0.0, 1000.0, (0.1, 2.0), required=False),
             ]
     return (
-        *found,
+        *of_axes,
         Parameter("velocity_scale", "1", 0.0, -0.5, 0.5, (0.005, 0.05)),
         Parameter("position_drift", "m/sqrt(m)", 0.0, 0.0, 10.0, (0.01, 0.1)),
     )
@@ -123,7 +126,7 @@ def _parameters() -> tuple[Parameter, ...]:
 SENSOR = Sensor(
     name="measured_state",
     stage="state",
-    summary="Errors of an estimated state with a size, a bias and a colour for every axis",
+    summary="Errors of an estimated state: size, bias and correlation times for every axis",
     equation="p + b_p + n_p + d, (1 + k) v + R (b_v + n_v), R Exp(b_R + n_R); n = s (sqrt(f) e_f "
     "+ sqrt(1 - f) e), e' = a e + sqrt(1 - a^2) white, a = exp(-dt / lasts), e_f in the same way; "
     "d' = d + c sqrt(|dp|) white",
@@ -132,7 +135,7 @@ SENSOR = Sensor(
     values=MeasuredState,
     parameters=_parameters(),
     grows=(
-        *(name for axis in AXES for name in _named(axis)[:2]),
+        *(name for axis in AXES for name in _keys(axis)[:2]),
         "velocity_scale",
         "position_drift",
     ),

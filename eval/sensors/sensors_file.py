@@ -1,7 +1,8 @@
-"""The sensors file (TOML): which models act, and how strongly; read, checked by key, written.
+"""Read, check and write sensors files (TOML), which list sensor models with their parameters.
 
-Each model has a table under what it acts on ([state], [gates], [depth] or [imu]; several as
-[[state]]), whose `kind` is its name. A parameter that is left out has its neutral value.
+Each model has a table named after what it changes ([state], [gates], [depth] or [imu]; several as
+[[state]]), whose `kind` is the model's name. A parameter that is left out has its neutral value,
+which gives no error.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from eval.sensors import SENSORS, scaled
+from eval.sensors import SENSORS, scale_model
 from eval.sensors.interface import STAGES, Ages, Sensor
 from tracks.common.files import write_text
 from tracks.common.names import printable
@@ -25,7 +26,7 @@ NO_AGES = Ages()
 
 
 class SensorsFileError(ValueError):
-    """A sensors file is refused; the message has the key and what is allowed."""
+    """An unusable sensors file; the message has the key and what is allowed."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,9 @@ class SensorSet:
     """A set of sensor models; without models the observation is the truth."""
 
     name: str = "perfect"
-    """Its name in tables."""
+    """Name of the set in tables of results."""
     models: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    """Values (the model's NamedTuple of numbers) by the model's name, see
-    `eval.sensors.SENSORS`."""
+    """Name of a model in `eval.sensors.SENSORS` -> its values, a NamedTuple of numbers."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Return a picklable state, since a read-only view of a dict is not picklable."""
@@ -47,48 +47,50 @@ class SensorSet:
 
     @property
     def ages(self) -> Ages:
-        """Ages of the observation."""
-        found = [SENSORS[name].ages for name in self.models]
-        late = [(name, ages) for name, ages in zip(self.models, found, strict=True) if ages]
-        return next((ages(self.models[name]) for name, ages in late), NO_AGES)
+        """Ages of the observation when the policy uses it, by the model `delay`."""
+        for name, values in self.models.items():
+            ages_of = SENSORS[name].ages
+            if ages_of:
+                return ages_of(values)
+        return NO_AGES
 
     @property
-    def is_late(self) -> bool:
-        """Whether anything is old at the decision."""
+    def has_delay(self) -> bool:
+        """Whether the state or the image is delayed."""
         return bool(self.ages.state_s or self.ages.image_s)
 
     @property
     def estimator(self) -> Any:
-        """Settings of the estimator in the loop; None where the state comes as it is."""
+        """Settings of the state estimator that feeds the policy; None without one."""
         for name, values in self.models.items():
-            make = SENSORS[name].estimate
-            if make:
-                return make(values)
+            settings_of = SENSORS[name].estimate
+            if settings_of:
+                return settings_of(values)
         return None
 
 
 PERFECT = SensorSet()
-"""The truth."""
+"""The set without errors: the policy observes the truth."""
 
 
 def sensor_set(models: Mapping[str, Mapping[str, float]], name: str = "custom") -> SensorSet:
     """Return a checked set of models from the parameters that differ from neutral.
 
     Args:
-        models: the parameters of each model, by its name.
-        name: for people.
+        models: name of a model -> its parameters.
+        name: name of the set in tables of results.
 
     Raises:
-        ValueError: as `parse_sensors`.
+        ValueError: as in `parse_sensors`.
     """
     return parse_sensors(_table(name, models))
 
 
-def grown(sensors: SensorSet, magnitude: float) -> SensorSet:
+def scale_sensors(sensors: SensorSet, magnitude: float) -> SensorSet:
     """Return `sensors` with their errors scaled by `magnitude`; 0: the truth, 1: unchanged."""
     if magnitude in (0.0, 1.0):
         return sensors if magnitude else PERFECT
-    models = {name: scaled(name, values, magnitude) for name, values in sensors.models.items()}
+    models = {name: scale_model(name, values, magnitude) for name, values in sensors.models.items()}
     return SensorSet(f"{sensors.name} x {magnitude:g}", MappingProxyType(models))
 
 
@@ -104,8 +106,8 @@ def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
         source: a path (it ends in .toml, has a folder or exists) or a shipped name.
 
     Raises:
-        SensorsFileError: for what the file says or lacks.
-        ValueError: for a name that is neither.
+        SensorsFileError: for an unusable file.
+        ValueError: for a name that is neither a file nor a shipped set.
     """
     return load_shipped(source, PRESETS, "sensors", parse_sensors, SensorsFileError)
 
@@ -120,22 +122,23 @@ def parse_sensors(table: Mapping[str, Any]) -> SensorSet:
     top.expect(("name", "schema", *STAGES))
     if top.whole("schema", SCHEMA) != SCHEMA:
         raise top.error("schema", table["schema"], f"{SCHEMA}: this version of the suite reads it")
-    given: dict[str, Any] = {}
+    values_of: dict[str, Any] = {}
     for stage in STAGES:
-        alone = isinstance(table.get(stage), Mapping)
-        for entry in [top.table(stage)] if alone else top.tables(stage):
+        single = isinstance(table.get(stage), Mapping)
+        for entry in [top.table(stage)] if single else top.tables(stage):
             sensor = SENSORS.find(entry.text("kind"))
             if sensor.stage != stage:
                 raise entry.error("kind", sensor.name, f"a model of [{stage}]; put this one under "
                                   f"[[{sensor.stage}]]")  # fmt: skip
-            if sensor.name in given:
+            if sensor.name in values_of:
                 raise entry.error("kind", sensor.name, "each model once")
-            given[sensor.name] = _values(sensor, entry)
-    models = {name: given[name] for name in SENSORS if name in given}
+            values_of[sensor.name] = _values(sensor, entry)
+    models = {name: values_of[name] for name in SENSORS if name in values_of}
     return SensorSet(top.text("name"), MappingProxyType(models))
 
 
 def _values(sensor: Sensor, table: Table) -> Any:
+    """Return the parameters of a model from its table, checked against their bounds."""
     table.expect(("kind", *(parameter.name for parameter in sensor.parameters)))
     return sensor.values(
         *(
@@ -152,6 +155,7 @@ def sensors_table(sensors: SensorSet) -> dict[str, Any]:
 
 
 def _table(name: str, models: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return the parameters of `models` as the nested table of a sensors file."""
     stages: dict[str, list[dict[str, Any]]] = {}
     for kind, values in models.items():
         stages.setdefault(SENSORS.find(kind).stage, []).append({"kind": kind, **values})
@@ -159,11 +163,11 @@ def _table(name: str, models: Mapping[str, Mapping[str, float]]) -> dict[str, An
 
 
 def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str = "") -> None:
-    """Write `sensors` as a file that `load_sensors` reads back equal, whole or not at all.
+    """Write `sensors` as a file that `load_sensors` reads back equal; after an error, no file.
 
     Args:
-        sensors: what to write; they are checked as a file would be.
-        path: where to.
+        sensors: the set to write; it is checked like a file.
+        path: path of the file.
         comment: lines for the head of the file.
 
     Raises:

@@ -1,4 +1,8 @@
-"""Errors of an estimated state: drift, coloured noise with a bias, tilt by drag, delay."""
+"""Sensor models of an estimated state: `state_drift`, `state_noise`, `drag_tilt` and `delay`.
+
+They are the drift of dead reckoning, coloured noise with a bias, a tilt error that drag causes, and
+the delay of state and image.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,10 @@ from eval.sensors.interface import (
     View,
     column,
     length,
+    noise_factor,
     product,
-    remembered,
-    turned_by,
-    yawed,
+    rotation_since,
+    yaw_matrix,
 )
 from tracks.geometry.rotation import cross, exp_rot, to_world
 
@@ -27,7 +31,7 @@ SMALL = 1e-3
 
 
 class StateDrift(NamedTuple):
-    """Values of `state_drift`."""
+    """Parameters of `state_drift`; units in `STATE_DRIFT`."""
 
     position: Array
     """s_p: drift of the position, for each axis, over the root of the distance."""
@@ -42,13 +46,13 @@ class StateDrift(NamedTuple):
 
 
 def state_drift_start(values: StateDrift, moment: Moment) -> dict[str, Any]:
-    """Return the drift of the distance flown before the trial, and the pose at the start."""
+    """Return the errors from the distance flown before the trial, and the pose at the start."""
     xp, draws = moment.draws.normal.__array_namespace__(), moment.draws.normal
-    before = xp.sqrt(values.flown)
+    root_flown = xp.sqrt(values.flown)
     return {
         "scale": 1.0 + values.scale * draws[..., 0],
-        "yaw": values.yaw * before * draws[..., 1],
-        "error_w": column(values.position * before) * draws[..., 2:],
+        "yaw": values.yaw * root_flown * draws[..., 1],
+        "error_w": column(values.position * root_flown) * draws[..., 2:],
         "pos_w": moment.truth.pos_w,
         "rot_w": moment.truth.rot_w,
     }
@@ -57,20 +61,20 @@ def state_drift_start(values: StateDrift, moment: Moment) -> dict[str, Any]:
 def state_drift_sense(
     values: StateDrift, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the state of dead reckoning."""
+    """Return the view with the state that dead reckoning estimates."""
     truth, draws = moment.truth, moment.draws.normal
     step_w = truth.pos_w - memory["pos_w"]
-    way = root(length(step_w))
-    turned = root(length(turned_by(truth.rot_w, memory["rot_w"])))
-    yaw = memory["yaw"] + values.yaw * way * draws[..., 3]
-    yaw = yaw + values.yaw_turning * turned * draws[..., 4]
-    turn, scale = yawed(yaw), column(memory["scale"])
-    error_w = memory["error_w"] + scale * to_world(turn, step_w) - step_w
-    error_w = error_w + column(values.position * way) * draws[..., :3]
+    root_path = root(length(step_w))
+    root_angle = root(length(rotation_since(truth.rot_w, memory["rot_w"])))
+    yaw = memory["yaw"] + values.yaw * root_path * draws[..., 3]
+    yaw = yaw + values.yaw_turning * root_angle * draws[..., 4]
+    yaw_rot, scale = yaw_matrix(yaw), column(memory["scale"])
+    error_w = memory["error_w"] + scale * to_world(yaw_rot, step_w) - step_w
+    error_w = error_w + column(values.position * root_path) * draws[..., :3]
     seen = seen._replace(
         pos_w=seen.pos_w + error_w,
-        vel_w=scale * to_world(turn, seen.vel_w),
-        rot_w=product(turn, seen.rot_w),
+        vel_w=scale * to_world(yaw_rot, seen.vel_w),
+        rot_w=product(yaw_rot, seen.rot_w),
     )
     now = {"yaw": yaw, "error_w": error_w, "pos_w": truth.pos_w, "rot_w": truth.rot_w}
     return seen, memory | now
@@ -85,11 +89,11 @@ def root(size: Array) -> Array:
 STATE_DRIFT = Sensor(
     name="state_drift",
     stage="state",
-    summary="Dead reckoning drifts with distance and turning, and its scale is off",
+    summary="Dead reckoning drifts with distance and rotation, and its scale has an error",
     equation="dp_est = (1 + k) Rz(psi) dp + s_p sqrt(|dp|) n, "
-    "dpsi = s_y sqrt(|dp|) n + s_t sqrt(angle) n; v, R turn with psi",
+    "dpsi = s_y sqrt(|dp|) n + s_t sqrt(angle) n; v, R rotate with psi",
     source="Delmerico & Scaramuzza 2018, Delmerico et al. 2019 (UZH-FPV): about 0.5 to 2 % of "
-    "the way after 100 m, hence 0.05 to 0.2 m after 1 m; yaw and scale: 0.1 to 1 deg after 1 m, "
+    "the path after 100 m, hence 0.05 to 0.2 m after 1 m; yaw and scale: 0.1 to 1 deg after 1 m, "
     "about 1 %, our estimate",
     values=StateDrift,
     parameters=(
@@ -108,7 +112,7 @@ STATE_DRIFT = Sensor(
 
 
 class StateNoise(NamedTuple):
-    """Values of `state_noise`."""
+    """Parameters of `state_noise`, standard deviations along each axis; units in `STATE_NOISE`."""
 
     position: Array
     """s_p: standard deviation of the position, for each axis."""
@@ -135,16 +139,17 @@ def state_noise_sense(
 ) -> tuple[View, dict[str, Any]]:
     """Return the view with an estimated position, velocity and attitude."""
     xp = seen.pos_w.__array_namespace__()
-    kept = xp.exp(-moment.dt_s / xp.maximum(values.correlation, 1e-9))
-    error = column(kept) * memory["error"] + column(remembered(kept)) * moment.draws.normal
+    decay = xp.exp(-moment.dt_s / xp.maximum(values.correlation, 1e-9))
+    error = column(decay) * memory["error"] + column(noise_factor(decay)) * moment.draws.normal
     bias = memory["bias"]
-    turn_b = column(values.attitude) * error[..., 6:] + column(values.attitude_bias) * bias[..., 3:]
-    drift_b = column(values.velocity_bias) * bias[..., :3]
-    velocity_w = column(values.velocity) * error[..., 3:6] + to_world(seen.rot_w, drift_b)
+    rotation_b = column(values.attitude) * error[..., 6:]
+    rotation_b = rotation_b + column(values.attitude_bias) * bias[..., 3:]
+    bias_b = column(values.velocity_bias) * bias[..., :3]
+    vel_error_w = column(values.velocity) * error[..., 3:6] + to_world(seen.rot_w, bias_b)
     seen = seen._replace(
         pos_w=seen.pos_w + column(values.position) * error[..., :3],
-        vel_w=seen.vel_w + velocity_w,
-        rot_w=product(seen.rot_w, exp_rot(turn_b)),
+        vel_w=seen.vel_w + vel_error_w,
+        rot_w=product(seen.rot_w, exp_rot(rotation_b)),
     )
     return seen, {"error": error, "bias": bias}
 
@@ -176,7 +181,7 @@ STATE_NOISE = Sensor(
 
 
 class DragTilt(NamedTuple):
-    """Values of `drag_tilt`."""
+    """Parameters of `drag_tilt`; units in `DRAG_TILT`."""
 
     drag: Array
     """Deceleration over speed of the drag that the estimator neglects."""
@@ -224,7 +229,7 @@ DRAG_TILT = Sensor(
 
 
 class Delay(NamedTuple):
-    """Values of `delay`."""
+    """Parameters of `delay`."""
 
     state: float
     """Mean age of the state."""
@@ -235,7 +240,7 @@ class Delay(NamedTuple):
 
 
 def delay_ages(values: Delay) -> Ages:
-    """Return the ages: `eval/judging/ages.py` takes each view at the physics step before them."""
+    """Return the ages of state and image; `eval/judging/ages.py` selects the old views by them."""
     return Ages(*map(float, values))
 
 
@@ -243,7 +248,7 @@ DELAY = Sensor(
     name="delay",
     stage="state",
     summary="State and image are delayed when the policy decides",
-    equation="seen(t) = true(t - a), a = age (1 + jitter u), u even from -1 to 1 each decision",
+    equation="seen(t) = true(t - a), a = age (1 + jitter u), u uniform from -1 to 1 each decision",
     source="Falanga et al. 2019 (latency of vision in flight): 10 to 100 ms",
     values=Delay,
     parameters=(

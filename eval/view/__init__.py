@@ -1,1 +1,1 @@
-"""Recordings, pictures and videos of trials."""
+"""Recordings, pictures and videos of trials, the flights of a policy along a track."""

@@ -1,4 +1,7 @@
-"""Layout of a recording: one tab for each trial, with track, depth image and plots."""
+"""Layout of a recording in the rerun viewer: one tab for each trial, a flight along a track.
+
+A tab has two views of the track, the policy's depth image, plots of the signals and the events.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +12,42 @@ import numpy as np
 import rerun.blueprint as rrb
 
 TIMELINE = "time"
-"""The timeline of a trial, seconds from its start."""
+"""Name of the timeline of a trial, in seconds from its start."""
+BACKGROUND = [245, 246, 248]
+"""Colour behind the 3D views, 0-255."""
 
 
 class Tab(NamedTuple):
     """Inputs of the layout of one trial."""
 
     root: str
-    """Entity path of the trial."""
+    """Entity path of the trial in the recording."""
     title: str
     has_depth: bool
+    """Whether the trial has depth images."""
     low_w: np.ndarray
     """(3,) lower corner of the visible region [m]."""
     high_w: np.ndarray
-    """(3,) upper corner [m]."""
+    """(3,) upper corner of the visible region [m]."""
 
 
-def layout(tabs: Sequence[Tab], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return the blueprint of a recording of these trials, which plays the span `shown_s` [s]."""
-    return tabbed([_tab(tab) for tab in tabs], shown_s)
+def trials_blueprint(tabs: Sequence[Tab], playback_s: tuple[float, float]) -> rrb.Blueprint:
+    """Return the layout of a recording of trials, which plays the span `playback_s` [s]."""
+    return tabs_blueprint([_trial_view(tab) for tab in tabs], playback_s)
 
 
-def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.Blueprint:
-    """Return a blueprint with a tab for each of `parts`, which plays the span `shown_s` [s].
+def tabs_blueprint(
+    views: Sequence[rrb.Container], playback_s: tuple[float, float]
+) -> rrb.Blueprint:
+    """Return a layout with a tab for each of `views`, which plays the span `playback_s` [s].
 
     The viewer has no setting for the initial time, but a loop over a selection begins at its start.
     Without it a file opens at its last time. (A viewer of 0.41 that loads slowly plays from the
     start to the end and stops there.)
     """
-    begin, end = (round(1e9 * time) for time in shown_s)
+    begin, end = (round(1e9 * time) for time in playback_s)
     return rrb.Blueprint(
-        parts[0] if len(parts) == 1 else rrb.Tabs(*parts, active_tab=0),
+        views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0),
         rrb.TimePanel(
             state="expanded",
             timeline=TIMELINE,
@@ -53,16 +61,17 @@ def tabbed(parts: Sequence[rrb.Container], shown_s: tuple[float, float]) -> rrb.
     )
 
 
-def _tab(tab: Tab) -> rrb.Vertical:
+def _trial_view(tab: Tab) -> rrb.Vertical:
+    """Return the views of one trial."""
     world = f"{tab.root}/world"
     overview = rrb.Spatial3DView(
         origin=world,
-        # Back-projected depth would hide the track, so only the view from behind shows it.
+        # Points of the depth image would hide the track, so only the view from behind shows them.
         contents=["$origin/**", "- $origin/drone/camera/**"],
         name="track",
-        background=[245, 246, 248],
+        background=BACKGROUND,
         line_grid=False,
-        eye_controls=_overview(tab),
+        eye_controls=_overview_camera(tab),
     )
     side_views: list[rrb.View] = [
         rrb.Spatial3DView(
@@ -70,7 +79,7 @@ def _tab(tab: Tab) -> rrb.Vertical:
             origin=f"{world}/drone",
             contents=[f"{world}/**", "- $origin/pin"],
             name="behind the drone",
-            background=[245, 246, 248],
+            background=BACKGROUND,
             line_grid=False,
             eye_controls=rrb.EyeControls3D(
                 kind=rrb.Eye3DKind.Orbital,
@@ -106,14 +115,16 @@ def _tab(tab: Tab) -> rrb.Vertical:
     )
 
 
-def _overview(tab: Tab) -> rrb.EyeControls3D:
-    """Return a camera above the track's long side that shows all of it."""
-    middle, size = (tab.low_w + tab.high_w) / 2, tab.high_w - tab.low_w
-    away = np.array([0.0, -1.0, 0.75]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.75])
+def _overview_camera(tab: Tab) -> rrb.EyeControls3D:
+    """Return a camera above the track's long side that shows the whole track."""
+    centre_w, size = (tab.low_w + tab.high_w) / 2, tab.high_w - tab.low_w
+    # Towards the camera: perpendicular to the long side, 37 degrees above the horizon.
+    direction = np.array([0.0, -1.0, 0.75]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.75])
+    # Chosen so that tracks of all shapes fill the view.
     distance = 0.57 * float(np.max(size[:2])) + 0.2 * float(np.min(size[:2])) + 1.0
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
-        position=middle + distance * away / np.linalg.norm(away),
-        look_target=middle,
+        position=centre_w + distance * direction / np.linalg.norm(direction),
+        look_target=centre_w,
         eye_up=[0.0, 0.0, 1.0],
     )

@@ -1,4 +1,4 @@
-"""Pictures of a drone on a track, from any viewpoint or from behind it."""
+"""Draw pictures of a drone on a track, from any viewpoint or from behind the drone."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import numpy as np
 from PIL import Image
 
 from eval.view import colours
-from eval.view.scene3d import Faces, Lines, cut_up, look_at, paint
+from eval.view.scene3d import Faces, Lines, divide_faces, look_at, paint
 from eval.view.solids import track_solids
 from tracks.track import Track
 
 OVERSAMPLING = 2
-"""Pictures are drawn this much larger and then reduced, for smooth edges."""
+"""Pictures are drawn this many times larger and then reduced, for smooth edges."""
 ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
+"""Distance of the drawn rotors from the drone's centre, and their radius [m]."""
+BODY_HALF_SIZE_M = (0.064, 0.064, 0.025)
+"""Half extents of the drawn body [m]."""
 BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
-"""Position of `chase_image`'s camera behind and above the drone, and of its target ahead [m]."""
+"""Distances of `chase_image`'s camera behind and above the drone, and of its target ahead [m]."""
+MIN_EYE_HEIGHT_M = 0.15
+"""Least height of the camera above the ground [m]."""
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.0)
 
 
@@ -24,31 +29,33 @@ class Scenery(NamedTuple):
     """The triangles of a track."""
 
     corners_w: np.ndarray
-    """(F, 3, 3) [m]."""
+    """(F, 3, 3) corners [m]."""
     gate: np.ndarray
-    """(F,) number of the gate to whose frame each belongs, or -1."""
+    """(F,) number of the gate to whose frame a triangle belongs, or -1."""
 
 
 class Drone(NamedTuple):
     """A drone in a picture."""
 
     pos_w: np.ndarray
-    """(3,) [m]."""
+    """(3,) position [m]."""
     rot_w: np.ndarray
-    """(3, 3) body to world."""
+    """(3, 3) attitude, body to world."""
     gates: int
     """Number of passed gates."""
 
 
 def scenery_of(track: Track) -> Scenery:
-    """Return the triangles of a track, for `painted`."""
+    """Return the triangles of a track, for `draw_drone`."""
     solids = track_solids(track)
-    corners, whose = cut_up(np.concatenate([solid.vertices[solid.faces] for solid in solids]))
-    gates = [-1 if solid.gate is None else solid.gate for solid in solids]
-    return Scenery(corners, np.repeat(gates, [len(solid.faces) for solid in solids])[whose])
+    corners_w = np.concatenate([solid.vertices[solid.faces] for solid in solids])
+    gate_of_solid = [-1 if solid.gate is None else solid.gate for solid in solids]
+    gate = np.repeat(gate_of_solid, [len(solid.faces) for solid in solids])
+    corners_w, triangle = divide_faces(corners_w)
+    return Scenery(corners_w, gate[triangle])
 
 
-def painted(
+def draw_drone(
     scenery: Scenery,
     drone: Drone,
     eye_to_w: tuple[np.ndarray, np.ndarray],
@@ -56,49 +63,56 @@ def painted(
     size: tuple[int, int],
     lines: Lines = NO_LINES,
 ) -> Image.Image:
-    """Return the picture from `eye_to_w`, the camera's position and its target [m].
-
-    Triangles between the camera and the drone are left out.
+    """Return a picture of a drone on a track, without the triangles between camera and drone.
 
     Args:
-        scenery: of the track.
-        drone: sets the colours of passed and next gates.
-        eye_to_w: (3,) each.
-        fov_deg: field of view across [deg].
+        scenery: triangles of the track.
+        drone: the drone; its number of passed gates sets the gates' colours.
+        eye_to_w: the camera's position and its target, (3,) each [m].
+        fov_deg: horizontal field of view [deg].
         size: width and height [pixels].
         lines: additional lines.
     """
     eye, target = eye_to_w
     body = _drone_faces(drone.pos_w, drone.rot_w)
-    shown = _beyond(scenery.corners_w, eye, drone.pos_w)
+    visible = _not_between(scenery.corners_w, eye, drone.pos_w)
     faces = Faces(
-        np.concatenate([scenery.corners_w[shown], body.corners_w]),
-        np.concatenate([_track_colour(scenery.gate[shown], drone.gates), body.colour]),
+        np.concatenate([scenery.corners_w[visible], body.corners_w]),
+        np.concatenate([_track_colour(scenery.gate[visible], drone.gates), body.colour]),
     )
-    big = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
-    return paint(look_at(eye, target, fov_deg, big), faces, lines).reduce(OVERSAMPLING)
+    oversampled = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
+    return paint(look_at(eye, target, fov_deg, oversampled), faces, lines).reduce(OVERSAMPLING)
 
 
 def chase_image(
     scenery: Scenery, drone: Drone, vel_w: np.ndarray, size: tuple[int, int], fov_deg: float = 78.0
 ) -> np.ndarray:
-    """Return (height, width, 3) uint8 from behind a drone that flies at vel_w (3,) [m/s]."""
-    # The heading contributes for a drone at rest.
-    way = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
-    ahead = np.append(way / max(float(np.linalg.norm(way)), 1e-6), 0.0)
+    """Return a picture (height, width, 3) uint8 from behind a drone.
+
+    Args:
+        scenery: triangles of the track.
+        drone: the drone.
+        vel_w: (3,) velocity of the drone [m/s], which sets the direction of the view.
+        size: width and height [pixels].
+        fov_deg: horizontal field of view [deg].
+    """
+    # The heading sets the direction for a drone at rest.
+    direction = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
+    ahead = np.append(direction / max(float(np.linalg.norm(direction)), 1e-6), 0.0)
     eye = drone.pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
-    eye[2] = max(eye[2], 0.15)
-    return np.asarray(painted(scenery, drone, (eye, drone.pos_w + AHEAD_M * ahead), fov_deg, size))
+    eye[2] = max(eye[2], MIN_EYE_HEIGHT_M)
+    target = drone.pos_w + AHEAD_M * ahead
+    return np.asarray(draw_drone(scenery, drone, (eye, target), fov_deg, size))
 
 
 def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) -> np.ndarray:
     """Return a picture (H, W, 3) with a depth image (h, w) [m] in its lower right corner.
 
     Args:
-        picture: uint8.
-        depth_m: coloured up to `range_m`, enlarged with the nearest pixel.
-        range_m: the camera's [m].
-        share: the picture's width over that of the depth image.
+        picture: (H, W, 3) uint8.
+        depth_m: (h, w) depth image [m]; it is enlarged without interpolation.
+        range_m: depth at the end of the colour scale [m].
+        share: width of the picture divided by the width of the depth image in it.
     """
     width = picture.shape[1] // share
     height = min(picture.shape[0], max(1, width * depth_m.shape[0] // depth_m.shape[1]))
@@ -109,13 +123,14 @@ def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) 
     return out
 
 
-def _beyond(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
-    """Return which faces (F, 3, 3) are not between camera and drone, (F,)."""
-    way = pos_w - eye_w
-    return ((corners_w - eye_w) @ way).max(axis=1) > way @ way
+def _not_between(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
+    """Return which faces (F, 3, 3) reach beyond the drone as seen from the camera, bool (F,)."""
+    to_drone = pos_w - eye_w
+    return ((corners_w - eye_w) @ to_drone).max(axis=1) > to_drone @ to_drone
 
 
 def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
+    """Return the colours (F, 3) of the track's faces, which belong to gate `gate` (F,) or -1."""
     colour = np.tile(np.array(colours.SOLID, dtype=float), (len(gate), 1))
     colour[gate >= 0] = 0.55 * np.array(colours.AHEAD) + 0.45 * 255
     colour[gate == next_gate] = colours.AHEAD
@@ -125,7 +140,7 @@ def _track_colour(gate: np.ndarray, next_gate: int) -> np.ndarray:
 
 def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
     """Return the faces of a body and four rotors, the front ones orange."""
-    x, y, z = 0.064, 0.064, 0.025
+    x, y, z = BODY_HALF_SIZE_M
     box = np.array([[i * x, j * y, k * z] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     body = [box[[q[0], q[a], q[a + 1]]] for q in quads for a in (1, 2)]
@@ -136,6 +151,6 @@ def _drone_faces(pos_w: np.ndarray, rot_w: np.ndarray) -> Faces:
         middle = np.array([i * ARM_M / np.sqrt(2), j * ARM_M / np.sqrt(2), 0.03])
         for a, b in zip(ring[:-1], ring[1:], strict=True):
             parts += [np.array([middle, middle + a, middle + b])]
-            parts += [np.array([middle, middle + b, middle + a])]  # seen from below, too
+            parts += [np.array([middle, middle + b, middle + a])]  # the lower side
             colour += [colours.AHEAD if i > 0 else colours.SOLID_EDGE] * 2
     return Faces(pos_w + np.array(parts) @ rot_w.T, np.array(colour, dtype=float))

@@ -1,10 +1,10 @@
-"""Recordings of measured and simulated flights together, for the rerun viewer.
+"""Write measured flights with their simulations as a recording for the rerun 3D viewer.
 
-A flight has the entities `/flight_k/world/measured`, and `world/LABEL` for each simulation, each
-with its `path` and a moving `drone`; the series `error/LABEL/position`, `.../velocity`,
-`.../attitude` and `.../rates`, and `velocity_x/measured`, `velocity_x/LABEL`, ... on the timeline
-`time` in seconds from the flight's start. A simulation consists of rollouts; lines break between
-them.
+Flight k has the entities `/flight_k/world/measured`, and `world/LABEL` for each simulation, each
+with its `path` and a moving `drone`. Its series are `error_position/LABEL`, `error_velocity/LABEL`,
+`error_attitude/LABEL` and `error_rates/LABEL`, and `velocity_x/measured`, `velocity_x/LABEL`, ...
+on the timeline `time` in seconds from the flight's start. A simulation consists of rollouts, which
+start from measured states; lines break between them.
 """
 
 from __future__ import annotations
@@ -17,33 +17,35 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from eval.view.blueprint import tabbed
+from eval.view.blueprint import BACKGROUND, tabs_blueprint
 from eval.view.recording import APPLICATION, DRONE_HALF_SIZE, time_columns
 from tracks.common.files import replacing_file
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
-"""Version of the recording's entities, in its properties."""
+"""Version of the recording's entities, which is stored in its properties."""
 MEASURED = (29, 36, 48)
+"""Colour of the measured flight, 0-255."""
 SIMULATED = ((224, 137, 43), (36, 99, 201), (122, 92, 184))
 """Colours of the simulations, in order."""
 ERRORS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "rad/s"}
+"""Part of the state -> unit of its error."""
 SERIES = tuple(f"{group}_{axis}" for group in ("velocity", "rates") for axis in "xyz")
 
 
-class Track(NamedTuple):
+class States(NamedTuple):
     """Measured or simulated states of a drone at T times; NaN where unknown."""
 
     time_s: np.ndarray
-    """(T,) since the flight's start [s]."""
+    """(T,) time since the flight's start [s]."""
     pos_w: np.ndarray
-    """(T, 3) [m]."""
+    """(T, 3) position [m]."""
     quat_wxyz: np.ndarray
-    """(T, 4)."""
+    """(T, 4) attitude, body to world."""
     vel_w: np.ndarray
-    """(T, 3) [m/s]."""
+    """(T, 3) velocity [m/s]."""
     rate_b: np.ndarray
-    """(T, 3) [rad/s]."""
+    """(T, 3) body rates [rad/s]."""
 
 
 class Simulation(NamedTuple):
@@ -51,35 +53,35 @@ class Simulation(NamedTuple):
 
     label: str
     """Name in the viewer."""
-    rollouts: Sequence[Track]
-    """One after another in time."""
+    rollouts: Sequence[States]
+    """The simulated states of each rollout, in the order of time."""
     errors: Sequence[np.ndarray]
-    """(T, 4) of each rollout: simulated less measured of position, velocity [m, m/s], attitude
-    [deg] and rates [rad/s], as lengths."""
+    """(T, 4) errors of each rollout: norms of simulated minus measured position [m], velocity
+    [m/s], attitude [deg] and body rates [rad/s]."""
 
 
-class Compared(NamedTuple):
+class ComparedFlight(NamedTuple):
     """One measured flight and its simulations."""
 
     name: str
-    measured: Track
+    measured: States
     simulations: Sequence[Simulation]
 
 
 def write_comparison(
     path: str | Path,
-    flights: Sequence[Compared],
+    flights: Sequence[ComparedFlight],
     half_size: tuple[float, float, float] = DRONE_HALF_SIZE,
 ) -> Path:
     """Write flights and their simulations as a rerun recording (.rrd) with a layout.
 
     Args:
         path: file to write, ending in `.rrd`.
-        flights: each gets a tab.
+        flights: the flights; each gets a tab.
         half_size: half extents of the drone's box [m].
 
     Raises:
-        ValueError: where there is no flight.
+        ValueError: where `flights` is empty.
         OSError: where the file cannot be written; nothing is left under its name.
     """
     if not flights:
@@ -101,9 +103,10 @@ def write_comparison(
 def _log_flight(
     recording: rr.RecordingStream,
     root: str,
-    flight: Compared,
+    flight: ComparedFlight,
     half_size: tuple[float, float, float],
 ) -> None:
+    """Log a flight, its simulations and their errors below the entity `root`."""
     world = f"{root}/world"
     recording.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_drone(recording, f"{world}/measured", [flight.measured], MEASURED, half_size, "measured")
@@ -114,34 +117,37 @@ def _log_flight(
         _log_drone(recording, entity, simulation.rollouts, colour, half_size, simulation.label)
         if not simulation.rollouts:
             continue
-        whole = Track(*(_broken(parts) for parts in zip(*simulation.rollouts, strict=True)))
-        _log_series(recording, root, label, whole, colour, 1.2)
-        errors = _broken(simulation.errors)
+        states = States(
+            *(_concatenate_with_gaps(parts) for parts in zip(*simulation.rollouts, strict=True))
+        )
+        _log_series(recording, root, label, states, colour, 1.2)
+        errors = _concatenate_with_gaps(simulation.errors)
         for k, name in enumerate(ERRORS):
             line = f"{root}/error_{name}/{label}"
-            _log_line(recording, line, whole.time_s, errors[:, k], simulation.label, colour, 1.5)
+            _log_line(recording, line, states.time_s, errors[:, k], simulation.label, colour, 1.5)
 
 
 def _log_drone(
     recording: rr.RecordingStream,
     entity: str,
-    tracks: Sequence[Track],
+    rollouts: Sequence[States],
     colour: tuple[int, int, int],
     half_size: tuple[float, float, float],
     label: str,
 ) -> None:
-    strips = [track.pos_w[np.isfinite(track.pos_w).all(axis=1)] for track in tracks]
+    """Log the path of each rollout, and a drone that moves through all of them."""
+    strips = [states.pos_w[np.isfinite(states.pos_w).all(axis=1)] for states in rollouts]
     strips = [strip for strip in strips if len(strip) > 1]
     lines = rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=0.012)
     recording.log(f"{entity}/path", lines, static=True)
-    if not tracks:
+    if not rollouts:
         return
-    track = Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    good = np.isfinite(track.pos_w).all(axis=1) & np.isfinite(track.quat_wxyz).all(axis=1)
+    states = States(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
+    good = np.isfinite(states.pos_w).all(axis=1) & np.isfinite(states.quat_wxyz).all(axis=1)
     columns = rr.Transform3D.columns(
-        translation=track.pos_w[good], quaternion=np.roll(track.quat_wxyz[good], -1, axis=1)
+        translation=states.pos_w[good], quaternion=np.roll(states.quat_wxyz[good], -1, axis=1)
     )
-    recording.send_columns(f"{entity}/drone", time_columns(track.time_s[good]), columns)
+    recording.send_columns(f"{entity}/drone", time_columns(states.time_s[good]), columns)
     body = rr.Boxes3D(half_sizes=[half_size], colors=[colour], labels=[label])
     recording.log(f"{entity}/drone/body", body, static=True)
 
@@ -150,14 +156,15 @@ def _log_series(
     recording: rr.RecordingStream,
     root: str,
     label: str,
-    track: Track,
+    states: States,
     colour: tuple[int, int, int],
     width: float,
 ) -> None:
-    values = np.concatenate([track.vel_w, track.rate_b], axis=1)
+    """Log velocity and body rates as curves, one for each axis."""
+    values = np.concatenate([states.vel_w, states.rate_b], axis=1)
     for k, name in enumerate(SERIES):
         line = f"{root}/{name}/{label}"
-        _log_line(recording, line, track.time_s, values[:, k], label, colour, width)
+        _log_line(recording, line, states.time_s, values[:, k], label, colour, width)
 
 
 def _log_line(
@@ -169,14 +176,15 @@ def _log_line(
     colour: tuple[int, int, int],
     width: float,
 ) -> None:
+    """Log one curve with its style."""
     style = rr.SeriesLines(names=[label], colors=[colour], widths=[width])
     recording.log(entity, style, static=True)
     columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
     recording.send_columns(entity, time_columns(time_s), columns)
 
 
-def _broken(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return `parts` joined, with a row of NaN between them; times continue."""
+def _concatenate_with_gaps(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the concatenated `parts`, with a row of NaN (for times, 1 us later) between them."""
     rows: list[np.ndarray] = []
     for number, part in enumerate(parts):
         rows.append(part)
@@ -186,18 +194,20 @@ def _broken(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _layout(flights: Sequence[Compared]) -> rrb.Blueprint:
+def _layout(flights: Sequence[ComparedFlight]) -> rrb.Blueprint:
     times = [flight.measured.time_s for flight in flights]
-    # The start is skipped, where simulations still agree with the measurement.
-    shown = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))
-    return tabbed([_tab(f"/flight_{number}", f) for number, f in enumerate(flights)], shown)
+    # The playback skips the start, where simulations still agree with the measurement.
+    playback_s = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))
+    views = [_flight_view(f"/flight_{number}", flight) for number, flight in enumerate(flights)]
+    return tabs_blueprint(views, playback_s)
 
 
-def _tab(root: str, flight: Compared) -> rrb.Vertical:
+def _flight_view(root: str, flight: ComparedFlight) -> rrb.Vertical:
+    """Return the views of one flight: paths, errors and curves."""
     overview = rrb.Spatial3DView(
         origin=f"{root}/world",
         name="measured and simulated",
-        background=[245, 246, 248],
+        background=BACKGROUND,
         line_grid=False,
     )
     errors = [

@@ -1,4 +1,7 @@
-"""Pictures of trials as PNG (or PDF, SVG), from above and from the side; need no display."""
+"""Draw pictures of trials (flights along a track) as PNG, PDF or SVG, without a display.
+
+`write_picture` draws one trial from above and from the side, `write_grid` several from above.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +23,23 @@ from matplotlib.text import Text
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.colours import SPEED_MAP, hexed
+from eval.view.colours import SPEED_MAP, hex_text
 from eval.view.solids import outline, track_solids
 from eval.worlds.trial import TrialResult
 from tracks.common.files import replacing_file
 from tracks.track import Track
 
 Shown = tuple[Track, Flight | None, TrialResult | None]
-"""A track, with an optional flight and its result."""
+"""A track, with an optional flight and its outcome."""
 
 TOP, SIDE = (0, 1), (0, 2)
-"""World axes of a view, horizontal and vertical."""
+"""World axes of a view: the horizontal and the vertical one, 0 for x."""
 MARGIN_M = 1.0
+"""Distance that a picture extends beyond track and flight [m]."""
 PATH_WIDTH = 2.2
+"""Width of the flight's path [points]."""
 PASSED, CRASH, START, GREY = map(
-    hexed, (colours.PASSED, colours.CRASH, colours.START, colours.SOLID_EDGE)
+    hex_text, (colours.PASSED, colours.CRASH, colours.START, colours.SOLID_EDGE)
 )
 
 
@@ -49,21 +54,21 @@ def write_picture(
 
     Args:
         path: file to write; its ending sets the format.
-        track: of the trial.
-        flight: the path flown, coloured by speed.
-        result: for the title and the mark at the end.
+        track: track of the trial.
+        flight: log of the trial; its path is coloured by speed.
+        result: outcome of the trial, for the title and the mark at the end.
         dpi: dots per inch; the picture is up to 9.5 inches wide and 9.2 high.
 
     Raises:
         OSError: where the file cannot be written; nothing is left under its name.
     """
     low, high = _limits(track, flight)
-    across, deep, tall = high - low
-    # Both views have the same scale, so their heights follow from the track's extent.
-    scale = min(7.6 / across, 7.5 / (deep + tall))
-    size = (max(across * scale, 4.5) + 1.9, (deep + tall) * scale + 1.65)
+    extent_x, extent_y, extent_z = high - low
+    # Both views have the same scale [inch/m], so their heights follow from the track's extent.
+    scale = min(7.6 / extent_x, 7.5 / (extent_y + extent_z))
+    size = (max(extent_x * scale, 4.5) + 1.9, (extent_y + extent_z) * scale + 1.65)
     figure = Figure(figsize=size, layout="constrained")
-    top, side = figure.subplots(2, 1, sharex=True, height_ratios=[deep, tall])
+    top, side = figure.subplots(2, 1, sharex=True, height_ratios=[extent_y, extent_z])
     speed = _speed_range([flight])
     for axes, view in ((top, TOP), (side, SIDE)):
         _draw(axes, (track, flight, result), view, speed)
@@ -85,6 +90,12 @@ def write_picture(
 def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi: int = 110) -> Path:
     """Draw several trials from above, each in a panel, with one colour bar.
 
+    Args:
+        path: file to write; its ending sets the format.
+        trials: tracks, with optional flights and outcomes.
+        columns: number of panels in a row.
+        dpi: dots per inch.
+
     Raises:
         ValueError: where `trials` is empty.
         OSError: where the file cannot be written; nothing is left under its name.
@@ -94,14 +105,14 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
     columns = min(columns, len(trials))
     rows = math.ceil(len(trials) / columns)
     limits = [_limits(track, flight) for track, flight, _ in trials]
-    # Row heights follow from the shapes of their panels.
-    shape = np.array([(high - low)[1] / (high - low)[0] for low, high in limits])
-    shape = np.clip(shape, 0.3, 1.1)
-    tall = [shape[row * columns : (row + 1) * columns].max() for row in range(rows)]
-    panel = 4.2
-    height = sum(panel * part + 0.85 for part in tall) + 0.5
+    # Row heights follow from the aspect ratios of their panels.
+    ratio = np.array([(high - low)[1] / (high - low)[0] for low, high in limits])
+    ratio = np.clip(ratio, 0.3, 1.1)
+    row_ratios = [ratio[row * columns : (row + 1) * columns].max() for row in range(rows)]
+    panel = 4.2  # width of a panel [inch]
+    height = sum(panel * row_ratio + 0.85 for row_ratio in row_ratios) + 0.5
     figure = Figure(figsize=(panel * columns + 0.9, height), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, height_ratios=tall)
+    grid = figure.subplots(rows, columns, squeeze=False, height_ratios=row_ratios)
     speed = _speed_range([flight for _, flight, _ in trials])
     for axes in grid.flat[len(trials) :]:
         axes.set_axis_off()
@@ -115,9 +126,9 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
         axes.set_ylabel("y [m]", fontsize=8)
         axes.set_title(_title(track), fontsize=9, fontweight="bold", loc="left", pad=16)
         if result is not None:
-            where = {"xycoords": "axes fraction", "textcoords": "offset points"}
+            units = {"xycoords": "axes fraction", "textcoords": "offset points"}
             text = _outcome(result, short=True)
-            axes.annotate(text, (0, 1), xytext=(0, 4), fontsize=8, color="#444444", **where)
+            axes.annotate(text, (0, 1), xytext=(0, 4), fontsize=8, color="#444444", **units)
     if any(flight is not None for _, flight, _ in trials):
         _colour_bar(figure, list(grid.flat), speed)
     _legend(figure, trials)
@@ -127,19 +138,20 @@ def write_grid(path: str | Path, trials: Sequence[Shown], columns: int = 3, dpi:
 def _draw(
     axes: Axes, shown: Shown, view: tuple[int, int], speed: Normalize, small: bool = False
 ) -> None:
+    """Draw the gates, obstacles, path, start and end of a trial in one view."""
     track, flight, result = shown
     if flight is not None and not len(flight.time_s):
         flight = None  # a trial that ended at its first step
     gates, passed = track.scene.gates, _passed(flight, result)
     solids = track_solids(track)
     obstacles = [solid.vertices for solid in solids if solid.gate is None]
-    # Nearer solids are drawn later: higher ones from above, those of lower y from the side.
-    obstacles.sort(key=lambda at: at[:, 2].max() if view == TOP else -at[:, 1].min())
+    # Solids nearer to the viewer are drawn later: the highest from above, lowest y from the side.
+    obstacles.sort(key=lambda points: points[:, 2].max() if view == TOP else -points[:, 1].min())
     axes.add_collection(
         PolyCollection(
-            [outline(at[:, view]) for at in obstacles],
-            facecolor=hexed(colours.SOLID),
-            edgecolor=hexed(colours.SOLID_EDGE),
+            [outline(points[:, view]) for points in obstacles],
+            facecolor=hex_text(colours.SOLID),
+            edgecolor=hex_text(colours.SOLID_EDGE),
             lw=0.6,
             alpha=0.75,
         )
@@ -152,7 +164,8 @@ def _draw(
     )
     if view == TOP:
         for number, (center, rot) in enumerate(zip(gates.center_w, gates.rot_w, strict=True)):
-            _number(axes, number, center[:2], rot[:2, 0], _gate_colour(number, passed), small)
+            colour = _gate_colour(number, passed)
+            _draw_gate_number(axes, number, center[:2], rot[:2, 0], colour, small)
     if flight is not None:
         _draw_path(axes, flight, view, speed, small)
     start = track.start_pos_w[list(view)]
@@ -169,7 +182,7 @@ def _draw(
 
 
 def _passed(flight: Flight | None, result: TrialResult | None) -> int:
-    """Return how many gates were passed."""
+    """Return the number of passed gates."""
     if result is not None:
         return result.gates_passed
     return 0 if flight is None or not len(flight.time_s) else int(flight.gate.max())
@@ -177,39 +190,43 @@ def _passed(flight: Flight | None, result: TrialResult | None) -> int:
 
 def _gate_colour(number: int | None, passed: int) -> str:
     ahead = number is None or number >= passed
-    return hexed(colours.AHEAD) if ahead else PASSED
+    return hex_text(colours.AHEAD) if ahead else PASSED
 
 
 def _draw_path(
     axes: Axes, flight: Flight, view: tuple[int, int], speed: Normalize, small: bool
 ) -> None:
+    """Draw the flight's path, coloured by speed."""
     points = flight.pos_w[:, view]
-    pieces = np.stack([points[:-1], points[1:]], axis=1)
+    segments = np.stack([points[:-1], points[1:]], axis=1)
     speeds = np.linalg.norm(flight.vel_w, axis=1)[:-1]
     width = PATH_WIDTH * (0.75 if small else 1.0)
-    path = LineCollection(list(pieces), cmap=SPEED_MAP, norm=speed, lw=width, zorder=5)
+    path = LineCollection(list(segments), cmap=SPEED_MAP, norm=speed, lw=width, zorder=5)
     path.set_array(speeds)
     path.set_capstyle("round")
     axes.add_collection(path)
 
 
-def _number(
+def _draw_gate_number(
     axes: Axes,
     number: int,
     center: np.ndarray,
-    along: np.ndarray,
+    direction: np.ndarray,
     colour: str,
     small: bool,
 ) -> None:
-    away = 13 if not small else 8
-    along = along / max(float(np.linalg.norm(along)), 1e-9)
-    across = np.array([-along[1], along[0]])
+    """Draw a gate's number, from 0 as in `TrialResult.collided_with`, and its flight direction.
+
+    `center` (2,) and `direction` (2,) are the gate's position and x axis, seen from above.
+    """
+    distance_pt = 13 if not small else 8
+    direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
+    across = np.array([-direction[1], direction[0]])
     label = center + 0.75 * across
-    # Numbered from 0, as in the names of what was collided with ("gate 3 frame").
     axes.annotate(
         str(number),
         (label[0], label[1]),
-        xytext=tuple(across * away * 0.6),
+        xytext=tuple(across * distance_pt * 0.6),
         textcoords="offset points",
         ha="center",
         va="center",
@@ -219,12 +236,13 @@ def _number(
         zorder=7,
     )
     if not small:
-        tip = (center[0] + 0.55 * along[0], center[1] + 0.55 * along[1])
+        tip = (center[0] + 0.55 * direction[0], center[1] + 0.55 * direction[1])
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.0, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", tip, xytext=(center[0], center[1]), arrowprops=arrow, zorder=4)
 
 
 def _mark_end(axes: Axes, end: np.ndarray, ended_by: str, size: float) -> None:
+    """Mark the end of the flight: a star for a finished trial, a cross for any other."""
     if ended_by == "finished":
         axes.scatter(*end, s=size * 4, marker="*", color=PASSED, edgecolor="white", zorder=8)
     else:
@@ -232,13 +250,14 @@ def _mark_end(axes: Axes, end: np.ndarray, ended_by: str, size: float) -> None:
 
 
 def _limits(track: Track, flight: Flight | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner (3,) of the region to draw [m]."""
     points = [track.start_pos_w[None], *(solid.vertices for solid in track_solids(track))]
     if flight is not None:
         points.append(flight.pos_w[np.isfinite(flight.pos_w).all(axis=1)])
-    every = np.concatenate(points)
-    low, high = every.min(axis=0) - MARGIN_M, every.max(axis=0) + MARGIN_M
-    low[2] = min(-0.2, every[:, 2].min() - 0.2)
-    high[2] = every[:, 2].max() + 0.4
+    points_w = np.concatenate(points)
+    low, high = points_w.min(axis=0) - MARGIN_M, points_w.max(axis=0) + MARGIN_M
+    low[2] = min(-0.2, points_w[:, 2].min() - 0.2)
+    high[2] = points_w[:, 2].max() + 0.4
     return low, high
 
 
@@ -257,17 +276,16 @@ def _colour_bar(figure: Figure, axes: list[Axes], speed: Normalize) -> None:
 
 
 def _legend(figure: Figure, trials: Sequence[Shown]) -> None:
-    """Name the marks that are drawn, above the views."""
+    """Draw a legend of the marks above the views."""
     passed = [_passed(flight, result) for _, flight, result in trials]
     gates = [len(track.scene.gates.center_w) for track, _, _ in trials]
-    grey = (hexed(colours.SOLID), hexed(colours.SOLID_EDGE))
     marks: list[Artist] = [
         Line2D([], [], ls="", marker="o", mfc="white", mec=START, mew=1.8, ms=7, label="start"),
-        Patch(facecolor=grey[0], edgecolor=grey[1], label="obstacle"),
+        Patch(facecolor=hex_text(colours.SOLID), edgecolor=GREY, label="obstacle"),
     ]
-    if any(done < of for done, of in zip(passed, gates, strict=True)):
-        words = "gate ahead" if any(passed) else "gate"
-        marks.insert(1, Line2D([], [], color=hexed(colours.AHEAD), lw=4, label=words))
+    if any(done < total for done, total in zip(passed, gates, strict=True)):
+        label = "gate ahead" if any(passed) else "gate"
+        marks.insert(1, Line2D([], [], color=hex_text(colours.AHEAD), lw=4, label=label))
     if any(passed):
         marks.insert(1, Line2D([], [], color=PASSED, lw=4, label="gate passed"))
     figure.legend(
@@ -291,7 +309,7 @@ def _outcome(result: TrialResult, short: bool = False) -> str:
 def _save(figure: Figure, path: str | Path, dpi: int) -> Path:
     FigureCanvasAgg(figure)
     for text in figure.findobj(Text):
-        text.set_parse_math(False)  # a name of a policy or a track may hold dollar signs
+        text.set_parse_math(False)  # names of policies and tracks may have dollar signs
     with replacing_file(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
     return Path(path)

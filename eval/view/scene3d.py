@@ -1,7 +1,7 @@
-"""A small renderer of flat-shaded triangles and lines, so that a video needs no GPU and no GL.
+"""A small renderer of flat-shaded triangles and lines that needs no GPU and no OpenGL.
 
-Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972),
-which is correct for small faces except for rare overlaps; large faces are divided before.
+Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972). The
+result is correct for small faces except for rare overlaps, so large faces are divided first.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from eval.view.colours import brightness
 from eval.view.solids import flat_normals
 
 NEAR_M = 0.05
-"""Distance from the camera below which faces are clipped [m]."""
+"""Depth below which faces are clipped [m]."""
 FOG_M = 45.0
 """Distance at which a colour has faded by `FOG_SHARE` [m]."""
 FOG_SHARE = 0.65
+"""Largest share of the sky's colour in a far face."""
 SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
+"""Colours of the sky, the ground and its grid lines, 0-255."""
 GRID_REACH_M = 24
-
-
+"""Distance from the camera to the last grid line [m]; lines are 1 m apart."""
 LONGEST_M = 2.0
 """Longest side of a face before it is divided [m]."""
 MOST_FACES = 6000
@@ -33,11 +34,11 @@ class Viewpoint(NamedTuple):
     """A pinhole camera anywhere in the world."""
 
     eye_w: np.ndarray
-    """(3,) [m]."""
+    """(3,) position [m]."""
     axes_w: np.ndarray
-    """(3, 3) rows right, down and forward."""
+    """(3, 3) camera axes right, down and forward as rows, world frame."""
     focal: float
-    """[pixels]."""
+    """Focal length [pixels]."""
     size: tuple[int, int]
     """Width and height [pixels]."""
 
@@ -46,42 +47,58 @@ class Faces(NamedTuple):
     """Triangles to draw."""
 
     corners_w: np.ndarray
-    """(F, 3, 3) [m], counter-clockwise from outside."""
+    """(F, 3, 3) corners [m], counter-clockwise seen from outside."""
     colour: np.ndarray
-    """(F, 3) 0-255, before shading."""
+    """(F, 3) colours before shading, 0-255."""
 
 
 class Lines(NamedTuple):
-    """Pieces of a line to draw."""
+    """Line segments to draw."""
 
     ends_w: np.ndarray
-    """(L, 2, 3) [m]."""
+    """(L, 2, 3) end points [m]."""
     colour: np.ndarray
-    """(L, 3) 0-255."""
+    """(L, 3) colours, 0-255."""
     width_m: float
+    """Width of the lines [m]."""
 
 
-def cut_up(corners_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles (F, 3, 3) divided until no side is long, and their origins (F',)."""
-    whose = np.arange(len(corners_w))
+def divide_faces(corners_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide triangles until no side is longer than `LONGEST_M`, or there are `MOST_FACES`.
+
+    Args:
+        corners_w: (F, 3, 3) corners of the triangles [m].
+
+    Returns:
+        The corners of the parts (F', 3, 3), and the index of each part's triangle (F',).
+    """
+    triangle = np.arange(len(corners_w))
     while True:
         sides = np.linalg.norm(corners_w - np.roll(corners_w, -1, axis=1), axis=-1)
         long = np.flatnonzero(sides.max(axis=1, initial=0.0) > LONGEST_M)
         if not len(long) or len(corners_w) + len(long) > MOST_FACES:
-            return corners_w, whose
-        turn = (sides[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(corners_w[long], turn[..., None], axis=1), 1, 0)
+            return corners_w, triangle
+        # Corners in an order in which the longest side, which is halved, goes from a to b.
+        order = (sides[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(corners_w[long], order[..., None], axis=1), 1, 0)
         middle = 0.5 * (a + b)
         halves = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
-        keep = np.delete(np.arange(len(corners_w)), long)
-        corners_w = np.concatenate([corners_w[keep], halves])
-        whose = np.concatenate([whose[keep], whose[long], whose[long]])
+        short = np.delete(np.arange(len(corners_w)), long)
+        corners_w = np.concatenate([corners_w[short], halves])
+        triangle = np.concatenate([triangle[short], triangle[long], triangle[long]])
 
 
 def look_at(
     eye_w: np.ndarray, target_w: np.ndarray, fov_deg: float, size: tuple[int, int]
 ) -> Viewpoint:
-    """Return the level camera at `eye_w` towards `target_w`; `fov_deg` is horizontal."""
+    """Return a camera without roll that looks from one point to another.
+
+    Args:
+        eye_w: (3,) position of the camera [m].
+        target_w: (3,) point in the middle of the picture [m].
+        fov_deg: horizontal field of view [deg].
+        size: width and height [pixels].
+    """
     forward = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= max(float(np.linalg.norm(right)), 1e-9)
@@ -90,12 +107,12 @@ def look_at(
 
 
 def to_camera(view: Viewpoint, points_w: np.ndarray) -> np.ndarray:
-    """Return points (..., 3) in camera axes: right, down, forward [m]."""
+    """Return points (..., 3) of the world frame in camera axes: right, down, forward [m]."""
     return (points_w - view.eye_w) @ view.axes_w.T
 
 
 def to_pixels(view: Viewpoint, points_c: np.ndarray) -> np.ndarray:
-    """Return the pixels (..., 2) of points in camera axes (..., 3) in front of the eye."""
+    """Return the pixels (..., 2) of points (..., 3) in camera axes, in front of the camera."""
     middle = np.array(view.size) / 2
     return middle + view.focal * points_c[..., :2] / points_c[..., 2:]
 
@@ -130,15 +147,18 @@ def paint(view: Viewpoint, faces: Faces, lines: Lines) -> Image.Image:
 
 
 def _distance(shapes_c: np.ndarray) -> np.ndarray:
+    """Return the distances of the shapes' centres from the camera [m]."""
     return np.linalg.norm(shapes_c.mean(axis=1), axis=-1)
 
 
 def _fade(colour: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return colours that change to the sky's with distance."""
     share = FOG_SHARE * np.clip(distance / FOG_M, 0, 1)[:, None]
     return np.clip((1 - share) * colour + share * np.array(SKY), 0, 255)
 
 
 def _paint_ground(draw: ImageDraw.ImageDraw, view: Viewpoint) -> None:
+    """Draw a large square of ground below the camera, with grid lines."""
     reach = 500.0
     square = np.array([[-reach, -reach], [reach, -reach], [reach, reach], [-reach, reach]])
     ground = np.insert(square + view.eye_w[:2], 2, 0.0, axis=1)
@@ -158,11 +178,11 @@ def _paint_ground(draw: ImageDraw.ImageDraw, view: Viewpoint) -> None:
 
 def _clip(shape_c: np.ndarray) -> np.ndarray:
     """Return the part of a polygon (k, 3) in front of the camera (Sutherland, Hodgman 1974)."""
-    kept = []
-    for here, after in zip(shape_c, np.roll(shape_c, -1, axis=0), strict=True):
-        if here[2] > NEAR_M:
-            kept.append(here)
-        if (here[2] > NEAR_M) != (after[2] > NEAR_M):
-            part = (NEAR_M * 1.001 - here[2]) / (after[2] - here[2])
-            kept.append(here + part * (after - here))
-    return np.array(kept).reshape(-1, 3)
+    clipped = []
+    for corner, following in zip(shape_c, np.roll(shape_c, -1, axis=0), strict=True):
+        if corner[2] > NEAR_M:
+            clipped.append(corner)
+        if (corner[2] > NEAR_M) != (following[2] > NEAR_M):
+            share = (NEAR_M * 1.001 - corner[2]) / (following[2] - corner[2])
+            clipped.append(corner + share * (following - corner))
+    return np.array(clipped).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""A track's solids as triangles, with gate frames and obstacles separated."""
+"""A track's solids (the frames of its gates, and its obstacles) as triangles for drawing."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ class Solid(NamedTuple):
 
     name: str
     gate: int | None
-    """Number of the gate to whose frame it belongs, or None."""
+    """Number of the gate to whose frame the solid belongs; None for an obstacle."""
     vertices: np.ndarray
-    """(V, 3) [m]."""
+    """(V, 3) positions [m]."""
     faces: np.ndarray
-    """(F, 3) indices of vertices, counter-clockwise from outside."""
+    """(F, 3) indices of vertices, counter-clockwise seen from outside."""
 
 
 def track_solids(track: Track) -> list[Solid]:
     """Return every solid of `track`: the bars of the gates' frames first, then the obstacles."""
     gates = track.scene.gates.opening_g.shape[0]
-    # Bars come first in a scene and share their gate's name, so the first names are the gates'.
+    # The bars of gates come first in a scene, and each has its gate's name.
     number = {name: k for k, name in enumerate(list(dict.fromkeys(track.names))[:gates])}
     return [
         Solid(name, number.get(name), np.asarray(mesh.vertices), np.asarray(mesh.faces))
@@ -33,15 +33,15 @@ def track_solids(track: Track) -> list[Solid]:
     ]
 
 
-def joined(solids: list[Solid]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (V, 3) and faces (F, 3) of several solids as one mesh."""
-    offset = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
-    faces = [solid.faces + begin for solid, begin in zip(solids, offset, strict=False)]
+def join_solids(solids: list[Solid]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices (V, 3) [m] and faces (F, 3) of several solids as one mesh."""
+    offsets = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    faces = [solid.faces + offset for solid, offset in zip(solids, offsets, strict=False)]
     return np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces)
 
 
 def flat_normals(corners: np.ndarray) -> np.ndarray:
-    """Return the unit normals (F, 3) of triangles (F, 3, 3), zero where one has no area."""
+    """Return the unit normals (F, 3) of triangles (F, 3, 3); zero for a triangle without area."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
 
@@ -49,7 +49,7 @@ def flat_normals(corners: np.ndarray) -> np.ndarray:
 def outline(points: np.ndarray) -> np.ndarray:
     """Return the corners (k, 2) of the convex hull of `points` (n, 2), counter-clockwise.
 
-    Andrew's monotone chain (1979), which also works for points on one line.
+    The method is Andrew's monotone chain (1979), which also works for collinear points.
     """
     ordered = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     if len(ordered) < 3:
@@ -58,11 +58,12 @@ def outline(points: np.ndarray) -> np.ndarray:
 
 
 def _half_hull(ordered: np.ndarray) -> list[np.ndarray]:
+    """Return the lower half of the hull of points in increasing order, or its upper half."""
     hull: list[np.ndarray] = []
     for point in ordered:
         while len(hull) >= 2:
-            one, two = hull[-1] - hull[-2], point - hull[-2]
-            if one[0] * two[1] - one[1] * two[0] > 0:
+            last, new = hull[-1] - hull[-2], point - hull[-2]
+            if last[0] * new[1] - last[1] * new[0] > 0:  # a turn to the left
                 break
             hull.pop()
         hull.append(point)

@@ -1,7 +1,7 @@
-"""A short video of a trial from behind the drone, next to its depth image.
+"""Write a video of a trial, a flight along a track, from behind the drone.
 
-The frames are painted by `scene3d.py` and encoded by `video_file.py`, so neither a display nor a
-GPU is needed.
+The policy's depth image is next to the view. `scene3d.py` draws the frames and `video_file.py`
+encodes them, so neither a display nor a GPU is needed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from eval.logs.flight import Flight
 from eval.view import colours
-from eval.view.chase import Drone, painted, scenery_of
+from eval.view.chase import AHEAD_M, MIN_EYE_HEIGHT_M, Drone, draw_drone, scenery_of
 from eval.view.scene3d import SKY, Lines
 from eval.view.video_file import write_gif, write_mp4
 from eval.worlds.trial import TrialResult
@@ -25,14 +25,15 @@ from tracks.common.files import replacing_file
 from tracks.geometry.rotation import quat_to_rot
 from tracks.track import Track
 
-ENDINGS = (".mp4", ".gif")
+SUFFIXES = (".mp4", ".gif")
 DEPTH_RANGE_M = 10.0
+"""Depth at the end of the colour scale [m]."""
 TRAIL_S = 1.6
 """Duration of the path shown behind the drone [s]."""
-
-
 SIDE_SHARE = 1 / 3
-"""Width of the depth image over that of a frame, for flights with depth images."""
+"""Width of the depth image divided by that of a frame, for flights with depth images."""
+HEADING_SMOOTHING_S, POSITION_SMOOTHING_S = 0.25, 0.06
+"""Standard deviations of the filters of the camera's direction and position [s]."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,11 @@ class VideoOptions:
     size: tuple[int, int] = (960, 540)
     """Width and height, even numbers [pixels]."""
     fps: int = 30
-    """Frames a second, at real speed."""
+    """Frames per second of the video."""
     slowdown: float = 1.0
-    """2 plays at half speed."""
+    """Duration of the video divided by that of the flight: 2 plays at half speed."""
     fov_deg: float = 78.0
-    """Field of view across [deg]."""
+    """Horizontal field of view [deg]."""
     behind_m: float = 1.5
     """Distance of the camera behind the drone [m]."""
     above_m: float = 0.55
@@ -60,7 +61,7 @@ SMALL = VideoOptions(size=(720, 360), fps=12)
 
 
 def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
-    """Return the time of each frame in the flight [s], the held ones at the end included."""
+    """Return the flight time of each frame (F,) [s], with the repeated last frame."""
     end = float(flight.time_s[-1])
     times = np.arange(float(flight.time_s[0]), end, 1 / (options.fps * options.slowdown))
     return np.concatenate([times, np.full(max(1, round(options.hold_s * options.fps)), end)])
@@ -78,19 +79,19 @@ def write_video(
 
     Args:
         path: file to write, ending in `.mp4` or `.gif`.
-        track: of the trial.
-        flight: with optional depth images.
-        result: of the trial.
-        options: size and speed.
+        track: track of the trial.
+        flight: log of the trial, with or without depth images.
+        result: outcome of the trial.
+        options: size, speed and camera; None: the defaults of `VideoOptions`.
         on_frame: called with the number of finished frames, of `len(frame_times(...))`.
 
     Raises:
-        ValueError: where the ending is another, the size odd, or the flight has no two rows.
+        ValueError: for another ending, an odd size, or a flight with fewer than two rows.
         OSError: where the file cannot be written; nothing is left under its name.
     """
     path, options = Path(path), options or VideoOptions()
-    kind = path.suffix.lower()
-    if kind not in ENDINGS:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise ValueError(f"{path}: ending {path.suffix!r}; a video ends in .mp4 or .gif")
     if options.size[0] % 2 or options.size[1] % 2 or min(options.size) < 64:
         raise ValueError(f"size {options.size}; both must be even and 64 or more")
@@ -99,7 +100,7 @@ def write_video(
         raise ValueError(f"{path}: a flight of {len(flight.time_s)} usable rows; two are needed")
     frames = video_frames(track, flight, result, options)
     with replacing_file(path) as temporary:
-        if kind == ".gif":
+        if suffix == ".gif":
             write_gif(temporary, frames, options.fps, _swatches(), on_frame)
         else:
             write_mp4(temporary, frames, options.size, options.fps, on_frame)
@@ -114,33 +115,35 @@ def video_frames(
     times = frame_times(flight, options)
     speed = np.linalg.norm(flight.vel_w, axis=1)
     top = colours.top_speed(speed)
-    pieces = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
+    segments_w = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
     path_colour = colours.speed_colours(speed[:-1], top)
     rot_w = quat_to_rot(flight.quat_wxyz)
-    eye_w, target_w = _chase(flight, rot_w, options)
-    decided = np.flatnonzero(flight.policy_step)
-    seen = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
-    side_width = 0 if seen is None else round(options.size[0] * SIDE_SHARE)
+    eye_w, target_w = _chase_camera(flight, rot_w, options)
+    policy_rows = np.flatnonzero(flight.policy_step)
+    images = flight.depth_m if flight.depth_m is not None and len(flight.depth_m) else None
+    side_width = 0 if images is None else round(options.size[0] * SIDE_SHARE)
     size = options.size[0] - side_width, options.size[1]
     for time in times:
-        k = int(np.searchsorted(flight.time_s, time, side="right")) - 1
-        pos, eye, target = (_at(flight, values, time) for values in (flight.pos_w, eye_w, target_w))
-        next_gate = int(flight.gate[k])
-        shown = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
-        lines = Lines(pieces[shown], path_colour[shown], 0.03)
-        drone = Drone(pos, rot_w[k], next_gate)
+        row = int(np.searchsorted(flight.time_s, time, side="right")) - 1
+        pos, eye, target = (
+            _interpolate(flight, values, time) for values in (flight.pos_w, eye_w, target_w)
+        )
+        passed = int(flight.gate[row])
+        trail = (flight.time_s[:-1] > time - TRAIL_S) & (flight.time_s[1:] <= time)
+        lines = Lines(segments_w[trail], path_colour[trail], 0.03)
+        drone = Drone(pos, rot_w[row], passed)
         frame = Image.new("RGB", options.size, SKY)
-        frame.paste(painted(scenery, drone, (eye, target), options.fov_deg, size, lines))
-        if seen is not None:
-            number = int(np.searchsorted(decided, k, side="right")) - 1
-            _paint_depth(frame, side_width, seen[min(max(number, 0), len(seen) - 1)])
+        frame.paste(draw_drone(scenery, drone, (eye, target), options.fov_deg, size, lines))
+        if images is not None:
+            number = int(np.searchsorted(policy_rows, row, side="right")) - 1
+            _draw_depth(frame, side_width, images[min(max(number, 0), len(images) - 1)])
         ended = time >= flight.time_s[-1]
-        _write_on(frame, side_width, track, result, float(time), float(speed[k]), next_gate, ended)
+        _draw_text(frame, side_width, track, result, float(time), float(speed[row]), passed, ended)
         yield frame
 
 
 def _swatches() -> np.ndarray:
-    """Return the colours (n, 3) that occur in a video but hardly in its first frame."""
+    """Return the colours (n, 3) of a video that are rare in its first frame."""
     gates = np.array([colours.AHEAD, colours.PASSED, colours.CRASH, colours.START])
     shades = [gates * shade for shade in (0.5, 0.65, 0.8, 0.95)]
     depths = colours.depth_colours(np.linspace(0, DEPTH_RANGE_M, 40), DEPTH_RANGE_M)
@@ -148,7 +151,7 @@ def _swatches() -> np.ndarray:
 
 
 def _finite_part(flight: Flight) -> Flight:
-    """Return the flight up to the first row that is not finite: where it diverged."""
+    """Return the flight up to the first row that is not finite, where the simulation diverged."""
     state = np.concatenate([flight.pos_w, flight.quat_wxyz, flight.vel_w], axis=1)
     bad = np.flatnonzero(~np.isfinite(state).all(axis=1))
     if not len(bad):
@@ -157,29 +160,32 @@ def _finite_part(flight: Flight) -> Flight:
     return flight._replace(**rows)
 
 
-def _at(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
+def _interpolate(flight: Flight, values: np.ndarray, time: float) -> np.ndarray:
     return np.array([np.interp(time, flight.time_s, column) for column in values.T])
 
 
-def _chase(
+def _chase_camera(
     flight: Flight, rot_w: np.ndarray, options: VideoOptions
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the camera's position and target for every row, (T, 3) each [m]."""
-    step = max(float(np.median(np.diff(flight.time_s))), 1e-6)
-    # The heading contributes for a drone at rest.
-    way = flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0]
-    way = gaussian_filter1d(np.nan_to_num(way), 0.25 / step, axis=0, mode="nearest")
-    way = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
-    ahead = np.insert(way, 2, 0.0, axis=1)
-    smooth = gaussian_filter1d(np.nan_to_num(flight.pos_w), 0.06 / step, axis=0, mode="nearest")
+    step_s = max(float(np.median(np.diff(flight.time_s))), 1e-6)
+
+    def smooth(values: np.ndarray, sd_s: float) -> np.ndarray:
+        return gaussian_filter1d(np.nan_to_num(values), sd_s / step_s, axis=0, mode="nearest")
+
+    # The heading sets the direction for a drone at rest.
+    direction = smooth(flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0], HEADING_SMOOTHING_S)
+    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
+    ahead = np.insert(direction, 2, 0.0, axis=1)
+    pos_w = smooth(flight.pos_w, POSITION_SMOOTHING_S)
     up = np.array([0.0, 0.0, options.above_m])
-    eye = smooth - options.behind_m * ahead + up
-    eye[:, 2] = np.maximum(eye[:, 2], 0.15)
-    return eye, smooth + 1.2 * ahead + 0.15 * up
+    eye_w = pos_w - options.behind_m * ahead + up
+    eye_w[:, 2] = np.maximum(eye_w[:, 2], MIN_EYE_HEIGHT_M)
+    return eye_w, pos_w + AHEAD_M * ahead + 0.15 * up
 
 
-def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
-    """Draw the policy's depth image at the right, below its label."""
+def _draw_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
+    """Draw the policy's depth image at the right, with its label and the scale of its colours."""
     size = (width, max(1, width * depth_m.shape[0] // depth_m.shape[1]))
     small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
     corner = (frame.width - width, (frame.height - size[1]) // 2)
@@ -190,22 +196,21 @@ def _paint_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
     text = f"depth image, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
     middle = corner[0] + width / 2
     draw.text((middle, corner[1] - 6), text, fill=colours.DRONE, font=font, anchor="mb")
-    # The scale of its colours.
     left, top, wide = int(corner[0] + 0.1 * width), corner[1] + size[1] + 8, int(0.8 * width)
     scale = colours.depth_colours(np.linspace(0.0, DEPTH_RANGE_M, wide)[None], DEPTH_RANGE_M)
     high = max(4, frame.height // 60)
     frame.paste(Image.fromarray(scale).resize((wide, high), Image.Resampling.NEAREST), (left, top))
     for share in (0.0, 0.5, 1.0):
-        mark = (left + share * wide, top + high + 3)
+        label_at = (left + share * wide, top + high + 3)
         label = f"{share * DEPTH_RANGE_M:g}" + (" m" if share == 1.0 else "")
-        draw.text(mark, label, fill=colours.DRONE, font=font, anchor="mt")
+        draw.text(label_at, label, fill=colours.DRONE, font=font, anchor="mt")
 
 
 def _font_size(frame: Image.Image) -> int:
     return max(frame.height // 27, 11)
 
 
-def _write_on(
+def _draw_text(
     image: Image.Image,
     side_width: int,
     track: Track,
@@ -215,11 +220,12 @@ def _write_on(
     passed: int,
     ended: bool,
 ) -> None:
+    """Draw the track's name, the state of the flight, and in the last frame its outcome."""
     draw = ImageDraw.Draw(image)
     font = ImageFont.load_default(size=_font_size(image))
     gates = len(track.scene.gates.center_w)
     title = f"{track.family}  level {track.level}  seed {track.seed}"
-    # A pale edge keeps words readable on a dark gate.
+    # A pale edge keeps the text readable on a dark gate.
     edge: dict[str, Any] = {"stroke_width": max(1, image.height // 270), "stroke_fill": SKY}
     draw.text((14, 10), title, fill=colours.DRONE, font=font, **edge)
     status = f"{time:5.2f} s    {speed:4.1f} m/s    gates {passed}/{gates}"
@@ -227,5 +233,5 @@ def _write_on(
     if ended:
         colour = colours.PASSED if result.ended_by == "finished" else colours.CRASH
         large = ImageFont.load_default(size=image.height // 14)
-        where = ((image.width - side_width) / 2, image.height * 0.2)
-        draw.text(where, result.ending, fill=colour, font=large, anchor="mm", **edge)
+        position = ((image.width - side_width) / 2, image.height * 0.2)
+        draw.text(position, result.ending, fill=colour, font=large, anchor="mm", **edge)

@@ -1,4 +1,4 @@
-"""Frames encoded as a video file: MP4 through ffmpeg, or GIF."""
+"""Encode the frames of a video as a file: MP4 through ffmpeg, or GIF."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 COLOURS = 128
-"""Colours of a GIF's palette."""
+"""Number of colours in a GIF's palette."""
 
 
 def write_mp4(
@@ -23,21 +23,21 @@ def write_mp4(
     fps: int,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write frames of `size` (width, height) as H.264 through ffmpeg's own pipe.
+    """Write frames as H.264 in MP4, through a pipe to ffmpeg.
 
     Args:
         path: file to write, ending in `.mp4`.
-        frames: one after the other; only one is held at a time.
-        size: even numbers [pixels].
-        fps: frames a second.
-        on_frame: called with the number of frames that are done.
+        frames: the frames in order; only one is in memory at a time.
+        size: width and height, even numbers [pixels].
+        fps: frames per second.
+        on_frame: called with the number of finished frames.
 
     Raises:
-        OSError: where ffmpeg fails, with what it says.
+        OSError: where ffmpeg fails, with its message.
     """
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps)]
-    # yuv420p and the index in front: plays in every browser, and while it still loads.
+    # yuv420p plays in every browser; with the index in front a video plays while it loads.
     command += ["-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "22"]
     command += ["-movflags", "+faststart", str(path)]
     pipe = subprocess.PIPE
@@ -49,7 +49,7 @@ def write_mp4(
                 if on_frame is not None:
                     on_frame(number)
         except BrokenPipeError:
-            pass  # the encoder has given up and says why
+            pass  # the encoder has failed; its message is read below
         except BaseException:
             encoder.kill()
             raise
@@ -68,32 +68,32 @@ def write_gif(
     swatches: np.ndarray | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write frames as GIF, all with one palette; the arguments are `write_mp4`'s.
+    """Write frames as a GIF that loops, all with one palette.
 
     Args:
         path: file to write, ending in `.gif`.
-        frames: one after the other.
-        fps: frames a second.
-        swatches: (n, 3) colours 0-255 that the palette needs besides the first frame's.
-        on_frame: called with the number of frames that are done.
+        frames: the frames in order.
+        fps: frames per second.
+        swatches: (n, 3) colours 0-255 that the palette needs in addition to the first frame's.
+        on_frame: called with the number of finished frames.
     """
     indexed: list[Image.Image] = []
     for number, frame in enumerate(frames, start=1):
         palette = indexed[0] if indexed else _palette(frame, swatches)
-        # Without dithering areas stay of one colour, which a GIF holds in few bytes.
+        # Without dithering, areas have one colour, which a GIF stores in few bytes.
         indexed.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
         if on_frame is not None:
             on_frame(number)
-    # A GIF counts in hundredths of a second: frames are not all shown as long, and none is lost.
+    # A GIF's durations are whole hundredths of a second, so they differ from frame to frame.
     ends = [10 * round(100 * number / fps) for number in range(len(indexed) + 1)]
     durations = [end - start for start, end in itertools.pairwise(ends)]
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0)
 
 
 def _palette(frame: Image.Image, swatches: np.ndarray | None) -> Image.Image:
-    """Return an image with the palette of `frame` and of `swatches`, which fill as many pixels."""
-    source = np.asarray(frame, dtype=np.uint8).reshape(-1, 3)
+    """Return an image with the palette of `frame` and `swatches`, with equal weight for each."""
+    pixels = np.asarray(frame, dtype=np.uint8).reshape(-1, 3)
     if swatches is not None:
-        more = np.repeat(swatches.astype(np.uint8), max(1, len(source) // len(swatches)), axis=0)
-        source = np.concatenate([source, more])
-    return Image.fromarray(source[None]).quantize(COLOURS)
+        more = np.repeat(swatches.astype(np.uint8), max(1, len(pixels) // len(swatches)), axis=0)
+        pixels = np.concatenate([pixels, more])
+    return Image.fromarray(pixels[None]).quantize(COLOURS)

@@ -1,10 +1,11 @@
-"""Simulators ("worlds") by name; their modules are imported on first use.
+"""Registry of the simulators ("worlds"), and the interface that each of them has.
 
-Another package adds one with an entry point of the group `diffracing_suite.worlds`, a program for
-its own process with `WORLDS.register(name, a_class)`.
+A world simulates trials, which are flights along a track, in a fixed number of slots. It does not
+depend on policies: it gets actions and returns views. The judge, which scores policies, connects
+both. Modules of worlds are imported on first use.
 
-A world simulates trials in a fixed number of slots. It is independent of policies: it gets actions
-and returns views.
+Another package adds a world with an entry point of the group `diffracing_suite.worlds`. A program
+adds one for its own process with `WORLDS.register(name, a_class)`.
 """
 
 from __future__ import annotations
@@ -33,50 +34,57 @@ WORLDS: Registry[Any] = Registry(
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
-"""Name to class (`World`), called with (vehicle, camera, layout, rules, slots=, threads=)."""
+"""Name -> class (`World`), called with (vehicle, camera, layout, rules, slots=, threads=)."""
 
 
 class Rows(NamedTuple):
-    """States to record at one physics step: rows of a flight log, for the slots in `due`."""
+    """States of all slots at one physics step; the slots in `due` get a row in their flight log."""
 
     due: np.ndarray
-    """(N,) bool."""
+    """(N,) bool, slots that record this step."""
     time_s: np.ndarray
-    """(N,) since each trial's start [s]."""
+    """(N,) time since each trial's start [s]."""
     pos_w: np.ndarray
-    """(N, 3) centre of mass [m]."""
+    """(N, 3) position of the centre of mass [m]."""
     quat_wxyz: np.ndarray
-    """(N, 4) body to world."""
+    """(N, 4) attitude, body to world."""
     vel_w: np.ndarray
-    """(N, 3) [m/s]."""
+    """(N, 3) velocity [m/s]."""
     rate_b: np.ndarray
-    """(N, 3) [rad/s]."""
+    """(N, 3) body rates [rad/s]."""
     thrust_cmd: np.ndarray
-    """(N,) per nominal mass [m/s^2]."""
+    """(N,) commanded thrust per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray
-    """(N, 3) [rad/s]."""
+    """(N, 3) commanded body rates [rad/s]."""
     rotor_speed: np.ndarray
-    """(N, 4) [rad/s]."""
+    """(N, 4) rotor speeds [rad/s]."""
     gate: np.ndarray
     """(N,) number of the next gate."""
 
 
 class World(Protocol):
-    """A fixed number of slots, each flying one trial at a time.
+    """A simulator with a fixed number of slots, in each of which one trial flies at a time.
 
-    Optional attributes: `integrator` (`"euler"`) goes into its logs, with the step; logs without it
-    count as continuous in time. `cost` is the time of a trial relative to MuJoCo, for estimates; 1
-    without it. `compiles` is true where each number of slots compiles a program of its own: such a
-    world gets all trials at once, in one process. `actions` are the kinds of action besides
-    acceleration; the class then takes an argument `action`, a `policies.spec.ActionSpec`.
+    Optional attributes:
 
-    Optional static methods: `check()` raises a ValueError for a missing package;
-    `differences(vehicle)` returns a sentence for each deviation from the vehicle file;
-    `nearest(vehicle)` returns the vehicle that describes the simulated one best.
+    - `integrator` (`"euler"`) is written to flight logs, with the step; logs without it count as
+      continuous in time.
+    - `cost` is the computing time of a trial relative to MuJoCo's, for estimates; default 1.
+    - `compiles` is true where each number of slots needs a compilation. Such a world gets all
+      trials at once, in one process.
+    - `actions` are the supported kinds of action other than acceleration. The class then takes an
+      argument `action`, a `policies.spec.ActionSpec`.
+
+    Optional static methods:
+
+    - `check()` raises a ValueError for a missing package.
+    - `differences(vehicle)` returns a sentence for each deviation from the vehicle file.
+    - `nearest(vehicle)` returns the vehicle file that describes the simulated vehicle best.
     """
 
     name: str
     slots: int
+    """Number of trials that fly at the same time."""
     dt: float
     """Length of a physics step [s]."""
 
@@ -86,7 +94,7 @@ class World(Protocol):
         ...
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
-        """Start trials from (slot, track, trial); their states at time 0 are judged."""
+        """Start trials from (slot, track, trial); one in contact at time 0 has ended already."""
         ...
 
     def view(self, wanted: np.ndarray) -> View:
@@ -96,8 +104,11 @@ class World(Protocol):
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, size) for its number of physics steps (N,).
 
-        A trial that ends stays where it ended. With `record` the rows come back: before every
-        new command, and the state in which a trial ended.
+        A trial that ends keeps its last state.
+
+        Returns:
+            With `record`, the rows of the flight logs: before every new command, and at the end of
+            a trial; else [].
         """
         ...
 
@@ -107,7 +118,7 @@ class World(Protocol):
 
 
 def world_class(name: str) -> Any:
-    """Return the class of the world `name` (for `REFERENCE` the function).
+    """Return the class of the world `name`; for `REFERENCE`, the function.
 
     Raises:
         ValueError: for an unknown simulator, or a missing package.
@@ -118,24 +129,28 @@ def world_class(name: str) -> Any:
     return world
 
 
-def flown_by(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
-    """Return the argument for another kind of action than acceleration; {} for acceleration.
+def action_argument(name: str, action: ActionSpec) -> dict[str, ActionSpec]:
+    """Return the argument `action` of the world's class; {} for an acceleration, the default.
+
+    Args:
+        name: the simulator.
+        action: the policy's action.
 
     Raises:
-        ValueError: where that simulator supports accelerations only.
+        ValueError: where the simulator does not support this kind of action.
     """
     if action.kind == "acceleration":
         return {}
     if action.kind not in getattr(WORLDS.find(name), "actions", ()):
         raise ValueError(
-            f"simulator {name!r} flies no actions of kind {action.kind!r}; fly in 'mujoco', or "
+            f"simulator {name!r} supports no actions of kind {action.kind!r}; fly in 'mujoco', or "
             "give its class `actions` and the argument `action` (docs/worlds.md)"
         )
     return {"action": action}
 
 
 def compiles(name: str) -> bool:
-    """Return whether the world `name` compiles a program for its number of slots."""
+    """Return whether the world `name` needs a compilation for each number of slots."""
     return getattr(WORLDS.find(name), "compiles", False)
 
 

@@ -1,10 +1,11 @@
-"""Collisions by distance (JAX): does the body's box touch a solid?
+"""Distances between the drone's collision box and the solids of a scene, for collisions in JAX.
 
 All computations are in the box's axes. Boxes and triangles use separating axes (Gottschalk, Lin and
-Manocha 1996; Akenine-Moeller 2001). The distance to a capsule is convex along its axis and found by
-bisection; that to a sphere is the distance of its centre. For a cylinder, a point is projected to
-the cylinder and back to the box in turn, with momentum (alternating projections, Cheney and
-Goldstein 1959; Beck and Teboulle 2009), until it converges to the nearest pair of points.
+Manocha 1996; Akenine-Moeller 2001). The distance to a capsule is convex along its axis, so its
+minimum is found by bisection; a sphere's distance is that of its centre minus its radius. For a
+cylinder, a point is projected to the cylinder and back to the box, again and again and with
+momentum, and converges to the nearest pair of points (alternating projections, Cheney and Goldstein
+1959; Beck and Teboulle 2009).
 """
 
 from __future__ import annotations
@@ -24,29 +25,28 @@ from tracks.geometry.scene import Array, Counts, Rods, Scene
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
 """Number of tested solids of each kind, the nearest ones; updated every `NEAR_STEPS`."""
 NEAR_STEPS = 40
-"""Physics steps: 0.4 m at 5 m/s and 500 Hz."""
+"""Number of physics steps between updates: a drone flies 0.4 m at 5 m/s and 500 Hz."""
 HALVINGS = 20
-"""Number of halvings of a capsule's length, to a millionth of it."""
+"""Number of bisections of a capsule's length, to a millionth of it."""
 ROUNDS = 12
 """Number of projections to a cylinder and back."""
-REACH = 1.5
-"""Length of a projection over the way to the surface: beyond 1 the rounds converge faster, from 2
-on they may not."""
+OVER_RELAXATION = 1.5
+"""Factor of the step towards a cylinder's surface: above 1 the rounds converge faster, from 2 on
+they may diverge."""
 CONTACT_M = 1e-3
-"""A cylinder nearer than this is met: as near as the rounds come, and half a step's way at 1 m/s
-[m]."""
-_CULLED = ("boxes", "cylinders", "capsules", "spheres")
+"""A cylinder nearer than this counts as touched [m]: the accuracy of the rounds, and half the
+distance flown in a step at 1 m/s."""
 PARALLEL = 1e-3
 """Directions within this angle of parallel [rad] need no common normal: other axes cover them."""
-_OWN = tuple(np.eye(3, dtype=np.float32))
+_CULLED = ("boxes", "cylinders", "capsules", "spheres")
+_BOX_AXES = tuple(np.eye(3, dtype=np.float32))
 _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(8, 3)
 
 
 def near_solids(scene: Scene, pos_w: Array) -> Scene:
-    """Keep the `NEAR` solids of each kind whose surfaces are nearest to pos_w (N, 3).
+    """Return the scene with the `NEAR` solids of each kind nearest to pos_w (N, 3), and all meshes.
 
-    Surfaces, as long walls would leave no place to what is near by their bounding spheres. Meshes
-    are kept whole.
+    Distances are to the surfaces. By bounding spheres, long walls would displace nearer solids.
     """
     solids = scene._replace(triangles=scene.triangles[:, :0])
     distance, first, scores = distances(solids, pos_w)[0], 0, {}
@@ -63,61 +63,61 @@ def box_distances(
     """Return lower bounds of the distances (N, S + 1) [m] of box and solids; 0 or less: contact.
 
     Args:
-        scene: batched, (N, ...), S solids in all.
-        pos_w: (N, 3) bodies [m].
-        rot_w: (N, 3, 3) body to world.
-        half_size: (3,) of the body's box [m].
-        middle_b: (3,) the box's middle in body axes [m].
+        scene: batched scene (N, ...) with S solids.
+        pos_w: (N, 3) positions of the bodies [m].
+        rot_w: (N, 3, 3) attitudes, body to world.
+        half_size: (3,) half extents of the body's box [m].
+        middle_b: (3,) the box's centre in body axes [m].
 
     Returns:
-        In the order boxes, cylinders, capsules, spheres, triangles, ground. How deep bodies are in
-        one another is not measured.
+        The distances in the order boxes, cylinders, capsules, spheres, triangles, ground. In
+        contact the number is no penetration depth.
     """
     middle_w, frame = pos_w + to_world(rot_w, middle_b), rot_w[:, None]
 
-    def turned(vectors_w: Array) -> Array:
+    def to_box_axes(vectors_w: Array) -> Array:
         return to_local(frame, vectors_w)
 
-    def placed(points_w: Array) -> Array:
+    def to_box(points_w: Array) -> Array:
         return to_local(frame, points_w - middle_w[:, None])
 
-    def placed_rods(rods: Rods) -> Rods:
-        return rods._replace(center_w=placed(rods.center_w), axis_w=turned(rods.axis_w))
+    def rods_to_box(rods: Rods) -> Rods:
+        return rods._replace(center_w=to_box(rods.center_w), axis_w=to_box_axes(rods.axis_w))
 
-    boxes, corners = scene.boxes, [placed(scene.triangles[..., k, :]) for k in range(3)]
-    sides = [turned(boxes.rot_w[..., k]) for k in range(3)]
+    boxes, corners = scene.boxes, [to_box(scene.triangles[..., k, :]) for k in range(3)]
+    sides = [to_box_axes(boxes.rot_w[..., k]) for k in range(3)]
     ground = middle_w[:, 2] - (jnp.abs(rot_w[:, 2]) * half_size).sum(-1)
-    found = [
-        _from_boxes(placed(boxes.center_w), sides, boxes.half_size, half_size),
-        _from_cylinders(placed_rods(scene.cylinders), half_size),
-        _from_capsules(placed_rods(scene.capsules), half_size),
-        _beyond(placed(scene.spheres.center_w), half_size) - scene.spheres.radius,
+    distances_m = [
+        _from_boxes(to_box(boxes.center_w), sides, boxes.half_size, half_size),
+        _from_cylinders(rods_to_box(scene.cylinders), half_size),
+        _from_capsules(rods_to_box(scene.capsules), half_size),
+        _from_points(to_box(scene.spheres.center_w), half_size) - scene.spheres.radius,
         _from_triangles(corners, half_size),
         ground[:, None],
     ]
-    return jnp.concatenate(found, axis=-1)
+    return jnp.concatenate(distances_m, axis=-1)
 
 
-def _out(point: Array, half_size: Array) -> Array:
-    """Return the vector from the nearest point of the box to points (..., 3), 0 inside."""
+def _outwards(point: Array, half_size: Array) -> Array:
+    """Return the vectors from the nearest point of the box to points (..., 3), 0 inside."""
     return point - jnp.clip(point, -half_size, half_size)
 
 
-def _beyond(point: Array, half_size: Array) -> Array:
-    """Return the distances (...) of points (..., 3) from the box, 0 inside."""
-    out = _out(point, half_size)
-    return jnp.sqrt((out * out).sum(-1))
+def _from_points(point: Array, half_size: Array) -> Array:
+    """Return the distances (...,) of points (..., 3) from the box, 0 inside."""
+    outwards = _outwards(point, half_size)
+    return jnp.sqrt((outwards * outwards).sum(-1))
 
 
-def _parted(
+def _separation(
     axes: list[Array], low_high: Callable[[Array], tuple[Array, Array]], half_size: Array
 ) -> Array:
     """Return the largest separation of the box and a convex solid over a set of axes.
 
     Args:
-        axes: (..., 3) each, of any length; those of none part nothing.
-        low_high: from where to where the solid reaches along such an axis.
-        half_size: (3,) of the box.
+        axes: (..., 3) each, of any length; axes of length zero are ignored.
+        low_high: function that returns the solid's extent along an axis, its ends.
+        half_size: (3,) half extents of the box.
     """
     gaps = []
     for axis in axes:
@@ -128,19 +128,26 @@ def _parted(
     return functools.reduce(jnp.maximum, gaps)
 
 
-def _from_boxes(center: Array, sides: list[Array], reach: Array, half_size: Array) -> Array:
-    """Return the separation of boxes: centres (N, K, 3), unit vectors of sides, half sizes."""
+def _from_boxes(center: Array, sides: list[Array], extent: Array, half_size: Array) -> Array:
+    """Return the separation (N, K) of boxes.
+
+    Args:
+        center: (N, K, 3) centres of the boxes.
+        sides: (N, K, 3) each, unit vectors of their sides.
+        extent: (N, K, 3) their half extents.
+        half_size: (3,) half extents of the body's box.
+    """
 
     def low_high(axis: Array) -> tuple[Array, Array]:
         middle = (axis * center).sum(-1)
-        half = sum(jnp.abs((axis * side).sum(-1)) * reach[..., k] for k, side in enumerate(sides))
+        half = sum(jnp.abs((axis * side).sum(-1)) * extent[..., k] for k, side in enumerate(sides))
         return middle - half, middle + half
 
-    return _parted([*_OWN, *sides, *_across(sides)], low_high, half_size)
+    return _separation([*_BOX_AXES, *sides, *_normals(sides)], low_high, half_size)
 
 
 def _from_triangles(corners: list[Array], half_size: Array) -> Array:
-    """Return the separation of triangles: (N, K, 3) for each corner."""
+    """Return the separation (N, K) of triangles, given by three corners (N, K, 3)."""
 
     def low_high(axis: Array) -> tuple[Array, Array]:
         along = [(axis * corner).sum(-1) for corner in corners]
@@ -149,14 +156,14 @@ def _from_triangles(corners: list[Array], half_size: Array) -> Array:
     a, b, c = corners
     edges = [_unit(b - a), _unit(c - b), _unit(a - c)]
     normal = cross(edges[0], edges[1])
-    return _parted([*_OWN, normal, *_across(edges)], low_high, half_size)
+    return _separation([*_BOX_AXES, normal, *_normals(edges)], low_high, half_size)
 
 
-def _across(directions: list[Array]) -> list[Array]:
+def _normals(directions: list[Array]) -> list[Array]:
     """Return the common normals of the box's sides and each of `directions`."""
     return [
-        cross(jnp.broadcast_to(own, direction.shape), direction)
-        for own in _OWN
+        cross(jnp.broadcast_to(box_axis, direction.shape), direction)
+        for box_axis in _BOX_AXES
         for direction in directions
     ]
 
@@ -167,27 +174,31 @@ def _unit(vector: Array) -> Array:
 
 
 def _from_capsules(rods: Rods, half_size: Array) -> Array:
-    """Return the separation of capsules, by bisection of each axis."""
+    """Return the distances (N, K) of capsules, by bisection along each axis."""
 
-    def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def bisect(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
         point = rods.center_w + middle[..., None] * rods.axis_w
-        grows = (_out(point, half_size) * rods.axis_w).sum(-1) > 0.0
+        grows = (_outwards(point, half_size) * rods.axis_w).sum(-1) > 0.0
         return jnp.where(grows, low, middle), jnp.where(grows, middle, high)
 
     ends = (-rods.half_length, rods.half_length)
-    low, high = jax.lax.fori_loop(0, HALVINGS, halved, ends)
+    low, high = jax.lax.fori_loop(0, HALVINGS, bisect, ends)
     point = rods.center_w + (0.5 * (low + high))[..., None] * rods.axis_w
-    return _beyond(point, half_size) - rods.radius
+    return _from_points(point, half_size) - rods.radius
 
 
 def _from_cylinders(rods: Rods, half_size: Array) -> Array:
-    """Return the separation of cylinders less `CONTACT_M`, from two points of the box."""
-    alone = jax.tree.map(lambda array: array[:, :, None], rods)
+    """Return the distances (N, K) of cylinders minus `CONTACT_M`.
+
+    The projections start from two points of the box: the nearest to the cylinder's centre, and the
+    corner nearest to the cylinder. The smaller result counts.
+    """
+    single = jax.tree.map(lambda array: array[:, :, None], rods)
 
     def from_point(point: Array) -> tuple[Array, Array]:
-        distance, away = to_cylinders(alone, point)
+        distance, away = to_cylinders(single, point)
         return distance[..., 0], away[..., 0, :]
 
     def into_box(point: Array) -> Array:
@@ -199,14 +210,12 @@ def _from_cylinders(rods: Rods, half_size: Array) -> Array:
     corner = jnp.take_along_axis(corners, nearest[None, ..., None], axis=0)[0]
     start = jnp.stack([into_box(rods.center_w), corner])
 
-    def there_and_back(
-        number: Array, carry: tuple[Array, Array, Array]
-    ) -> tuple[Array, Array, Array]:
+    def project(number: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         point, before, least = carry
-        ahead = into_box(point + number / (number + 3.0) * (point - before))
+        ahead = into_box(point + number / (number + 3.0) * (point - before))  # with momentum
         distance, away = from_point(ahead)
         least = jnp.minimum(least, distance)
-        return into_box(ahead - REACH * distance[..., None] * away), point, least
+        return into_box(ahead - OVER_RELAXATION * distance[..., None] * away), point, least
 
     least = jnp.full(start.shape[:-1], jnp.inf, start.dtype)
-    return jax.lax.fori_loop(0, ROUNDS, there_and_back, (start, start, least))[2].min(0) - CONTACT_M
+    return jax.lax.fori_loop(0, ROUNDS, project, (start, start, least))[2].min(0) - CONTACT_M

@@ -1,4 +1,4 @@
-"""Shared parts of the simulators on MuJoCo's C engine: models, rays and contacts."""
+"""Parts that the simulators on MuJoCo's C engine share: models, depth images and contacts."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
 BODY = 1
-"""Number of the quadrotor's body: the first after the world body."""
+"""Index of the quadrotor's body in a model; the world body has index 0."""
 NO_AUTORESET = mujoco.mjtDisableBit.mjDSBL_AUTORESET
-"""Disables MuJoCo's reset of invalid states, which the judge must detect."""
+"""Flag that disables MuJoCo's reset of invalid states, so that a trial can end as diverged."""
 
 
-def compile_model(track: Track, vehicle: Vehicle, dt: float, to: Counts) -> mujoco.MjModel:
+def compile_model(track: Track, vehicle: Vehicle, dt: float, padded: Counts) -> mujoco.MjModel:
     """Return the model of a vehicle on a track, padded so that all trials share one layout.
 
     Args:
-        track: with its scene.
-        vehicle: that flies.
+        track: the track with its scene.
+        vehicle: the vehicle that flies.
         dt: length of a physics step [s].
-        to: padded number of solids of each kind.
+        padded: number of solids of each kind, padding included.
     """
     spec = mujoco.MjSpec()
     spec.option.disableflags |= NO_AUTORESET
-    add_scene(spec, track.scene, track.names, track.mesh_sizes, to)
+    add_scene(spec, track.scene, track.names, track.mesh_sizes, padded)
     return compile_quadrotor(spec, vehicle, dt)
 
 
-class Eye:
-    """A depth camera that uses MuJoCo's rays."""
+class DepthCamera:
+    """A depth camera whose images come from MuJoCo's ray casts."""
 
     def __init__(self, camera: Camera) -> None:
+        """Make a camera with the image size and field of view of `camera`."""
         self.camera = camera
         self._rays_b = cast_rays_b(camera)
 
@@ -49,12 +50,18 @@ class Eye:
         rot_w: np.ndarray,
         group: int | None = None,
     ) -> np.ndarray:
-        """Return the planar depth image (H, W) [m] from pos_w (3,) and rot_w (3, 3).
+        """Return the planar depth image (H, W) [m], without the quadrotor itself.
 
-        The quadrotor itself is not seen, and of a `group` of geoms nothing but that. The solids'
-        places must be computed in `data`. Rays have an optical-axis component of 1, so the ray
-        parameter is the planar depth; rays that hit nothing read as the range.
+        A pixel whose ray hits nothing gets the camera's range.
+
+        Args:
+            model: the model of the scene.
+            data: its data, with computed positions of the solids.
+            pos_w: (3,) position of the camera [m].
+            rot_w: (3, 3) attitude, body to world.
+            group: only geoms of this group are visible; None: all.
         """
+        # Rays have a component of 1 along the optical axis, so the ray parameter is planar depth.
         groups = None
         if group is not None:
             groups = (np.arange(mujoco.mjNGROUP) == group).astype(np.uint8)
@@ -73,7 +80,7 @@ class Eye:
             depth,
             None,
             count,
-            # A shorter cut-off would also skip the ground where its origin is further away.
+            # A shorter cut-off would also skip the ground if its origin is further away.
             mujoco.mjMAXVAL,
         )
         depth = np.where(geom < 0, self.camera.range_m, depth)
@@ -81,7 +88,7 @@ class Eye:
 
 
 def motion_of(data: mujoco.MjData) -> Motion:
-    """Return the quadrotor's state as a batch of one; needs the results of `mj_step1` in `data`."""
+    """Return the quadrotor's state as a batch of one; `mj_step1` must have been run on `data`."""
     rot_w = data.xmat[BODY].reshape(1, 3, 3).copy()
     pos_w, velocity = data.qpos[None, :3].copy(), data.qvel[None].copy()
     return Motion(pos_w, rot_w, velocity[:, :3], velocity[:, 3:])
@@ -90,12 +97,17 @@ def motion_of(data: mujoco.MjData) -> Motion:
 def contact_name(model: mujoco.MjModel, data: mujoco.MjData) -> str:
     """Return the name of the solid with the deepest contact in `data`."""
     deepest = min(data.contact, key=lambda contact: contact.dist)
-    own = [int(model.geom_bodyid[geom]) == BODY for geom in deepest.geom]
-    return solid_name(model.geom(int(deepest.geom[1 if own[0] else 0])).name)
+    first_is_body = int(model.geom_bodyid[deepest.geom[0]]) == BODY
+    return solid_name(model.geom(int(deepest.geom[1 if first_is_body else 0])).name)
 
 
 def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
-    """Refuse a track on which `vehicle` is in contact at the start.
+    """Raise an error for a track on which `vehicle` is in contact at the start.
+
+    Args:
+        name: name of the track, for the message.
+        track: the track.
+        vehicle: the vehicle that flies.
 
     Raises:
         ValueError: naming the track, the start and the touched solid.
@@ -113,6 +125,6 @@ def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
 
 
 def start_state(track: Track) -> np.ndarray:
-    """Return the free joint's (7,) position and quaternion wxyz at the start of `track`."""
-    half = track.start_yaw / 2
-    return np.array([*track.start_pos_w, np.cos(half), 0.0, 0.0, np.sin(half)])
+    """Return the free joint's state (7,) at the start of `track`: position [m], quaternion wxyz."""
+    half_yaw = track.start_yaw / 2
+    return np.array([*track.start_pos_w, np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)])

@@ -1,10 +1,10 @@
-"""The simulator `mjx`: many trials at once in JAX, for accelerators.
+"""The simulator `mjx`: many trials (flights along a track) at once in JAX, for accelerators.
 
-MuJoCo's JAX engine moves the free body; its contacts are off, since they cost ten times as much as
-all else and a trial ends at the first of them: collisions are found by signed distance, images by
-analytic rays. Everything between two decisions of the policy is one compiled function. States are
-float32, so a flight drifts from the `mujoco` world's; a trial's outcome still depends on nothing
-but the trial.
+MuJoCo's JAX engine moves the free body. Its contacts are disabled: they take ten times the time of
+all other computations, and a trial ends at the first contact anyway. Collisions are found by signed
+distances instead, and depth images by analytic ray casting. The steps between two decisions of the
+policy are one compiled function. States are float32, so a flight departs slowly from the same one
+in `mujoco`. A trial's outcome does not depend on the other trials.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
 from eval.worlds.collision import NEAR_STEPS, box_distances, near_solids
 from eval.worlds.engine import start_state
-from eval.worlds.slots import IDLE, Gusts, Layout, empty_course, pad_gates
+from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
@@ -51,30 +51,31 @@ from tracks.geometry.rotation import quat_to_rot, to_world
 from tracks.geometry.scene import Array, Scene, pad, stack
 from tracks.track import Track
 
-with contextlib.redirect_stdout(io.StringIO()):  # its import prints what optional parts are missing
+with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of missing packages
     from mujoco import mjx
 
 
 PRECISION = "highest"
-"""Precision of matrix products: by default accelerators round to fewer bits, too few for
-rotations."""
+"""Precision of matrix products; the default of accelerators is too low for rotations."""
 FARTHEST_M = 1000.0
 """Largest coordinate, at which a float32's resolution is 0.06 mm [m]."""
 
 
-class Flying(NamedTuple):
+class SlotStates(NamedTuple):
     """The state of all slots on the device."""
 
     qpos: Array
-    """(N, 7)."""
+    """(N, 7) position [m] and quaternion wxyz."""
     qvel: Array
-    """(N, 6)."""
+    """(N, 6) velocity in the world [m/s] and body rates [rad/s]."""
     loops: AutopilotState
+    """State of the autopilot."""
     progress: Progress
+    """Progress of the trials."""
 
 
 class MjxWorld:
-    """MuJoCo in JAX, for GPUs: all slots in one compiled program."""
+    """A world that simulates all slots in one compiled JAX program, for GPUs."""
 
     name = "mjx"
     integrator = "euler"
@@ -91,7 +92,7 @@ class MjxWorld:
         threads: int = 1,
         action: ActionSpec | None = None,
     ) -> None:
-        """Make the world; the arguments are those of `MujocoWorld`, but JAX sets the threads."""
+        """Make the world; the arguments are those of `MujocoWorld`, but `threads` has no effect."""
         self.slots = slots
         self._layout, self._rules, self._camera = layout, rules, camera
         self._autopilot = make_autopilot(vehicle, action)
@@ -102,24 +103,25 @@ class MjxWorld:
         self._half_size = np.asarray(vehicle.body.half_size)
         self._middle_b = -np.asarray(self._autopilot.plant.constants.com_offset_b)
         self._rays_b = jnp.asarray(cast_rays_b(camera), jnp.float32)
-        self._most = 0
+        self._max_steps = 0
         self._has_noise = uses_noise(self._autopilot.plant)
-        self._noise = [Gusts(IDLE)] * slots
+        self._noise = [GustDraws(IDLE)] * slots
         self._course = empty_course(slots, layout)
         self._tracks: list[Track | None] = [None] * slots
         self._scene: Scene | None = None
         self._on_device: tuple[Course, Scene] | None = None
         self._state = self._idle()
 
-    @functools.partial(jax.jit, static_argnums=0)  # one program instead of one an operation
-    def _idle(self) -> Flying:
-        still = jnp.zeros((self.slots, 3))
-        nothing = Motion(still, jnp.tile(jnp.eye(3), (self.slots, 1, 1)), still, still)
-        progress = start_progress(nothing.pos_w)
+    @functools.partial(jax.jit, static_argnums=0)  # one program instead of one for each operation
+    def _idle(self) -> SlotStates:
+        """Return the states of slots before their first trial."""
+        zeros = jnp.zeros((self.slots, 3))
+        motion = Motion(zeros, jnp.tile(jnp.eye(3), (self.slots, 1, 1)), zeros, zeros)
+        progress = start_progress(motion.pos_w)
         progress = progress._replace(ended=jnp.full(self.slots, -1, jnp.int32))
         qpos = jnp.tile(jnp.asarray([0.0, 0, 0, 1, 0, 0, 0]), (self.slots, 1))
-        loops = start_autopilot(self._autopilot, nothing, self._no_draws())
-        return Flying(qpos, jnp.zeros((self.slots, 6)), loops, progress)
+        loops = start_autopilot(self._autopilot, motion, self._no_draws())
+        return SlotStates(qpos, jnp.zeros((self.slots, 6)), loops, progress)
 
     @property
     def progress(self) -> Progress:
@@ -133,7 +135,7 @@ class MjxWorld:
         """Start trials from (slot, track, trial).
 
         Raises:
-            ValueError: for a track so far from the origin that float32 does not tell its steps.
+            ValueError: for a track so far from the origin that float32 is too coarse.
         """
         for _, track, _ in entries:
             _check_near(track)
@@ -142,19 +144,20 @@ class MjxWorld:
         for slot, track, trial in entries:
             started[slot], self._tracks[slot] = True, track
             gates = pad_gates(track.scene.gates, self._layout.gates, self._layout.corners)
-            one = stack([track.scene._replace(gates=gates)], self._layout.solids)
+            scene = stack([track.scene._replace(gates=gates)], self._layout.solids)
             if self._scene is None:
-                self._scene = jax.tree.map(lambda a: np.repeat(a, self.slots, axis=0), one)
-            for every, new in zip(jax.tree.leaves(self._scene), jax.tree.leaves(one), strict=True):
-                every[slot] = new[0]
+                self._scene = jax.tree.map(lambda a: np.repeat(a, self.slots, axis=0), scene)
+            arrays = zip(jax.tree.leaves(self._scene), jax.tree.leaves(scene), strict=True)
+            for of_all_slots, of_slot in arrays:
+                of_all_slots[slot] = of_slot[0]
             for field, value in zip(self._course.gates, gates, strict=True):
                 field[slot] = value
             self._course.count[slot] = len(track.scene.gates.center_w)
             qpos[slot] = start_state(track)
             if noise is not None:
-                self._noise[slot] = Gusts(trial)
+                self._noise[slot] = GustDraws(trial)
                 noise[slot] = self._noise[slot].at(0, 1)[0]
-        # A copy: on a CPU JAX may go on looking at the array it is given.
+        # Copies, because on a CPU JAX may share memory with the arrays that it gets.
         on_device = jax.tree.map(lambda a: jnp.array(a), (self._course, self._scene))
         self._on_device = on_device
         with jax.default_matmul_precision(PRECISION):
@@ -165,39 +168,43 @@ class MjxWorld:
     @functools.partial(jax.jit, static_argnums=0)
     def _start(
         self,
-        state: Flying,
+        state: SlotStates,
         qpos: Array,
         started: Array,
         noise: Array | None,
         course: Course,
         scene: Scene,
-    ) -> Flying:
+    ) -> SlotStates:
+        """Return the states with new trials at `qpos` in the slots `started` (N,) bool."""
         motion = _motion(qpos, jnp.zeros_like(state.qvel))
         loops = start_autopilot(self._autopilot, motion, noise)
-        fresh = Flying(qpos, jnp.zeros_like(state.qvel), loops, start_progress(motion.pos_w))
-        state = select(started, fresh, state)
+        initial = SlotStates(qpos, jnp.zeros_like(state.qvel), loops, start_progress(motion.pos_w))
+        state = select(started, initial, state)
         near = near_solids(scene, motion.pos_w)
         return self._judge(state, started, jnp.zeros_like(started), course, near)
 
     def _judge(
-        self, state: Flying, which: Array, bad: Array, course: Course, near: Scene
-    ) -> Flying:
-        """Judge the current states of the slots in `which`; diverged ones are reset to rest."""
+        self, state: SlotStates, selected: Array, invalid: Array, course: Course, near: Scene
+    ) -> SlotStates:
+        """Apply the rules to the `selected` slots (N,) bool; diverged slots are reset to rest.
+
+        `invalid` (N,) bool are the slots in which no step was possible, `near` the nearest solids.
+        """
         motion = _motion(state.qpos, state.qvel)
-        diverged = bad | has_diverged(self._rules, motion)
+        diverged = invalid | has_diverged(self._rules, motion)
         pos_w, rot_w, _, _ = motion
         distance = box_distances(near, pos_w, rot_w, self._half_size, self._middle_b)
         contact = (distance <= 0.0).any(-1)
-        verdict = judge_state(
+        progress = judge_state(
             self._rules, state.progress, course, self.dt, motion, contact, diverged
         )
-        progress = select(which, verdict, state.progress)
-        lost = progress.ended == DIVERGED
+        progress = select(selected, progress, state.progress)
+        reset = (progress.ended == DIVERGED)[:, None]
         rest = jnp.asarray([0.0, 0, 0, 1, 0, 0, 0])
-        qpos = jnp.where(lost[:, None], rest, state.qpos)
-        qvel = jnp.where(lost[:, None], 0.0, state.qvel)
-        judged = Flying(qpos, qvel, state.loops, progress)
-        # Types of their own: one that Python's numbers gave would compile everything twice.
+        qpos = jnp.where(reset, rest, state.qpos)
+        qvel = jnp.where(reset, 0.0, state.qvel)
+        judged = SlotStates(qpos, qvel, state.loops, progress)
+        # `astype` removes weak types, with which the next call would compile again.
         return jax.tree.map(lambda a: a.astype(a.dtype), judged)
 
     def collided_with(self, slot: int) -> str:
@@ -212,61 +219,67 @@ class MjxWorld:
         return _solid_names(track, self._layout)[int(np.asarray(distance)[0].argmin())]
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return the current view."""
+        """Return the current view, with images for all slots."""
         assert self._on_device is not None
         course, scene = self._on_device
         with jax.default_matmul_precision(PRECISION):
-            seen = self._view(self._state, course, scene)
-        return View(*(np.asarray(part, np.float64) for part in seen))
+            view = self._view(self._state, course, scene)
+        return View(*(np.asarray(field, np.float64) for field in view))
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _view(self, state: Flying, course: Course, scene: Scene) -> View:
+    def _view(self, state: SlotStates, course: Course, scene: Scene) -> View:
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
-        gate, after = (next_gate(course, state.progress.gates + ahead) for ahead in (0, 1))
-        return view_of(pos_w, rot_w, vel_w, gate, after, nearest(self._camera, depth))
+        gate = next_gate(course, state.progress.gates)
+        second_gate = next_gate(course, state.progress.gates + 1)
+        return view_of(pos_w, rot_w, vel_w, gate, second_gate, nearest(self._camera, depth))
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, size) for its number of physics steps (N,)."""
         assert self._on_device is not None
-        # Decisions are a step more or less apart; one length means one compiled program.
-        self._most = most = max(self._most, int(steps.max(initial=0)))
+        # Periods between decisions differ by a step; with one length there is one compilation.
+        self._max_steps = max_steps = max(self._max_steps, int(steps.max(initial=0)))
         noise = None
         if self._has_noise:
             first = np.asarray(self._state.progress.step) + 1
             pairs = zip(first.tolist(), self._noise, strict=True)
-            noise = np.stack([draws.at(step, most) for step, draws in pairs], axis=1)
+            noise = np.stack([draws.at(step, max_steps) for step, draws in pairs], axis=1)
             noise = noise.astype(np.float32)
         with jax.default_matmul_precision(PRECISION):
             self._state, rows = self._fly(
                 self._state, jnp.asarray(action_b, jnp.float32), jnp.asarray(steps), noise,
-                *self._on_device, most, record,
+                *self._on_device, max_steps, record,
             )  # fmt: skip
         if not record:
             return []
-        each = [jax.tree.map(np.asarray, part) for part in rows]
+        # Rows before commands and rows at the ends of trials, each field (max_steps, N, ...).
+        kinds = [jax.tree.map(np.asarray, kind) for kind in rows]
         return [
-            Rows(*(field[k] for field in part)) for k in range(most) for part in each
-            if part.due[k].any()
+            Rows(*(field[k] for field in kind)) for k in range(max_steps) for kind in kinds
+            if kind.due[k].any()
         ]  # fmt: skip
 
     @functools.partial(jax.jit, static_argnums=(0, 7, 8))
     def _fly(
         self,
-        state: Flying,
+        state: SlotStates,
         action_b: Array,
         steps: Array,
         noise: Array | None,
         course: Course,
         scene: Scene,
-        most: int,
+        max_steps: int,
         record: bool,
-    ) -> tuple[Flying, tuple[Rows, Rows] | None]:
+    ) -> tuple[SlotStates, tuple[Rows, Rows] | None]:
+        """Simulate `steps` (N,) physics steps, and return the states and the recorded rows.
+
+        The rows are those before a new command, and those at the end of a trial.
+        """
         near = near_solids(scene, state.qpos[:, :3])
 
-        def one(
-            carry: tuple[Flying, Scene], inputs: tuple[Array, Array | None]
-        ) -> tuple[tuple[Flying, Scene], Any]:
+        def physics_step(
+            carry: tuple[SlotStates, Scene], inputs: tuple[Array, Array | None]
+        ) -> tuple[tuple[SlotStates, Scene], Any]:
             (state, near), (done, draws) = carry, inputs
             near = jax.lax.cond(
                 (done > 0) & (done % NEAR_STEPS == 0),
@@ -280,18 +293,18 @@ class MjxWorld:
                 self._autopilot, state.loops, motion, action_b, gate_w, step, draws
             )
             loops = select(flying, loops, state.loops)
-            bad = ~is_wrench(self._rules, wrench)
+            invalid = ~is_wrench(self._rules, wrench)
             force_w = to_world(motion.rot_w, wrench.force_b)
             applied = jnp.concatenate([force_w, wrench.torque_b], axis=-1)
             qpos, qvel = self._integrate(state.qpos, state.qvel, applied)
-            go = flying & ~bad
-            moved = Flying(
-                jnp.where(go[:, None], qpos, state.qpos),
-                jnp.where(go[:, None], qvel, state.qvel),
+            moving = (flying & ~invalid)[:, None]
+            moved = SlotStates(
+                jnp.where(moving, qpos, state.qpos),
+                jnp.where(moving, qvel, state.qvel),
                 loops,
                 state.progress._replace(step=step + flying.astype(jnp.int32)),
             )
-            after = self._judge(moved, flying, bad, course, near)
+            after = self._judge(moved, flying, invalid, course, near)
             if not record:
                 return (after, near), None
             before = state._replace(loops=loops)
@@ -302,21 +315,22 @@ class MjxWorld:
                 self._rows(ended, after, loops.plant.rotor_speed),
             )
 
-        (state, _), rows = jax.lax.scan(one, (state, near), (jnp.arange(most), noise))
+        steps_and_noise = jnp.arange(max_steps), noise
+        (state, _), rows = jax.lax.scan(physics_step, (state, near), steps_and_noise)
         return state, rows
 
     def _integrate(self, qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
-        """Return the state after one step of the free body."""
-        still = mjx.make_data(self._model)
+        """Return qpos and qvel after one step of the free bodies, under forces `applied` (N, 6)."""
+        initial = mjx.make_data(self._model)
 
-        def one(qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
-            data = still.replace(qpos=qpos, qvel=qvel, qfrc_applied=applied)
+        def step_body(qpos: Array, qvel: Array, applied: Array) -> tuple[Array, Array]:
+            data = initial.replace(qpos=qpos, qvel=qvel, qfrc_applied=applied)
             data = mjx.step(self._model, data)
             return data.qpos, data.qvel
 
-        return jax.vmap(one)(qpos, qvel, applied)
+        return jax.vmap(step_body)(qpos, qvel, applied)
 
-    def _rows(self, due: Array, state: Flying, rotor_speed: Array) -> Rows:
+    def _rows(self, due: Array, state: SlotStates, rotor_speed: Array) -> Rows:
         command = state.loops.command
         return Rows(
             due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],
@@ -329,18 +343,19 @@ _box_distances = jax.jit(box_distances)
 
 
 def _check_near(track: Track) -> None:
-    places_w = np.vstack([track.scene.gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
-    farthest = float(np.abs(places_w).max())
+    """Reject a track with a coordinate beyond `FARTHEST_M`."""
+    points_w = np.vstack([track.scene.gates.center_w, np.reshape(track.start_pos_w, (1, 3))])
+    farthest = float(np.abs(points_w).max())
     if farthest > FARTHEST_M:
         raise ValueError(
-            f"track {track.family!r} reaches {farthest:.0f} m from the origin; world 'mjx' is of "
-            f"single precision and flies up to {FARTHEST_M:.0f} m: move the track nearer, or fly "
-            "in 'mujoco'"
+            f"track {track.family!r} reaches {farthest:.0f} m from the origin; world 'mjx' has "
+            f"single precision and allows {FARTHEST_M:.0f} m: move the track nearer, or fly in "
+            "'mujoco'"
         )
 
 
 def _motion(qpos: Array, qvel: Array) -> Motion:
-    """Return the motion (N, ...) of free joints; the quaternion is normalised on the way."""
+    """Return the motion (N, ...) of free joints, with normalised quaternions."""
     quat = qpos[:, 3:]
     rot_w = quat_to_rot(quat / jnp.sqrt((quat * quat).sum(-1, keepdims=True)))
     return Motion(qpos[:, :3], rot_w, qvel[:, :3], qvel[:, 3:])
@@ -348,14 +363,14 @@ def _motion(qpos: Array, qvel: Array) -> Motion:
 
 def _solid_names(track: Track, layout: Layout) -> list[str]:
     """Return a name for every column of `box_distances` on the padded scene."""
-    names, left = [], list(track.names)
+    names, remaining = [], list(track.names)
     scene = track.scene
     kinds = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
-    for kind, room in zip(kinds, layout.solids, strict=False):
-        real = len(kind[0])
-        names += left[:real] + ["parked"] * (room - real)
-        left = left[real:]
-    for mesh, size in zip(left, track.mesh_sizes, strict=True):
+    for solids, padded_count in zip(kinds, layout.solids, strict=False):
+        count = len(solids[0])
+        names += remaining[:count] + ["parked"] * (padded_count - count)
+        remaining = remaining[count:]
+    for mesh, size in zip(remaining, track.mesh_sizes, strict=True):
         names += [mesh] * size
     names += ["parked"] * (layout.solids.triangles - len(scene.triangles))
     return [*names, GROUND]

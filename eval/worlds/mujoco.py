@@ -1,4 +1,4 @@
-"""The simulator `mujoco`, the default: MuJoCo's C engine steps many trials at once."""
+"""The simulator `mujoco`, the default: MuJoCo's C engine simulates many trials at once."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tracks.geometry.rotation import to_world
 
 
 class MujocoWorld(SceneSlots):
-    """The simulator: the quadrotor model gives force and torque, MuJoCo integrates the motion.
+    """A world in which the quadrotor model gives force and torque, and MuJoCo moves the body.
 
-    Each step also computes the contacts at the new state, for the judge and for the next step.
+    Each step also computes the contacts at the new state, which may end the trial.
     """
 
     name = "mujoco"

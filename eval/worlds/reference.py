@@ -1,7 +1,7 @@
-"""The simulator `reference`: one trial as a loop of MuJoCo steps, in one readable function.
+"""The simulator `reference`: one trial (a flight along a track) as a loop of MuJoCo steps.
 
-Tests compare the batched simulators with it. It shares the vehicle with them and nothing else: it
-counts gates and ends a trial by its own code.
+Tests compare the batched simulators with this readable function. Both use the same vehicle model,
+but this one counts gates and ends a trial by separate code.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from eval.judging.outputs import Outputs
 from eval.judging.sensors import Sensors
 from eval.quadrotor.autopilot import autopilot_step, make_autopilot, start_autopilot
 from eval.quadrotor.plant import Motion, uses_noise
-from eval.sensors import sensing
+from eval.sensors import view_models
 from eval.sensors.sensors_file import PERFECT, SensorSet
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import REFERENCE
-from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
-from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
+from eval.worlds.slots import gust_draws, layout_of
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.observation import observe, view_of
 from policies.policy import Policy
@@ -37,27 +37,27 @@ def fly_trial(
     rules: Rules | None = None,
     limits: ActionLimits | None = None,
     rows: int = 64,
-    wanted: SensorSet = PERFECT,
+    sensor_set: SensorSet = PERFECT,
 ) -> TrialResult:
-    """Fly one trial.
+    """Fly one trial and return its outcome.
 
     Args:
         policy: the policy.
-        trial: its family, level and seed.
-        track: the trial's.
-        vehicle: what it flies.
-        rules: when a trial ends.
-        limits: what an action may be.
+        trial: family, level and seed of the trial.
+        track: track of the trial.
+        vehicle: the vehicle that flies.
+        rules: rules for the end of a trial; None: the defaults.
+        limits: limits of actions; None: the defaults.
         rows: number of rows of the policy's inputs, as in the batched simulators, since the output
             of some policies depends on it; all rows but the first are zero.
-        wanted: errors in what the policy sees.
+        sensor_set: errors of the policy's observations.
 
     Raises:
         ValueError: for delayed or filtered observations, which this simulator does not have.
     """
-    if wanted.is_late or wanted.estimator:
-        lacks = "has no estimator in the loop" if wanted.estimator else "shows nothing late"
-        raise ValueError(f"world 'reference' {lacks}; fly in 'mujoco', which flies alike")
+    if sensor_set.has_delay or sensor_set.estimator:
+        missing = "state estimator" if sensor_set.estimator else "delay of observations"
+        raise ValueError(f"world 'reference' has no {missing}; fly in 'mujoco'")
     rules, limits = rules or Rules(), limits or ActionLimits()
     autopilot = make_autopilot(vehicle, policy.spec.action)
     dt, spec = autopilot.dt, policy.spec
@@ -68,17 +68,15 @@ def fly_trial(
     gates, count = track.scene.gates, len(track.scene.gates.center_w)
     draws = np.zeros((1, 3))
     if uses_noise(autopilot.plant):
-        draws = noise_of(trial, round(rules.time_limit_s / dt) + 2)
-    eye, hidden = Eye(spec.camera), policy.start(rows)
+        draws = gust_draws(trial, round(rules.time_limit_s / dt) + 2)
+    camera, hidden = DepthCamera(spec.camera), policy.start(rows)
     loops = start_autopilot(autopilot, motion_of(data), draws[:1] if len(draws) > 1 else None)
     sensors = None
-    if sensing(wanted.models):
-        sensors = Sensors(wanted, 1, spec.rate_hz, spec.camera)
+    if view_models(sensor_set.models):
+        sensors = Sensors(sensor_set, 1, spec.rate_hz, spec.camera)
         sensors.start(0, trial)
-    limits, action_b = (
-        limits_of(limits, spec.action, vehicle),
-        first_action(spec.action, vehicle)[None],
-    )
+    limits = limits_of(limits, spec.action, vehicle)
+    action_b = first_action(spec.action, vehicle)[None]
     outputs, bad, limited, late, decisions = Outputs(1, spec.action), 0, 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
@@ -86,7 +84,7 @@ def fly_trial(
     ended_by, collided_with, step = None, None, 0
 
     while True:
-        # Judge the state that the last step led to.
+        # Check the state after the last step.
         motion = motion_of(data)
         pos_w = motion.pos_w[0]
         if not _is_flight(motion, rules):
@@ -113,21 +111,23 @@ def fly_trial(
         if ended_by is not None:
             break
 
-        # Ask the policy when it is its time.
+        # Run the policy at its rate.
         gate_w = gates.center_w[None, passed]
         if step == np.rint(decisions * (1 / (spec.rate_hz * dt))):
-            depth = eye.image(model, data, pos_w, motion.rot_w[0])
+            depth_m = camera.image(model, data, pos_w, motion.rot_w[0])
             numbers = (passed, min(passed + 1, count - 1))
-            gate, after = (Gates(*(field[[number]] for field in gates)) for number in numbers)
-            seen = view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth[None])
+            next_gate, second_gate = (Gates(*(f[[number]] for f in gates)) for number in numbers)
+            view = view_of(
+                motion.pos_w, motion.rot_w, motion.vel_w, next_gate, second_gate, depth_m[None]
+            )
             if sensors:
-                seen = seen._replace(gate_number=np.array([passed]))
-                seen = sensors.see(seen, np.array([decisions == 0]), np.array([True]))
-            state, image = observe(spec, seen, action_b)
-            fresh = np.full(rows, decisions == 0)
+                view = view._replace(gate_number=np.array([passed]))
+                view = sensors.see(view, np.array([decisions == 0]), np.array([True]))
+            state, image = observe(spec, view, action_b)
+            is_first = np.full(rows, decisions == 0)
             inputs = (_padded(x, rows) for x in (state, image))
             last_b = np.repeat(action_b, rows, 0)
-            guarded, hidden = call_policy(limits, policy, hidden, *inputs, fresh, last_b)
+            guarded, hidden = call_policy(limits, policy, hidden, *inputs, is_first, last_b)
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
             bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
@@ -137,9 +137,9 @@ def fly_trial(
                 break
 
         # Fly one step.
-        blow = draws[None, step + 1] if len(draws) > 1 else None
+        gust_draw = draws[None, step + 1] if len(draws) > 1 else None
         loops, wrench = autopilot_step(
-            autopilot, loops, motion, action_b, gate_w, np.array([step]), blow
+            autopilot, loops, motion, action_b, gate_w, np.array([step]), gust_draw
         )
         step += 1
         if not (np.abs([wrench.force_b, wrench.torque_b]) <= rules.wrench_limit).all():
@@ -150,8 +150,8 @@ def fly_trial(
         mujoco.mj_step2(model, data)
         mujoco.mj_step1(model, data)
 
-    # The speed at a contact is not "before any contact".
-    free = speeds[:-1] if ended_by == "collision" else speeds
+    # v_max is the largest speed before any contact.
+    contact_free = speeds[:-1] if ended_by == "collision" else speeds
     return TrialResult(
         *trial,
         policy=policy.name,
@@ -165,7 +165,7 @@ def fly_trial(
         pos_y=float(before_w[1]),
         pos_z=float(before_w[2]),
         time_s=step * dt,
-        v_max=max(free, default=0.0),
+        v_max=max(contact_free, default=0.0),
         v_mean=sum(speeds) / max(len(speeds), 1),
         gates_8s=passed_8s,
         gates_035=passed_035,
@@ -186,6 +186,7 @@ def _is_flight(motion: Motion, rules: Rules) -> bool:
 
 
 def _padded(values: np.ndarray, rows: int) -> np.ndarray:
+    """Return the first row of `values`, followed by rows of zeros."""
     padded = np.zeros((rows, *values.shape[1:]), np.float32)
     padded[0] = values[0]
     return padded

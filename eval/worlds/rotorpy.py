@@ -1,10 +1,10 @@
 """The simulator `rotorpy`: RotorPy's multirotor flies the trials (Folk, Paulos and Kumar 2023).
 
-Policy, autopilot, rate loop and mixer are the suite's, since a vehicle file describes them; so are
-scene, images, contacts and rules. RotorPy's batched multirotor gets the commanded rotor speeds and
-simulates the rotors' lag, thrust, drag, air and rigid body. Its integrator is the fixed Runge-Kutta
-step of order 4 at the rate loop's frequency. The adaptive one chooses its steps by all rows
-together, so a trial would depend on the other trials.
+The suite's own code runs policy, autopilot, rate loop and mixer, since a vehicle file describes
+them, and scene, images, contacts and rules. RotorPy's batched multirotor gets the commanded rotor
+speeds and simulates the rotors' lag, thrust, drag, air and rigid body. Its integrator is
+Runge-Kutta of order 4 with a fixed step, at the rate loop's frequency. The adaptive integrator has
+one step size for all drones, so a trial would depend on the other trials.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from policies.spec import ActionSpec
 from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import quat_to_rot, to_local
 
-STEPS_A_LAG = 1.0
-"""The rotors' time constant is no shorter than so many steps: RotorPy divides by it, and its
-integrator follows a shorter one badly."""
+MIN_LAG_STEPS = 1.0
+"""Least time constant of the rotors, in steps: RotorPy divides by it, and its integrator is
+inaccurate for a shorter one."""
 XYZW = [1, 2, 3, 0]
-"""Index in RotorPy's quaternion of w, x, y and z."""
+"""Indices of x, y, z and w in a quaternion wxyz; RotorPy's are xyzw."""
 
 
-class Push(NamedTuple):
-    """Inputs of a step of RotorPy."""
+class StepInput(NamedTuple):
+    """Inputs of a step of RotorPy, constant during the step."""
 
     rotor_speed: np.ndarray
-    """(N, 4) commanded, held during the step [rad/s]."""
+    """(N, 4) commanded rotor speeds [rad/s]."""
     wind_w: np.ndarray
-    """(N, 3) held during the step [m/s]."""
+    """(N, 3) wind [m/s]."""
 
 
 class RotorpyWorld(SceneSlots):
-    """RotorPy, an optional package: slots of its `BatchedMultirotor`.
+    """A world whose drones are RotorPy's `BatchedMultirotor`; the package is optional.
 
-    Its logs count as continuous in time.
+    Its logs count as continuous in time, since it has no `integrator`.
     """
 
     name = "rotorpy"
     cost = 6.0
+    """Computing time of a trial relative to MuJoCo's."""
 
     def __init__(
         self,
@@ -77,14 +78,14 @@ class RotorpyWorld(SceneSlots):
         """Check that RotorPy is installed and usable.
 
         Raises:
-            ValueError: where it is not installed, with what to do.
+            ValueError: where it is not installed; the message has the command that installs it.
         """
         rotorpy()
 
     @staticmethod
     def differences(vehicle: Vehicle) -> list[str]:
         """Return a sentence for each deviation of the simulation from `vehicle`."""
-        return rotorpy_vehicle.differences(vehicle, STEPS_A_LAG / vehicle.controller.frequency)
+        return rotorpy_vehicle.differences(vehicle, MIN_LAG_STEPS / vehicle.controller.frequency)
 
     @staticmethod
     def nearest(vehicle: Vehicle) -> Vehicle:
@@ -98,47 +99,49 @@ class RotorpyWorld(SceneSlots):
         gate_w: np.ndarray,
         step: np.ndarray,
         noise: np.ndarray | None,
-    ) -> tuple[AutopilotState, Push]:
+    ) -> tuple[AutopilotState, StepInput]:
         loops = attitude_step(self._autopilot, self._loops, motion, action_b, gate_w, step)
         plant = self._autopilot.plant
-        commanded = motor_speed_command(self._autopilot, action_b)
-        state, wanted = rotor_command(plant, loops.plant, loops.command, motion.rate_b, commanded)
+        motor_action = motor_speed_command(self._autopilot, action_b)
+        state, speed_cmd = rotor_command(
+            plant, loops.plant, loops.command, motion.rate_b, motor_action
+        )
         winds, air_vel_w = winds_on(plant, state.wind, motion, noise)
         loops = loops._replace(plant=state._replace(wind=winds))
-        return loops, Push(wanted, motion.vel_w - air_vel_w)
+        return loops, StepInput(speed_cmd, motion.vel_w - air_vel_w)
 
-    def _move(self, flying: np.ndarray, motion: Motion, push: Push) -> np.ndarray:
+    def _move(self, flying: np.ndarray, motion: Motion, push: StepInput) -> np.ndarray:
         qpos, qvel, speed = self._multirotor.step(
             self._qpos, self._qvel, self._loops.plant.rotor_speed, push
         )
-        after = np.concatenate([qpos, qvel, speed], axis=-1)
-        fits = np.asarray(np.isfinite(after).all(-1))
-        go = flying & fits
-        self._qpos[go], self._qvel[go] = qpos[go], qvel[go]
-        speed = np.where(go[:, None], speed, self._loops.plant.rotor_speed)
+        state = np.concatenate([qpos, qvel, speed], axis=-1)
+        valid = np.asarray(np.isfinite(state).all(-1))
+        moving = flying & valid
+        self._qpos[moving], self._qvel[moving] = qpos[moving], qvel[moving]
+        speed = np.where(moving[:, None], speed, self._loops.plant.rotor_speed)
         plant = self._loops.plant._replace(rotor_speed=speed)
         self._loops = self._loops._replace(plant=plant)
-        self._batch.forward(np.flatnonzero(go).astype(np.int32), stage=TO_CONTACTS)
-        return ~fits
+        self._batch.forward(np.flatnonzero(moving).astype(np.int32), stage=TO_CONTACTS)
+        return ~valid
 
 
 class Multirotor:
-    """N of RotorPy's multirotors of one vehicle, stepped independently, in double precision."""
+    """N independent multirotors of RotorPy with the same vehicle, in double precision."""
 
     def __init__(self, vehicle: Vehicle, dt: float, count: int) -> None:
-        """Make `count` of `vehicle` for steps of `dt` [s].
+        """Make `count` multirotors with the parameters of `vehicle`, for steps of `dt` [s].
 
         Raises:
             ValueError: where RotorPy is not installed.
         """
         import torch
 
-        theirs, cpu = rotorpy(), torch.device("cpu")
-        parameters = rotorpy_vehicle.rotorpy_parameters(vehicle, STEPS_A_LAG * dt)
+        module, cpu = rotorpy(), torch.device("cpu")
+        parameters = rotorpy_vehicle.rotorpy_parameters(vehicle, MIN_LAG_STEPS * dt)
         self._dt, self._rows, self._mass = dt, torch.arange(count), parameters["mass"]
         start = {"x": torch.zeros(count, 3, dtype=torch.float64)}
-        self._theirs = theirs.BatchedMultirotor(
-            theirs.BatchedMultirotorParams([parameters] * count, count, cpu),
+        self._multirotor = module.BatchedMultirotor(
+            module.BatchedMultirotorParams([parameters] * count, count, cpu),
             count,
             start,
             cpu,
@@ -146,15 +149,15 @@ class Multirotor:
         )
 
     def step(
-        self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray, push: Push
+        self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray, push: StepInput
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, qvel and rotor speeds after one step; the object has no state.
 
         Args:
             qpos: (N, 7) position [m] and quaternion wxyz.
             qvel: (N, 6) velocity in the world [m/s] and body rates [rad/s].
-            rotor_speed: (N, 4) [rad/s].
-            push: what is held during the step.
+            rotor_speed: (N, 4) rotor speeds [rad/s].
+            push: inputs that are constant during the step.
         """
         import torch
 
@@ -169,21 +172,21 @@ class Multirotor:
         state = {name: torch.tensor(value) for name, value in state.items()}
         commanded = {"cmd_motor_speeds": torch.tensor(push.rotor_speed)}
         with _in_doubles():
-            after = self._theirs.step(state, commanded, self._dt, self._rows)
-        part = {name: value.numpy() for name, value in after.items()}
-        qpos = np.concatenate([part["x"], part["q"][:, [3, 0, 1, 2]]], axis=-1)
-        return qpos, np.concatenate([part["v"], part["w"]], axis=-1), part["rotor_speeds"]
+            after = self._multirotor.step(state, commanded, self._dt, self._rows)
+        new = {name: value.numpy() for name, value in after.items()}
+        qpos = np.concatenate([new["x"], new["q"][:, [3, 0, 1, 2]]], axis=-1)
+        return qpos, np.concatenate([new["v"], new["w"]], axis=-1), new["rotor_speeds"]
 
     def specific_force_b(
         self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray
     ) -> np.ndarray:
-        """Return force over mass in still air, (N, 3) [m/s^2]; arguments as in `step`."""
+        """Return the specific force (N, 3) [m/s^2] without wind; arguments as in `step`."""
         import torch
 
         vel_b = to_local(quat_to_rot(qpos[:, 3:]), qvel[:, :3])
-        moving = (torch.tensor(part) for part in (qvel[:, 3:], rotor_speed, vel_b))
+        inputs = (torch.tensor(value) for value in (qvel[:, 3:], rotor_speed, vel_b))
         with _in_doubles():
-            force_b, _ = self._theirs.compute_body_wrench(*moving, self._rows)
+            force_b, _ = self._multirotor.compute_body_wrench(*inputs, self._rows)
         return force_b.numpy() / self._mass
 
 
@@ -192,24 +195,24 @@ def _in_doubles() -> Iterator[None]:
     """Set torch's default type to double, which RotorPy uses for its arrays."""
     import torch
 
-    usual = torch.get_default_dtype()
+    dtype_before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
         with torch.no_grad():
             yield
     finally:
-        torch.set_default_dtype(usual)
+        torch.set_default_dtype(dtype_before)
 
 
 def rotorpy() -> Any:
     """Return RotorPy's module of multirotors.
 
     Raises:
-        ValueError: where it or its batched part is not installed.
+        ValueError: where RotorPy, or a package that its batched part needs, is not installed.
     """
     try:
-        for needed in ("torchdiffeq", "roma"):  # which it can do without, but not batched
-            importlib.import_module(needed)
+        for package in ("torchdiffeq", "roma"):  # needed by RotorPy's batched part
+            importlib.import_module(package)
         return importlib.import_module("rotorpy.vehicles.multirotor")
     except ModuleNotFoundError as error:
         raise ValueError(

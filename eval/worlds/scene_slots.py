@@ -1,7 +1,8 @@
-"""Slots of `mujoco.batch`, in which MuJoCo computes contacts and mesh images of each trial.
+"""Base class of simulators ("worlds") that find contacts with MuJoCo's C engine, in many slots.
 
-Every slot has its own model, padded to one layout, and its own MjData. After each operation the
-contacts of the current state are up to date, so that it is judged before the next step.
+A slot flies one trial at a time, a flight along a track. Every slot has its own MuJoCo model,
+padded to a common size, and its own MjData in a `mujoco.batch`. After each operation the contacts
+of the current state are up to date, so the rules are applied before the next step.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from eval.quadrotor.autopilot import AutopilotState, make_autopilot, start_autop
 from eval.quadrotor.plant import MAX_DELAY, Motion, make_plant, uses_noise
 from eval.vehicles.vehicle import Vehicle
 from eval.worlds import Rows
-from eval.worlds.engine import BODY, Eye, compile_model, contact_name, start_state
-from eval.worlds.slots import IDLE, Gusts, Layout, empty_course, pad_gates
+from eval.worlds.engine import BODY, DepthCamera, compile_model, contact_name, start_state
+from eval.worlds.slots import IDLE, GustDraws, Layout, empty_course, pad_gates
 from eval.worlds.trial import (
     DIVERGED,
     FLYING,
@@ -43,12 +44,12 @@ from tracks.geometry.tiles import depth_images, make_tiles
 from tracks.track import Track
 
 TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
-"""Stage of the engine after which a state can be judged."""
+"""Stage of the engine after which the contacts of a state are known."""
 _NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
 class SceneSlots(ABC):
-    """A `World` without the dynamics; everything but the engine is numpy over all slots.
+    """A `World` without dynamics, computed in NumPy over all slots, except for contacts.
 
     Subclasses define `_control` (the autopilot's output) and `_move` (the motion of the bodies).
     """
@@ -69,19 +70,19 @@ class SceneSlots(ABC):
         """Make the world.
 
         Args:
-            vehicle: that flies.
-            camera: the policy's.
+            vehicle: the vehicle that flies.
+            camera: the policy's camera.
             layout: sizes that fit every track.
-            rules: when a trial ends.
-            slots: how many trials fly at once.
-            threads: for physics; the outcome is the same with any number.
-            action: the policy's action; None for an acceleration.
+            rules: rules for the end and the score of a trial.
+            slots: number of trials that fly at the same time.
+            threads: number of threads for physics; results do not depend on it.
+            action: the policy's action; None: an acceleration.
         """
         self.slots = slots
         self._vehicles, self._layout, self._rules = [vehicle] * slots, layout, rules
         self._autopilot = make_autopilot(vehicle, action)
         self.dt = self._autopilot.dt
-        self._eye, self._tiles = Eye(camera), make_tiles(camera)
+        self._depth_camera, self._tiles = DepthCamera(camera), make_tiles(camera)
         self._threads = threads
         self._course = empty_course(slots, layout)
         self._progress = start_progress(np.zeros((slots, 3)))
@@ -89,9 +90,9 @@ class SceneSlots(ABC):
         self._models: list[mujoco.MjModel] = []
         self._scene: Scene | None = None
         self._meshes: dict[int, mujoco.MjData] = {}
-        self._noise: list[Gusts] | None = None
+        self._noise: list[GustDraws] | None = None
         if uses_noise(self._autopilot.plant):
-            self._noise = [Gusts(IDLE)] * slots
+            self._noise = [GustDraws(IDLE)] * slots
 
     @property
     def progress(self) -> Progress:
@@ -99,9 +100,10 @@ class SceneSlots(ABC):
         return self._progress
 
     def _build(self, model: mujoco.MjModel) -> None:
+        """Make the batch of slots, all with `model` at first."""
         self._models = [model] * self.slots
         self._batch = Batch(model, self.slots, self._threads, persistent=True)
-        # Live views: state in, contacts and orientation of the current state out.
+        # Views of the engine's memory: the state is written, contacts and attitude are read.
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._applied = self._batch.bind("qfrc_applied")
         self._contacts = self._batch.bind("ncon")
@@ -116,26 +118,26 @@ class SceneSlots(ABC):
 
         Args:
             entries: the trials to fly.
-            vehicles: one an entry, that have the effects of the world's with other values; where
-                some loads have them, all have.
+            vehicles: one vehicle for each entry, with the world's effects but other values. If one
+                call has vehicles, all calls must have them.
         """
         if vehicles is not None:
-            self._change([slot for slot, _, _ in entries], vehicles)
+            self._set_vehicles([slot for slot, _, _ in entries], vehicles)
         for slot, track, trial in entries:
             model = compile_model(track, self._vehicles[slot], self.dt, self._layout.solids)
             if not self._models:
                 self._build(model)
             self._models[slot] = model
-            if track.mesh_sizes:  # meshes do not move: one computation serves all images
+            if track.mesh_sizes:  # meshes do not move, so one computation suffices for all images
                 self._meshes[slot] = mujoco.MjData(model)
                 mujoco.mj_kinematics(model, self._meshes[slot])
             self._course.count[slot] = len(track.scene.gates.center_w)
             if self._noise is not None:
-                self._noise[slot] = Gusts(trial)
+                self._noise[slot] = GustDraws(trial)
         ids = np.array([slot for slot, _, _ in entries], np.int32)
         started = np.zeros(self.slots, bool)
         started[ids] = True
-        self._scene = self._scene_with([track.scene for _, track, _ in entries], ids, started)
+        self._scene = self._insert_scenes([track.scene for _, track, _ in entries], ids, started)
         self._course = self._course._replace(gates=self._scene.gates)
         self._batch.set_models(self._models)
         self._batch.reset(ids, stage=_NOTHING)
@@ -145,13 +147,13 @@ class SceneSlots(ABC):
 
         motion = self._motion()
         noise = self._draws(np.where(started, -1, self._progress.step))
-        fresh = start_autopilot(self._autopilot, motion, noise)
-        self._loops = make_contiguous(select(started, fresh, getattr(self, "_loops", fresh)))
+        initial = start_autopilot(self._autopilot, motion, noise)
+        self._loops = make_contiguous(select(started, initial, getattr(self, "_loops", initial)))
         self._progress = select(started, start_progress(motion.pos_w), self._progress)
         self._judge(started, np.zeros(self.slots, bool))
 
-    def _change(self, slots: list[int], vehicles: Sequence[Vehicle]) -> None:
-        """Assign a vehicle to each of `slots`."""
+    def _set_vehicles(self, slots: list[int], vehicles: Sequence[Vehicle]) -> None:
+        """Assign a vehicle to each of `slots`, and stack the values of all vehicles' effects."""
         for slot, vehicle in zip(slots, vehicles, strict=True):
             self._vehicles[slot] = vehicle
         values = {}
@@ -161,7 +163,7 @@ class SceneSlots(ABC):
         plant = make_plant(self._vehicles[0], self.dt, values, MAX_DELAY)
         self._autopilot = replace(self._autopilot, plant=plant)
 
-    def _scene_with(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
+    def _insert_scenes(self, scenes: list[Scene], ids: np.ndarray, started: np.ndarray) -> Scene:
         """Return the scenes of all slots without meshes, with `scenes` in the slots `ids`."""
         layout = self._layout
         padded = [
@@ -181,29 +183,32 @@ class SceneSlots(ABC):
         velocity = self._qvel.copy()
         return Motion(self._qpos[:, :3].copy(), rot_w, velocity[:, :3], velocity[:, 3:])
 
-    def _judge(self, which: np.ndarray, bad_wrench: np.ndarray) -> None:
-        """Judge the current states of the slots in `which`."""
+    def _judge(self, selected: np.ndarray, invalid: np.ndarray) -> None:
+        """Apply the rules to the current states of the `selected` slots (N,) bool.
+
+        `invalid` (N,) bool are the slots in which no step was possible.
+        """
         motion, contact = self._motion(), self._contacts > 0
-        diverged = bad_wrench | has_diverged(self._rules, motion)
-        with np.errstate(invalid="ignore", over="ignore"):  # of rows that have diverged
+        diverged = invalid | has_diverged(self._rules, motion)
+        with np.errstate(invalid="ignore", over="ignore"):  # in slots that have diverged
             judged = judge_state(
                 self._rules, self._progress, self._course, self.dt, motion, contact, diverged
             )
-        self._progress = select(which, judged, self._progress)
+        self._progress = select(selected, judged, self._progress)
 
     def collided_with(self, slot: int) -> str:
         """Return the name of the solid that the trial in `slot` collided with."""
         return contact_name(self._models[slot], self._batch.get_data(slot))
 
     def view(self, wanted: np.ndarray) -> View:
-        """Return the current view."""
+        """Return the current view; images only for the slots in `wanted` (N,) bool."""
         motion = self._motion()
-        camera, slots = self._eye.camera, np.flatnonzero(wanted)
+        camera, slots = self._depth_camera.camera, np.flatnonzero(wanted)
         depth = np.full((self.slots, camera.height, camera.width), camera.range_m)
         depth[slots] = self._images(slots, *take(motion[:2], slots))
         gate = next_gate(self._course, self._progress.gates)
-        after = next_gate(self._course, self._progress.gates + 1)
-        return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, after, depth)
+        second_gate = next_gate(self._course, self._progress.gates + 1)
+        return view_of(motion.pos_w, motion.rot_w, motion.vel_w, gate, second_gate, depth)
 
     def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
         """Return the depth images of `slots` (K,) from pos_w (K, 3) and rot_w (K, 3, 3)."""
@@ -211,7 +216,7 @@ class SceneSlots(ABC):
         for row, slot in enumerate(slots.tolist()):
             if slot in self._meshes:
                 model, data = self._models[slot], self._meshes[slot]
-                meshes = self._eye.image(model, data, pos_w[row], rot_w[row], MESH_GROUP)
+                meshes = self._depth_camera.image(model, data, pos_w[row], rot_w[row], MESH_GROUP)
                 depth[row] = np.minimum(depth[row], meshes)
         return depth
 
@@ -224,17 +229,22 @@ class SceneSlots(ABC):
         step: np.ndarray,
         noise: np.ndarray | None,
     ) -> tuple[AutopilotState, Any]:
-        """Return the loops after a physics step, and their output for `_move`.
+        """Return the autopilot's state after a physics step, and its output for `_move`.
 
         The arguments are those of `eval.quadrotor.autopilot.autopilot_step`, for all slots.
         """
 
     @abstractmethod
     def _move(self, flying: np.ndarray, motion: Motion, push: Any) -> np.ndarray:
-        """Fly one physics step in the slots `flying` (N,) bool, from `motion`, under `push`.
+        """Simulate one physics step in some slots.
+
+        Args:
+            flying: (N,) bool, the slots to simulate.
+            motion: (N, ...) states before the step.
+            push: output of `_control`.
 
         Returns:
-            (N,) bool: slots in which no step is possible, and which keep their state.
+            The slots in which no step is possible, (N,) bool; they keep their state.
         """
 
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
@@ -246,32 +256,33 @@ class SceneSlots(ABC):
                 break
             step, motion = self._progress.step, self._motion()
             gate_w = next_centre(self._course, self._progress.gates)
-            speed_before = self._loops.plant.rotor_speed
+            rotor_speed = self._loops.plant.rotor_speed
             draws = self._draws(step)
             loops, push = self._control(motion, action_b, gate_w, step, draws)
             self._loops = make_contiguous(select(flying, loops, self._loops))
             if record:
                 due = flying & (step % self._autopilot.attitude_every == 0)
-                rows += self._rows(due, speed_before)
-            bad = self._move(flying, motion, push)
+                rows += self._rows(due, rotor_speed)
+            invalid = self._move(flying, motion, push)
             self._progress = self._progress._replace(step=step + flying)
-            self._judge(flying, bad)
+            self._judge(flying, invalid)
             if record:
                 ended = ~np.isin(self._progress.ended, (FLYING, DIVERGED))
                 rows += self._rows(flying & ended, self._loops.plant.rotor_speed)
-            lost = np.flatnonzero(flying & (self._progress.ended == DIVERGED))
-            if len(lost):  # its numbers must not appear in later arithmetic of all slots
-                self._batch.reset(lost.astype(np.int32), stage=TO_CONTACTS)
+            diverged = np.flatnonzero(flying & (self._progress.ended == DIVERGED))
+            if len(diverged):  # their invalid numbers must not enter later computations
+                self._batch.reset(diverged.astype(np.int32), stage=TO_CONTACTS)
         return rows
 
     def _draws(self, step: np.ndarray) -> np.ndarray | None:
-        """Return the draws (N, 3) that follow `step` (N,); -1 is before the start."""
+        """Return the gusts' draws (N, 3) after `step` (N,); -1 is before the start."""
         if self._noise is None:
             return None
         pairs = zip(step.tolist(), self._noise, strict=True)
         return np.concatenate([draws.at(k + 1, 1) for k, draws in pairs])
 
     def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
+        """Return the rows of the flight logs at this step; [] where no slot is in `due`."""
         if not due.any():
             return []
         loops = self._loops

@@ -1,4 +1,7 @@
-"""Shared parts of worlds with slots: layouts, courses and random numbers of trials."""
+"""Parts that the simulators ("worlds") with slots share: scene sizes, gates and random numbers.
+
+A slot flies one trial at a time, which is a flight along a track.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,11 @@ class Layout(NamedTuple):
     """Sizes to which all scenes are padded, so that any trial fits any slot."""
 
     solids: Counts
+    """Number of solids of each kind."""
     gates: int
+    """Number of gates."""
     corners: int
-    """Of an opening."""
+    """Number of corners of a gate's opening."""
 
 
 def layout_of(tracks: Iterable[Track]) -> Layout:
@@ -37,14 +42,14 @@ def layout_of(tracks: Iterable[Track]) -> Layout:
     return layout
 
 
-def fitting(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[list[int]]:
-    """Return the numbers of trials in groups that can share slots.
+def slot_groups(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[list[int]]:
+    """Return groups of trials, by their index, that can share slots.
 
-    The size of a MuJoCo model depends on its meshes, so a track with meshes is its own group.
+    The size of a MuJoCo model depends on its meshes, so a track with meshes has its own group.
 
     Args:
-        trials: to be flown.
-        tracks: those from files.
+        trials: the trials to fly.
+        tracks: name of a track from a file -> track.
     """
     groups: dict[str, list[int]] = {}
     for number, trial in enumerate(trials):
@@ -54,20 +59,20 @@ def fitting(trials: Sequence[TrialSpec], tracks: Mapping[str, Track]) -> list[li
 
 
 def empty_course(slots: int, layout: Layout) -> Course:
-    """Return the course of empty slots, with room for gates."""
-    n, g = slots, layout.gates
+    """Return the gates of empty slots, as arrays of the layout's size."""
+    shape = slots, layout.gates
     gates = Gates(
-        np.zeros((n, g, 3)),
-        np.tile(np.eye(3), (n, g, 1, 1)),
-        np.zeros((n, g, layout.corners, 2)),
-        np.zeros((n, g)),
-        np.zeros((n, g)),
+        np.zeros((*shape, 3)),
+        np.tile(np.eye(3), (*shape, 1, 1)),
+        np.zeros((*shape, layout.corners, 2)),
+        np.zeros(shape),
+        np.zeros(shape),
     )
-    return Course(gates, np.ones(n, np.int32))
+    return Course(gates, np.ones(slots, np.int32))
 
 
 def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
-    """Return `gates` with the last gate and each opening's last corner repeated."""
+    """Return `gates` padded to `number` gates with `corners` corners, by repeating the last one."""
     more = corners - gates.opening_g.shape[1]
     opening = np.concatenate([gates.opening_g, np.repeat(gates.opening_g[:, -1:], more, 1)], 1)
     index = np.minimum(np.arange(number), len(gates.center_w) - 1)
@@ -75,30 +80,34 @@ def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
 
 
 GUSTS, SENSED, STATE_AGES, IMAGE_AGES = range(1, 5)
-"""Uses of a trial's random numbers; each has its own stream."""
+"""Uses of a trial's random numbers; each has its own random generator."""
 GUSTS_AT_ONCE = 1024
-"""Number of steps whose draws are made together."""
+"""Number of steps whose draws are generated together."""
 IDLE = TrialSpec("", 0, 0)
 """Trial of a slot before the first load."""
 
 
 def generator_of(trial: TrialSpec, use: int, part: str = "") -> np.random.Generator:
-    """Return the random generator of a trial for one use and part, which determine it.
+    """Return the random generator of a trial for one use, which these arguments determine.
 
-    For a track file only its name counts, without the folder.
+    Args:
+        trial: the trial; for a track file only its name counts, without the folder.
+        use: one of `GUSTS`, `SENSED`, `STATE_AGES` and `IMAGE_AGES`.
+        part: name of a part of the use, such as a sensor model; each has its own generator.
     """
     name = PurePath(trial.track).name
     key = [trial.seed, trial.difficulty, *name.encode(), use, *part.encode()]
     return np.random.default_rng(np.random.SeedSequence(key))
 
 
-class Gusts:
-    """A trial's draws for gusts, equal to `noise_of`, but generated during the flight.
+class GustDraws:
+    """Random draws for a trial's gusts, equal to `gust_draws`, but generated during the flight.
 
-    A flight of an hour at 10 kHz would need 0.9 GB at once.
+    The draws of one hour at 10 kHz would need 0.9 GB at once.
     """
 
     def __init__(self, trial: TrialSpec) -> None:
+        """Prepare the draws of `trial` from its first step on."""
         self._trial = trial
         self._rewind()
 
@@ -109,18 +118,18 @@ class Gusts:
     def at(self, step: int, count: int) -> np.ndarray:
         """Return the draws (count, 3) of the steps from `step` on.
 
-        Later steps are cheap; an earlier `step` repeats the draws from the start.
+        Steps are cheap in increasing order; a step before the last one generates all draws again.
         """
         if step < self._first:
             self._rewind()
         while self._first + len(self._rows) < step + count:
-            passed = min(step - self._first, len(self._rows))
+            used = min(step - self._first, len(self._rows))
             more = self._generator.standard_normal((GUSTS_AT_ONCE, 3))
-            self._rows = np.concatenate([self._rows[passed:], more])
-            self._first += passed
+            self._rows = np.concatenate([self._rows[used:], more])
+            self._first += used
         return self._rows[step - self._first :][:count]
 
 
-def noise_of(trial: TrialSpec, steps: int) -> np.ndarray:
-    """Return standard normal draws (steps, 3) for a trial's gusts, determined by the trial."""
+def gust_draws(trial: TrialSpec, steps: int) -> np.ndarray:
+    """Return standard normal draws (steps, 3) for a trial's gusts; the trial determines them."""
     return generator_of(trial, GUSTS).standard_normal((steps, 3))

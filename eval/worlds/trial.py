@@ -1,6 +1,7 @@
-"""Trials: their specification, end and score, with the same rules in every simulator.
+"""Specification, end and score of a trial, with the same rules in every simulator.
 
-The rules are pure functions of arrays over many trials (N rows), for numpy and JAX.
+A trial is a flight of a policy along a track. The rules are pure functions of NumPy or JAX arrays,
+whose rows are N trials.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from tracks.track import Track
 FLYING = 0
 """Code in `Progress.ended` of a running trial."""
 ENDINGS = ("finished", "collision", "tipped", "timeout", "diverged")
-"""Values of `ended_by`; `Progress.ended` is 1 + the index."""
+"""Values of `TrialResult.ended_by`; `Progress.ended` is 1 + the index."""
 FINISHED, COLLISION, TIPPED, TIMEOUT, DIVERGED = range(1, 6)
 
 
@@ -26,7 +27,7 @@ class TrialSpec(NamedTuple):
     """Specification of a trial; with policy and vehicle it determines the outcome."""
 
     track: str
-    """Name of the family, or path of a custom track's file."""
+    """Name of a family of tracks, or path of a custom track's file."""
     difficulty: int
     """Level, 0 to 9."""
     seed: int
@@ -43,12 +44,12 @@ class TrialResult(NamedTuple):
     vehicle: str
     world: str
     success: bool
-    """All gates in order, no collision, in time."""
+    """Whether all gates were passed in order, in time and without a collision."""
     gates_passed: int
     ended_by: str
     """One of `ENDINGS`."""
     collided_with: str | None
-    """The solid's name, or None unless `ended_by` is collision."""
+    """Name of the solid in a collision; None for other endings."""
     pos_x: float
     """Position of the centre of mass at the end, world [m]; the last finite one if diverged."""
     pos_y: float
@@ -60,20 +61,20 @@ class TrialResult(NamedTuple):
     v_mean: float
     """Mean |vel_w| [m/s]."""
     gates_8s: int
-    """Gates passed within 8 s."""
+    """Number of gates passed within 8 s."""
     gates_035: int
-    """Gates by the baseline's rule: within 0.35 m of the centres, in order."""
+    """Number of gates by the baseline's rule: within 0.35 m of the centres, in order."""
     bad_actions: int
-    """Actions that were not finite; the last good one was flown instead."""
+    """Number of actions that were not finite; the last finite one was flown instead."""
     limited_actions: int
-    """Actions beyond the limit, which were reduced to it."""
+    """Number of actions beyond the limit, which were reduced to it."""
     late_actions: int
     """1 where the policy exceeded a set deadline or gave no answer, which ends a trial as timeout;
     else 0."""
     decisions: int = 0
-    """Decisions of the policy; 0 in files without this column."""
+    """Number of decisions of the policy; 0 in files without this column."""
     output_max: float = 0.0
-    """Largest absolute component of the policy's raw output; 0 for none."""
+    """Largest absolute component of the policy's raw output; 0 without decisions."""
     action_up: float = 0.0
     """Mean vertical component of wanted net accelerations [m/s^2], counted as 0 where the vehicle
     does not climb; 0 for other actions."""
@@ -85,12 +86,12 @@ class TrialResult(NamedTuple):
 
     @property
     def ending(self) -> str:
-        """The end as text, such as "collision with gate 3 frame"."""
+        """The end of the trial as text, such as "collision with gate 3 frame"."""
         return self.ended_by + (f" with {self.collided_with}" if self.collided_with else "")
 
 
 def track_of(tracks: Mapping[str, Track], trial: TrialSpec) -> Track:
-    """Return the track that `trial` is flown on: one of the custom `tracks`, or its family's."""
+    """Return the track of `trial`: one of the custom `tracks` by name, or one of a family."""
     if trial.track in tracks:
         return tracks[trial.track]
     return make_track(trial.track, trial.difficulty, trial.seed)
@@ -105,7 +106,7 @@ class Rules:
     short_window_s: float = 8.0
     """Gates passed by this time count as `gates_8s` [s]."""
     near_radius_m: float = NEAR_RADIUS_M
-    """The baseline's rule: a gate counts within this distance of its centre [m]."""
+    """By the baseline's rule a gate counts within this distance of its centre [m]."""
     speed_limit: float = 1e3
     """A body faster than this [m/s] has diverged."""
     rate_limit: float = 1e4
@@ -115,81 +116,86 @@ class Rules:
 
 
 class Course(NamedTuple):
-    """The gates of N trials, padded to the same number by repeating the last."""
+    """The gates of N trials, padded to the same number by repeating the last one."""
 
     gates: Gates
-    """(N, G, ...)."""
+    """(N, G, ...) the gates."""
     count: Array
-    """(N,) gates to pass, int32."""
+    """(N,) number of gates to pass, int32."""
 
 
 class Progress(NamedTuple):
     """Progress of trials; all arrays are (N,) except `pos_w`."""
 
     step: Array
-    """Physics steps flown, int32."""
+    """Number of simulated physics steps, int32."""
     ended: Array
-    """`FLYING` or one of the codes above, int32."""
+    """`FLYING`, or `FINISHED` to `DIVERGED`, int32."""
     gates: Array
-    """Gates crossed in order: also the number of the next gate, int32."""
+    """Number of gates crossed in order, which is the index of the next gate, int32."""
     gates_8s: Array
-    """Gates crossed within `Rules.short_window_s`, int32."""
+    """Number of gates crossed within `Rules.short_window_s`, int32."""
     gates_035: Array
-    """Gates by the baseline's rule, int32."""
+    """Number of gates by the baseline's rule, int32."""
     v_max: Array
-    """[m/s]."""
+    """Largest |vel_w| before any contact [m/s]."""
     v_sum: Array
-    """Sum of |vel_w| over the states judged so far [m/s]."""
+    """Sum of |vel_w| over all steps [m/s]."""
     pos_w: Array
-    """(N, 3) position at the last state judged [m]."""
+    """(N, 3) position at the last step [m]."""
 
 
 def steps_to_next(decision: Array, period: float) -> Array:
-    """Return the whole physics steps from each decision, given by its number, to the next.
+    """Return the number of physics steps (N,) from each decision of the policy to the next.
 
-    A `period` of 16.7 steps (30 Hz at 500 Hz of physics) alternates between 17, 16 and 17.
+    Args:
+        decision: (N,) number of the decision in its trial, from 0.
+        period: time between decisions in physics steps; one of 16.7 (30 Hz with physics of 500 Hz)
+            gives 17, 16 and 17 steps.
     """
     xp = decision.__array_namespace__()
     return (xp.rint((decision + 1) * period) - xp.rint(decision * period)).astype(int)
 
 
 def start_progress(pos_w: Array) -> Progress:
-    """Return the progress of trials about to start at pos_w (N, 3)."""
+    """Return the progress of trials that start at pos_w (N, 3) [m]."""
     xp = pos_w.__array_namespace__()
-    count, real = xp.zeros(pos_w.shape[0], dtype=xp.int32), xp.zeros_like(pos_w[:, 0])
-    return Progress(count, count, count, count, count, real, real, pos_w)
+    zeros_int, zeros = xp.zeros(pos_w.shape[0], dtype=xp.int32), xp.zeros_like(pos_w[:, 0])
+    return Progress(zeros_int, zeros_int, zeros_int, zeros_int, zeros_int, zeros, zeros, pos_w)
 
 
 def next_gate(course: Course, number: Array) -> Gates:
-    """Return each row's gate `number` (N,), or the last one beyond it, with arrays (N, ...)."""
-    return Gates(*_rows_of(course, number, course.gates))
+    """Return gate `number` (N,) of each trial, at most its last gate, with arrays (N, ...)."""
+    return Gates(*_select_gate(course, number, course.gates))
 
 
 def next_centre(course: Course, number: Array) -> Array:
-    """Return the centre (N, 3) of each row's gate `number` (N,), as `next_gate` does [m]."""
-    return _rows_of(course, number, [course.gates.center_w])[0]
+    """Return the centre (N, 3) [m] of the gate that `next_gate` returns."""
+    return _select_gate(course, number, [course.gates.center_w])[0]
 
 
-def _rows_of(course: Course, number: Array, fields: Sequence[Array]) -> list[Array]:
+def _select_gate(course: Course, number: Array, fields: Sequence[Array]) -> list[Array]:
+    """Return `fields` (N, G, ...) of gates, for gate `number` of each trial: (N, ...)."""
     xp = number.__array_namespace__()
-    rows, at = xp.arange(number.shape[0]), xp.minimum(number, course.count - 1)
-    return [field[rows, at] for field in fields]
+    rows, gate = xp.arange(number.shape[0]), xp.minimum(number, course.count - 1)
+    return [field[rows, gate] for field in fields]
 
 
 def has_diverged(rules: Rules, motion: Motion) -> Array:
-    """Return which states are not finite or impossibly fast, (N,) bool."""
+    """Return which states are not finite, or faster than the rules allow, (N,) bool."""
     xp = motion.pos_w.__array_namespace__()
     # A comparison with NaN is false.
-    speed_fits = (xp.abs(motion.vel_w) <= rules.speed_limit).all(-1)
-    rate_fits = (xp.abs(motion.rate_b) <= rules.rate_limit).all(-1)
-    return ~(xp.isfinite(motion.pos_w).all(-1) & speed_fits & rate_fits)
+    speed_valid = (xp.abs(motion.vel_w) <= rules.speed_limit).all(-1)
+    rate_valid = (xp.abs(motion.rate_b) <= rules.rate_limit).all(-1)
+    return ~(xp.isfinite(motion.pos_w).all(-1) & speed_valid & rate_valid)
 
 
 def is_wrench(rules: Rules, wrench: Wrench) -> Array:
-    """Return which forces and torques are finite and possible, (N,) bool."""
+    """Return which forces and torques are finite and within the rules' limit, (N,) bool."""
     xp = wrench.force_b.__array_namespace__()
-    both = xp.concatenate(wrench, axis=-1)
-    return (xp.abs(both) <= rules.wrench_limit).all(-1)  # a comparison with NaN is false
+    force_and_torque = xp.concatenate(wrench, axis=-1)
+    # A comparison with NaN is false.
+    return (xp.abs(force_and_torque) <= rules.wrench_limit).all(-1)
 
 
 def judge_state(
@@ -201,19 +207,19 @@ def judge_state(
     contact: Array,
     diverged: Array,
 ) -> Progress:
-    """Return the progress after judging the states at physics step `progress.step`.
+    """Apply the rules to the states at physics step `progress.step`, and return the new progress.
 
-    A contact found in a state counts before a gate crossed on the way to it: a trial that touches
-    the last gate's frame in the step in which it crosses has not finished.
+    A contact has priority over a gate crossed in the same step: a trial that touches the last
+    gate's frame in the step in which it crosses the gate has not finished.
 
     Args:
-        rules: when a trial ends.
-        progress: of N trials; ended rows are returned unchanged.
+        rules: rules for the end and the score of a trial.
+        progress: progress of N trials; trials that have ended do not change.
         course: the gates of each trial's track.
         dt: length of a physics step [s].
         motion: (N, ...) the states.
-        contact: (N,) bool, the body is in contact.
-        diverged: (N,) bool, the state is invalid and its numbers are ignored.
+        contact: (N,) bool, whether the body is in contact.
+        diverged: (N,) bool, whether the state is invalid; its numbers are ignored.
     """
     pos_w, rot_w, vel_w, _ = motion
     xp = pos_w.__array_namespace__()

@@ -1,1 +1,4 @@
-"""Test cases with hidden effects: made from seeds, diagnosed without their answers, scored."""
+"""Blind tests of the diagnosis, which names physical effects that a vehicle file lacks.
+
+Cases with hidden effects are made from seeds, diagnosed without their answers, and scored.
+"""

@@ -1,4 +1,8 @@
-"""Make one case from its description: flights with the hidden effects, their logs, the answer."""
+"""Make one blind case from its description: flights with hidden effects, their logs, the answer.
+
+The answer has the names that a diagnosis must give. Effects that the flights do not separate come
+from the oracle (`suite/blind/oracle/`), which computes how well flights determine each parameter.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +28,12 @@ from suite.blind.oracle.information import (
     columns_of,
     detectable,
     information,
-    left_over,
     linearised,
     log_ratio,
+    remaining_ratio,
 )
 from suite.blind.outside import KINDS, changed_values, draw_change, make_outside, true_parameters
-from suite.blind.simulators import Logged, Simulator, simulator_for
+from suite.blind.simulators import LogFlights, Simulator, simulator_for
 from suite.common.errors import WorkFailed
 from suite.diagnose.plan import SEPARATIONS
 
@@ -46,13 +50,15 @@ class Built:
     truth: Vehicle
     """The flown vehicle."""
     trajectories: tuple[Trajectory, ...]
+    """The commanded trajectories."""
     logs: tuple[FlightLog, ...]
+    """The logs of the flights, with noise."""
     answer: dict[str, Any]
-    """The answer, which the diagnosis does not see."""
+    """The answer, which the diagnosis does not get."""
 
 
 def build(case: Case) -> Built:
-    """Return the case; it has the same bits for the same description.
+    """Make the case; the same description always gives the same bits.
 
     Raises:
         WorkFailed: if no draw of flights and strengths gave valid flights.
@@ -63,7 +69,7 @@ def build(case: Case) -> Built:
             return _attempt(case, np.random.default_rng([*case.seed, attempt]))
         except (FlightFailed, _Unsuitable) as error:
             reasons.append(str(error))
-    raise WorkFailed(f"{case.kind} {case.hidden}: no sound flights in {TRIES} draws: {reasons[-1]}")
+    raise WorkFailed(f"{case.kind} {case.hidden}: no valid flights in {TRIES} draws: {reasons[-1]}")
 
 
 class _Unsuitable(Exception):
@@ -71,9 +77,10 @@ class _Unsuitable(Exception):
 
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
+    """Make the case with one draw of flights and strengths, from `rng`."""
     ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
     simulator = simulator_for(case, rng)
-    nominal = simulator.given
+    nominal = simulator.nominal
     if case.kind == "outside":
         return _outside(case, simulator, sensors, ways, rng)
     changes, multiples, effects = {}, {}, {}
@@ -87,11 +94,11 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
         effects[name] = changed_values(nominal, table, name, change, rng)
     has_voltage = bool(sensors.voltage)
     if case.separation >= 0 and has_voltage:
-        _by_voltage(nominal, changes, effects)
-    truth = with_effects(simulator.given, effects)
+        _depend_on_voltage(nominal, changes, effects)
+    truth = with_effects(simulator.nominal, effects)
     flown = simulator.fly(truth, ways, rng)
-    named = {name: change for name, change in changes.items() if not EFFECTS[name].random}
-    judged = _judged(case, nominal, flown(None), sensors, named) if named else {}
+    steady = {name: change for name, change in changes.items() if not EFFECTS[name].random}
+    expected = _expected_names(case, nominal, flown(None), sensors, steady) if steady else {}
     answer = {
         "kind": case.kind,
         "verdict": "named" if case.hidden else "no_gap",
@@ -100,7 +107,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
                 "name": name,
                 "parameters": true_parameters(name, effects[name], has_voltage),
                 "multiple": multiples[name],
-                **judged.get(name, {"sigma": None, "required": [], "allowed": []}),
+                **expected.get(name, {"sigma": None, "required": [], "allowed": []}),
             }
             for name in case.hidden
         ],
@@ -108,46 +115,52 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     return _built(case, simulator, truth, ways, flown, answer, rng)
 
 
-def _judged(
+def _expected_names(
     case: Case,
     nominal: Vehicle,
     logs: Sequence[FlightLog],
     sensors: Sensors,
-    named: dict[str, np.ndarray],
+    changes: dict[str, np.ndarray],
 ) -> dict[str, dict[str, Any]]:
-    """Return for each effect in `named` its strength and the names that may replace it."""
+    """Return for each effect in `changes` its strength and the names that may replace it."""
     info = information(nominal, logs, sensors)
     if case.kind == "pair":
-        _check_pair(info, named, nominal)
-    long = information(nominal, logs, sensors, horizon_s=LONG_S)
-    rests, hidden = (alternatives(each, named, nominal) for each in (info, long))
+        _check_pair(info, changes, nominal)
+    long_info = information(nominal, logs, sensors, horizon_s=LONG_S)
+    # Remaining log-likelihood ratios of the alternatives, in short and in long rollouts.
+    short, long = (alternatives(each, changes, nominal) for each in (info, long_info))
     return {
         name: {
             "sigma": float(np.sqrt(2.0 * log_ratio(info.block(name), change))),
-            "required": [o for o in rests[name] if hidden[name].get(o, np.inf) < REQUIRED],
-            "allowed": list(rests[name]),
-            "left_over": rests[name],
-            "left_over_of_long_stretches": hidden[name],
+            "required": [o for o in short[name] if long[name].get(o, np.inf) < REQUIRED],
+            "allowed": list(short[name]),
+            "left_over": short[name],
+            "left_over_of_long_stretches": long[name],
         }
-        for name, change in named.items()
+        for name, change in changes.items()
     }
 
 
-def _by_voltage(nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]) -> None:
-    """Let act by the voltage, in place, what would act by time where no voltage is logged."""
+def _depend_on_voltage(
+    nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]
+) -> None:
+    """Make effects of the battery depend on its voltage instead of time, in place."""
     for name in effects:
         convert = EFFECTS[name].with_voltage
         if convert is not None:
             effects[name] = convert(effects[name], FALL_V_PER_S)
-            given = all_values(nominal)[name]
+            nominal_values = all_values(nominal)[name]
             columns = columns_of(True, [name])
-            changes[name] = np.array([c.value(effects[name]) - c.value(given) for c in columns])
+            changes[name] = np.array(
+                [c.value(effects[name]) - c.value(nominal_values) for c in columns]
+            )
 
 
 def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
     """Return `change` scaled to `case.multiple` times the strength detectable on gentle flights.
 
-    Gentle flights show less than those of the table, and a change must be detectable to be named.
+    Gentle flights are less informative than those of the table of strengths, and a diagnosis can
+    only name a change that is detectable.
     """
     sensors = SENSORS["capture"]
     ways = SEPARATIONS[case.separation].blurred
@@ -169,18 +182,19 @@ def _outside(
     Its strength is computed on a flight at the usual strength: `case.multiple` times the strength
     that is just detectable after a fit of the whole catalogue.
     """
-    name, nominal = case.hidden[0], simulator.given
+    name, nominal = case.hidden[0], simulator.nominal
     kind = KINDS[name]
 
-    def flown_at(strength: float) -> tuple[Logged, float]:
+    def fly_at(strength: float) -> tuple[LogFlights, float]:
         extra = make_outside(name, strength, nominal.mass)
         flown = simulator.fly(nominal, ways, rng, extra)
-        return flown, unnameable(nominal, flown(None), sensors)
+        return flown, unexplained_ratio(nominal, flown(None), sensors)
 
-    _, rest = flown_at(kind.usual)
-    wanted = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(rest, 1e-9))
-    strength = float(np.clip(wanted, 0.2 * kind.usual, kind.most))
-    flown, rest = flown_at(strength)
+    _, ratio = fly_at(kind.usual)
+    # The log-likelihood ratio grows with the square of the strength.
+    target = case.multiple * kind.usual * np.sqrt(THRESHOLD / max(ratio, 1e-9))
+    strength = float(np.clip(target, 0.2 * kind.usual, kind.most))
+    flown, ratio = fly_at(strength)
     answer = {
         "kind": case.kind,
         "verdict": "unknown",
@@ -189,23 +203,24 @@ def _outside(
             "name": name,
             "strength": strength,
             "unit": kind.unit,
-            "multiple": float(np.sqrt(rest / THRESHOLD)),
+            "multiple": float(np.sqrt(ratio / THRESHOLD)),
         },
     }
-    return _built(case, simulator, simulator.given, ways, flown, answer, rng)
+    return _built(case, simulator, simulator.nominal, ways, flown, answer, rng)
 
 
-def unnameable(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
+def unexplained_ratio(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
     """Return the log-likelihood ratio that remains after a joint fit of the whole catalogue."""
     block = linearised(nominal, logs, sensors, columns_of(bool(sensors.voltage)))
-    seen, flat = block.residual.ravel(), block.slope.reshape(block.residual.size, -1)
-    size = np.linalg.norm(flat, axis=0)
-    flat = flat[:, size > 0.0] / size[size > 0.0]
-    fitted = np.linalg.lstsq(flat, seen, rcond=1e-6)[0]
-    return float(0.5 * ((seen - flat @ fitted) ** 2).sum())
+    residual, jacobian = block.residual.ravel(), block.slope.reshape(block.residual.size, -1)
+    size = np.linalg.norm(jacobian, axis=0)
+    jacobian = jacobian[:, size > 0.0] / size[size > 0.0]
+    fitted = np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0]
+    return float(0.5 * ((residual - jacobian @ fitted) ** 2).sum())
 
 
 def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
+    """Return the trajectories of the case's kind."""
     if case.separation >= 0:
         entry = SEPARATIONS[case.separation]
         added = entry.separating if case.kind == "separated" else ()
@@ -215,13 +230,13 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
     return ordinary_flights(rng)
 
 
-def _check_pair(info: Information, named: dict[str, np.ndarray], nominal: Vehicle) -> None:
-    """Refuse two effects if one alone could explain the flights: that is another kind of case."""
-    first, second = named
-    for mine, other in ((first, second), (second, first)):
-        alone = left_over(info, {mine: named[mine]}, mine, other, nominal)
-        if alone < 2.0 * THRESHOLD:
-            raise _Unsuitable(f"{other} explains most of {mine}")
+def _check_pair(info: Information, changes: dict[str, np.ndarray], nominal: Vehicle) -> None:
+    """Reject two effects if one of them could explain the flights: that is another kind of case."""
+    first, second = changes
+    for name, other in ((first, second), (second, first)):
+        ratio = remaining_ratio(info, {name: changes[name]}, name, other, nominal)
+        if ratio < 2.0 * THRESHOLD:
+            raise _Unsuitable(f"{other} explains most of {name}")
 
 
 def _built(
@@ -229,17 +244,18 @@ def _built(
     simulator: Simulator,
     truth: Vehicle,
     ways: Sequence[Trajectory],
-    flown: Logged,
+    flown: LogFlights,
     answer: dict[str, Any],
     rng: np.random.Generator,
 ) -> Built:
+    """Return the case with noisy logs, and an answer that describes how it was made."""
     logs = flown(rng)
     answer = {
         **answer,
         **({"conditions": simulator.conditions} if simulator.conditions else {}),
         "case": asdict(case),
         "trajectories": [asdict(way) for way in ways],
-        # Without it a short answer could be guessed from its hash.
+        # Without a salt a short answer could be guessed from its hash.
         "salt": rng.bytes(16).hex(),
     }
-    return Built(simulator.given, truth, tuple(ways), logs, answer)
+    return Built(simulator.nominal, truth, tuple(ways), logs, answer)

@@ -1,6 +1,7 @@
-"""Commanded trajectories flown in continuous time by an engine that shares no code with the fit.
+"""Fly trajectories of blind cases in continuous time, with an engine of separate code.
 
-The tracking controller is the one of the other simulators, since it only gives commands.
+The engine shares no code with the model that the diagnosis fits. The tracking controller is the one
+of the other simulators, since it only gives commands.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from suite.blind.continuous.log import Noise, log_of_flight
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
 
-ROLL_S = 0.25
+MARGIN_S = 0.25
 """Time before the first row and after the last one, for poses with a time offset [s]."""
 
 
-def with_loop(vehicle: Vehicle, frequency: float) -> Vehicle:
+def with_loop_frequency(vehicle: Vehicle, frequency: float) -> Vehicle:
     """Return `vehicle` with its rate loop at `frequency` [Hz]."""
     return replace(vehicle, controller=replace(vehicle.controller, frequency=frequency))
 
@@ -40,74 +41,81 @@ def fly_continuous(
     extra: Extra | None = None,
     step_s: float = STEP_S,
 ) -> Flown:
-    """Fly `trajectories` side by side.
+    """Fly N trajectories in parallel.
 
     Args:
         nominal: vehicle of the tracking controller.
-        truth: flown vehicle; its loop has the frequency of `conditions`.
-        trajectories: N of them.
+        truth: vehicle that flies; its rate loop gets the frequency of `conditions`.
+        trajectories: the trajectories, a flight for each.
         conditions: rates and jitter.
-        rng: of stamps and gusts.
-        extra: additional physics.
+        rng: random generator of time stamps and gusts.
+        extra: additional physics; None: none.
         step_s: longest step [s].
 
     Raises:
         FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.
         ValueError: for an effect without an equation in the engine.
     """
-    quadrotor = quadrotor_of(with_loop(truth, conditions.loop_hz))
-    last = max(way.duration_s for way in trajectories)
+    quadrotor = quadrotor_of(with_loop_frequency(truth, conditions.loop_hz))
+    end_s = max(trajectory.duration_s for trajectory in trajectories) + MARGIN_S
     stamp_s = jittered_stamps(
-        rng, len(trajectories), -ROLL_S, last + ROLL_S, conditions.row_hz, conditions.jitter
+        rng, len(trajectories), -MARGIN_S, end_s, conditions.row_hz, conditions.jitter
     )
-    lag = quadrotor.time_constant
-    finest = min(step_s, lag / 5.0) if lag > 0.0 else step_s
-    plan = schedule(stamp_s, 1.0 / conditions.loop_hz, quadrotor.delay, max(finest, 0.02 * step_s))
+    # Steps resolve the rotors' lag.
+    lag_s = quadrotor.time_constant
+    lag_step_s = min(step_s, lag_s / 5.0) if lag_s > 0.0 else step_s
+    longest_s = max(lag_step_s, 0.02 * step_s)
+    plan = schedule(stamp_s, 1.0 / conditions.loop_hz, quadrotor.delay, longest_s)
     pilot = _Pilot(nominal, trajectories, stamp_s, extra)
     start = np.zeros((len(trajectories), 13))
-    for index, way in enumerate(trajectories):
+    for index, trajectory in enumerate(trajectories):
         # Before time 0 a trajectory is constant, except for its heading.
-        first = way.reference(stamp_s[:1, index])
-        half = 0.5 * float(first.yaw[0])
+        first = trajectory.reference(stamp_s[:1, index])
+        half_yaw = 0.5 * float(first.yaw[0])
         start[index, POS] = first.pos_w[0]
-        start[index, QUAT] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        start[index, QUAT] = [np.cos(half_yaw), 0.0, 0.0, np.sin(half_yaw)]
     battery = Battery(FULL_V, FALL_V_PER_S, SAG_V)
     push = None if extra is None else pilot.push
     return fly(quadrotor, plan, start, pilot, rng, battery, push)
 
 
 class _Pilot:
-    """Tracks the trajectories of N flights, row by row."""
+    """Tracking controller of N flights, with the additional physics of their case."""
 
     def __init__(
-        self, nominal: Vehicle, ways: Sequence[Trajectory], stamp_s: np.ndarray, extra: Extra | None
+        self,
+        nominal: Vehicle,
+        trajectories: Sequence[Trajectory],
+        stamp_s: np.ndarray,
+        extra: Extra | None,
     ) -> None:
         self._nominal, self._stamp_s, self._extra = nominal, stamp_s, extra
-        each = [way.reference(stamp_s[:, index]) for index, way in enumerate(ways)]
-        self._wanted = Reference(*(np.stack(parts, axis=1) for parts in zip(*each, strict=True)))
-        self._summed_w = np.zeros((len(ways), 3))
+        references = [t.reference(stamp_s[:, index]) for index, t in enumerate(trajectories)]
+        fields = zip(*references, strict=True)
+        self._reference = Reference(*(np.stack(field, axis=1) for field in fields))
+        self._integral_w = np.zeros((len(trajectories), 3))
 
-    def __call__(self, seen: Rows) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, states: Rows) -> tuple[np.ndarray, np.ndarray]:
         """Return the logged command and the command that acts, (N, 4) each."""
-        row = seen.number
-        now = Reference(*(part[row] for part in self._wanted))
-        motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
-        check_flights(motion, now, seen.time_s)
-        since = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
-        off = now.pos_w - seen.pos_w
-        self._summed_w = np.clip(self._summed_w + since[:, None] * off, -1.0, 1.0)
-        given = steer(self._nominal, PilotGains(), now, motion, self._summed_w)
-        acting = given
+        row = states.number
+        reference = Reference(*(field[row] for field in self._reference))
+        motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
+        check_flights(motion, reference, states.time_s)
+        dt = self._stamp_s[row] - self._stamp_s[max(row - 1, 0)]
+        error_w = reference.pos_w - states.pos_w
+        self._integral_w = np.clip(self._integral_w + dt[:, None] * error_w, -1.0, 1.0)
+        command = steer(self._nominal, PilotGains(), reference, motion, self._integral_w)
+        acting = command
         if self._extra is not None:
-            acting = self._extra.command(given, float(seen.time_s[0]))
-        return given.packed, acting.packed
+            acting = self._extra.command(command, float(states.time_s[0]))
+        return command.packed, acting.packed
 
-    def push(self, seen: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
-        """Return the force of the additional physics in a step (N, 3) [N]."""
+    def push(self, states: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
+        """Return the force of the additional physics in a step, body axes (N, 3) [N]."""
         assert self._extra is not None
-        motion = Motion(seen.pos_w, seen.rot_w, seen.vel_w, seen.rate_b)
+        motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
         wrench = Wrench(force_b, np.zeros_like(force_b))
-        time_s = seen.time_s[:, None]
+        time_s = states.time_s[:, None]
         # One number per flight, unlike in other simulators.
         return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
 
@@ -120,12 +128,21 @@ def logs_of(
     conditions: Conditions,
     rng: np.random.Generator | None,
 ) -> tuple[FlightLog, ...]:
-    """Return the flights' logs with the noise density of `sensors`, or without if `rng` is None."""
+    """Return the logs of the flights, with the noise density of `sensors`.
+
+    Args:
+        flown: the flights.
+        trajectories: their trajectories, which set the logs' durations.
+        truth: the vehicle that flew.
+        sensors: logged channels and their noise.
+        conditions: rates, jitter and lost rows.
+        rng: random generator of the noise; None: no noise.
+    """
     noise, about = Noise(*astuple(sensors)[1:]), {"source": "suite blind", "vehicle": truth.name}
     return tuple(
         log_of_flight(
-            flown, index, way.duration_s, truth.effects, noise, conditions, rng,
+            flown, index, trajectory.duration_s, truth.effects, noise, conditions, rng,
             f"flight_{index + 1}", about,
         )
-        for index, way in enumerate(trajectories)
+        for index, trajectory in enumerate(trajectories)
     )  # fmt: skip

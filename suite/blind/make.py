@@ -1,8 +1,8 @@
-"""A set of cases on disk: the diagnosis's inputs, and the answers in a separate folder.
+"""Write a set of blind cases to disk, with the answers in a separate folder, and read it again.
 
-`OUT/set.json` has the seed and options of the set. `OUT/cases/case_001/` has vehicle.toml,
-flight_1.parquet and so on, the inputs of a diagnosis; `OUT/answers/case_001.json` the hidden
-effects; `OUT/manifest.json` the hashes of all files.
+A blind case is a set of flights with hidden effects. `OUT/set.json` has the seed and options of the
+set. `OUT/cases/case_001/` has the inputs of a diagnosis: vehicle.toml, flight_1.parquet, ...
+`OUT/answers/case_001.json` has the hidden effects, and `OUT/manifest.json` the hashes of all files.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Manifest:
     """The files of a set."""
 
     cases: dict[str, dict[str, str]]
-    """By case: SHA-256 of each input file of the diagnosis."""
+    """Case -> input file of the diagnosis -> SHA-256 of the file."""
     answers: dict[str, str]
-    """By case: SHA-256 of its answer."""
+    """Case -> SHA-256 of its answer."""
     failed: dict[str, str] = field(default_factory=dict)
-    """By case: the reason for which it could not be made."""
+    """Case -> "not made", for cases without valid flights."""
 
 
 def make_set(
@@ -49,15 +49,15 @@ def make_set(
     simulator: str = MUJOCO,
     workers: Workers | None = None,
 ) -> Manifest:
-    """Make the missing cases in `out`, and the manifest.
+    """Make the missing cases in `out`, and return the manifest of the set.
 
     Args:
         out: folder of the set.
-        seed: of the set.
+        seed: seed of the set.
         count: approximate number of cases; None: all.
-        console: shows progress.
+        console: shows the progress.
         simulator: one of `DRAWERS`; all but `mujoco` have smaller sets.
-        workers: of the cases; None: this process.
+        workers: processes that make cases in parallel; None: this process.
 
     Raises:
         ValueError: if `out` has a set of another seed, count, simulator or table of strengths, or
@@ -66,8 +66,8 @@ def make_set(
     if simulator == ROTORPY:
         world_class(ROTORPY)
     cases = DRAWERS[simulator](seed, count)
-    about = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
-    _same_set(out, about)
+    options = {"seed": seed, "count": count, "simulator": simulator, "strengths": _hash(TABLE)}
+    _check_options(out, options)
     names = [
         name
         for name in cases
@@ -81,7 +81,7 @@ def make_set(
             if isinstance(built, str):
                 failed[name] = built
                 return
-            # The answer first: every existing case has one.
+            # The answer is written first, so that every existing case has one.
             write_json(out / "answers" / f"{name}.json", {**stamp(SCHEMA, seed), **built.answer})
             with replacing_folder(out / "cases" / name) as temporary:
                 save_vehicle(built.nominal, temporary / "vehicle.toml")
@@ -142,28 +142,29 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
     answers = {}
     for name, files in manifest.cases.items():
         answer = out / "answers" / f"{name}.json"
-        made = {out / "cases" / name / file: digest for file, digest in files.items()}
-        for path, digest in {**made, answer: manifest.answers[name]}.items():
+        digests = {out / "cases" / name / file: digest for file, digest in files.items()}
+        for path, digest in {**digests, answer: manifest.answers[name]}.items():
             if not path.is_file() or _hash(path) != digest:
                 raise ValueError(
                     f"{path}: not the file that the manifest was made with; make the set again "
-                    "elsewhere"
+                    "in another folder"
                 )
         answers[name] = read_json(answer)
     return answers
 
 
-def _same_set(out: Path, wanted: dict[str, Any]) -> None:
+def _check_options(out: Path, options: dict[str, Any]) -> None:
+    """Write the options of a new set, or check that they are those of the set in `out`."""
     path = out / "set.json"
-    there = read_json(path) if path.is_file() else None
-    if there is None:
-        write_json(path, {**stamp(SCHEMA, wanted["seed"]), **wanted})
+    stored = read_json(path) if path.is_file() else None
+    if stored is None:
+        write_json(path, {**stamp(SCHEMA, options["seed"]), **options})
         return
-    for key, value in wanted.items():
-        if there.get(key) != value:
+    for key, value in options.items():
+        if stored.get(key) != value:
             raise ValueError(
-                f"{path}: {key} is {there.get(key)!r} there, {value!r} here; "
-                "give another --out, or the same options to go on"
+                f"{path}: {key} is {stored.get(key)!r} in the file, {value!r} in this command; "
+                "give another --out, or the same options to continue"
             )
 
 

@@ -1,4 +1,8 @@
-"""Hidden physics of a case: values of an effect, or physics outside the catalogue."""
+"""The hidden physics of a blind case: values of an effect, or physics that no effect describes.
+
+Effects are the physical causes of mismatch in the catalogue (`eval/effects/`), which a diagnosis
+can name. For physics outside the catalogue the correct verdict is `unknown`.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +22,15 @@ from tracks.common.names import unknown_name
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
+"""Function of strength, true mass [kg], motion, wrench and time [s] that returns an acceleration
+(N, 3), world axes [m/s^2]."""
 
 
 class Outside:
-    """Base class: a kind changes the command or adds a wrench. One object is for one `fly`."""
+    """Base class of physics outside the catalogue, which changes the command or adds a wrench.
+
+    An object may have a state, so it is for one call of `fly`.
+    """
 
     def __init__(self, strength: float, mass: float) -> None:
         """Prepare for flights of a quadrotor of true `mass` [kg]; `strength` as in `KINDS`."""
@@ -32,7 +41,7 @@ class Outside:
         return command
 
     def wrench(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> Wrench:
-        """Return what is added to `wrench`."""
+        """Return the wrench that is added to `wrench`, body axes."""
         acc_w = self.acc_w(motion, wrench, time_s, dt)
         force_b = self.mass * to_local(motion.rot_w, acc_w)
         return Wrench(force_b, np.zeros_like(force_b))
@@ -49,24 +58,25 @@ class SlungLoad(Outside):
     """
 
     LENGTH_M, STIFFNESS, DAMPING = 0.4, 60.0, 0.3
+    """Length of the line without load [m], its stiffness [N/m] and damping [N s/m]."""
 
     _pos_w = _vel_w = np.zeros(0)
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return the line's force, and move the load, which is at rest at the start."""
+        """Return the acceleration by the line, and move the load, which hangs at rest at first."""
         if not self._pos_w.size:
             stretch = self.strength * GRAVITY / self.STIFFNESS
             self._pos_w = motion.pos_w - np.array([0.0, 0.0, self.LENGTH_M + stretch])
             self._vel_w = motion.vel_w.copy()
-        line = self._pos_w - motion.pos_w
-        length = np.sqrt((line**2).sum(-1, keepdims=True))
-        along = line / length
-        closing = ((self._vel_w - motion.vel_w) * along).sum(-1, keepdims=True)
-        tension = self.STIFFNESS * (length - self.LENGTH_M) + self.DAMPING * closing
-        pull = np.where(length > self.LENGTH_M, np.maximum(tension, 0.0), 0.0) * along
-        self._vel_w = self._vel_w + dt * (-pull / self.strength + [0.0, 0.0, -GRAVITY])
+        line_w = self._pos_w - motion.pos_w
+        length = np.sqrt((line_w**2).sum(-1, keepdims=True))
+        direction_w = line_w / length
+        stretch_rate = ((self._vel_w - motion.vel_w) * direction_w).sum(-1, keepdims=True)
+        tension = self.STIFFNESS * (length - self.LENGTH_M) + self.DAMPING * stretch_rate
+        force_w = np.where(length > self.LENGTH_M, np.maximum(tension, 0.0), 0.0) * direction_w
+        self._vel_w = self._vel_w + dt * (-force_w / self.strength + [0.0, 0.0, -GRAVITY])
         self._pos_w = self._pos_w + dt * self._vel_w
-        return pull / self.mass
+        return force_w / self.mass
 
 
 class Hysteresis(Outside):
@@ -86,17 +96,17 @@ class BentThrust(Outside):
     """A nonlinear thrust curve."""
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return c + s (c - g)^2 / g."""
+        """Return the command with the thrust c + s (c - g)^2 / g, s the strength."""
         thrust = command.thrust
-        bent = thrust + self.strength * (thrust - GRAVITY) ** 2 / GRAVITY
-        return Command(np.maximum(bent, 0.0), command.rate_b)
+        curved = thrust + self.strength * (thrust - GRAVITY) ** 2 / GRAVITY
+        return Command(np.maximum(curved, 0.0), command.rate_b)
 
 
 class Push(Outside):
-    """An acceleration in world axes that depends only on the state."""
+    """An acceleration that is a function of the present state and time."""
 
     def __init__(self, strength: float, mass: float, law: Law) -> None:
-        """Prepare; `law` takes (strength, mass, motion, wrench, time) and returns (N, 3)."""
+        """Prepare for flights with the acceleration of `law`; see `Outside`."""
         super().__init__(strength, mass)
         self._law = law
 
@@ -106,38 +116,38 @@ class Push(Outside):
 
 
 def _power_drag(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """Drag with |v|^1.6: -s |v|^0.6 v."""
+    """Return a drag that grows with |v|^1.6: -s |v|^0.6 v."""
     speed = np.sqrt((motion.vel_w**2).sum(-1, keepdims=True))
     return -s * speed**0.6 * motion.vel_w
 
 
 def _heading_force(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """A sideways force that changes its sign twice per turn: s cos(2 yaw) along body y."""
+    """Return a sideways force that depends on the heading: s cos(2 yaw) along body y."""
     yaw = np.arctan2(motion.rot_w[:, 1, 0], motion.rot_w[:, 0, 0])
     return s * np.cos(2.0 * yaw)[:, None] * motion.rot_w[:, :, 1]
 
 
 def _wake(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """Descent into the own wake: -s (sinking speed beyond 0.5 m/s)^2 along body z."""
-    sinking = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
-    return -s * sinking**2 * motion.rot_w[:, :, 2]
+    """Return the loss of thrust in the own wake: -s (sink rate beyond 0.5 m/s)^2 along body z."""
+    sink_rate = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
+    return -s * sink_rate**2 * motion.rot_w[:, :, 2]
 
 
 def _tether(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """A spring to a place in the world: -s (pos - anchor)."""
+    """Return the pull of a spring to a fixed point: -s (pos - anchor)."""
     return -s * (motion.pos_w - np.array([1.0, -1.0, 0.0]))
 
 
 def _ripple(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """Thrust that pulses at 3.1 Hz: s sin(2 pi 3.1 t) of it."""
+    """Return a thrust oscillation at 3.1 Hz: s sin(2 pi 3.1 t) times the thrust."""
     share = s * np.sin(2.0 * np.pi * 3.1 * t)
     return share * wrench.force_b[:, 2:] / m * motion.rot_w[:, :, 2]
 
 
 def _updraft(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """A column of rising air: s exp(-r^2 / 2 (0.9 m)^2) upwards, r from the column's middle."""
-    square = ((motion.pos_w[:, :2] - np.array([2.0, 1.0])) ** 2).sum(-1)
-    return (s * np.exp(-0.5 * square / 0.9**2))[:, None] * np.array([0.0, 0.0, 1.0])
+    """Return the push of rising air, s exp(-r^2 / (2 (0.9 m)^2)) at a distance r from its axis."""
+    distance_squared = ((motion.pos_w[:, :2] - np.array([2.0, 1.0])) ** 2).sum(-1)
+    return (s * np.exp(-0.5 * distance_squared / 0.9**2))[:, None] * np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -145,13 +155,13 @@ class Kind:
     """One kind of physics outside the catalogue."""
 
     make: Callable[..., Outside]
-    """From strength and true mass [kg]."""
+    """Function from strength and true mass [kg] to the physics."""
     unit: str
-    """Of the strength."""
+    """Unit of the strength."""
     usual: float
-    """The strength at which the table of strengths evaluates it."""
+    """Usual strength, from which a case's strength is computed."""
     most: float
-    """The largest flown strength."""
+    """Largest strength of a case."""
 
 
 KINDS: dict[str, Kind] = {
@@ -165,7 +175,9 @@ KINDS: dict[str, Kind] = {
     "updraft": Kind(partial(Push, law=_updraft), "m/s^2", 1.0, 5.0),
     "bent_thrust": Kind(BentThrust, "1", 0.1, 0.4),
 }
-"""Kinds by name."""
+"""Name -> kind of physics outside the catalogue."""
+BOUND_SHARE = 0.98
+"""Largest change of a parameter, as a share of the distance to its physical bound."""
 
 
 def make_outside(name: str, strength: float, mass: float) -> Outside:
@@ -179,69 +191,80 @@ def make_outside(name: str, strength: float, mass: float) -> Outside:
     return KINDS[name].make(strength, mass)
 
 
-INSIDE = 0.98
-"""Largest share of the distance to a physical bound."""
-
-
 def draw_change(
     rng: np.random.Generator, nominal: Vehicle, sensors: str, effect: str, multiple: float
 ) -> tuple[np.ndarray, float]:
-    """Return the change of each column of the effect, and its multiple of the detectable strength.
+    """Draw a change of an effect's parameters in a random direction.
 
-    The direction is random; the strength along it is `multiple` times the detectable one, limited
-    by the physical bounds.
+    Args:
+        rng: random generator of the direction.
+        nominal: the vehicle file for the diagnosis.
+        sensors: name of the logged channels and their noise.
+        effect: name of the effect.
+        multiple: strength, as a multiple of the detectable one; physical bounds may reduce it.
+
+    Returns:
+        The change of each column in the table of strengths (P,), and its multiple.
 
     Raises:
-        ValueError: if the flights of the table do not show the effect.
+        ValueError: if the effect is not identifiable on the flights of the table.
     """
     columns = columns_in_table(nominal.name, sensors, effect)
     room = np.array([column.room(nominal) for column in columns])
     if columns[0].spec.one_at_a_time:
-        alone = np.eye(len(columns))[rng.integers(len(columns))]
-        direction = columns[0].spec.signs[0] * alone
+        unit_vector = np.eye(len(columns))[rng.integers(len(columns))]
+        direction = columns[0].spec.signs[0] * unit_vector
     else:
         sign = rng.choice([-1.0, 1.0], len(columns))
         # Upwards if the given value cannot, or does not usually, become smaller.
         upwards = (room[:, 0] > -1e-9) | np.array([c.spec.upwards(nominal) for c in columns])
         direction = rng.uniform(0.5, 1.0, len(columns)) * np.where(upwards, 1.0, sign)
-    unit = detectable_along(nominal.name, sensors, effect, direction)
-    if not np.isfinite(unit):
+    detectable = detectable_along(nominal.name, sensors, effect, direction)
+    if not np.isfinite(detectable):
         raise ValueError(
-            f"{effect} cannot be seen on vehicle {nominal.name!r} with sensors {sensors!r}; "
+            f"{effect} is not identifiable on vehicle {nominal.name!r} with sensors {sensors!r}; "
             "draw another vehicle or other sensors"
         )
-    change = multiple * unit * direction
-    limit = INSIDE * np.where(change > 0.0, room[:, 1], room[:, 0])
-    moving = np.abs(change) > 0.0
-    cut = float(np.min(np.abs(limit[moving] / change[moving]), initial=1.0))
-    return min(cut, 1.0) * change, min(cut, 1.0) * multiple
+    change = multiple * detectable * direction
+    limit = BOUND_SHARE * np.where(change > 0.0, room[:, 1], room[:, 0])
+    nonzero = np.abs(change) > 0.0
+    factor = float(np.min(np.abs(limit[nonzero] / change[nonzero]), initial=1.0))
+    return factor * change, factor * multiple
 
 
 def changed_values(
     nominal: Vehicle, sensors: str, effect: str, change: np.ndarray, rng: np.random.Generator
 ) -> Any:
-    """Return the effect's values (plain numbers): the given vehicle's plus `change`."""
-    given = all_values(nominal)[effect]
-    fields = {key: np.array(value, dtype=float) for key, value in given._asdict().items()}
+    """Return the values of the effect in the nominal vehicle plus a change, as plain numbers.
+
+    Args:
+        nominal: the vehicle file for the diagnosis.
+        sensors: name of the logged channels and their noise.
+        effect: name of the effect.
+        change: (P,) change of each column in the table of strengths.
+        rng: random generator of components that are not identifiable.
+    """
+    nominal_values = all_values(nominal)[effect]
+    fields = {k: np.array(value, dtype=float) for k, value in nominal_values._asdict().items()}
     columns = columns_in_table(nominal.name, sensors, effect)
     for column, step in zip(columns, change, strict=True):
         value = fields[column.parameter]
         value[(column.component,) if value.ndim else ()] += step
     for parameter in EFFECTS[effect].parameters:
         for component in parameter.unseen:
-            # Not identifiable, so any value is right.
+            # The component is not identifiable, so a diagnosis need not find its value.
             size = 0.5 * parameter.typical[1]
             fields[parameter.name][component] = rng.uniform(-size, size)
     plain = {k: tuple(v.tolist()) if v.ndim else float(v) for k, v in fields.items()}
-    return type(given)(**plain)
+    return type(nominal_values)(**plain)
 
 
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
-    """Return the expected diagnosis: totals, with null for unidentifiable components."""
-    found: dict[str, Any] = {}
+    """Return the expected parameters of a diagnosis: totals, None where not identifiable."""
+    expected: dict[str, Any] = {}
     for parameter in EFFECTS[effect].identifiable(has_voltage):
         value = getattr(values, parameter.name)
         if parameter.size:
             value = [None if i in parameter.unseen else v for i, v in enumerate(value)]
-        found[parameter.name] = value
-    return found
+        expected[parameter.name] = value
+    return expected

@@ -1,12 +1,12 @@
-"""Commanded trajectories flown in RotorPy, another simulator with equations of its own.
+"""Fly trajectories of blind cases in RotorPy, a simulator with different equations.
 
-Tracking controller, rate loop and mixer are ours, since the vehicle file describes them; rotors,
-air and rigid body are RotorPy's, as in the simulator `rotorpy`.
+Tracking controller, rate loop and mixer are the suite's, since the vehicle file describes them.
+RotorPy simulates rotors, air and rigid body, as in the simulator `rotorpy`.
 
 RotorPy's rotor drag and inflow depend on each hub's airspeed `v + w x r`, those of our catalogue on
-the body's. At rotor speed `Omega` the difference is an angular damping: a drag `k Omega` in the
-rotor plane turns against `w_z` by `k Omega (x^2 + y^2)` a rotor, an inflow along body z against
-`w_x` by `k Omega y^2` and against `w_y` by `k Omega x^2`.
+the body's. At rotor speed `Omega` the difference is an angular damping. For each rotor, a drag
+`k Omega` in the rotor plane damps `w_z` by `k Omega (x^2 + y^2)`; an inflow along body z damps
+`w_x` by `k Omega y^2` and `w_y` by `k Omega x^2`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,18 @@ from eval.flights.trajectory import Reference, Trajectory
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.rotorpy import Multirotor, Push
+from eval.worlds.rotorpy import Multirotor, StepInput
 from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from tracks.geometry.rotation import quat_to_rot
 
+DAMPING = "angular_damping"
+"""Effect of the catalogue that a diagnosis may name for the damping by moving hubs."""
+WITHIN = 1.5
+"""Largest ratio of a named damping to that in hover; flights differ from hover."""
+
 
 def check_effects(truth: Vehicle) -> None:
-    """Refuse a vehicle with an effect that RotorPy does not have in the same form.
+    """Raise an error for a vehicle with an effect that RotorPy does not have in the same form.
 
     Raises:
         ValueError: with the effect and what is allowed.
@@ -44,7 +49,16 @@ def check_effects(truth: Vehicle) -> None:
 def fly_rotorpy(
     nominal: Vehicle, truth: Vehicle, trajectories: Sequence[Trajectory], rate_hz: float
 ) -> list[Recording]:
-    """Fly `trajectories` side by side in RotorPy; the arguments are those of `fly`.
+    """Fly `trajectories` in parallel in RotorPy.
+
+    Args:
+        nominal: vehicle of the tracking controller, the rate loop and the mixer.
+        truth: vehicle that flies.
+        trajectories: the trajectories, a flight for each.
+        rate_hz: rows of the records per second [Hz].
+
+    Returns:
+        The records of the flights.
 
     Raises:
         FlightFailed: if a flight tips over, touches the ground or leaves its trajectory.
@@ -53,9 +67,9 @@ def fly_rotorpy(
     check_effects(truth)
     frequency = nominal.controller.frequency
     dt, period = 1.0 / frequency, round(frequency / rate_hz)
-    wanted = reference_of(trajectories, period, dt)
-    bodies = _RotorpyBodies(nominal, truth, wanted, dt)
-    return follow(bodies, nominal, trajectories, wanted, period, dt)
+    reference = reference_of(trajectories, period, dt)
+    bodies = _RotorpyBodies(nominal, truth, reference, dt)
+    return follow(bodies, nominal, trajectories, reference, period, dt)
 
 
 class _RotorpyBodies:
@@ -63,17 +77,17 @@ class _RotorpyBodies:
 
     integrator: str | None = None
 
-    def __init__(self, nominal: Vehicle, truth: Vehicle, wanted: Reference, dt: float) -> None:
-        count = wanted.yaw.shape[1]
-        half, none = wanted.yaw[0] / 2, np.zeros(count)
-        quat = np.stack([np.cos(half), none, none, np.sin(half)], axis=-1)
+    def __init__(self, nominal: Vehicle, truth: Vehicle, reference: Reference, dt: float) -> None:
+        count = reference.yaw.shape[1]
+        half_yaw, zeros = reference.yaw[0] / 2, np.zeros(count)
+        quat = np.stack([np.cos(half_yaw), zeros, zeros, np.sin(half_yaw)], axis=-1)
         self._plant = make_plant(nominal, dt)
         self._multirotor = Multirotor(truth, dt, count)
-        self._qpos = np.concatenate([wanted.pos_w[0], quat], axis=-1)
-        self._qvel = np.concatenate([wanted.vel_w[0], np.zeros((count, 3))], axis=-1)
+        self._qpos = np.concatenate([reference.pos_w[0], quat], axis=-1)
+        self._qvel = np.concatenate([reference.vel_w[0], np.zeros((count, 3))], axis=-1)
         hover = Command(np.full(count, GRAVITY), np.zeros((count, 3)))
         self._speed = wanted_speed(self._plant, hover, np.zeros((count, 3)))
-        self._still = np.zeros((count, 3))
+        self._no_wind_w = np.zeros((count, 3))
 
     def motion(self) -> tuple[Motion, np.ndarray]:
         quat = self._qpos[:, 3:]
@@ -82,41 +96,41 @@ class _RotorpyBodies:
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
         speed = self._speed
-        push = Push(wanted_speed(self._plant, command, motion.rate_b), self._still)
+        push = StepInput(wanted_speed(self._plant, command, motion.rate_b), self._no_wind_w)
         self._qpos, self._qvel, self._speed = self._multirotor.step(
             self._qpos, self._qvel, speed, push
         )
         acc_b = self._multirotor.specific_force_b(self._qpos, self._qvel, self._speed)
         voltage = np.full(len(speed), FULL_V)
-        return Step(speed, voltage, command, Wrench(self._still, self._still), acc_b)
+        no_wrench = Wrench(self._no_wind_w, self._no_wind_w)
+        return Step(speed, voltage, command, no_wrench, acc_b)
 
 
-NAME = "angular_damping"
-WITHIN = 1.5
-"""Largest ratio of a named damping to that of moving hubs in hover, since flights are no hover."""
+def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
+    """Return the angular damping (3,) about body axes that moving hubs cause in hover [1/s].
 
-
-def damping_of_hubs(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.ndarray:
-    """Return the damping (3,) by moving hubs in hover that an answer's `effects` cause [1/s]."""
-    place = np.asarray(vehicle.rotors.position)
-    inertia = np.asarray(vehicle.inertia)
-    thrust = vehicle.mass * GRAVITY / len(place)
+    Args:
+        effects: the effects of a case's answer.
+        vehicle: the vehicle file for the diagnosis.
+    """
+    hub_b = np.asarray(vehicle.rotors.position)
+    thrust = vehicle.mass * GRAVITY / len(hub_b)
     speed = np.sqrt(thrust / vehicle.rotors.thrust_coefficient)
-    x_sum, y_sum = (place[:, :2] ** 2).sum(axis=0) * speed
-    found = np.zeros(3)
+    x_sum, y_sum = (hub_b[:, :2] ** 2).sum(axis=0) * speed
+    torque_per_rate = np.zeros(3)
     for effect in effects:
         if effect["name"] == "rotor_drag":
-            found[2] += effect["parameters"]["coefficient"] * (x_sum + y_sum)
+            torque_per_rate[2] += effect["parameters"]["coefficient"] * (x_sum + y_sum)
         if effect["name"] == "inflow":
-            found[:2] += effect["parameters"]["coefficient"] * np.array([y_sum, x_sum])
-    return found / inertia
+            torque_per_rate[:2] += effect["parameters"]["coefficient"] * np.array([y_sum, x_sum])
+    return torque_per_rate / np.asarray(vehicle.inertia)
 
 
-def is_of_hubs(effect: Mapping[str, Any], damping: np.ndarray) -> bool:
-    """Return whether a diagnosis' `effect` is the damping (3,) by moving hubs."""
-    if effect["name"] != NAME or effect.get("alternatives") or not damping.any():
+def is_hub_damping(effect: Mapping[str, Any], damping: np.ndarray) -> bool:
+    """Return whether a diagnosis's `effect` is the damping (3,) [1/s] by moving hubs."""
+    if effect["name"] != DAMPING or effect.get("alternatives") or not damping.any():
         return False
     value = np.asarray(effect["parameters"]["coefficient"]["value"], float)
-    most = int(damping.argmax())
-    ratio = value[most] / damping[most]
+    largest = int(damping.argmax())
+    ratio = value[largest] / damping[largest]
     return bool(1.0 / WITHIN <= ratio <= WITHIN) and int(value.argmax()) in np.flatnonzero(damping)

@@ -1,4 +1,7 @@
-"""Run the diagnosis on the cases of a set."""
+"""Run the diagnosis on the blind cases of a set, and store its results next to them.
+
+A blind case is a set of flights with hidden effects, which the diagnosis must name.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +20,10 @@ from tracks.common.files import write_json
 from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
-"""Takes flight logs, the vehicle file and an output folder, and writes `diagnosis.json` there."""
+"""Function of flight logs, the vehicle file and an output folder that writes `diagnosis.json`."""
 TIMED, FAILED = "seconds.json", "error.json"
-"""File in the folder of a diagnosed case: the time of the diagnosis, or why it failed."""
-CRASHED = 500
+"""Files in the folder of a diagnosed case: the time of the diagnosis, or the reason it failed."""
+LONGEST_ERROR = 500
 """Longest error text that is stored, in characters."""
 
 
@@ -31,11 +34,17 @@ def run_set(
     into: Path | None = None,
     workers: Workers | None = None,
 ) -> int:
-    """Diagnose every case without a result, and return the number of results.
+    """Diagnose every case without a result, and return the number of cases with one.
 
-    Results go to `into` (OUT/results if not given), one folder a case, with `seconds.json`
-    next to `diagnosis.json`. A case that fails gets `error.json` and is tried again next time.
-    `workers` diagnose several at once; None is this process.
+    A case gets a folder with `diagnosis.json` and `seconds.json`. A case that fails gets
+    `error.json`, and is tried again in the next run.
+
+    Args:
+        out: folder of the set.
+        diagnose: the diagnosis to run.
+        console: shows the progress.
+        into: folder of the results; None: OUT/results.
+        workers: processes that diagnose cases in parallel; None: this process.
     """
     results = into or out / "results"
     names = list(load_manifest(out).cases)
@@ -47,14 +56,15 @@ def run_set(
     with console.progress("diagnoses", len(names)) as update:
         if workers is None or workers == 1:
             for done, job in enumerate(jobs, len(names) - len(jobs)):
-                _one(diagnose, job, console)
+                _diagnose_case(diagnose, job, console)
                 update(done + 1, job.task)
         else:
-            all_done(partial(_one, diagnose), jobs, workers, console, "diagnoses")
+            all_done(partial(_diagnose_case, diagnose), jobs, workers, console, "diagnoses")
     return sum((results / name / TIMED).is_file() for name in names)
 
 
-def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
+def _diagnose_case(diagnose: Diagnose, job: Job, console: Console) -> None:
+    """Diagnose the case in the folder `job.reads`, and write the result to `job.folder`."""
     del console
     case, folder = job.reads, job.folder
     assert case is not None
@@ -66,14 +76,14 @@ def _one(diagnose: Diagnose, job: Job, console: Console) -> None:
         json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
     # Any failure is a result of this case; the other cases continue.
     except Exception as reason:
-        write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:CRASHED]})
+        write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:LONGEST_ERROR]})
         return
     error.unlink(missing_ok=True)
     write_json(folder / TIMED, {"seconds": time.perf_counter() - start})
 
 
-def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
-    """Diagnose by `suite diagnose`, in this process.
+def diagnose_by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
+    """Run the command `suite diagnose` in this process; a function of the type `Diagnose`.
 
     Raises:
         WorkFailed: if the command ends with another code than 0.
@@ -83,14 +93,14 @@ def by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> None:
 
     from suite.cli import main
 
-    said = io.StringIO()
+    output = io.StringIO()
     args = [*map(str, flights), "--vehicle", str(vehicle), "--out", str(out)]
     # Hidden effects are as small as flights can detect, often below the thresholds of relevance.
     args += ["--relevance", "0", "0", "0"]
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         code = main(["diagnose", *args])
     if code == INTERRUPTED:
         raise KeyboardInterrupt
     if code:
-        last = said.getvalue().strip().splitlines()[-1:]
-        raise WorkFailed(f"suite diagnose ended with code {code}: {' '.join(last)}")
+        last_line = output.getvalue().strip().splitlines()[-1:]
+        raise WorkFailed(f"suite diagnose ended with code {code}: {' '.join(last_line)}")

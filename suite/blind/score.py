@@ -1,4 +1,7 @@
-"""Scores of diagnoses: named effects, false names and intervals, compared with the answers."""
+"""Score the diagnoses of blind cases: compare named effects and intervals with the answers.
+
+A blind case is a set of flights with hidden effects, which the diagnosis must name.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from eval.judging.statistics import wilson
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.blind.cases import MULTIPLES, ROTORPY
 from suite.blind.make import load_manifest, open_answers, simulator_of
-from suite.blind.rotorpy_flight import damping_of_hubs, is_of_hubs
+from suite.blind.rotorpy_flight import hub_damping, is_hub_damping
 from suite.blind.run import FAILED, TIMED
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
@@ -33,9 +36,13 @@ class Verdict:
     """The score of one case."""
 
     case: str
+    """Name of the case."""
     kind: str
+    """Kind of the case; see `suite.blind.cases.Case`."""
     hidden: tuple[str, ...]
+    """The hidden effects."""
     multiple: float
+    """Largest strength of a hidden effect, as a multiple of the just detectable one."""
     verdict: str
     """Verdict of the diagnosis; `failed` if there is none."""
     named: tuple[tuple[str, ...], ...]
@@ -43,12 +50,13 @@ class Verdict:
     found: bool
     """Whether every hidden effect is named, with the right alternatives."""
     extra: int
-    """Number of named effects that are false, with all alternatives."""
+    """Number of named effects of which neither the name nor an alternative is true."""
     covered: tuple[bool, ...]
-    """Whether the interval of each component contains the true value."""
+    """Whether the 95 % interval of each component contains the true value."""
     gap_ratio: float | None
-    """Gap after over noise floor."""
+    """Rollout error with the named effects divided by that of noise alone; None without names."""
     seconds: float | None
+    """Time of the diagnosis [s]."""
     brought: int = 0
     """Number of named effects that are physics of the simulator itself, by name and size."""
 
@@ -60,15 +68,20 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Share:
-    """A line of the table: a count of cases, with a 95 % Wilson interval of the share."""
+    """A row of the table: a count of cases, with a 95 % Wilson interval of the share."""
 
     what: str
+    """Description of the counted cases."""
     count: int
+    """Number of counted cases."""
     of: int
+    """Number of all cases in question."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     wanted: str
-    """The goal."""
+    """The goal, as text."""
 
 
 def score_case(
@@ -78,21 +91,27 @@ def score_case(
     seconds: float | None,
     hubs: np.ndarray | None = None,
 ) -> Verdict:
-    """Return the score of `diagnosis` (None if it failed) for `answer`.
+    """Return the score of a diagnosis.
 
-    `hubs` (3,) is the angular damping by moving hubs in the simulator [1/s], if it has one.
+    Args:
+        name: name of the case.
+        answer: contents of the case's answer.
+        diagnosis: contents of `diagnosis.json`; None if the diagnosis failed.
+        seconds: time of the diagnosis [s]; None if it failed.
+        hubs: (3,) angular damping by moving hubs in the simulator [1/s]; None if it has none.
     """
     truths: Sequence[Mapping[str, Any]] = answer["effects"]
     hidden = [answer["outside"]] if answer.get("outside") else truths
     effects = [] if diagnosis is None else diagnosis.get("effects", [])
+    # A named effect with its alternatives is a set of names.
     sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
-    brought = [hubs is not None and is_of_hubs(e, hubs) for e in effects]
-    pairs = _matched(truths, sets)
+    brought = [hubs is not None and is_hub_damping(e, hubs) for e in effects]
+    pairs = _match(truths, sets)
     right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
-    names, used = {truth["name"] for truth in truths}, set(pairs.values())
-    # False names, and true names that another set already has.
+    names, matched = {truth["name"] for truth in truths}, set(pairs.values())
+    # Sets without a true name are extra, and sets whose true name another set already has.
     extra = [
-        e not in used if names & set(group) else not brought[e] for e, group in enumerate(sets)
+        e not in matched if names & set(group) else not brought[e] for e, group in enumerate(sets)
     ]
     covered = [
         inside
@@ -125,23 +144,23 @@ def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
         ValueError: if a file of the set has changed, or no case was diagnosed.
     """
     folder = results or out / "results"
-    scored, in_rotorpy = [], simulator_of(out) == ROTORPY
+    verdicts, in_rotorpy = [], simulator_of(out) == ROTORPY
     for name, answer in open_answers(out).items():
         if not any((folder / name / mark).is_file() for mark in (TIMED, FAILED)):
             continue
         hubs = None
         if in_rotorpy:
             vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
-            hubs = damping_of_hubs(answer["effects"], vehicle)
+            hubs = hub_damping(answer["effects"], vehicle)
         diagnosis = _read(folder / name / "diagnosis.json")
         timing = _read(folder / name / TIMED)
-        # Without its time a diagnosis did not end normally.
-        good = diagnosis if timing else None
+        # A diagnosis without its time did not end normally.
+        completed = diagnosis if timing else None
         seconds = timing["seconds"] if timing else None
-        scored.append(score_case(name, answer, good, seconds, hubs))
-    if not scored:
+        verdicts.append(score_case(name, answer, completed, seconds, hubs))
+    if not verdicts:
         raise ValueError(f"{folder}: no case was diagnosed yet; do that with `suite blind run`")
-    return scored
+    return verdicts
 
 
 def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
@@ -151,23 +170,23 @@ def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
-    """Return the lines of the table with shares, without empty ones."""
+    """Return the rows of the table with shares, without empty ones."""
 
     def of(kind: str) -> list[Verdict]:
         return [v for v in verdicts if v.kind == kind]
 
     single, null, pair = of("single"), of("null"), of("pair")
     # A failed diagnosis names nothing, which must not count as correct.
-    ended = [v for v in verdicts if v.verdict != "failed"]
-    by_chance = {name for name, effect in EFFECTS.items() if effect.random}
-    ratios = [v.gap_ratio for v in verdicts if v.found and not by_chance & set(v.hidden)]
+    completed = [v for v in verdicts if v.verdict != "failed"]
+    random_effects = {name for name, effect in EFFECTS.items() if effect.random}
+    ratios = [v.gap_ratio for v in verdicts if v.found and not random_effects & set(v.hidden)]
     lines = [
         ("single effects: named, nothing else", "95 %", [v.exact for v in single]),
         *(
             (
                 f"  of these at {times:g} times detectable",
                 "",
-                [v.exact for v in single if _near(v.multiple, MULTIPLES) == times],
+                [v.exact for v in single if _nearest(v.multiple, MULTIPLES) == times],
             )
             for times in MULTIPLES
         ),
@@ -175,27 +194,28 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         ("single effects: named, others perhaps too", "", [v.found for v in single]),
         ("single effects: verdict `named`", "", [v.verdict == "named" for v in single]),
         ("nulls: something named", "at most 2 of 100",
-         [bool(v.named) for v in ended if v.kind == "null"]),
+         [bool(v.named) for v in completed if v.kind == "null"]),
         ("nulls: verdict `no_gap`", "", [v.verdict == "no_gap" for v in null]),
-        ("outside the catalogue: `unknown` or `partly`", "85 %", [*map(_expected, of("outside"))]),
+        ("outside the catalogue: `unknown` or `partly`", "85 %",
+         [_is_expected(v) for v in of("outside")]),
         ("pairs: both named", "80 %", [v.found for v in pair]),
         ("pairs: both named, nothing else", "", [v.exact for v in pair]),
         _without_hubs(pair),
         ("inseparable: the right set", "95 %", [v.exact for v in of("blurred")]),
         ("the same with separating flights", "95 %", [v.exact for v in of("separated")]),
-        ("cases with a spurious extra name", "", [v.extra > 0 for v in ended if v.hidden]),
+        ("cases with a spurious extra name", "", [v.extra > 0 for v in completed if v.hidden]),
         ("95 % intervals that contain the true value", "90-98 %",
          [x for v in verdicts for x in v.covered]),
         (f"gap after within {GAP_LIMIT} of the noise floor, where named", "all",
          [ratio <= GAP_LIMIT for ratio in ratios if ratio is not None]),
         ("diagnosis failed", "none", [v.verdict == "failed" for v in verdicts]),
     ]  # fmt: skip
-    found = []
+    rows = []
     for what, wanted, flags in lines:
         if flags:
             share = wilson(sum(flags), len(flags))
-            found.append(Share(what, sum(flags), len(flags), share.low, share.high, wanted))
-    return found
+            rows.append(Share(what, sum(flags), len(flags), share.low, share.high, wanted))
+    return rows
 
 
 def report(out: Path, verdicts: Sequence[Verdict]) -> str:
@@ -217,14 +237,14 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         [v.case, v.kind, ", ".join(v.hidden) or "–", f"{v.multiple:.1f}", v.verdict,
          "; ".join(" or ".join(group) for group in v.named) or "–"]
         for v in verdicts
-        if not _expected(v)
+        if not _is_expected(v)
     ]  # fmt: skip
     heads = ["case", "kind", "hidden", "x detectable", "verdict", "named"]
     title = f"{len(wrong)} of {len(verdicts)} cases are not as expected:"
-    waiting, failed = not_run(out, verdicts), load_manifest(out).failed
-    count = len(waiting) + len(verdicts)
+    missing, failed = not_run(out, verdicts), load_manifest(out).failed
+    count = len(missing) + len(verdicts)
     notes = [
-        waiting and f"Not run yet, so in none of these numbers: {len(waiting)} of {count} cases.",
+        missing and f"Not run yet, so in none of these numbers: {len(missing)} of {count} cases.",
         failed and f"Not made: {', '.join(failed)}.",
     ]
     text = "\n".join(
@@ -239,7 +259,7 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
         **stamp(SCHEMA, None),
         "shares": counted,
         "seconds_median": median(times) if times else None,
-        "not_run": waiting,
+        "not_run": missing,
         "cases": verdicts,
     }
     write_json(out / "table.json", summary)
@@ -247,19 +267,17 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
 
 
 def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
-    """Return the line on correct cases if a named damping by moving hubs counts as false."""
+    """Return the row of correct cases if a named damping by moving hubs counts as false."""
     brought = any(v.brought for v in verdicts)
     flags = [v.exact and not v.brought for v in verdicts if brought]
     kind = verdicts[0].kind if verdicts else ""
     return f"  {kind}: with no damping by moving hubs in addition", "", flags
 
 
-def _matched(
-    truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]
-) -> dict[int, int]:
-    """Return for each true effect the index of the named effect, each used once.
+def _match(truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]) -> dict[int, int]:
+    """Return the index of a true effect -> index of the set that names it; each set is used once.
 
-    First names have priority over alternatives, for sets with a common name.
+    For sets with a common name, first names have priority over alternatives.
     """
     pairs: dict[int, int] = {}
     for first_only in (True, False):
@@ -272,31 +290,34 @@ def _matched(
 
 
 def _is_right(truth: Mapping[str, Any], group: tuple[str, ...]) -> bool:
+    """Return whether a set of names has all required alternatives and only allowed ones."""
     # Hypotheses of several effects are ignored: the oracle has only single effects.
     others = {name for name in group if len(effects_in(name)) == 1} - {truth["name"]}
     return set(truth["required"]) <= others <= set(truth["allowed"]) | set(truth["required"])
 
 
-def _covered(truth: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[bool]:
+def _covered(truth: Mapping[str, Any], estimated: Mapping[str, Any]) -> Iterator[bool]:
+    """Yield for each component of an effect whether its interval contains the true value."""
     for name, value in truth.items():
-        interval = (found.get(name) or {}).get("ci95")
+        interval = (estimated.get(name) or {}).get("ci95")
         if interval is None:
             continue
         values = value if isinstance(value, list) else [value]
         intervals = interval if isinstance(value, list) else [interval]
-        if "index" in found:
-            # Components (from 1) that are listed alone, such as one weak rotor.
-            index = found["index"]["value"]
+        if "index" in estimated:
+            # Only some components (numbered from 1) are listed, such as one weak rotor.
+            index = estimated["index"]["value"]
             index, intervals = (
                 (index, interval) if isinstance(index, list) else ([index], [interval])
             )
             values = [values[int(number) - 1] for number in index]
-        for one, span in zip(values, intervals, strict=False):
-            if one is not None and span is not None and None not in span:
-                yield bool(span[0] <= one <= span[1])
+        for true, span in zip(values, intervals, strict=False):
+            if true is not None and span is not None and None not in span:
+                yield bool(span[0] <= true <= span[1])
 
 
-def _expected(v: Verdict) -> bool:
+def _is_expected(v: Verdict) -> bool:
+    """Return whether the diagnosis has the correct verdict and the correct names."""
     if v.kind == "null":
         return v.verdict == "no_gap"
     if v.kind == "outside":
@@ -304,11 +325,12 @@ def _expected(v: Verdict) -> bool:
     return v.exact
 
 
-def _near(value: float, steps: Sequence[float]) -> float:
+def _nearest(value: float, steps: Sequence[float]) -> float:
     return min(steps, key=lambda step: abs(step - value))
 
 
 def _read(path: Path) -> Any:
+    """Return the contents of a JSON file; None if it is missing or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

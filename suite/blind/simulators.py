@@ -1,4 +1,7 @@
-"""The simulators of cases: MuJoCo, RotorPy, and the continuous-time engine."""
+"""Select the simulator that flies a blind case: MuJoCo, RotorPy, or the continuous-time engine.
+
+A case is a set of flights with hidden effects, on which the diagnosis is tested.
+"""
 
 from __future__ import annotations
 
@@ -14,52 +17,56 @@ from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
 from suite.blind.cases import CONTINUOUS, ROTORPY, Case
 from suite.blind.continuous.timing import draw_conditions
-from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop
-from suite.blind.oracle.strength import given_vehicle
+from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
+from suite.blind.oracle.strength import nominal_vehicle
 from suite.blind.rotorpy_flight import fly_rotorpy
 
-Ways = Sequence[Trajectory]
+Trajectories = Sequence[Trajectory]
 Random = np.random.Generator
-Logged = Callable[[Random | None], tuple[FlightLog, ...]]
-"""(random generator of the noise) -> logs of a case's flights; None logs without noise."""
+LogFlights = Callable[[Random | None], tuple[FlightLog, ...]]
+"""Function from the random generator of the noise (None: no noise) to the logs of a case."""
 
 
 @dataclass(frozen=True)
 class Simulator:
     """A simulator for one case."""
 
-    given: Vehicle
+    nominal: Vehicle
     """The vehicle file for the diagnosis."""
-    fly: Callable[..., Logged]
-    """(truth, ways, rng, extra) -> flights of a vehicle on N trajectories, with random effects and
-    additional physics, if any."""
+    fly: Callable[..., LogFlights]
+    """Function that flies N trajectories. Its arguments are the true vehicle, the trajectories, the
+    random generator of gusts, and additional physics (optional)."""
     conditions: dict[str, Any] = field(default_factory=dict)
     """Conditions of flight and log, for the answer."""
 
 
 def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
-    """Return the simulator of `case`; `rng` draws its conditions, if it has any."""
-    given, sensors = given_vehicle(case.vehicle), SENSORS[case.sensors]
+    """Return the simulator of `case`; in continuous time `rng` draws the flights' conditions."""
+    nominal, sensors = nominal_vehicle(case.vehicle), SENSORS[case.sensors]
 
-    def stepped(truth: Vehicle, ways: Ways, rng: Random, extra: Extra | None = None) -> Logged:
+    def fly_in_steps(
+        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
+    ) -> LogFlights:
         if case.simulator == ROTORPY:
-            flown = fly_rotorpy(given, truth, ways, sensors.rate_hz)
+            flown = fly_rotorpy(nominal, truth, trajectories, sensors.rate_hz)
         else:
             has_voltage = bool(sensors.voltage)
-            flown = fly(given, truth, ways, sensors.rate_hz, extra, rng, has_voltage)
+            flown = fly(nominal, truth, trajectories, sensors.rate_hz, extra, rng, has_voltage)
         return lambda rng: tuple(
             log_of(flight, truth, sensors, rng, f"flight_{index + 1}")
             for index, flight in enumerate(flown)
         )
 
     if case.simulator != CONTINUOUS:
-        return Simulator(given, stepped)
+        return Simulator(nominal, fly_in_steps)
 
     conditions = draw_conditions(rng)
-    looped = with_loop(given, conditions.loop_hz)
+    nominal_at_rate = with_loop_frequency(nominal, conditions.loop_hz)
 
-    def between(truth: Vehicle, ways: Ways, rng: Random, extra: Extra | None = None) -> Logged:
-        flown = fly_continuous(looped, truth, ways, conditions, rng, extra)
-        return lambda rng: logs_of(flown, ways, truth, sensors, conditions, rng)
+    def fly_in_continuous_time(
+        truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
+    ) -> LogFlights:
+        flown = fly_continuous(nominal_at_rate, truth, trajectories, conditions, rng, extra)
+        return lambda rng: logs_of(flown, trajectories, truth, sensors, conditions, rng)
 
-    return Simulator(looped, between, asdict(conditions))
+    return Simulator(nominal_at_rate, fly_in_continuous_time, asdict(conditions))

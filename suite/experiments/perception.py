@@ -13,7 +13,13 @@ from eval.judging.statistics import paired_success, wilson
 from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors import SENSORS
-from eval.sensors.sensors_file import PERFECT, SensorSet, grown, load_sensors, shipped_sensors
+from eval.sensors.sensors_file import (
+    PERFECT,
+    SensorSet,
+    load_sensors,
+    scale_sensors,
+    shipped_sensors,
+)
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
@@ -123,7 +129,7 @@ def growing_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -
     """Return a sweep over `magnitudes` (times the usual) of each of `sets`."""
 
     def at(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
-        return vehicle, grown(sensors, size)
+        return vehicle, scale_sensors(sensors, size)
 
     return [
         Sweep(name, "magnitude, times the usual", magnitudes, partial(at, sensors))

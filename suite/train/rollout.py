@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 
 from eval import sensors
-from eval.sensors import SENSORS, scaled, sensing
+from eval.sensors import SENSORS, scale_model, view_models
 from eval.sensors.draws import keyed_draws
-from eval.sensors.interface import product, turned_by
+from eval.sensors.interface import product, rotation_since
 from policies.networks import delta_network, network
 from policies.observation import Observation, View, observe
 from suite.train import losses
@@ -128,19 +128,19 @@ def make_senses(config: TrainConfig) -> Senses:
     """
     assert config.sensors is not None
     held, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
-    parts, longest = sensing(held), config.sensors.magnitude[1]
-    ages = (scaled(name, held[name], longest) for name in held if name == "delay")
+    parts, longest = view_models(held), config.sensors.magnitude[1]
+    ages = (scale_model(name, held[name], longest) for name in held if name == "delay")
     # Number of stored views: the largest possible age in policy periods.
     periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in ages), default=0)
 
-    def grown(worlds: Worlds) -> dict[str, Any]:
+    def current_models(worlds: Worlds) -> dict[str, Any]:
         assert worlds.sensed is not None
-        return sensors.magnified(parts, worlds.sensed.magnitude)
+        return sensors.scale_models(parts, worlds.sensed.magnitude)
 
     def start(worlds: Worlds, truth: View) -> Any:
         assert worlds.sensed is not None
         about = worlds.sensed.trial, dt_s, spec.camera
-        return (truth,) * periods, sensors.start(grown(worlds), truth, *about)
+        return (truth,) * periods, sensors.start(current_models(worlds), truth, *about)
 
     def see(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
         past, kept = memory
@@ -152,13 +152,13 @@ def make_senses(config: TrainConfig) -> Senses:
         old = truth
         if past:
             assert worlds.sensed is not None
-            delay = scaled("delay", held["delay"], worlds.sensed.magnitude["delay"])
+            delay = scale_model("delay", held["delay"], worlds.sensed.magnitude["delay"])
             own = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
             chance = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(own)
             shake = 1.0 + delay.jitter * (2.0 * chance[:, :2] - 1.0)
             ages = jnp.stack([delay.state, delay.image], -1) * shake / dt_s
             old = older(views, ages[:, 0], jnp.floor(ages[:, 1] + chance[:, 2]))
-        seen, kept = sensors.sense(grown(worlds), kept, old, draws, dt_s, spec.camera)
+        seen, kept = sensors.sense(current_models(worlds), kept, old, draws, dt_s, spec.camera)
         image = jax.lax.stop_gradient(seen.depth_m)
         return seen._replace(depth_m=image), (views[:periods], jax.lax.stop_gradient(kept))
 
@@ -176,7 +176,7 @@ def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View
     seen = views[0]
     for number, (late, before) in enumerate(pairwise(views)):
         share = age - number
-        part, turn_b = share[:, None], turned_by(before.rot_w, late.rot_w)
+        part, turn_b = share[:, None], rotation_since(before.rot_w, late.rot_w)
         old = select(share > 0.5, before, late)._replace(
             pos_w=late.pos_w + part * (before.pos_w - late.pos_w),
             vel_w=late.vel_w + part * (before.vel_w - late.vel_w),

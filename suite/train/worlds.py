@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from eval.sensors import SENSORS, sensing
+from eval.sensors import SENSORS, view_models
 from eval.sensors.draws import blank_draws, draw
 from eval.sensors.interface import Draws
 from suite.train.config import TrainConfig
@@ -185,7 +185,7 @@ def _sensed(config: TrainConfig, iteration: int) -> Sensed | None:
     for name in config.sensors.seen.models:
         drawn = rng.uniform(*config.sensors.magnitude, batch)
         magnitude[name] = np.where(perfect, 0.0, drawn).astype(np.float32)
-    for name in sensing(config.sensors.seen.models):
+    for name in view_models(config.sensors.seen.models):
         blank = blank_draws(SENSORS[name].trial, batch, camera)
         for row in range(batch):
             draw(blank, row, rng)

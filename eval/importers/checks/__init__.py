@@ -1,1 +1,1 @@
-"""Whether a log agrees with itself."""
+"""Checks of an imported log against itself: time in flight, impossible samples, delays."""

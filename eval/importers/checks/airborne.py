@@ -1,4 +1,4 @@
-"""Find take-off and landing from the motors and the height."""
+"""Find take-off and landing in a log from the motors' effort and the height."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eval.logs.faults.finding import Finding
 RUNNING = 0.5
 """Share of the usual effort in flight above which the motors carry the vehicle."""
 HOLD_S = 0.3
-"""Least time above it without a break [s]."""
+"""Least time above `RUNNING` without a break [s]."""
 RISE_M = 0.05
 """Height above the ground from which the vehicle counts as flying [m]."""
 POWER = {
@@ -21,41 +21,41 @@ POWER = {
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
-    """Return the first and the last time in flight [s]; infinite for a start or end in flight.
+    """Return the first and the last time in flight [s], and a finding.
+
+    A time is infinite where the log starts or ends in flight, or has no signal of the motors.
 
     Args:
-        recording: with the time in s.
+        recording: signals of the log, with their times in seconds.
     """
-    whole = (-np.inf, np.inf)
-    effort = _effort(recording)
+    no_limits = (-np.inf, np.inf)
+    effort = _motor_effort(recording)
     if effort is None:
-        text = "nothing says when the motors run: nothing is cut; see --start and --end"
-        return whole, [Finding("note", "ground", text)]
-    time_s, share = effort.time_s, effort.value[:, 0]
-    running = share > RUNNING
-    long = _lasting(time_s, running)
-    if not long.any():
-        text = "the motors never run for long: nothing is cut"
-        return whole, [Finding("doubt", "ground", text)]
-    first, last = int(np.argmax(long)), len(long) - 1 - int(np.argmax(long[::-1]))
-    on_ground = time_s[first] > time_s[0], time_s[last] < time_s[-1]
-    start = time_s[first] if on_ground[0] else -np.inf
-    stop = time_s[last] if on_ground[1] else np.inf
+        text = "no signal shows when the motors run: nothing is cut; see --start and --end"
+        return no_limits, [Finding("note", "ground", text)]
+    time_s = effort.time_s
+    in_flight = _long_runs(time_s, effort.value[:, 0] > RUNNING)
+    if not in_flight.any():
+        text = f"the motors never run for {HOLD_S:g} s: nothing is cut"
+        return no_limits, [Finding("doubt", "ground", text)]
+    first, last = np.flatnonzero(in_flight)[[0, -1]]
+    start = float(time_s[first]) if time_s[first] > time_s[0] else -np.inf
+    stop = float(time_s[last]) if time_s[last] < time_s[-1] else np.inf
     if "pos" in recording.signals:
-        start, stop = _risen(recording.signals["pos"], start, stop)
+        start, stop = _off_ground(recording.signals["pos"], start, stop)
     if not np.isfinite(start) and not np.isfinite(stop):
-        return whole, [Finding("ok", "ground", "it flies from the first row to the last")]
-    words = []
+        return no_limits, [Finding("ok", "ground", "it flies from the first row to the last")]
+    cuts = []
     if np.isfinite(start):
-        words.append(f"the {start - time_s[0]:.1f} s before take-off")
+        cuts.append(f"the {start - time_s[0]:.1f} s before take-off")
     if np.isfinite(stop):
-        words.append(f"the {time_s[-1] - stop:.1f} s after landing")
-    text = f"{' and '.join(words)} are left out"
+        cuts.append(f"the {time_s[-1] - stop:.1f} s after landing")
+    text = f"{' and '.join(cuts)} are left out"
     return (float(start), float(stop)), [Finding("note", "ground", text)]
 
 
-def _effort(recording: Recording) -> Signal | None:
-    """Return the motors' effort, about 1 in flight."""
+def _motor_effort(recording: Recording) -> Signal | None:
+    """Return the motors' thrust relative to its median in flight; None without such a signal."""
     for name, power in POWER.items():
         samples = recording.signals.get(name)
         if samples is None or len(samples.time_s) < 10:
@@ -69,7 +69,7 @@ def _effort(recording: Recording) -> Signal | None:
     return None
 
 
-def _lasting(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
+def _long_runs(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
     """Return which samples belong to a run of at least `HOLD_S`."""
     edges = np.flatnonzero(np.diff(running.astype(int))) + 1
     out = np.zeros(len(running), dtype=bool)
@@ -79,8 +79,11 @@ def _lasting(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
     return out
 
 
-def _risen(pos: Signal, start: float, stop: float) -> tuple[float, float]:
-    """Return the first and last time within `start` and `stop` above the ground."""
+def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
+    """Return the first and last time [s] within `start` and `stop` above the ground.
+
+    The ground is the median height over the second before the start and after the stop.
+    """
     height = pos.value[:, 2]
     inside = (pos.time_s >= start) & (pos.time_s <= stop)
     if np.isfinite(start):

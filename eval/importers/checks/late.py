@@ -1,4 +1,7 @@
-"""Estimate and remove the delay of the pose (motion capture or state estimate) against the gyro."""
+"""Estimate and remove the delay of a log's pose against its gyro.
+
+The pose comes from motion capture or a state estimator, whose clock may lag and drift.
+"""
 
 from __future__ import annotations
 
@@ -16,33 +19,35 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
     """Return the recording with the pose shifted to the gyro's clock, and the findings.
 
     Args:
-        recording: with time in s, rates in rad/s and a flight log's frames; holds quat and rate.
+        recording: signals with times in s, rates in rad/s and a flight log's frames; it must have
+            quat and rate.
         fix: shift the pose; otherwise only report the delay.
     """
     quat, rate = recording.signals["quat"], recording.signals["rate"]
-    found = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
-    if found is None:
+    late = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
+    if late is None:
         return recording, []
-    delay, error = found.delay_s, found.error_s
+    delay, error = late.delay_s, late.error_s
     figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
     is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
-    keep = "leave --no-fix out: the pose is moved"
+    option = "leave --no-fix out: the import shifts the pose"
     status = "corrected" if fix else "doubt"
-    if found.drifts:
-        about = ("clock_drift", found.drift, 0.95, keep)
-        findings.append(Finding(status, "pose clock", found.drift_figures(), *about))
+    if late.drifts:
+        about = ("clock_drift", late.drift, 0.95, option)
+        findings.append(Finding(status, "pose clock", late.drift_figures(), *about))
     if is_late:
-        sure = 0.95 if abs(delay) > LATE_S else 0.8
-        text = f"{figures}: pose and velocity are moved by that" if fix else f"{figures}; left so"
-        about = ("clock_offset", delay, sure, keep)
+        confidence = 0.95 if abs(delay) > LATE_S else 0.8
+        text = f"{figures}: pose and velocity are shifted" if fix else f"{figures}; not corrected"
+        about = ("clock_offset", delay, confidence, option)
         findings.append(Finding(status, "pose delay", text, *about))
     else:
         findings.append(Finding("ok", "pose delay", figures))
-    if not fix or not (is_late or found.drifts):
+    if not fix or not (is_late or late.drifts):
         return recording, findings
-    drift = found.drift if found.drifts else 0.0
-    by = {name: delay + drift * (s.time_s - found.middle_s)
-          for name, s in recording.signals.items() if name in LATE}  # fmt: skip
-    moved = {name: recording.signals[name] for name in by}
-    signals = {name: Signal(s.time_s - by[name], s.value) for name, s in moved.items()}
-    return replace(recording, signals={**recording.signals, **signals}), findings
+    drift = late.drift if late.drifts else 0.0
+    signals = dict(recording.signals)
+    for name in LATE:
+        if name in signals:
+            time_s, value = signals[name]
+            signals[name] = Signal(time_s - (delay + drift * (time_s - late.middle_s)), value)
+    return replace(recording, signals=signals), findings

@@ -1,7 +1,7 @@
-"""Log formats, one file each: a summary, the detection and the reader.
+"""Registry of the log formats that can be imported; each module here detects and reads one.
 
-Another package adds one with an entry point of the group `diffracing_suite.formats`, a program for
-its own process with `FORMATS.register(name, module)`.
+Another package adds a format with an entry point of the group `diffracing_suite.formats`. A program
+adds one for its own process with `FORMATS.register(name, module)`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Format(Protocol):
     """A module or object that reads one format.
 
     Optional attributes: `ASKED_LAST = True` for a format that accepts any table, so that the others
-    are tried before it; `TAKES_MAP = False` where a mapping file has no use; `TAKES_SOURCE = False`
-    where the pose has a single source.
+    are tried before it; `TAKES_MAP = False` if it uses no mapping file; `TAKES_SOURCE = False` if
+    its pose has a single source.
     """
 
     SUMMARY: str
@@ -36,11 +36,12 @@ class Format(Protocol):
         ...
 
     def read(self, path: Path, options: ImportOptions) -> Recording:
-        """Return the file's signals."""
+        """Return the signals of the file at `path`, in the flight log's units and frames."""
         ...
 
 
-def _wrong(name: str, module: Any) -> str | None:
+def _registration_error(name: str, module: Any) -> str | None:
+    """Return why `module` is not a format, or None."""
     missing = [part for part in ("SUMMARY", "detect", "read") if not hasattr(module, part)]
     return f"it has no {' and no '.join(missing)}" if missing else None
 
@@ -52,7 +53,7 @@ FORMATS: Registry[Format] = Registry(
         name: f"eval.importers.formats.{name}"
         for name in ("px4", "betaflight", "ardupilot", "crazyflie", "table", "mcap")
     },
-    _wrong,
+    _registration_error,
 )
 
 
@@ -62,7 +63,7 @@ def detect(path: Path, options: ImportOptions) -> str:
     Formats that accept any table are tried last.
 
     Raises:
-        FlightLogError: where the file cannot be read, or is of no known format.
+        FlightLogError: where the file cannot be read, or has no known format.
     """
     head = read_head(path)
     candidates = sorted(FORMATS.items(), key=lambda item: getattr(item[1], "ASKED_LAST", False))

@@ -1,7 +1,7 @@
-"""ArduPilot's `.bin` logs, read by pymavlink (extra `mavlink`).
+"""Read ArduPilot's `.bin` logs with pymavlink (extra `mavlink`).
 
-The vehicle's world is north-east-down and its body forward-right-down. Messages and units as in
-ArduPilot's documentation of its log messages (Copter 4.x); the first that is there is taken.
+The vehicle's world is north-east-down and its body forward-right-down. Messages and units follow
+ArduPilot's documentation of its log messages (Copter 4.x); the first one in the log is used.
 
 | signal | messages |
 |---|---|
@@ -40,20 +40,20 @@ SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False
 HEAD = b"\xa3\x95\x80"
 MESSAGES = ("IMU", "ATT", "XKF1", "NKF1", "RATE", "CTUN", "RCOU", "ESC", "BAT", "PARM", "MSG")
-HELD = ("data_map", "filehandle")
-"""What a reader of pymavlink has open."""
+OPEN_HANDLES = ("data_map", "filehandle")
+"""Attributes of a pymavlink reader that must be closed."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """Motors 1 to 4 of a quadrotor X (x forward, y left): front right, rear left, front left, rear
 right."""
 QUAD_PLUS = ((0.0, -1.0), (0.0, 1.0), (1.0, 0.0), (-1.0, 0.0))
-"""The same of a plus: right, left, front, rear."""
+"""Motors 1 to 4 of a quadrotor plus: right, left, front, rear."""
 MOTOR_1 = 33
-"""SERVOn_FUNCTION of motor 1; the others follow, 82 and up from motor 9 on."""
+"""SERVOn_FUNCTION of motor 1; motors 2 to 4 have the next numbers."""
 DEG, RPM = np.pi / 180.0, np.pi / 30.0
 MISSING = "an ArduPilot log; pip install 'diffracing-suite[mavlink]' reads it"
 
 Rows = Mapping[str, np.ndarray]
-"""The columns of one message."""
+"""The columns of one kind of message, by field name."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -65,13 +65,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """Return the signals of the log at `path`.
 
     Raises:
-        FlightLogError: where the reader is not installed, or it is no such log.
+        FlightLogError: where the reader is not installed, or the file is not an ArduPilot log.
     """
     messages, parameters, about = _load(path)
     findings: list[Finding] = []
     parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def take(name: str, kinds: tuple[str, ...], columns: str, factor: Any) -> None:
+        """Add a signal from the first message that has its columns."""
         names = columns.split()
         for kind in kinds:
             rows = messages.get(kind, {})
@@ -101,14 +102,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
         findings.append(Finding("note", "motors", f"pulses of {low:g} to {high:g} us are 0 to 1"))
     if "ESC" in messages:
         parts |= _motors(messages["ESC"], findings)
-    kind = int(parameters.get("FRAME_CLASS", 1.0))
-    if kind != 1:
-        text = f"FRAME_CLASS is {kind}, not 1: no quadrotor"
-        about_it = ("motor_count", None, 0.95, "none: only quadrotors can be diagnosed")
-        findings.append(Finding("doubt", "motors", text, *about_it))
-    side = QUAD_PLUS if parameters.get("FRAME_TYPE", 1.0) == 0.0 else QUAD_X
+    frame_class = int(parameters.get("FRAME_CLASS", 1.0))
+    if frame_class != 1:
+        text = f"FRAME_CLASS is {frame_class}, not 1: no quadrotor"
+        fault = ("motor_count", None, 0.95, "none: only quadrotors can be diagnosed")
+        findings.append(Finding("doubt", "motors", text, *fault))
+    motor_side = QUAD_PLUS if parameters.get("FRAME_TYPE", 1.0) == 0.0 else QUAD_X
     signals, more = collect(parts, str(path))
-    return Recording(str(path), signals, (*findings, *more), side, about)
+    return Recording(str(path), signals, (*findings, *more), motor_side, about)
 
 
 def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
@@ -118,8 +119,8 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
     except ImportError:
         raise FlightLogError(str(path), None, None, MISSING) from None
 
-    class Forward(DFReader_binary):
-        """Refuses a message without a length, which the reader would read again for ever."""
+    class NoEmptyMessages(DFReader_binary):
+        """Reader that rejects a message of no length, which pymavlink would read for ever."""
 
         def _parse_next(self) -> Any:
             before = self.offset
@@ -133,19 +134,19 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
         with (
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(io.StringIO()),
-            _native_lines_dropped(),
+            _stderr_discarded(),
             contextlib.ExitStack() as opened,
         ):
-            reader = Forward.__new__(Forward)
-            # Where a damaged file ends its constructor, it leaves the file open.
+            reader = NoEmptyMessages.__new__(NoEmptyMessages)
+            # A constructor that fails on a damaged file leaves the file open.
             opened.push(partial(_close, reader))
             reader.__init__(str(path))
             while (message := reader.recv_match(type=list(MESSAGES))) is not None:
                 table[message.get_type()].append(message.to_dict())
-        parameters = {str(one["Name"]): float(one["Value"]) for one in table.pop("PARM")}
-        texts = [str(one["Message"]) for one in table.pop("MSG")]
+        parameters = {str(row["Name"]): float(row["Value"]) for row in table.pop("PARM")}
+        texts = [str(row["Message"]) for row in table.pop("MSG")]
         messages = {name: _columns(rows, name) for name, rows in table.items() if rows}
-    except Exception as error:  # whatever a damaged file makes of the reader
+    except Exception as error:  # a damaged file can cause any exception in the reader
         reason = f"an ArduPilot log that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
     parameters = {name: value for name, value in parameters.items() if np.isfinite(value)}
@@ -153,11 +154,11 @@ def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]
 
 
 @contextlib.contextmanager
-def _native_lines_dropped() -> Iterator[None]:
-    """Drop what compiled code writes to standard error: the reader's, a line a damaged byte."""
+def _stderr_discarded() -> Iterator[None]:
+    """Discard what compiled code writes to standard error: one line per damaged byte."""
     try:
-        kept = os.dup(2)
-    except OSError:  # closed: nothing can be written there
+        stderr_copy = os.dup(2)
+    except OSError:  # standard error is closed, so nothing can be written to it
         yield
         return
     try:
@@ -165,43 +166,48 @@ def _native_lines_dropped() -> Iterator[None]:
             os.dup2(null.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr_copy, 2)
+        os.close(stderr_copy)
 
 
 def _close(reader: Any, kind: object, error: object, trace: TracebackType | None) -> None:
-    """Close what a reader has open, at the end of a context that may end with an error."""
-    # The frames of a failed constructor hold views of its map, which keep that from closing.
+    """Close the files of a reader at the end of a context, also after an error."""
+    # The frames of a failed constructor hold views of the memory map, which cannot close then.
     traceback.clear_frames(trace)
-    for name in HELD:
+    for name in OPEN_HANDLES:
         if name in vars(reader):
             vars(reader)[name].close()
 
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
-    """Return a message's numbers by column, of its first instance or core; of all ESCs."""
-    first = [r for r in rows if not r.get("I", r.get("C", 0))] if name != "ESC" else rows
-    rows = first or rows
+    """Return the numeric columns of a message: of its first instance or core, or of all ESCs."""
+    if name != "ESC":
+        rows = [r for r in rows if not r.get("I", r.get("C", 0))] or rows
     numbers = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
     return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numbers}
 
 
 def _outputs(parameters: Mapping[str, float]) -> list[int]:
-    """Return the outputs of motors 1 to 4; the first four where the log has no assignment."""
-    by = {parameters.get(f"SERVO{k}_FUNCTION"): k for k in range(14, 0, -1)}
-    wired = [by.get(float(MOTOR_1 + k)) for k in range(4)]
-    found = [k for k in wired if k is not None]
-    return found if len(found) == 4 else [] if any(wired) else [1, 2, 3, 4]
+    """Return the outputs of motors 1 to 4; [] where only some of them have one.
+
+    A log without any assignment has the motors on the first four outputs.
+    """
+    output_of = {parameters.get(f"SERVO{k}_FUNCTION"): k for k in range(14, 0, -1)}
+    outputs = [output_of.get(float(MOTOR_1 + k)) for k in range(4)]
+    assigned = [k for k in outputs if k is not None]
+    if not assigned:
+        return [1, 2, 3, 4]
+    return assigned if len(assigned) == 4 else []
 
 
 def _motors(esc: Rows, findings: list[Finding]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return rotor speeds [rad/s] at the times of the first ESC, by lines between the others'."""
+    """Return rotor speeds [rad/s] at the times of the first ESC; the others are interpolated."""
     name = "Instance" if "Instance" in esc else "I"
-    numbers = sorted(set(esc.get(name, np.zeros(0)).tolist()))
-    findings += check_count(len(numbers), "by the ESCs of the log")
-    if len(numbers) != 4 or not {"RPM", "TimeUS"} <= set(esc) or not np.any(esc["RPM"]):
+    instances = sorted(set(esc.get(name, np.zeros(0)).tolist()))
+    findings += check_count(len(instances), "by the ESCs of the log")
+    if len(instances) != 4 or not {"RPM", "TimeUS"} <= set(esc) or not np.any(esc["RPM"]):
         return {}
-    each = [esc[name] == k for k in numbers]
-    time_s = esc["TimeUS"][each[0]] * 1e-6
-    speed = [np.interp(time_s, esc["TimeUS"][one] * 1e-6, esc["RPM"][one]) for one in each]
-    return {"motor": (time_s, np.stack(speed, axis=1) * RPM)}
+    rows_of = [esc[name] == k for k in instances]
+    time_s = esc["TimeUS"][rows_of[0]] * 1e-6
+    speeds = [np.interp(time_s, esc["TimeUS"][rows] * 1e-6, esc["RPM"][rows]) for rows in rows_of]
+    return {"motor": (time_s, np.stack(speeds, axis=1) * RPM)}

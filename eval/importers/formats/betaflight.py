@@ -1,11 +1,11 @@
-"""Blackbox logs of Betaflight: raw ones (`.bbl`, `.bfl`), and CSV files of `blackbox_decode`.
+"""Read Blackbox logs of Betaflight: raw (`.bbl`, `.bfl`), or CSV files of `blackbox_decode`.
 
-Betaflight's body is forward-left-up already: roll right, nose down and a turn to the left are
-positive, in the gyro, the set points and the motor mixer alike. Rates are in deg/s, also where
-the header names no unit (ten times that under `blackbox_high_resolution`, which the attitude shows:
-`eval/logs/faults/vectors.py`). Units given to `blackbox_decode` stand in brackets after
-a column's name.
-Position and attitude are not logged: --pose brings them, or --partial does without.
+Betaflight's body frame is forward-left-up already: roll right, nose down and yaw left are positive
+in the gyro, the set points and the motor mixer. Rates are in deg/s, also where the header names no
+unit. CSV files under `blackbox_high_resolution` are in 0.1 deg/s, which a comparison with the
+attitude detects (`eval/logs/faults/vectors.py`). Units that `blackbox_decode` was set to are in
+brackets after a column's name. Position and attitude are not logged: --pose adds them, or --partial
+imports the log without.
 """
 
 from __future__ import annotations
@@ -39,10 +39,12 @@ _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
 _ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
-"""Factors to our units by the unit in the header; raw voltages of Betaflight 4 are in 10 mV."""
+"""Unit in the header -> factor to our unit, for each quantity; "" is a column without a unit. Raw
+voltages of Betaflight 4 are in 10 mV."""
 LEAST_V, MOST_V = 2.5, 30.0
-"""A higher voltage is ten times too large: `blackbox_decode` divides by ten to make volts, as was
-right before Betaflight 4 (a quadrotor of more than seven cells and older firmware is rarer)."""
+"""Range of plausible voltages [V]. A higher one is ten times too large: `blackbox_decode` divides
+by ten to make volts, which was right before Betaflight 4 only. A quadrotor with more than seven
+cells is rarer than this error."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
 _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
 
@@ -58,7 +60,7 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 
 
 class Blackbox:
-    """The columns of one file, found by name whatever their unit."""
+    """The columns of one file, selected by their name without the unit."""
 
     def __init__(self, path: Path) -> None:
         """Read the log at `path`, raw or as a table."""
@@ -71,51 +73,57 @@ class Blackbox:
         else:
             self.columns, _, warnings = read_columns(path)
             self.findings += [Finding("note", "file", text) for text in warnings]
-        self._found: dict[str, tuple[str, str]] = {}
+        self._units: dict[str, tuple[str, str]] = {}  # name without unit -> full name, unit
         for column in self.columns:
             match = _UNIT.match(column)
             if match:
-                self._found[match["name"]] = (column, match["unit"] or "")
+                self._units[match["name"]] = (column, match["unit"] or "")
 
-    def settings(self, name: str, given: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the numbers of a setting of the header, or `given` where it has others or none."""
-        found = self.header.get(name)
-        found = found if isinstance(found, (list, tuple)) else (found,)
-        usable = tuple(one for one in found if isinstance(one, (int, float)) and np.isfinite(one))
-        return usable if len(usable) == len(found) == len(given) else given
+    def settings(self, name: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the numbers of a header setting, or `default` if it has not as many numbers."""
+        setting = self.header.get(name)
+        entries = setting if isinstance(setting, (list, tuple)) else (setting,)
+        values = tuple(v for v in entries if isinstance(v, (int, float)) and np.isfinite(v))
+        return values if len(values) == len(entries) == len(default) else default
 
     def has(self, *names: str) -> bool:
-        """Return whether all the columns are there."""
-        return all(name in self._found for name in names)
+        """Return whether the file has all these columns."""
+        return all(name in self._units for name in names)
 
     def unit(self, name: str) -> str:
         """Return the unit in a column's name, "" where there is none."""
-        return self._found[name][1]
+        return self._units[name][1]
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
         """Return columns (N, C) in our unit.
 
+        Args:
+            names: names of the columns, without units.
+            factor: unit in the file -> factor to our unit.
+
         Raises:
-            FlightLogError: for a column that is missing, of an unknown unit, or not of numbers.
+            FlightLogError: for a column that is missing, has an unknown unit, or is not numeric.
         """
         out = []
         for name in names:
-            if name not in self._found:
-                raise FlightLogError(self.name, name, None, "missing; is this of blackbox_decode?")
-            column, unit = self._found[name]
+            if name not in self._units:
+                reason = "missing; was the file made by blackbox_decode?"
+                raise FlightLogError(self.name, name, None, reason)
+            column, unit = self._units[name]
             if unit not in factor:
                 known = ", ".join(repr(u) for u in factor if u)
-                raise FlightLogError(self.name, column, None, f"unit {unit!r}, not of {known}")
+                reason = f"has the unit {unit!r}; known are {known}"
+                raise FlightLogError(self.name, column, None, reason)
             values = np.asarray(self.columns[column])
             if name == "time":
-                # Frames that could not be decoded have an X for their time.
+                # Frames that could not be decoded have an X as their time.
                 values = np.array([None if v == "X" else v for v in values.tolist()])
             out.append(numbers({column: values}, column, self.name) * factor[unit])
         return np.stack(out, axis=1)
 
 
 def read(path: Path, options: ImportOptions) -> Recording:
-    """Return the signals of the log at `path`; its motors have `options.motor_poles` magnets.
+    """Return the signals of the log at `path`.
 
     Raises:
         FlightLogError: where a column of every Betaflight log is missing or unusable.
@@ -134,13 +142,15 @@ def read(path: Path, options: ImportOptions) -> Recording:
         parts["cmd_rate"] = box.values([f"setpoint[{k}]" for k in axes], {"": DEG, "deg/s": DEG})
         parts["throttle"] = box.values(["setpoint[3]"], {"": 1e-3})
     elif box.has("rcCommand[3]"):
-        text = "no setpoint columns: sticks are not rates, so there is no rate command"
+        text = "no setpoint columns: stick positions are not rates, so there is no rate command"
         findings.append(Finding("doubt", "command", text))
     if box.has("vbatLatest"):
         unit = box.unit("vbatLatest")
         parts["voltage"] = _volts(box.values(["vbatLatest"], _VOLT), unit, options.fix, findings)
-    poles = int(box.settings("motor_poles", (options.motor_poles,))[0])
-    parts |= _motors(box, poles if options.motor_poles == 14 else options.motor_poles, findings)
+    poles = options.motor_poles
+    if poles == ImportOptions.motor_poles:  # the default: the header's number comes first
+        poles = int(box.settings("motor_poles", (poles,))[0])
+    parts |= _motors(box, poles, findings)
     parts |= _outputs(box, findings)
     signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
     about = {ours: str(box.header[key]) for key, ours in ABOUT.items() if box.header.get(key)}
@@ -148,24 +158,25 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
-    middle = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
+    """Return voltages [V], corrected where their unit is not the one of the column's name."""
+    median_v = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
     raw = voltage / _VOLT[""]
-    whole = np.all(np.mod(raw[np.isfinite(raw)], 1.0) == 0.0)
-    if not unit and not whole and LEAST_V <= 100.0 * middle <= MOST_V:
-        text = f"numbers around {100.0 * middle:.3g}, not whole and without a unit: they are volts"
-        about = ("voltage", middle, 0.95)
-        findings.append(Finding("corrected" if fix else "doubt", "voltage", text, *about))
-        return 100.0 * voltage if fix else voltage
-    if middle <= MOST_V:
+    integers = np.all(np.mod(raw[np.isfinite(raw)], 1.0) == 0.0)
+    if not unit and not integers and LEAST_V <= 100.0 * median_v <= MOST_V:
+        corrected = 100.0 * voltage
+        text = f"numbers around {100.0 * median_v:.3g}, not integer and without a unit: volts"
+    elif median_v <= MOST_V:
         return voltage
-    text = f"{middle:.4g} V in the file: ten times too much, as blackbox_decode writes Betaflight 4"
-    about = ("voltage", middle, 0.95)
-    findings.append(Finding("corrected" if fix else "doubt", "voltage", text, *about))
-    return voltage / 10.0 if fix else voltage
+    else:
+        corrected = voltage / 10.0
+        text = f"{median_v:.4g} V in the file: 10 times too high (blackbox_decode of Betaflight 4)"
+    status = "corrected" if fix else "doubt"
+    findings.append(Finding(status, "voltage", text, "voltage", median_v, 0.95))
+    return corrected if fix else voltage
 
 
 def _outputs(box: Blackbox, findings: list[Finding]) -> dict[str, np.ndarray]:
-    """Return motor commands from 0 to 1, by the range in the header or by DShot's."""
+    """Return motor commands from 0 to 1, scaled by the header's range, or else DShot's or PWM's."""
     names = [f"motor[{k}]" for k in range(4)]
     if not box.has(*names):
         return {}
@@ -186,7 +197,8 @@ def _motors(box: Blackbox, poles: int, findings: list[Finding]) -> dict[str, np.
     if not set(columns) >= set("0123"):
         return {}
     if poles < 2 or poles % 2:
-        raise FlightLogError(box.name, None, None, f"motor_poles is {poles}: even, 2 or more")
+        reason = f"motor_poles is {poles}; it must be even, 2 or more"
+        raise FlightLogError(box.name, None, None, reason)
     raw = [numbers(box.columns, columns[k], box.name) for k in "0123"]
     turns_per_s = np.stack(raw, axis=1) * 100.0 / (poles / 2) / 60.0
     text = f"rotor speeds from eRPM of motors with {poles} poles (--motor-poles)"

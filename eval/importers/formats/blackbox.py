@@ -1,9 +1,10 @@
-"""Raw Blackbox logs (`.bbl`, `.bfl`), decoded by betaflight-chirp-core (Apache-2.0).
+"""Decode raw Blackbox logs of Betaflight (`.bbl`, `.bfl`) with betaflight-chirp-core (Apache-2.0).
 
-The result has the columns that `blackbox_decode` prints, by the same names, in the units that the
-log's own header says (Betaflight's blackbox documentation): deg/s (a tenth of the number under
-`blackbox_high_resolution`), counts of `acc_1G`, hundredths of a volt (from Betaflight 4 on), eRPM
-in hundreds, and motor outputs between the two numbers of `motorOutput`.
+The result has the same column names as the CSV files of `blackbox_decode`. Units follow the log's
+header (Betaflight's Blackbox documentation): rates in deg/s (0.1 deg/s under
+`blackbox_high_resolution`, converted here), accelerations in counts (converted to g by `acc_1G`),
+voltage in 0.01 V (from Betaflight 4 on), eRPM in hundreds, and motor outputs in the range of
+`motorOutput`.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ MISSING = (
 
 
 class Decoded(NamedTuple):
-    """One log of a raw file."""
+    """One decoded log of a raw file."""
 
     columns: dict[str, np.ndarray]
-    """As `blackbox_decode` names them, the unit in brackets behind where it is not the usual."""
+    """Columns by the names of `blackbox_decode`; the name ends with an unusual unit in brackets."""
     header: dict[str, Any]
     """The settings in the log's header."""
     findings: tuple[Finding, ...]
+    """Notes on several logs in one file, and on damaged frames."""
 
 
 def decode(path: Path) -> Decoded:
@@ -48,23 +50,23 @@ def decode(path: Path) -> Decoded:
     raw = path.read_bytes()
     try:
         return _longest(decoder, raw)
-    except Exception as error:  # whatever a damaged file makes of the decoder
+    except Exception as error:  # a damaged file can cause any exception in the decoder
         reason = f"a Blackbox log that cannot be decoded ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
 
 
 def _longest(decoder: Any, raw: bytes) -> Decoded:
-    """Return the longest log of a file's bytes; damaged ones raise what they make the decoder."""
-    parts = decoder.split_sessions(raw)
-    number, (start, end) = max(enumerate(parts, start=1), key=lambda p: p[1][1] - p[1][0])
+    """Return the longest log in a file's bytes; the decoder's exceptions pass through."""
+    sessions = decoder.split_sessions(raw)
+    number, (start, end) = max(enumerate(sessions, start=1), key=lambda s: s[1][1] - s[1][0])
     parser = decoder.FlightLogParser(raw, start, end)
     parser.parse_header()
     parser.parse_data()
     if not parser.main_frames:
         raise ValueError("it has no frame; log again")
     findings = []
-    if len(parts) > 1:
-        text = f"holds {len(parts)} logs; the longest, number {number}, is read"
+    if len(sessions) > 1:
+        text = f"holds {len(sessions)} logs; the longest, number {number}, is read"
         findings.append(Finding("note", "file", text))
     damaged = int(parser.stats["total_corrupt_frames"])
     if damaged:
@@ -76,17 +78,18 @@ def _longest(decoder: Any, raw: bytes) -> Decoded:
 
 
 def _in_units(columns: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, np.ndarray]:
-    fine = 10.0 if header.get("blackbox_high_resolution") == 1 else 1.0
+    """Return the columns with rates in deg/s and accelerations in g."""
+    counts_per_deg_s = 10.0 if header.get("blackbox_high_resolution") == 1 else 1.0
+    counts_per_g = header.get("acc_1G")
+    if not isinstance(counts_per_g, (int, float)) or counts_per_g <= 0:
+        counts_per_g = ACC_1G
     out = {}
     for name, value in columns.items():
         stem = name.partition("[")[0]
         if stem in ("gyroADC", "gyroUnfilt") or (stem == "setpoint" and name != "setpoint[3]"):
-            out[name] = value / fine
+            out[name] = value / counts_per_deg_s
         elif stem == "accSmooth":
-            per_g = header.get("acc_1G")
-            out[f"{name} (g)"] = value / (
-                per_g if isinstance(per_g, (int, float)) and per_g > 0 else ACC_1G
-            )
+            out[f"{name} (g)"] = value / counts_per_g
         else:
             out[name] = value
     return out

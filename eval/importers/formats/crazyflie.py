@@ -1,14 +1,14 @@
-"""Logs of the Crazyflie's micro SD card deck.
+"""Read logs of the Crazyflie's micro SD card deck (uSD).
 
-A file is the byte 0xBC, the format's version (1 or 2) and the number of event kinds; each kind
-has a number, a name and its variables, named `group.name(t)` with t a type code of Python's
-`struct`. Events follow: the kind's number, a time (version 1: 32 bits of milliseconds, version 2:
-64 bits of microseconds) and the variables, little-endian and packed. A CRC-32 of all that ends
-the file; a Crazyflie that was switched off while logging leaves it out. Source: the firmware's
-documentation of the deck and its log variables (Bitcraze).
+A file begins with the byte 0xBC, the format's version (1 or 2) and the number of event kinds. Each
+kind has a number, a name and its variables, named `group.name(t)` with t a type code of Python's
+`struct`. Then come the events: the kind's number, a time (version 1: 32 bits of milliseconds,
+version 2: 64 bits of microseconds) and the variables, little-endian and packed. A CRC-32 of all
+bytes ends the file; it is missing if the Crazyflie was switched off while logging. Source: the
+firmware's documentation of the deck and its log variables (Bitcraze).
 
-The firmware's world is z-up and its body forward-left-up. Which variable is what, in which unit
-and sign, is said by `eval/importers/mappings/crazyflie.toml`.
+The firmware's world is z-up and its body forward-left-up. The mapping file
+`eval/importers/mappings/crazyflie.toml` assigns the variables to signals, with units and signs.
 """
 
 from __future__ import annotations
@@ -40,12 +40,14 @@ CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} |
     "q": "<i8",
     "Q": "<u8",
 }
-"""Type codes of variables as numpy types."""
+"""Type code of a variable -> numpy type."""
 DEFAULT_MAP = Path("crazyflie")
 """The shipped mapping of the firmware's log variables."""
 PACKED = "stateEstimateZ.quat"
+"""Variable with a compressed quaternion; see `unpack_quaternion`."""
 BACK_S, AHEAD_S = 1.0, 10.0
-"""Without a checksum, an event this far from the one before is the card's old content [s]."""
+"""In a file without a checksum, an event that is further than this before or after the event before
+it is old content of the card [s]."""
 
 
 class Kind(NamedTuple):
@@ -54,6 +56,7 @@ class Kind(NamedTuple):
     name: str
     variables: tuple[str, ...]
     layout: np.dtype
+    """Types of the variables as stored in the file."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -65,7 +68,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """Return the signals of the log at `path`.
 
     Raises:
-        FlightLogError: where it is no such log, of an unknown version, or broken in its header.
+        FlightLogError: where the file is not a log of the deck, has an unknown version, or has a
+            damaged header.
     """
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not a uSD deck log (its first byte is not BC)")
@@ -91,10 +95,17 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 
 def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], list[Finding]]:
-    """Return event name -> variable -> values, with the times [s] under `timestamp`.
+    """Decode the bytes of a log.
+
+    Args:
+        data: the bytes of the file.
+        name: name of the file, for messages.
+
+    Returns:
+        Event name -> variable -> values (N,), with the times [s] under `timestamp`; findings.
 
     Raises:
-        FlightLogError: where the header is broken or nothing follows it.
+        FlightLogError: where the header is damaged or no event follows it.
     """
     try:
         version, kinds, start = _header(data, name)
@@ -104,102 +115,109 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         reason = f"a uSD deck log whose header is broken ({error}); copy it again"
         raise FlightLogError(name, None, None, reason) from None
     findings = []
-    whole = len(data) > start + 4 and crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
-    if not whole:
+    complete = len(data) > start + 4 and crc32(data[:-4]) == struct.unpack("<I", data[-4:])[0]
+    if not complete:
         text = "the checksum is missing or wrong (switched off while logging?); read to the end"
         findings.append(Finding("doubt", "file", text))
-    stop = len(data) - 4 if whole else len(data)
-    unit = 1e-3 if version == 1 else 1e-6
+    stop = len(data) - 4 if complete else len(data)
+    unit_s = 1e-3 if version == 1 else 1e-6
     stamp = struct.Struct("<HI" if version == 1 else "<HQ")
-    found: dict[int, list[bytes]] = {number: [] for number in kinds}
-    at, last, newest = start, None, 0
-    while at + stamp.size <= stop:
-        number = int.from_bytes(data[at : at + 2], "little")
+    records: dict[int, list[bytes]] = {number: [] for number in kinds}
+    offset, last_s, last_kind = start, None, 0
+    while offset + stamp.size <= stop:
+        number = int.from_bytes(data[offset : offset + 2], "little")
         if number not in kinds:
-            # Without a checksum its four bytes, or the card's old content, may follow the log.
-            if not whole and stop - at <= 4:
+            # A wrong checksum (four bytes) or old content of the card may follow the log.
+            if not complete and stop - offset <= 4:
                 break
-            text = f"byte {at} starts no known event; {stop - at} bytes after it are not read"
+            text = f"byte {offset} starts no known event; {stop - offset} bytes are not read"
             findings.append(Finding("doubt", "file", text))
             break
-        end = at + stamp.size + kinds[number].layout.itemsize
+        end = offset + stamp.size + kinds[number].layout.itemsize
         if end > stop:
             break
-        when = stamp.unpack_from(data, at)[1] * unit
-        if not whole and last is not None and not -BACK_S < when - last < AHEAD_S:
-            text = f"byte {at} has a time {when - last:+.3g} s from the one before: what follows is"
-            findings.append(Finding("doubt", "file", f"{text} the card's old content, not read"))
+        time_s = stamp.unpack_from(data, offset)[1] * unit_s
+        if not complete and last_s is not None and not -BACK_S < time_s - last_s < AHEAD_S:
+            text = f"byte {offset} has a time {time_s - last_s:+.3g} s from the event before"
+            text += "; the bytes from there are old content of the card, not read"
+            findings.append(Finding("doubt", "file", text))
             break
-        found[number].append(data[at + 2 : end])
-        at, last, newest = end, when, number
-    if not whole and last is not None:
-        found[newest].pop()  # cut within it, or its end is the card's old content
+        records[number].append(data[offset + 2 : end])
+        offset, last_s, last_kind = end, time_s, number
+    if not complete and last_s is not None:
+        records[last_kind].pop()  # the last event may be cut, or end in old content of the card
     events = {}
     for number, kind in kinds.items():
         clock = np.dtype([("timestamp", "<u4" if version == 1 else "<u8")])
         layout = np.dtype(clock.descr + (kind.layout.descr if kind.variables else []))
-        table = np.frombuffer(b"".join(found[number]), dtype=layout)
+        table = np.frombuffer(b"".join(records[number]), dtype=layout)
         events[kind.name] = {v: table[v].astype(np.float64) for v in kind.variables}
-        events[kind.name]["timestamp"] = table["timestamp"].astype(np.float64) * unit
+        events[kind.name]["timestamp"] = table["timestamp"].astype(np.float64) * unit_s
     if not any(len(event["timestamp"]) for event in events.values()):
-        raise FlightLogError(name, None, None, "holds a header and no event: nothing was logged")
+        raise FlightLogError(name, None, None, "has a header and no event: nothing was logged")
     return events, findings
 
 
 def unpack_quaternion(packed: np.ndarray) -> np.ndarray:
-    """Return quaternions wxyz (N, 4) of the firmware's 32-bit form, good to about 0.1 deg.
+    """Return quaternions wxyz (N, 4) from the firmware's 32-bit form, accurate to about 0.1 deg.
 
-    The two highest bits number the largest of x, y, z, w, which is left out and positive; the
-    others follow in order, each a sign and nine bits that count to 1/sqrt(2).
+    The two highest bits are the index of the largest component of x, y, z, w. It is positive and
+    not stored, because the norm is 1. The other three follow in order, each as a sign bit and nine
+    bits of magnitude in units of 1 / (511 sqrt(2)).
+
+    Args:
+        packed: (N,) 32-bit integers.
     """
     bits = packed.astype(np.uint64)
     largest = (bits >> np.uint64(30)).astype(np.int64)
-    small = np.empty((len(bits), 3))
+    stored = np.empty((len(bits), 3))
     for k in range(3):
-        part = (bits >> np.uint64(10 * (2 - k))) & np.uint64(0x3FF)
-        size = (part & np.uint64(0x1FF)).astype(np.float64) / 511.0 * np.sqrt(0.5)
-        small[:, k] = np.where(part >> np.uint64(9), -size, size)
-    rest = np.sqrt(np.clip(1.0 - np.sum(small**2, axis=1), 0.0, 1.0))
+        field = (bits >> np.uint64(10 * (2 - k))) & np.uint64(0x3FF)
+        size = (field & np.uint64(0x1FF)).astype(np.float64) / 511.0 * np.sqrt(0.5)
+        stored[:, k] = np.where(field >> np.uint64(9), -size, size)
+    omitted = np.sqrt(np.clip(1.0 - np.sum(stored**2, axis=1), 0.0, 1.0))
     xyzw = np.empty((len(bits), 4))
     for index in range(4):
         rows = largest == index
-        xyzw[rows] = np.insert(small[rows], index, rest[rows], axis=1)
+        xyzw[rows] = np.insert(stored[rows], index, omitted[rows], axis=1)
     return xyzw[:, [3, 0, 1, 2]]
 
 
 def _header(data: bytes, name: str) -> tuple[int, dict[int, Kind], int]:
+    """Return the version, the event kinds by their numbers, and the offset of the first event."""
     version, count = struct.unpack_from("<HH", data, 1)
     if version not in (1, 2):
         reason = f"a uSD deck log of version {version}; 1 and 2 can be read"
         raise FlightLogError(name, None, None, reason)
-    at = 5
+    offset = 5
     kinds = {}
     for _ in range(count):
-        (number,) = struct.unpack_from("<H", data, at)
-        kind_name, at = _text(data, at + 2)
-        (width,) = struct.unpack_from("<H", data, at)
-        at += 2
+        (number,) = struct.unpack_from("<H", data, offset)
+        kind_name, offset = _text(data, offset + 2)
+        (width,) = struct.unpack_from("<H", data, offset)
+        offset += 2
         fields = []
         for _ in range(width):
-            text, at = _text(data, at)
+            text, offset = _text(data, offset)
             variable, _, code = text.rpartition("(")
             fields.append((variable, CODES[code.rstrip(")")]))
         names = {v for v, _ in fields} - {"", "timestamp"}
         if len(names) < len(fields):
-            raise ValueError(f"a variable of event {kind_name!r} has no name of its own")
+            raise ValueError(f"event {kind_name!r} has a variable with no name or a repeated one")
         kinds[number] = Kind(kind_name, tuple(v for v, _ in fields), np.dtype(fields))
-    return version, kinds, at
+    return version, kinds, offset
 
 
-def _text(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(0, at)
-    return data[at:end].decode("utf-8"), end + 1
+def _text(data: bytes, offset: int) -> tuple[str, int]:
+    """Return the zero-terminated text at `offset`, and the offset after it."""
+    end = data.index(0, offset)
+    return data[offset:end].decode("utf-8"), end + 1
 
 
 def _find(
     events: Mapping[str, Mapping[str, np.ndarray]], variables: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return time and values of `variables` from the event that holds them most often."""
+    """Return time and values of `variables` from the kind of event with most samples of them."""
     holding = [e for e in events.values() if all(v in e for v in variables)]
     best = max(holding, key=lambda event: len(event["timestamp"]), default=None)
     if best is None or not len(best["timestamp"]):

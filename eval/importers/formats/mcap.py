@@ -1,8 +1,8 @@
-"""MCAP files with ROS 2 messages, read by `mcap` and `mcap-ros2-support` (an extra).
+"""Read MCAP files with ROS 2 messages, with `mcap` and `mcap-ros2-support` (extra `mcap`).
 
 ROS's worlds are z-up and its bodies forward-left-up; quaternions are xyzw. The velocity of an
-Odometry is in its child frame, the body. A mapping file's [topics] says which topic to take where
-several hold the same kind of message, its `[frames] motors` where the motors are.
+Odometry is in its child frame, the body. A mapping file's [topics] selects a topic where several
+hold the same kind of message; its `[frames] motors` gives the positions of the motors.
 
 | kind | messages |
 |---|---|
@@ -43,7 +43,9 @@ KINDS: dict[str, tuple[str, ...]] = {
     "motors": ("actuator_msgs/Actuators", "mav_msgs/Actuators"),
     "battery": ("sensor_msgs/BatteryState",),
 }
-"""Kind of message -> types that hold it, `/msg/` left out."""
+"""Kind of message -> ROS types that hold it, without `/msg/`."""
+Stamped = tuple[int, int, Any]
+"""Time in the header [ns], time of recording [ns], message."""
 IGNORE_RATES, IGNORE_THRUST, IGNORE_ATTITUDE = 7, 64, 128
 """Bits of `AttitudeTarget.type_mask` (MAVLink's ATTITUDE_TARGET_TYPEMASK)."""
 
@@ -57,22 +59,23 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """Return the signals of the MCAP file at `path`.
 
     Raises:
-        FlightLogError: where it is no MCAP file, damaged, or the extra is not installed.
+        FlightLogError: where the file is not MCAP or damaged, or the extra is not installed.
         ValueError: for a mapping file that cannot be used.
     """
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not an MCAP file (its first bytes differ)")
     topic_of, motor_side = _choices(options.map)
-    found = _messages(path)
-    chosen: dict[str, list[tuple[int, int, Any]]] = {}
+    recorded = _messages(path)
+    chosen: dict[str, list[Stamped]] = {}
     findings: list[Finding] = []
     for kind in KINDS:
-        topics = {topic: held for (k, topic), held in found.items() if k == kind}
+        topics = {topic: messages for (k, topic), messages in recorded.items() if k == kind}
         if not topics:
             continue
         topic = topic_of.get(kind) or max(topics, key=lambda name: len(topics[name]))
         if topic not in topics:
-            reason = f"topic {topic!r} has no {' or '.join(KINDS[kind])}; {', '.join(topics)} do"
+            types = " or ".join(KINDS[kind])
+            reason = f"topic {topic!r} has no {types}; topics with it: {', '.join(topics)}"
             raise FlightLogError(str(path), None, None, reason)
         if len(topics) > 1 and kind not in topic_of:
             text = f"{kind} from {topic}; also there: {', '.join(sorted(topics.keys() - {topic}))}"
@@ -80,7 +83,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
         chosen[kind] = topics[topic]
     missing = sorted(topic_of.keys() - chosen.keys())
     if missing:
-        reason = f"topic {topic_of[missing[0]]!r} of the mapping is not there"
+        reason = f"the file has no topic {topic_of[missing[0]]!r}, which the mapping names"
         raise FlightLogError(str(path), None, None, reason)
     messages = _on_one_clock(chosen, findings)
     findings += _motor_count(messages)
@@ -91,7 +94,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
 def _choices(
     map_path: Path | None,
 ) -> tuple[dict[str, str], tuple[tuple[float, float], ...] | None]:
-    """Return the topics that a mapping file chooses, by kind, and where it has the motors."""
+    """Return the topics that a mapping file selects, by kind, and the positions of its motors."""
     if map_path is None:
         return {}, None
     top, topics, motor_side = read_toml(map_path), {}, None
@@ -107,8 +110,8 @@ def _choices(
     return topics, motor_side
 
 
-def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, int, Any]]]:
-    """Return (kind, topic) -> [(header's, recorder's time in ns, message)] of all of use."""
+def _messages(path: Path) -> dict[tuple[str, str], list[Stamped]]:
+    """Return (kind, topic) -> the messages of the kinds in `KINDS`."""
     try:
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
@@ -118,7 +121,7 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, int, Any]]]:
         )
         raise FlightLogError(str(path), None, None, reason) from None
     kind_of = {type_: kind for kind, types in KINDS.items() for type_ in types}
-    found: dict[tuple[str, str], list[tuple[int, int, Any]]] = {}
+    recorded: dict[tuple[str, str], list[Stamped]] = {}
     factory = DecoderFactory()
     try:
         with path.open("rb") as file:
@@ -131,32 +134,33 @@ def _messages(path: Path) -> dict[tuple[str, str], list[tuple[int, int, Any]]]:
                     continue
                 decoded = decode(message.data)
                 stamps = (_stamp(decoded), message.log_time)
-                found.setdefault((kind, channel.topic), []).append((*stamps, decoded))
+                recorded.setdefault((kind, channel.topic), []).append((*stamps, decoded))
     except Exception as error:
         reason = f"an MCAP file that cannot be read ({quoted(error)})"
         raise FlightLogError(str(path), None, None, reason) from None
-    if not found:
+    if not recorded:
         types = ", ".join(kind_of)
         raise FlightLogError(str(path), None, None, f"holds no ROS 2 message of {types}")
-    return found
+    return recorded
 
 
 def _on_one_clock(
-    chosen: dict[str, list[tuple[int, int, Any]]], findings: list[Finding]
+    chosen: dict[str, list[Stamped]], findings: list[Finding]
 ) -> dict[str, list[tuple[int, Any]]]:
-    """Return (time in ns, message) by kind: by the headers, or by the recorder for all of them.
+    """Return (time [ns], message) by kind, all by the headers' clock or all by the recorder's.
 
-    A header's stamp of 0 was never set; two clocks in one flight would tear it apart.
+    A header with a stamp of 0 was never set. Signals on two clocks would not match in time.
     """
-    unset = sorted(k for k, held in chosen.items() if any(header <= 0 for header, _, _ in held))
+    unset = sorted(k for k, messages in chosen.items() if any(m[0] <= 0 for m in messages))
     if unset:
         text = f"headers of {', '.join(unset)} have stamp 0: all times are the recorder's"
         findings.append(Finding("corrected", "time", text, "time_stamps", None, 0.95))
     clock = 1 if unset else 0
-    return {kind: [(m[clock], m[2]) for m in held] for kind, held in chosen.items()}
+    return {kind: [(m[clock], m[2]) for m in messages] for kind, messages in chosen.items()}
 
 
 def _motor_count(messages: dict[str, list[tuple[int, Any]]]) -> list[Finding]:
+    """Return a finding where more than four motors turn."""
     speeds = [np.abs(np.asarray(_all_speeds(m), float)) for _, m in messages.get("motors", ())]
     width = max((len(s) for s in speeds), default=0)
     if width <= 4:
@@ -166,6 +170,7 @@ def _motor_count(messages: dict[str, list[tuple[int, Any]]]) -> list[Finding]:
 
 
 def _stamp(message: Any) -> int:
+    """Return the time in a message's header [ns], 0 without one."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
@@ -173,18 +178,20 @@ def _stamp(message: Any) -> int:
 def _signals(
     messages: dict[str, list[tuple[int, Any]]], name: str
 ) -> tuple[dict[str, Signal], tuple[Finding, ...]]:
-    origin = min(when for held in messages.values() for when, _ in held)
+    """Return the signals of the messages, with times from 0 [s], and findings."""
+    origin_ns = min(time_ns for stamped in messages.values() for time_ns, _ in stamped)
     parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def take(signal: str, kind: str, value: Callable[[Any], list[float]]) -> None:
+        """Add a signal from messages of `kind`, unless an earlier kind has given it."""
         if kind not in messages or signal in parts:
             return
-        time_s = np.array([(when - origin) * 1e-9 for when, _ in messages[kind]])
+        time_s = np.array([(time_ns - origin_ns) * 1e-9 for time_ns, _ in messages[kind]])
         try:
             rows = np.array([value(message) for _, message in messages[kind]], dtype=float)
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
             types = " or ".join(KINDS[kind])
-            reason = f"messages of another definition than {types} has ({error}); log them again"
+            reason = f"messages differ from the definition of {types} ({error}); log them again"
             raise FlightLogError(name, signal, None, reason) from None
         parts[signal] = (time_s, rows)
 
@@ -227,5 +234,6 @@ def _all_speeds(message: Any) -> Any:
 
 
 def _speeds(message: Any) -> list[float]:
+    """Return the speeds of the first four motors [rad/s], without sign, NaN for missing ones."""
     four = [abs(float(speed)) for speed in list(_all_speeds(message))[:4]]
     return four + [float("nan")] * (4 - len(four))

@@ -1,10 +1,10 @@
-"""PX4 ULog files, read by pyulog.
+"""Read PX4 logs (ULog files) with pyulog.
 
 PX4's world is north-east-down and its body forward-right-down; quaternions are wxyz, body to
-world. The log becomes north-west-up and forward-left-up (`eval/importers/frames.py`). Source of
-the topics and their units: the message definitions of PX4 v1.11 to v1.16.
+world. The log is converted to north-west-up and forward-left-up (`eval/importers/frames.py`).
+Source of the topics and their units: the message definitions of PX4 v1.11 to v1.16.
 
-| signal | topics, the first that is there |
+| signal | topics, the first one in the log is used |
 |---|---|
 | quat | vehicle_attitude, vehicle_odometry |
 | pos, vel | vehicle_local_position, vehicle_odometry |
@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, turn
+from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, rotate
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
@@ -53,7 +53,7 @@ TOPICS = (
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
 QUADROTOR = 2
-"""MAV_TYPE of one."""
+"""MAV_TYPE of a quadrotor."""
 FIRST_MOTOR = 101
 """`actuator_function` of Motor1."""
 BODY_FRAME = 3
@@ -61,7 +61,9 @@ BODY_FRAME = 3
 RPM = 2.0 * np.pi / 60.0
 
 Topic = Mapping[str, np.ndarray]
+"""The columns of one topic, by field name."""
 Part = tuple[np.ndarray, np.ndarray]
+"""Times (N,) [s] and values (N, C) of a signal."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -73,14 +75,14 @@ def read(path: Path, options: ImportOptions) -> Recording:
     """Return the signals of the ULog file at `path`.
 
     Raises:
-        FlightLogError: where it is no ULog file or is damaged beyond reading.
+        FlightLogError: where the file is not a ULog file, or too damaged to read.
     """
     if not detect(read_head(path), options):
         raise FlightLogError(str(path), None, None, "not a ULog file (its first bytes differ)")
     log = _load(path)
     topics: dict[str, Topic] = {}
-    sides, findings = _motor_side(log.initial_parameters)
-    findings += _health(log)
+    motor_side, findings = _motor_side(log.initial_parameters)
+    findings += _check_file(log)
     for data in sorted(log.data_list, key=lambda data: -data.multi_id):
         if "timestamp" in data.data:
             topics[data.name] = data.data
@@ -103,37 +105,42 @@ def read(path: Path, options: ImportOptions) -> Recording:
     signals, more = collect(parts, str(path))
     info = log.msg_info_dict
     about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
-    return Recording(str(path), signals, (*findings, *more), sides, about)
+    return Recording(str(path), signals, (*findings, *more), motor_side, about)
 
 
-class _Forward(io.BufferedReader):
-    """A file in which a parser that steps back over a body comes to where it was read.
+class _TruncationSafeReader(io.BufferedReader):
+    """A file reader that keeps pyulog from an endless loop in a truncated file.
 
-    Of a body that is cut off by the end pyulog has read less than it steps back by, and would go in
-    circles for ever.
+    After an invalid message pyulog seeks back by the length of its body. If the file ends within
+    the body, pyulog has read fewer bytes than that, and would parse the same bytes again and again.
+    This reader corrects the seek by the bytes that are missing.
     """
 
-    _asked = _short = 0
+    _requested = _missing = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
-        self._asked = size or 0
-        self._short = max(self._asked - len(data), 0)
+        self._requested = size or 0
+        self._missing = max(self._requested - len(data), 0)
         return data
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
-        if whence == 1 and -offset >= self._asked > 0:
-            offset += self._short
+        if whence == 1 and -offset >= self._requested > 0:
+            offset += self._missing
         return super().seek(offset, whence)
 
 
 def _load(path: Path) -> Any:
+    """Return the parsed file, a `pyulog.ULog`."""
     from pyulog import ULog
 
     try:
-        # pyulog prints what it makes of damaged files (a finding says it once), and leaves a file
-        # that it opened itself open where it fails.
-        with _Forward(io.FileIO(path)) as file, contextlib.redirect_stdout(io.StringIO()):
+        # pyulog prints messages on damaged files, which a finding reports, and does not close a
+        # file that it opened itself if it fails.
+        with (
+            _TruncationSafeReader(io.FileIO(path)) as file,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             return ULog(file, list(TOPICS))
     except Exception as error:
         reason = f"a ULog file that cannot be read ({quoted(error)})"
@@ -141,20 +148,21 @@ def _load(path: Path) -> Any:
 
 
 def _columns(topic: Topic, names: Sequence[str]) -> np.ndarray | None:
+    """Return fields of a topic as (N, C); None where one is missing."""
     if any(name not in topic for name in names):
         return None
     return np.stack([np.asarray(topic[name], dtype=np.float64) for name in names], axis=1)
 
 
 def _time(topic: Topic) -> np.ndarray:
-    """Return when the values were measured [s]: `timestamp_sample` where the topic has it."""
+    """Return the times of measurement (N,) [s]: `timestamp_sample` where the topic has it."""
     stamp = topic.get("timestamp_sample", topic["timestamp"])
     stamp = np.where(np.asarray(stamp) > 0, stamp, topic["timestamp"])
     return stamp.astype(np.float64) * 1e-6
 
 
 def _vector(names: Sequence[str]) -> Callable[[Topic], Part | None]:
-    """Return a reader of a vector in a down-pointing frame, world or body."""
+    """Return a reader of a vector whose frame, world or body, has z down."""
 
     def read_vector(topic: Topic) -> Part | None:
         value = _columns(topic, names)
@@ -164,6 +172,8 @@ def _vector(names: Sequence[str]) -> Callable[[Topic], Part | None]:
 
 
 def _local(names: Sequence[str], valid: Sequence[str]) -> Callable[[Topic], Part | None]:
+    """Return a reader of a vector in the local world, NaN where a flag of `valid` is false."""
+
     def read_local(topic: Topic) -> Part | None:
         part = _vector(names)(topic)
         if part is None:
@@ -177,14 +187,14 @@ def _local(names: Sequence[str], valid: Sequence[str]) -> Callable[[Topic], Part
 
 
 def _odometry_velocity(topic: Topic) -> Part | None:
-    """Return the velocity where it is in the position's world or in the body.
+    """Return the velocity if it is in the position's world frame or in body axes, else None.
 
-    Frames are 1 (north-east-down), 2 (of another heading) and 3 (the body) from v1.14 on; before,
-    0, 1 and 3. Both worlds point down, and the position is in the same one.
+    From PX4 v1.14 on, frames are 1 (north-east-down), 2 (z down with another heading) and 3 (body).
+    Before, they are 0, 1 and 3.
     """
     frame = topic.get("velocity_frame")
-    new = "pose_frame" in topic
-    world = topic.get("pose_frame" if new else "local_frame")
+    since_v1_14 = "pose_frame" in topic
+    world = topic.get("pose_frame" if since_v1_14 else "local_frame")
     value = _columns(topic, [f"velocity[{k}]" for k in range(3)])
     value = _columns(topic, ["vx", "vy", "vz"]) if value is None else value
     if frame is None or value is None:
@@ -192,8 +202,9 @@ def _odometry_velocity(topic: Topic) -> Part | None:
     frame = np.asarray(frame)
     if np.all(frame == BODY_FRAME):
         quat = _columns(topic, [f"q[{k}]" for k in range(4)])
-        return None if quat is None else (_time(topic), turn(quat, value) * HALF_TURN)
-    if world is None or not np.all(np.isin(frame, (1, 2) if new else (0, 1)) & (frame == world)):
+        return None if quat is None else (_time(topic), rotate(quat, value) * HALF_TURN)
+    is_world = np.isin(frame, (1, 2) if since_v1_14 else (0, 1))
+    if world is None or not np.all(is_world & (frame == world)):
         return None
     return _time(topic), value * HALF_TURN
 
@@ -212,13 +223,13 @@ def _attitude(topic: Topic) -> Part | None:
 def _throttle(topic: Topic) -> Part | None:
     value = _columns(topic, ["thrust_body[2]"])
     if value is None:
-        value = _columns(topic, ["thrust"])  # before v1.10, upwards
+        value = _columns(topic, ["thrust"])  # before v1.10, positive upwards
         return None if value is None else (_time(topic), value)
     return _time(topic), -value
 
 
 def _motors(topic: Topic) -> Part | None:
-    """Return rotor speeds [rad/s] of Motor1 to Motor4, wherever they are wired."""
+    """Return rotor speeds (N, 4) [rad/s] of Motor1 to Motor4, on whichever outputs they are."""
     speed = _columns(topic, [f"esc[{k}].esc_rpm" for k in range(4)])
     if speed is None or not np.any(speed):
         return None
@@ -260,12 +271,13 @@ _READERS: dict[str, list[tuple[str, Callable[[Topic], Part | None]]]] = {
     "motor": [("esc_status", _motors)],
     "voltage": [("battery_status", _voltage)],
 }
+"""Signal -> the topics that may hold it, each with its reader, in the order of preference."""
 
 
 def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> list[Finding]:
     """Return a finding where the vehicle is not a quadrotor: by type, rotors and turning motors.
 
-    `esc_count` alone misleads: it counts what is wired.
+    `esc_count` is not used, because it counts ESCs that are connected, with or without a motor.
     """
     kind, rotors = (int(_parameter(parameters, name)) for name in ("MAV_TYPE", "CA_ROTOR_COUNT"))
     turning = 0
@@ -283,59 +295,64 @@ def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> 
 
 
 def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Finding]:
-    """Take another battery's voltage, in place, where the first one's is impossible."""
+    """Replace the first battery's voltage by another one's, in place, where it is impossible."""
     if "voltage" not in parts or not check_voltage_fails(parts["voltage"][1]):
         return []
     for number, topic in enumerate(others, start=1):
         part = _voltage(topic) if "timestamp" in topic else None
         if part is not None and not check_voltage_fails(part[1]):
-            middle = float(np.nanmedian(parts["voltage"][1]))
+            median_v = float(np.nanmedian(parts["voltage"][1]))
             parts["voltage"] = part
-            text = f"battery 0 says {middle:.3g} V, which none has; battery {number} is read"
-            return [Finding("corrected", "voltage", text, "voltage", middle, 0.97)]
+            text = f"battery 0 reports {median_v:.3g} V, not plausible; battery {number} is read"
+            return [Finding("corrected", "voltage", text, "voltage", median_v, 0.97)]
     return []
 
 
 def _no_position(topics: Mapping[str, Topic]) -> list[Finding]:
-    """Say why a local position is none: the estimator's own flags."""
+    """Return a note where the estimator's flags mark the local position as never valid."""
     topic = topics.get("vehicle_local_position", {})
-    never = [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]
-    text = f"{' and '.join(never)} of vehicle_local_position are false throughout"
-    return [Finding("note", "position", text)] if never else []
+    invalid = [f for f in ("xy_valid", "z_valid") if f in topic and not np.any(topic[f])]
+    text = f"{' and '.join(invalid)} of vehicle_local_position are false throughout"
+    return [Finding("note", "position", text)] if invalid else []
 
 
 def _parameter(parameters: Mapping[str, Any], name: str) -> float:
-    """Return a parameter, 0 where it is missing or, in a damaged file, no number."""
+    """Return a parameter; 0 where it is missing or, in a damaged file, not a number."""
     value = parameters.get(name, 0.0)
     return float(value) if is_number(value) else 0.0
 
 
 def _motor_side(parameters: Mapping[str, Any]) -> tuple[Any, list[Finding]]:
+    """Return the positions of motors 1 to 4 (x forward, y left), and a note if they are assumed."""
     side = tuple(
         (_parameter(parameters, f"CA_ROTOR{k}_PX"), -_parameter(parameters, f"CA_ROTOR{k}_PY"))
         for k in range(4)
     )
     if all(abs(x) + abs(y) > 0 for x, y in side):
         return side, []
-    text = "the log does not say where its motors are; taken as PX4's quadrotor X"
+    text = "the log has no positions of the motors; PX4's quadrotor X is assumed"
     return QUAD_X, [Finding("note", "motors", text)]
 
 
-def _health(log: Any) -> list[Finding]:
+def _check_file(log: Any) -> list[Finding]:
+    """Return findings on damage, dropouts and the thrust model's parameter."""
     findings = []
     if log.file_corruption:
-        findings.append(Finding("doubt", "file", "damaged in places; what is whole was read"))
+        findings.append(Finding("doubt", "file", "damaged in places; undamaged messages were read"))
     if log.dropouts:
         lost = sum(dropout.duration for dropout in log.dropouts) / 1000.0
         text = f"{len(log.dropouts)} dropouts, {lost:.2g} s in all (a slow memory card)"
         findings.append(Finding("note", "file", text))
     if _parameter(log.initial_parameters, "THR_MDL_FAC") == 0.0:
-        text = "THR_MDL_FAC is 0: PX4's thrust is the motors' signal, and rises faster than linear"
+        text = (
+            "THR_MDL_FAC is 0: PX4's thrust is the motors' signal, and thrust is not linear in it"
+        )
         findings.append(Finding("note", "thrust", text))
     return findings
 
 
 def _resets(topic: Topic) -> list[Finding]:
+    """Return a doubt where the estimator has reset the position."""
     jumps = 0
     for name in ("xy_reset_counter", "z_reset_counter"):
         if name in topic:

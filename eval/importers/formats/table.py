@@ -1,8 +1,8 @@
-"""CSV and Parquet tables, described by a mapping file (TOML).
+"""Read CSV and Parquet tables whose columns a mapping file (TOML) describes.
 
-Without a mapping the columns are those of a flight log. Slower signals leave cells empty; each
-signal is read at the rows where it is whole. A cell may hold a list, `[0.33 -0.07 2.17]`; its parts
-are `name[0]`, `name[1]`, ... docs/import.md shows a mapping with every key.
+Without a mapping the columns are those of a flight log. A signal slower than the rows leaves cells
+empty; only rows with all its columns are read. A cell may hold a list, `[0.33 -0.07 2.17]`, whose
+numbers are the columns `name[0]`, `name[1]`, ... docs/import.md shows a mapping with every key.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from tracks.common.names import closest
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
 ASKED_LAST = True
 PARQUET = b"PAR1"
-_PART = re.compile(r"^(.*)\[(\d)\]$")
+_LIST_ENTRY = re.compile(r"^(.*)\[(\d)\]$")
+"""Name of one number of a list column, such as `pos[0]`."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -49,21 +50,21 @@ def read(path: Path, options: ImportOptions) -> Recording:
 
 def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Recording:
     """Return the signals of the table at `path`, by the mapping at `map_path`; see `read`."""
-    given_map = None if map_path is None else read_map(map_path)
+    file_map = None if map_path is None else read_map(map_path)
     columns, text, warnings = read_columns(path)
-    mapping = given_map or own_map(columns)
+    mapping = file_map or own_map(columns)
     name, about = str(path), {}
-    if given_map is None:  # a flight log has metadata
+    if map_path is None:  # a flight log has metadata
         about, more = flight_metadata(text, name)
         warnings += more
     time_s = _time(columns, mapping, name, map_path is not None)
 
     def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
-        parts = [_cells(columns, each, name) for each in names]
-        there = [part for part in parts if part is not None]
-        if len(there) < len(names):
+        values = [_values(columns, column, name) for column in names]
+        present = [value for value in values if value is not None]
+        if len(present) < len(names):
             return None
-        return time_s, np.concatenate(there, axis=1)
+        return time_s, np.concatenate(present, axis=1)
 
     recording = recording_of(path, mapping, find, lambda c: _missing(columns, c), options)
     notes = tuple(Finding("note", "file", text) for text in warnings)
@@ -72,27 +73,33 @@ def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Rec
 
 
 def _time(
-    columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, described: bool
+    columns: Mapping[str, np.ndarray], mapping: LogMap, name: str, has_map: bool
 ) -> np.ndarray:
+    """Return the times (N,) of the rows [s]; `has_map` selects the hint in the error message."""
     if "time" not in mapping.columns:
-        hint = "name it in the mapping's [time]" if described else "describe the columns with --map"
-        there = ", ".join(list(columns)[:12])
-        reason = f"no column for the time; {hint}. There are: {there}"
+        hint = "name it in the mapping's [time]" if has_map else "describe the columns with --map"
+        present = ", ".join(list(columns)[:12])
+        reason = f"no column for the time; {hint}. There are: {present}"
         raise FlightLogError(name, "time", None, reason)
     alternatives = mapping.columns["time"]
     column = next((c for c in alternatives if c.names[0] in columns), alternatives[0])
     values = numbers(columns, column.names[0], name)
     if len(values) and values.dtype.kind in "iu" and abs(int(values[0])) > 2**52:
-        # Unix times in nanoseconds do not fit a float64: take the first away while whole.
+        # Unix times in nanoseconds exceed a float64's precision: subtract the first as integers.
         values = values - values[0]
     return values.astype(np.float64) * column.factor[0]
 
 
 def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndarray:
-    """Return a column as numbers, NaN where a cell is empty.
+    """Return a column as numbers (N,), NaN where a cell is empty.
+
+    Args:
+        columns: the table.
+        column: name of the column.
+        name: name of the file, for messages.
 
     Raises:
-        FlightLogError: where the column is missing or holds something else.
+        FlightLogError: where the column is missing or holds anything but numbers.
     """
     if column not in columns:
         raise FlightLogError(name, column, None, _missing(columns, column))
@@ -108,19 +115,17 @@ def _missing(columns: Mapping[str, np.ndarray], column: str) -> str:
     return "missing" + hint
 
 
-def _cells(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndarray | None:
-    """Return a column as (N, C): C numbers a cell, or one; None where it is not there."""
-    part = _PART.match(column)
-    if column in columns or part is None:
-        if column not in columns:
-            return None
+def _values(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.ndarray | None:
+    """Return a column as (N, C) with C numbers a cell; None where the table lacks it."""
+    if column in columns:
         if _holds_lists(columns[column]):
             return _lists(columns[column], column, name)
         return numbers(columns, column, name).astype(np.float64)[:, None]
-    whole, index = part.group(1), int(part.group(2))
-    if whole not in columns:
+    entry = _LIST_ENTRY.match(column)
+    if entry is None or entry.group(1) not in columns:
         return None
-    values = _lists(columns[whole], whole, name)
+    list_column, index = entry.group(1), int(entry.group(2))
+    values = _lists(columns[list_column], list_column, name)
     return values[:, index : index + 1] if index < values.shape[1] else None
 
 
@@ -132,7 +137,7 @@ def _holds_lists(values: np.ndarray) -> bool:
 
 
 def _lists(values: np.ndarray, column: str, name: str) -> np.ndarray:
-    """Return the numbers (N, C) in cells as `[0.33 -0.07 2.17]` or `(1, 2, 3)`."""
+    """Return the numbers (N, C) in cells such as `[0.33 -0.07 2.17]` or `(1, 2, 3)`."""
     rows: list[list[float]] = []
     for k, value in enumerate(values):
         text = value.strip().strip("[]()") if isinstance(value, str) else ""

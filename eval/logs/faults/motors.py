@@ -8,7 +8,7 @@ from itertools import permutations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, turn
+from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
 from eval.logs.faults.reading import option
@@ -255,8 +255,8 @@ def over_force(rows: Rows, thrust: np.ndarray) -> float:
     if "quat" in rows and "pos" in rows:
         quat, vel = conjugate(rows["quat"]), velocity_from_position(time_s, rows["pos"])
         acc = smooth(time_s, velocity_from_position(time_s, vel), WIDTH_S)
-        need = turn(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
-        along = turn(quat, vel)[:, 2:]
+        need = rotate(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
+        along = rotate(quat, vel)[:, 2:]
         drag = np.concatenate([along, along * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
     elif "acc" in rows:
         need = rows["acc"][:, 2]

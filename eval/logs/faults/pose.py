@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, multiply, rotation_vector, turn
+from eval.importers.frames import conjugate, multiply, rotate, rotation_vector
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.reading import axes_matrix, option, read_as
 from eval.logs.faults.relation import Match, match, rms, smooth
@@ -296,7 +296,7 @@ def _misfit_of(seen: Match) -> float:
 
 def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:
     """Return the body's axes in the world, averaged, (N, 3, 3): [:, :, k] is axis k."""
-    columns = [turn(quat, np.eye(3)[k]) for k in range(3)]
+    columns = [rotate(quat, np.eye(3)[k]) for k in range(3)]
     flat = smooth(time_s, np.concatenate(columns, axis=1), WIDTH_S)[::every]
     return np.moveaxis(flat.reshape(-1, 3, 3), 1, 2)
 

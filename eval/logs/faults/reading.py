@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, from_euler, multiply, turn
+from eval.importers.frames import conjugate, from_euler, multiply, rotate
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of time -> seconds."""
@@ -148,8 +148,8 @@ def _allowed(signal: str, step: str) -> bool:
 
 def _turned(value: np.ndarray, step: str, quat: np.ndarray) -> np.ndarray:
     if step == "plus-gravity":
-        return value + turn(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
-    return turn(quat if step == "from-body" else conjugate(quat), value)
+        return value + rotate(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
+    return rotate(quat if step == "from-body" else conjugate(quat), value)
 
 
 def _quat_as(value: np.ndarray, step: str) -> np.ndarray:

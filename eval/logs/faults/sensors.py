@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import turn
+from eval.importers.frames import rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import Rows
 from eval.logs.faults.reading import option
@@ -58,8 +58,8 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     vel = rows["vel"] if "vel" in rows else velocity_from_position(time_s, rows["pos"])
     load = np.mean(np.abs(rows[drive]), axis=1)
     load = load / (1.0 if drive in ("throttle", "pwm") else np.nanquantile(load, 0.99))
-    up = turn(rows["quat"], np.array([0.0, 0.0, 1.0]))[:, 2]
-    felt = turn(rows["quat"], rows["acc"])[:, 2] - GRAVITY
+    up = rotate(rows["quat"], np.array([0.0, 0.0, 1.0]))[:, 2]
+    felt = rotate(rows["quat"], rows["acc"])[:, 2] - GRAVITY
     both = np.stack([felt, up * load**2], axis=1)
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
     full = np.cumsum(both, axis=0)

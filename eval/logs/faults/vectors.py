@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, turn
+from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
@@ -71,7 +71,7 @@ def check_gyro(rows: Rows) -> list[Finding]:
         unknown = unseen("gyro", text, "gyro_axes", "gyro_frame", "body_frame")
         return [*unknown, *_gyro_scale_alone(rows, text)]
     found = match(turns, gyro)
-    world = match(turn(rows["quat"], turns), gyro)
+    world = match(rotate(rows["quat"], turns), gyro)
     in_world = not found.is_turned and _left(world) < GOOD and _left(found) > max(
         BAD, TIMES_BETTER * _left(world))  # fmt: skip
     if in_world:
@@ -82,7 +82,7 @@ def check_gyro(rows: Rows) -> list[Finding]:
         fix = option(("rate", "from-world"))
         return [Finding("corrected", "gyro", text, "gyro_frame", None, 0.98, fix)]
     findings = []
-    apart = rms(turn(rows["quat"], turns) - turns) / size
+    apart = rms(rotate(rows["quat"], turns) - turns) / size
     if apart < APART:
         text = f"body and world axes are {100 * apart:.0f} % of its turns apart only"
         findings.append(Finding("not identifiable", "gyro", text, "gyro_frame"))
@@ -205,7 +205,7 @@ def check_velocity(rows: Rows) -> list[Finding]:
         return [Finding("doubt", "velocity", text, "velocity_frame", left[""], sure)]
     else:
         findings = [Finding("note" if left[""] > OK else "ok", "velocity", figures)]
-        apart = 1.0 if quat is None else rms(turn(quat, path) - path) / speed
+        apart = 1.0 if quat is None else rms(rotate(quat, path) - path) / speed
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
@@ -226,8 +226,8 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
     time_s = rows["time"]
     acc_w = velocity_from_position(time_s, velocity_from_position(time_s, rows["pos"]))
     quat, acc = rows["quat"], rows["acc"]
-    down = turn(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
-    force = smooth(time_s, turn(conjugate(quat), acc_w) + down, WIDTH_S)
+    down = rotate(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
+    force = smooth(time_s, rotate(conjugate(quat), acc_w) + down, WIDTH_S)
     ratio = _middle(smooth(time_s, acc, WIDTH_S)) / max(_middle(force), 1e-9)
     unit, factor = _unit_of(ratio, 1.2)
     readings = {

@@ -1,1 +1,1 @@
-"""The Kalman filter of the estimator in the loop."""
+"""The Kalman filter of the sensor model `gate_filter`, which estimates a drone's state."""

@@ -1,19 +1,20 @@
-"""An error-state Kalman filter on an IMU and the corners of known gates (numpy and JAX).
+"""An error-state Kalman filter that uses an IMU and the corners of known gates (NumPy and JAX).
 
-The nominal state is position, velocity, attitude R (body to world) and the biases of accelerometer
-and gyro. Its error dx = (dp, dv, dtheta, da, dw) is small, with R_true = R Exp(dtheta), and has the
-covariance P (Solà 2017, "Quaternion kinematics for the error-state Kalman filter", sections 5 and
-6: local angular error). With a = acc - bias_a and w = gyro - bias_w, means over dt:
+The nominal state is position p, velocity v, attitude R (body to world) and the biases of
+accelerometer and gyro. Its error dx = (dp, dv, dtheta, da, dw) is small, with
+R_true = R Exp(dtheta), and has the covariance P (Solà 2017, "Quaternion kinematics for the
+error-state Kalman filter", sections 5 and 6: local angular error). With a = acc - bias_a and
+w = gyro - bias_w, means over dt:
 
     predict   v += (R Exp(w dt / 2) a + g) dt,  p += (v_before + v_after) dt / 2,  R = R Exp(w dt)
               dp += dv dt,  dv += -R [a]x dtheta dt - R da dt,  dtheta = Exp(-w dt) dtheta - dw dt
     observe   c = C R^T (m - p),  (u, v) = (c_y, c_z) / c_x     of a corner m, camera axes C
               dc = C [R^T (m - p)]x dtheta - C R^T dp
     update    P' = (P^-1 + H^T H / r)^-1,  dx = P' H^T z / r    of residuals z with variance r
-    reset     dtheta -> (I - [dtheta / 2]x) dtheta              as R takes the correction
+    reset     dtheta -> (I - [dtheta / 2]x) dtheta              when R is corrected
 
-The cost of an update does not grow with the number of corners, as H has only columns of dp and
-dtheta. Arrays have N leading rows, a drone each; every row is computed by itself.
+The matrix that an update solves is 6 x 6 for any number of corners, because H has nonzero columns
+for dp and dtheta only. The first axis of all arrays is the drone.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from tracks.geometry.scene import Array
 GRAVITY = 9.81
 """[m/s^2]."""
 SIZE = 15
-"""Numbers in the error: position, velocity, attitude, accelerometer bias, gyro bias."""
+"""Size of the error state: position, velocity, attitude, accelerometer bias, gyro bias."""
 
 
 class ImuNoise(NamedTuple):
@@ -46,20 +47,21 @@ class FilterSettings(NamedTuple):
     """Settings of a state estimator in the loop: of the filter and of the gate detections."""
 
     corner_sigma: float
-    """Noise of a corner in the image, of each tangent, over the camera's width [pixels]."""
+    """Noise of a corner in the image, along each axis, standard deviation [pixel]."""
     width: float
-    """Pixels across the camera's field of view."""
+    """Width of the image that covers the camera's field of view [pixel]."""
     frame_hz: float
+    """Frames per second [Hz]."""
     dropout: float
     """Share of the frames without a gate detection [1]."""
     dropout_s: float
-    """Mean duration of such a gap [s]."""
+    """Mean duration of a gap without detections [s]."""
     delay_s: float
     """Delay from a frame to the filter [s]."""
     range_m: float
     """Corners further away are not detected [m]."""
     start_sigma: Array
-    """(15,) standard deviations of the error at the start, in the filter's order."""
+    """(15,) standard deviations of the error at the start, in the order of the error state."""
     imu: ImuNoise
     """The IMU's errors as assumed by the filter."""
 
@@ -68,24 +70,24 @@ class FilterState(NamedTuple):
     """State and covariance of the filters of N drones."""
 
     pos_w: Array
-    """(N, 3) [m]."""
+    """(N, 3) position [m]."""
     vel_w: Array
-    """(N, 3) [m/s]."""
+    """(N, 3) velocity [m/s]."""
     rot_w: Array
-    """(N, 3, 3) body to world."""
+    """(N, 3, 3) attitude, body to world."""
     acc_bias_b: Array
-    """(N, 3) [m/s^2]."""
+    """(N, 3) accelerometer bias [m/s^2]."""
     gyro_bias_b: Array
-    """(N, 3) [rad/s]."""
+    """(N, 3) gyro bias [rad/s]."""
     covariance: Array
-    """(N, 15, 15) of the error, in the order of the module's text."""
+    """(N, 15, 15) covariance of the error state."""
 
 
 class Corners(NamedTuple):
     """Gate corners in the image of a camera at the body's origin, K for each drone."""
 
     image: Array
-    """(N, K, 2) tangents (left, up) from the optical axis [1]."""
+    """(N, K, 2) image coordinates (left, up), tangents of the angles to the optical axis [1]."""
     corner_w: Array
     """(N, K, 3) positions in the map [m]."""
     seen: Array
@@ -96,10 +98,10 @@ def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState
     """Return the state at the start, with biases of zero.
 
     Args:
-        pos_w: (N, 3) [m].
-        vel_w: (N, 3) [m/s].
-        rot_w: (N, 3, 3) body to world.
-        sigma: (15,) or (N, 15) standard deviations of the error, each in its unit.
+        pos_w: (N, 3) position [m].
+        vel_w: (N, 3) velocity [m/s].
+        rot_w: (N, 3, 3) attitude, body to world.
+        sigma: (15,) or (N, 15) standard deviations of the error, in SI units.
     """
     xp = pos_w.__array_namespace__()
     still, variance = xp.zeros_like(pos_w), xp.zeros((pos_w.shape[0], SIZE)) + sigma**2
@@ -107,17 +109,17 @@ def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState
 
 
 def move(state: FilterState, gyro_b: Array, acc_b: Array, dt: Array) -> FilterState:
-    """Return the nominal state after `dt`, with the same covariance. See `predict`."""
+    """Return the nominal state after `dt`, with the covariance unchanged; see `predict`."""
     xp = gyro_b.__array_namespace__()
     step = dt[:, None]
-    turn_b = (gyro_b - state.gyro_bias_b) * step
-    middle_w = xp.matmul(state.rot_w, exp_rot(0.5 * turn_b))
+    rotation_b = (gyro_b - state.gyro_bias_b) * step
+    middle_w = xp.matmul(state.rot_w, exp_rot(0.5 * rotation_b))
     acc_w = to_world(middle_w, acc_b - state.acc_bias_b) - xp.asarray([0.0, 0.0, GRAVITY])
     vel_w = state.vel_w + step * acc_w
     return state._replace(
         pos_w=state.pos_w + 0.5 * step * (state.vel_w + vel_w),
         vel_w=vel_w,
-        rot_w=xp.matmul(state.rot_w, exp_rot(turn_b)),
+        rot_w=xp.matmul(state.rot_w, exp_rot(rotation_b)),
     )
 
 
@@ -127,41 +129,42 @@ def predict(
     """Return the state one IMU sample later.
 
     Args:
-        state: before.
+        state: the state before.
         gyro_b: (N, 3) measured mean body rates during `dt` [rad/s].
-        acc_b: (N, 3) measured mean specific force, in the body axes of the middle [m/s^2].
-        dt: (N,) [s]; a row with 0 stays as it is.
-        noise: of the IMU.
+        acc_b: (N, 3) measured mean specific force, in the body axes at the middle of `dt` [m/s^2].
+        dt: (N,) duration of the sample [s]; a drone with 0 does not change.
+        noise: noise of the IMU.
     """
     xp = gyro_b.__array_namespace__()
     step = dt[:, None, None]
     zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
-    pushed = xp.matmul(state.rot_w, _skew(acc_b - state.acc_bias_b))
-    turned = exp_rot(-(gyro_b - state.gyro_bias_b) * dt[:, None])
-    change = _blocks(
+    acc_by_angle = xp.matmul(state.rot_w, _skew(acc_b - state.acc_bias_b))
+    angle_by_angle = exp_rot(-(gyro_b - state.gyro_bias_b) * dt[:, None])
+    transition = _blocks(
         [
             [one, one * step, zero, zero, zero],
-            [zero, one, -pushed * step, -state.rot_w * step, zero],
-            [zero, zero, turned, zero, -one * step],
+            [zero, one, -acc_by_angle * step, -state.rot_w * step, zero],
+            [zero, zero, angle_by_angle, zero, -one * step],
             [zero, zero, zero, one, zero],
             [zero, zero, zero, zero, one],
         ]
     )
+    # Process noise of dp, dv, dtheta, da and dw.
     densities = xp.stack([0.0 * dt + part for part in (0.0, noise.acc, noise.gyro, *noise[2:])], -1)
     added = xp.repeat(densities**2 * dt[:, None], 3, axis=-1)
-    covariance = xp.matmul(xp.matmul(change, state.covariance), xp.matrix_transpose(change))
+    covariance = xp.matmul(xp.matmul(transition, state.covariance), xp.matrix_transpose(transition))
     covariance = covariance + added[..., None] * xp.eye(SIZE)
     return move(state, gyro_b, acc_b, dt)._replace(covariance=covariance)
 
 
 def project(pos_w: Array, rot_w: Array, camera_b: Array, corner_w: Array) -> tuple[Array, Array]:
-    """Return where corners are in the image (N, K, 2) and their depth (N, K) [m].
+    """Return the corners' image coordinates (left, up) (N, K, 2) [1] and depths (N, K) [m].
 
     Args:
-        pos_w: (N, 3) [m].
-        rot_w: (N, 3, 3) body to world.
+        pos_w: (N, 3) position [m].
+        rot_w: (N, 3, 3) attitude, body to world.
         camera_b: (3, 3) camera axes (forward, left, up) as rows in body axes.
-        corner_w: (N, K, 3) [m].
+        corner_w: (N, K, 3) positions of the corners [m].
     """
     corner_b = to_local(rot_w[:, None], corner_w - pos_w[:, None])
     corner_c = to_world(camera_b, corner_b)
@@ -174,9 +177,9 @@ def update_gate(
     """Return the state after a measurement of gate corners.
 
     Args:
-        state: at the time of the image.
-        observation: what was seen.
-        variance: (N, K) of each number of `Corners.image`, or one for all [1].
+        state: the state at the time of the image.
+        observation: the detected corners.
+        variance: (N, K) variance of each coordinate in `Corners.image` [1], or one for all.
         camera_b: (3, 3) camera axes (forward, left, up) as rows in body axes.
     """
     xp = state.pos_w.__array_namespace__()
@@ -185,44 +188,45 @@ def update_gate(
     seen = observation.seen & (corner_c[..., 0] > 0.0)
     forward = xp.where(seen, corner_c[..., 0], 1.0)[..., None]
     expected = corner_c[..., 1:] / forward
-    # Rows of (C_side - image C_forward) / forward: how a move of the corner in body axes shows.
-    sides = (camera_b[1:] - expected[..., None] * camera_b[0]) / forward[..., None]
-    by_pos = -xp.matmul(sides, xp.matrix_transpose(state.rot_w)[:, None])
-    by_turn = xp.matmul(sides, _skew(corner_b))
-    slope = xp.concatenate([by_pos, by_turn], axis=-1)  # (N, K, 2, 6)
+    # Derivative of the image coordinates by the corner's position in body axes, (N, K, 2, 3).
+    image_by_corner = (camera_b[1:] - expected[..., None] * camera_b[0]) / forward[..., None]
+    by_pos = -xp.matmul(image_by_corner, xp.matrix_transpose(state.rot_w)[:, None])
+    by_angle = xp.matmul(image_by_corner, _skew(corner_b))
+    jacobian = xp.concatenate([by_pos, by_angle], axis=-1)  # (N, K, 2, 6)
     weight = (xp.where(seen, 1.0, 0.0) / variance)[..., None]
     residual = xp.where(seen[..., None], observation.image - expected, 0.0)
-    rows = slope.reshape(*slope.shape[:-3], -1, 6)
+    rows = jacobian.reshape(*jacobian.shape[:-3], -1, 6)
     weights = (weight + 0.0 * residual).reshape(*rows.shape[:-1], 1)
     transposed = xp.matrix_transpose(rows * weights)
     information = xp.matmul(transposed, rows)  # (N, 6, 6)
-    gathered = xp.matmul(transposed, residual.reshape(*rows.shape[:-1], 1))
-    # With U the columns of dp and dtheta: P' = P - P U (I + A U^T P U)^-1 A U^T P.
+    gradient = xp.matmul(transposed, residual.reshape(*rows.shape[:-1], 1))
+    # With A the information, g the gradient and U the unit columns of dp and dtheta:
+    # P' = P - P U (I + A U^T P U)^-1 A U^T P,  dx = P U (I + A U^T P U)^-1 g.
     before = state.covariance
-    reach = xp.concatenate([before[..., 0:3], before[..., 6:9]], axis=-1)  # P U, (N, 15, 6)
-    own = xp.concatenate([reach[..., 0:3, :], reach[..., 6:9, :]], axis=-2)
-    solved = xp.linalg.solve(xp.eye(6) + xp.matmul(information, own), xp.concatenate(
-        [xp.matmul(information, xp.matrix_transpose(reach)), gathered], axis=-1))  # fmt: skip
-    covariance = before - xp.matmul(reach, solved[..., :-1])
-    error = xp.matmul(reach, solved[..., -1:])[..., 0]
+    p_u = xp.concatenate([before[..., 0:3], before[..., 6:9]], axis=-1)  # (N, 15, 6)
+    u_p_u = xp.concatenate([p_u[..., 0:3, :], p_u[..., 6:9, :]], axis=-2)
+    solved = xp.linalg.solve(xp.eye(6) + xp.matmul(information, u_p_u), xp.concatenate(
+        [xp.matmul(information, xp.matrix_transpose(p_u)), gradient], axis=-1))  # fmt: skip
+    covariance = before - xp.matmul(p_u, solved[..., :-1])
+    error = xp.matmul(p_u, solved[..., -1:])[..., 0]
     return _corrected(state, error, covariance)
 
 
 def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterState:
-    """Return the state with the error (N, 15) put into it, and the error's frame moved along."""
+    """Return the state corrected by the error (N, 15), with the covariance after the reset."""
     xp = error.__array_namespace__()
-    turn_b = error[:, 6:9]
+    rotation_b = error[:, 6:9]
     zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
-    reset = one - 0.5 * _skew(turn_b)
-    moved = _blocks([
-        [reset if row == column == 2 else one if row == column else zero for column in range(5)]
+    reset_angle = one - 0.5 * _skew(rotation_b)
+    reset = _blocks([
+        [reset_angle if row == col == 2 else one if row == col else zero for col in range(5)]
         for row in range(5)
     ])  # fmt: skip
-    covariance = xp.matmul(xp.matmul(moved, covariance), xp.matrix_transpose(moved))
+    covariance = xp.matmul(xp.matmul(reset, covariance), xp.matrix_transpose(reset))
     return FilterState(
         state.pos_w + error[:, 0:3],
         state.vel_w + error[:, 3:6],
-        xp.matmul(state.rot_w, exp_rot(turn_b)),
+        xp.matmul(state.rot_w, exp_rot(rotation_b)),
         state.acc_bias_b + error[:, 9:12],
         state.gyro_bias_b + error[:, 12:15],
         0.5 * (covariance + xp.matrix_transpose(covariance)),
@@ -230,14 +234,17 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
 
 
 def error_of(state: FilterState, truth: FilterState) -> Array:
-    """Return the error of the state, (N, 15); the truth's covariance is not used."""
+    """Return the error of the state, (N, 15); the truth's covariance is not used.
+
+    The attitude error is the axis times the sine of the angle, in body axes.
+    """
     xp = state.pos_w.__array_namespace__()
-    turn = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
+    relative = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
     sine_b = 0.5 * xp.stack(
         [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
+            relative[:, 2, 1] - relative[:, 1, 2],
+            relative[:, 0, 2] - relative[:, 2, 0],
+            relative[:, 1, 0] - relative[:, 0, 1],
         ],
         axis=-1,
     )
@@ -247,9 +254,10 @@ def error_of(state: FilterState, truth: FilterState) -> Array:
 
 
 def nees(state: FilterState, truth: FilterState) -> Array:
-    """Return the normalised estimation error squared, (N,): chi-squared of 15 where P is right.
+    """Return the normalised estimation error squared, (N,).
 
-    Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+    It has a chi-squared distribution with 15 degrees of freedom if the covariance is correct
+    (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
     """
     xp = state.pos_w.__array_namespace__()
     error = error_of(state, truth)[..., None]

@@ -1,1 +1,1 @@
-"""A separate simulator for blind cases, in continuous time, without code of the fitted model."""
+"""A simulator for blind cases in continuous time, which shares no code with the fitted model."""

@@ -1,9 +1,8 @@
-"""The effects that act through air, rotors and body, each by its equation in the catalogue.
+"""Effects on thrust, force and torque in the continuous-time engine, and the wind.
 
-The air itself moves by a steady wind, and by gusts that are coloured to first order.
-
-A `Moment` has their inputs for N flights. Thrusts are changed in the order of `THRUSTS`: first
-additions to a rotor's thrust, then factors.
+Each effect follows its equation in the catalogue of effects, but shares no code with it. A `Moment`
+has the inputs for N flights. Thrusts are changed in the order of `THRUSTS`: first additions to a
+rotor's thrust, then factors. The wind is steady, with gusts that are first-order coloured noise.
 """
 
 from __future__ import annotations
@@ -15,41 +14,43 @@ import numpy as np
 
 
 class Moment(NamedTuple):
-    """N flights at one moment."""
+    """The states of N flights at one time, and their true constants."""
 
     mass: float
-    """True [kg]."""
+    """True mass [kg]."""
     inertia: np.ndarray
-    """(3,) true [kg m^2]."""
+    """(3,) true inertia [kg m^2]."""
     arm: np.ndarray
-    """(4, 3) rotors from the true centre of mass, body axes [m]."""
+    """(4, 3) positions of the rotors from the true centre of mass, body axes [m]."""
     spin: np.ndarray
-    """(4,) s_i."""
+    """(4,) directions of rotation s_i, 1 or -1."""
     pos_w: np.ndarray
-    """(N, 3) [m]."""
+    """(N, 3) position [m]."""
     rot_w: np.ndarray
-    """(N, 3, 3) body to world."""
+    """(N, 3, 3) attitude, body to world."""
     air_b: np.ndarray
     """(N, 3) v_b, velocity relative to the air in body axes [m/s]."""
     rate_b: np.ndarray
-    """(N, 3) [rad/s]."""
+    """(N, 3) body rates w [rad/s]."""
     speed: np.ndarray
-    """(N, 4) of the rotors [rad/s]."""
+    """(N, 4) rotor speeds Omega_i [rad/s]."""
     time_s: np.ndarray
-    """(N, 1) since the first row [s]."""
+    """(N, 1) time since the first row [s]."""
     fallen_v: np.ndarray
-    """(N, 1) voltage of the first row less the present one [V]."""
+    """(N, 1) voltage of the first row minus the present one [V]."""
     spin_up: np.ndarray | float = 0.0
-    """(N, 4) change of the rotor speeds [rad/s^2]."""
+    """(N, 4) derivative of the rotor speeds [rad/s^2]."""
 
 
 Force = Callable[[Any, Moment], np.ndarray]
+"""Function from an effect's values and a moment to a force or torque (N, 3), body axes."""
 Thrust = Callable[[Any, Moment, np.ndarray], np.ndarray]
+"""Function from an effect's values, a moment and the thrusts (N, 4) [N] to changed thrusts."""
 
 GROUND_CAP = 1.5
-"""Largest factor of the ground on a thrust."""
+"""Largest factor of the ground effect on a thrust."""
 GROUND_HEIGHT = 1e-3
-"""A rotor is never lower than this for it [m]."""
+"""Least height of a rotor in the ground effect's equation [m]."""
 
 
 def _inflow(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
@@ -62,7 +63,7 @@ def _ground_effect(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
     height = at.pos_w[:, 2:] + at.rot_w[:, 2] @ at.arm.T
     ratio = effect.rotor_radius / (4.0 * np.maximum(height, GROUND_HEIGHT))
     share = effect.strength * ratio**2
-    # Beyond a share of 1 the formula turns over; it is capped long before.
+    # From a share of 1 on the formula is not valid; the cap acts below it.
     return thrust / (1.0 - np.minimum(share, 1.0 - 1.0 / GROUND_CAP))
 
 
@@ -85,31 +86,31 @@ def _quadratic_drag(effect: Any, at: Moment) -> np.ndarray:
 
 def _rotor_drag(effect: Any, at: Moment) -> np.ndarray:
     """F_b += -k (sum Omega_i) (v_b - (v_b.e3) e3)."""
-    all_speeds = at.speed.sum(axis=1, keepdims=True)
-    return -effect.coefficient * all_speeds * at.air_b * [1.0, 1.0, 0.0]
+    speed_sum = at.speed.sum(axis=1, keepdims=True)
+    return -effect.coefficient * speed_sum * at.air_b * [1.0, 1.0, 0.0]
 
 
 def _translational_lift(effect: Any, at: Moment) -> np.ndarray:
     """F_b += m k (v_bx^2 + v_by^2) e3."""
-    across = at.air_b[:, :1] ** 2 + at.air_b[:, 1:2] ** 2
-    return at.mass * effect.coefficient * across * [0.0, 0.0, 1.0]
+    squared_airspeed = at.air_b[:, :1] ** 2 + at.air_b[:, 1:2] ** 2
+    return at.mass * effect.coefficient * squared_airspeed * [0.0, 0.0, 1.0]
 
 
 def _blade_flapping(effect: Any, at: Moment) -> np.ndarray:
     """tau_b += k (sum Omega_i) (v_b x e3)."""
-    all_speeds = at.speed.sum(axis=1, keepdims=True)
-    return effect.coefficient * all_speeds * _times_e3(at.air_b)
+    speed_sum = at.speed.sum(axis=1, keepdims=True)
+    return effect.coefficient * speed_sum * _cross_e3(at.air_b)
 
 
 def _torque_trim(effect: Any, at: Moment) -> np.ndarray:
-    """Constant body torque."""
+    """tau_b += a constant torque."""
     return np.broadcast_to(np.asarray(effect.torque, dtype=float), at.rate_b.shape)
 
 
 def _rotor_gyroscopic(effect: Any, at: Moment) -> np.ndarray:
     """tau_b += -J_r (sum s_i Omega_i) (w x e3)."""
     net = (at.speed * at.spin).sum(axis=1, keepdims=True)
-    return -effect.rotor_inertia * net * _times_e3(at.rate_b)
+    return -effect.rotor_inertia * net * _cross_e3(at.rate_b)
 
 
 def _rotor_spin_up(effect: Any, at: Moment) -> np.ndarray:
@@ -123,7 +124,7 @@ def _angular_damping(effect: Any, at: Moment) -> np.ndarray:
     return -at.inertia * np.multiply(effect.coefficient, at.rate_b)
 
 
-def _times_e3(vector: np.ndarray) -> np.ndarray:
+def _cross_e3(vector: np.ndarray) -> np.ndarray:
     """Return vector x e3 (N, 3)."""
     return vector[:, [1, 0, 2]] * [1.0, -1.0, 0.0]
 
@@ -133,14 +134,14 @@ THRUSTS: dict[str, Thrust] = {
     "ground_effect": _ground_effect,
     "battery_sag": _battery_sag,
 }
-"""By effect: (values, moment, thrusts (N, 4) [N]) to thrusts."""
+"""Effect -> its change of the thrusts (N, 4) [N]."""
 FORCES: dict[str, Force] = {
     "linear_drag": _linear_drag,
     "quadratic_drag": _quadratic_drag,
     "rotor_drag": _rotor_drag,
     "translational_lift": _translational_lift,
 }
-"""By effect: (values, moment) to a force on the centre of mass (N, 3), body axes [N]."""
+"""Effect -> its force on the centre of mass (N, 3), body axes [N]."""
 TORQUES: dict[str, Force] = {
     "blade_flapping": _blade_flapping,
     "torque_trim": _torque_trim,
@@ -148,22 +149,20 @@ TORQUES: dict[str, Force] = {
     "rotor_spin_up": _rotor_spin_up,
     "angular_damping": _angular_damping,
 }
-"""By effect: (values, moment) to a torque (N, 3), body axes [N m]."""
+"""Effect -> its torque (N, 3), body axes [N m]."""
 WINDS = ("constant_wind", "gusts")
 """Effects that move the air."""
-
-
-UPRIGHT = 0.5
-"""Vertical intensity over the horizontal one."""
-SLOWEST = 1.0
-"""Airspeed below which gusts change no slower [m/s]."""
+VERTICAL_SHARE = 0.5
+"""Intensity of vertical gusts divided by that of horizontal ones."""
+MIN_AIRSPEED = 1.0
+"""Least airspeed in the correlation time of gusts [m/s]."""
 
 
 class Wind:
-    """Wind on N flights, known at the ends of each step and linear between them."""
+    """Wind on N flights, computed at the ends of each step and linear between them."""
 
     def __init__(self, effects: dict[str, Any], count: int, rng: np.random.Generator) -> None:
-        """Prepare; gusts start from their stationary distribution."""
+        """Prepare for `count` flights; gusts start from their stationary distribution."""
         steady = effects["constant_wind"].velocity if "constant_wind" in effects else (0.0,) * 3
         self._steady_w = np.asarray(steady, dtype=float)
         self._gusts, self._rng = effects.get("gusts"), rng
@@ -171,33 +170,34 @@ class Wind:
         if self._gusts is not None:
             self._gust_w = self._intensity * rng.standard_normal((count, 3))
         self.still = self._gusts is None and not self._steady_w.any()
-        """Whether no air ever moves."""
+        """Whether the air never moves."""
 
     @property
     def _intensity(self) -> np.ndarray:
         assert self._gusts is not None
-        return float(self._gusts.intensity) * np.array([1.0, 1.0, UPRIGHT])
+        return float(self._gusts.intensity) * np.array([1.0, 1.0, VERTICAL_SHARE])
 
     @property
     def now_w(self) -> np.ndarray:
-        """(N, 3) [m/s]."""
+        """(N, 3) wind at the present time [m/s]."""
         return self._steady_w + self._gust_w
 
     def step(self, vel_w: np.ndarray, length_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the wind (N, 3) at the start and at the end of a step, and advance it [m/s].
 
-        dw/dt = -w / tau + noise with tau = length / max(airspeed, 1), exact for a constant tau.
+        Gusts follow dw/dt = -w / tau + noise with tau = length / max(airspeed, 1), solved exactly
+        for a tau that is constant in the step.
 
         Args:
-            vel_w: (N, 3) of the vehicles [m/s].
-            length_s: (N, 1) of the step [s].
+            vel_w: (N, 3) velocities of the vehicles [m/s].
+            length_s: (N, 1) length of the step [s].
         """
         before = self._gust_w
         if self._gusts is not None:
             air_w = vel_w - self._steady_w
             airspeed = np.sqrt((air_w * air_w).sum(axis=1, keepdims=True))
-            rate = np.maximum(airspeed, SLOWEST) / float(self._gusts.length)
-            kept = np.exp(-length_s * rate)
-            drawn = self._intensity * self._rng.standard_normal(before.shape)
-            self._gust_w = kept * before + np.sqrt(1.0 - kept**2) * drawn
+            rate = np.maximum(airspeed, MIN_AIRSPEED) / float(self._gusts.length)
+            decay = np.exp(-length_s * rate)
+            noise = self._intensity * self._rng.standard_normal(before.shape)
+            self._gust_w = decay * before + np.sqrt(1.0 - decay**2) * noise
         return self._steady_w + before, self._steady_w + self._gust_w

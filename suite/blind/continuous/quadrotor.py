@@ -1,8 +1,8 @@
 """The true constants of a vehicle with its effects, and its controller with nominal constants.
 
-Only definitions are shared with the suite: the nominal quadrotor's five steps and the catalogue's
-equations. No function of the catalogue is called. The controller computes torque from body rates,
-and rotor speeds within their range from torque.
+The continuous-time engine shares only definitions with the suite: the five steps of the nominal
+quadrotor (docs) and the equations of the catalogue of effects. It calls no function of the
+catalogue. The controller computes torque from body rates, and rotor speeds from torque.
 """
 
 from __future__ import annotations
@@ -15,55 +15,56 @@ from eval.vehicles.vehicle import Vehicle
 from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, WINDS
 
 GRAVITY = 9.81
-"""[m/s^2]."""
+"""Acceleration of gravity [m/s^2]."""
 CONSTANTS = (
     "motor_lag", "command_delay", "thrust_scale", "mass_offset", "com_offset", "inertia_scale",
     "rate_gain", "weak_motor", "thrust_tilt", "frame_tilt",
 )  # fmt: skip
 """Effects that change a constant of the vehicle or its environment."""
-OF_LOGS = ("gyro_bias", "accelerometer_bias", "clock_offset")
+LOG_FAULTS = ("gyro_bias", "accelerometer_bias", "clock_offset")
 """Effects that change only the log."""
 
 
-class Believed(NamedTuple):
+class NominalConstants(NamedTuple):
     """Constants of the rate loop and the mixer: the vehicle file's nominal values."""
 
     mass: float
-    """[kg]."""
+    """Nominal mass [kg]."""
     inertia: np.ndarray
-    """(3,) [kg m^2]."""
+    """(3,) nominal inertia [kg m^2]."""
     rate_gain: np.ndarray
-    """(3,) true K, since the catalogue's `rate_gain` is an error of the loop [1/s]."""
+    """(3,) true gain K [1/s], since the effect `rate_gain` is an error of the loop itself."""
     shares: np.ndarray
     """(4, 4) thrust of each rotor for a unit of (collective, torque about x, y, z)."""
     thrust_max: float
-    """Of one rotor [N]."""
+    """Largest thrust of one rotor [N]."""
     thrust_coefficient: float
     """k_T [N/(rad/s)^2]."""
     period_s: float
-    """Of the rate loop [s]."""
+    """Period of the rate loop [s]."""
 
 
 class Quadrotor(NamedTuple):
     """The true constants."""
 
-    believed: Believed
+    nominal: NominalConstants
+    """Constants of the controller."""
     mass: float
-    """[kg]."""
+    """Mass [kg]."""
     inertia: np.ndarray
-    """(3,) [kg m^2]."""
+    """(3,) inertia [kg m^2]."""
     gravity_w: np.ndarray
-    """(3,) [m/s^2]."""
+    """(3,) acceleration of gravity; it is not along -z if the world frame is tilted [m/s^2]."""
     arm: np.ndarray
-    """(4, 3) rotors from the true centre of mass, body axes [m]."""
+    """(4, 3) positions of the rotors from the true centre of mass, body axes [m]."""
     spin: np.ndarray
-    """(4,) s_i."""
+    """(4,) directions of rotation s_i, 1 or -1."""
     thrust_coefficient: np.ndarray
-    """(4,) [N/(rad/s)^2]."""
+    """(4,) k_T of each rotor [N/(rad/s)^2]."""
     torque_coefficient: np.ndarray
-    """(4,) [N m/(rad/s)^2]."""
+    """(4,) k_Q of each rotor [N m/(rad/s)^2]."""
     thrust_axis: np.ndarray
-    """(3,) along which the total thrust pushes, body axes."""
+    """(3,) unit vector of the total thrust, body axes."""
     time_constant: float
     """Time constant of the rotors [s]; 0 for no lag."""
     delay: float
@@ -79,49 +80,50 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
         ValueError: for an effect without an equation in this engine.
     """
     effects = dict(vehicle.effects)
-    known = {*CONSTANTS, *OF_LOGS, *THRUSTS, *FORCES, *TORQUES, *WINDS}
+    supported = {*CONSTANTS, *LOG_FAULTS, *THRUSTS, *FORCES, *TORQUES, *WINDS}
     for name in effects:
-        if name not in known:
+        if name not in supported:
             raise ValueError(
                 f"effects.{name}: the continuous engine has no equation for it; allowed: "
-                f"{', '.join(sorted(known))}"
+                f"{', '.join(sorted(supported))}"
             )
 
-    def value(effect: str, parameter: str, absent: Any) -> Any:
-        given = getattr(effects[effect], parameter) if effect in effects else absent
-        return np.asarray(given, dtype=float)
+    def value(effect: str, parameter: str, default: Any) -> Any:
+        """Return a parameter of an effect, or the default where the vehicle lacks the effect."""
+        found = getattr(effects[effect], parameter) if effect in effects else default
+        return np.asarray(found, dtype=float)
 
     rotors, controller = vehicle.rotors, vehicle.controller
     hubs, spin = np.array(rotors.position, dtype=float), np.array(rotors.spin, dtype=float)
-    weak = value("weak_motor", "scale", np.ones(4))
-    twist = -spin * rotors.torque_coefficient / rotors.thrust_coefficient
-    lift = rotors.thrust_coefficient * float(value("thrust_scale", "scale", 1.0))
-    believed = Believed(
+    motor_scale = value("weak_motor", "scale", np.ones(4))
+    yaw_per_thrust = -spin * rotors.torque_coefficient / rotors.thrust_coefficient
+    thrust_scale = float(value("thrust_scale", "scale", 1.0))
+    nominal = NominalConstants(
         mass=vehicle.mass,
         inertia=np.array(vehicle.inertia),
         rate_gain=np.array(controller.rate_gain) * value("rate_gain", "scale", np.ones(3)),
-        shares=np.linalg.inv(np.array([np.ones(4), hubs[:, 1], -hubs[:, 0], twist])),
+        shares=np.linalg.inv(np.array([np.ones(4), hubs[:, 1], -hubs[:, 0], yaw_per_thrust])),
         thrust_max=rotors.thrust_coefficient * rotors.speed_max**2,
         thrust_coefficient=rotors.thrust_coefficient,
         period_s=1.0 / controller.frequency,
     )
     return Quadrotor(
-        believed=believed,
+        nominal=nominal,
         mass=vehicle.mass + float(value("mass_offset", "offset", 0.0)),
-        inertia=believed.inertia * value("inertia_scale", "scale", np.ones(3)),
-        gravity_w=-GRAVITY * leaning_z(value("frame_tilt", "angle", np.zeros(2))),
+        inertia=nominal.inertia * value("inertia_scale", "scale", np.ones(3)),
+        gravity_w=-GRAVITY * tilted_z(value("frame_tilt", "angle", np.zeros(2))),
         arm=hubs - value("com_offset", "offset", np.zeros(3)),
         spin=spin,
-        thrust_coefficient=lift * weak,
-        torque_coefficient=rotors.torque_coefficient * weak,
-        thrust_axis=leaning_z(value("thrust_tilt", "angle", np.zeros(2))),
+        thrust_coefficient=rotors.thrust_coefficient * thrust_scale * motor_scale,
+        torque_coefficient=rotors.torque_coefficient * motor_scale,
+        thrust_axis=tilted_z(value("thrust_tilt", "angle", np.zeros(2))),
         time_constant=float(value("motor_lag", "time_constant", rotors.time_constant)),
         delay=float(value("command_delay", "delay", 0.0)),
         effects=effects,
     )
 
 
-def leaning_z(angle: np.ndarray) -> np.ndarray:
+def tilted_z(angle: np.ndarray) -> np.ndarray:
     """Return Rot(a_x, a_y, 0) e3 (3,): e3 rolled by a_x, then pitched by a_y [rad]."""
     roll, pitch = angle
     rolled = np.array([0.0, -np.sin(roll), np.cos(roll)])
@@ -132,44 +134,53 @@ TINY = 1e-12
 """Smaller thrusts are rounding errors [N]."""
 
 
-def wanted_speeds(believed: Believed, command: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
+def commanded_speeds(
+    nominal: NominalConstants, command: np.ndarray, rate_b: np.ndarray
+) -> np.ndarray:
     """Return the rotor speeds (N, 4) that the rate loop commands [rad/s].
 
     Args:
-        believed: the controller's constants.
+        nominal: the controller's constants.
         command: (N, 4) thrust per nominal mass [m/s^2], body rates [rad/s].
-        rate_b: (N, 3) measured by the loop [rad/s].
+        rate_b: (N, 3) body rates measured by the loop [rad/s].
     """
-    inertia = believed.inertia
+    inertia = nominal.inertia
     x, y, z = inertia
     # rate x (J rate), written out for a diagonal J.
-    turning = np.array([z - y, x - z, y - x]) * rate_b[:, [1, 2, 0]] * rate_b[:, [2, 0, 1]]
-    torque_b = inertia * believed.rate_gain * (command[:, 1:] - rate_b) + turning
-    thrust = allotted(believed, believed.mass * command[:, 0], torque_b)
-    return np.sqrt(thrust / believed.thrust_coefficient)
+    gyroscopic = np.array([z - y, x - z, y - x]) * rate_b[:, [1, 2, 0]] * rate_b[:, [2, 0, 1]]
+    torque_b = inertia * nominal.rate_gain * (command[:, 1:] - rate_b) + gyroscopic
+    thrust = allocate_thrust(nominal, nominal.mass * command[:, 0], torque_b)
+    return np.sqrt(thrust / nominal.thrust_coefficient)
 
 
-def allotted(believed: Believed, collective: np.ndarray, torque_b: np.ndarray) -> np.ndarray:
-    """Return each rotor's thrust (N, 4) for a collective (N,) [N] and a torque (N, 3) [N m].
+def allocate_thrust(
+    nominal: NominalConstants, collective: np.ndarray, torque_b: np.ndarray
+) -> np.ndarray:
+    """Return each rotor's thrust (N, 4) [N].
 
     If a rotor would exceed [0, f_max], roll and pitch are scaled by one factor until their spread
     is f_max, the collective is set to the nearest feasible value, and yaw is scaled to the
     remaining range.
+
+    Args:
+        nominal: the controller's constants.
+        collective: (N,) commanded sum of the thrusts [N].
+        torque_b: (N, 3) commanded torque, body axes [N m].
     """
-    lift, most = believed.shares[:, 0], believed.thrust_max
-    tilt = torque_b[:, :2] @ believed.shares[:, 1:3].T
-    yaw = torque_b[:, 2:] * believed.shares[:, 3]
-    free = collective[:, None] * lift + tilt + yaw
-    beyond = np.any((free < 0.0) | (free > most), axis=1)
-    if not beyond.any():
-        return free
+    share, limit = nominal.shares[:, 0], nominal.thrust_max
+    tilt = torque_b[:, :2] @ nominal.shares[:, 1:3].T
+    yaw = torque_b[:, 2:] * nominal.shares[:, 3]
+    unlimited = collective[:, None] * share + tilt + yaw
+    saturated = np.any((unlimited < 0.0) | (unlimited > limit), axis=1)
+    if not saturated.any():
+        return unlimited
     spread = tilt.max(axis=1) - tilt.min(axis=1)
-    tilt = tilt * np.minimum(1.0, most / np.maximum(spread, TINY))[:, None]
-    least_c = (-tilt / lift).max(axis=1)
-    most_c = ((most - tilt) / lift).min(axis=1)
-    level = np.minimum(np.maximum(collective, least_c), most_c)[:, None] * lift + tilt
-    room = np.where(yaw > 0.0, most - level, level)
-    moving = np.abs(yaw) > TINY
-    ratio = np.where(moving, np.maximum(room, 0.0) / np.where(moving, np.abs(yaw), 1.0), 1.0)
-    held = level + np.minimum(ratio.min(axis=1, keepdims=True), 1.0) * yaw
-    return np.where(beyond[:, None], np.clip(held, 0.0, most), free)
+    tilt = tilt * np.minimum(1.0, limit / np.maximum(spread, TINY))[:, None]
+    least = (-tilt / share).max(axis=1)
+    most = ((limit - tilt) / share).min(axis=1)
+    without_yaw = np.minimum(np.maximum(collective, least), most)[:, None] * share + tilt
+    room = np.where(yaw > 0.0, limit - without_yaw, without_yaw)
+    yaws = np.abs(yaw) > TINY
+    ratio = np.where(yaws, np.maximum(room, 0.0) / np.where(yaws, np.abs(yaw), 1.0), 1.0)
+    limited = without_yaw + np.minimum(ratio.min(axis=1, keepdims=True), 1.0) * yaw
+    return np.where(saturated[:, None], np.clip(limited, 0.0, limit), unlimited)

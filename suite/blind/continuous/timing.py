@@ -1,7 +1,8 @@
-"""The conditions of a flight and its schedule: rows, rate loop ticks, delayed commands, steps.
+"""Timing in the continuous-time engine: random rates and jitter, and the schedule of the steps.
 
-Every event is the end of a step, so that nothing jumps within a step. The steps of N flights are
-aligned row by row; a flight with fewer steps between two rows has steps of zero length at the end.
+Events are rows of the log, ticks of the rate loop, and delayed commands that begin to act. Every
+event is the end of a step, so that nothing jumps within a step. The steps of N flights are aligned
+row by row; a flight with fewer steps between two rows has steps of zero length before the next row.
 """
 
 from __future__ import annotations
@@ -31,23 +32,23 @@ class Schedule(NamedTuple):
     is_tick: np.ndarray
     """(S, N) whether the rate loop runs at the start of the step."""
     acting: np.ndarray
-    """(S, N) row of the command that acts in the step; -1 before the first."""
+    """(S, N) index of the row whose command acts in the step; -1 before the first."""
 
 
 def jittered_stamps(
     rng: np.random.Generator, count: int, start_s: float, end_s: float, rate_hz: float,
     jitter: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return the stamps (R + 1, N) of rows from `start_s` past `end_s` [s].
+    """Return the time stamps (R + 1, N) of rows from `start_s` past `end_s` [s].
 
-    Rows are nominally 1 / rate apart. The one at 0 has no jitter; the others have a uniform one of
-    up to `jitter` rows.
+    Rows are nominally 1 / `rate_hz` apart. The row at time 0 has no jitter; the others have a
+    uniform jitter of up to `jitter` rows.
     """
     period = 1.0 / rate_hz
     number = np.arange(int(np.ceil(start_s / period)), int(np.ceil(end_s / period)) + 2)
-    off = jitter * rng.uniform(-1.0, 1.0, (len(number), count))
-    off[number == 0] = 0.0
-    return (number[:, None] + off) * period
+    offset = jitter * rng.uniform(-1.0, 1.0, (len(number), count))
+    offset[number == 0] = 0.0
+    return (number[:, None] + offset) * period
 
 
 def schedule(
@@ -56,60 +57,66 @@ def schedule(
     """Return the steps of flights with rows at `stamp_s` (R + 1, N).
 
     Args:
-        stamp_s: times of the rows [s].
+        stamp_s: (R + 1, N) times of the rows [s].
         loop_s: period of the rate loop, which restarts at every row [s].
         delay_s: delay of commands [s].
         step_s: longest step [s].
     """
-    flights = [_one(stamps, loop_s, delay_s, step_s) for stamps in stamp_s.T]
+    flights = [_steps_of_flight(stamps, loop_s, delay_s, step_s) for stamps in stamp_s.T]
     rows = len(stamp_s) - 1
+    # Every row gets the number of steps of the flight that has most.
     counts = np.stack([np.bincount(row, minlength=rows) for row, *_ in flights], axis=1)
-    most = counts.max(axis=1)
-    block = np.concatenate([[0], np.cumsum(most)])
-    # Steps of zero length are at the end of a row.
-    ends = np.repeat(stamp_s[1:], most, axis=0)
-    parts = [ends, np.zeros_like(ends), np.zeros(ends.shape, bool), np.zeros(ends.shape, int)]
-    for index, (row, start, length, tick, acting) in enumerate(flights):
+    padded = counts.max(axis=1)
+    block = np.concatenate([[0], np.cumsum(padded)])
+    start_s = np.repeat(stamp_s[1:], padded, axis=0)  # steps of zero length start at the next row
+    length_s = np.zeros_like(start_s)
+    is_tick, acting = np.zeros(start_s.shape, bool), np.zeros(start_s.shape, int)
+    for index, (row, start, length, tick, command) in enumerate(flights):
         first = np.concatenate([[0], np.cumsum(counts[:-1, index])])
-        at = block[row] + np.arange(len(row)) - first[row]
-        for part, values in zip(parts, (start, length, tick, acting), strict=True):
-            part[at, index] = values
-        idle = np.ones(len(ends), bool)
-        idle[at] = False
-        before = np.maximum.accumulate(np.where(idle, 0, np.arange(len(ends))))
-        parts[3][idle, index] = parts[3][before[idle], index]
-    return Schedule(stamp_s, block, *parts)
+        steps = block[row] + np.arange(len(row)) - first[row]
+        start_s[steps, index], length_s[steps, index] = start, length
+        is_tick[steps, index], acting[steps, index] = tick, command
+        # In steps of zero length the command of the step before continues to act.
+        empty = np.ones(len(start_s), bool)
+        empty[steps] = False
+        before = np.maximum.accumulate(np.where(empty, 0, np.arange(len(start_s))))
+        acting[empty, index] = acting[before[empty], index]
+    return Schedule(stamp_s, block, start_s, length_s, is_tick, acting)
 
 
-def _one(
+def _steps_of_flight(
     stamps: np.ndarray, loop_s: float, delay_s: float, step_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the steps of one flight: row, start, length, loop tick, row of the acting command."""
-    span = np.diff(stamps)
-    ticks = np.maximum(np.ceil(span / loop_s - SAME_S / loop_s), 1.0).astype(int)
-    first = np.concatenate([[0], np.cumsum(ticks)])[:-1]
-    rank = np.arange(ticks.sum()) - np.repeat(first, ticks)
-    tick_s = np.repeat(stamps[:-1], ticks) + rank * loop_s
-    late_s = stamps[:-1] + delay_s
-    late_s = late_s[late_s < stamps[-1]]
-    after = np.searchsorted(tick_s, late_s)
-    gap = np.minimum(
-        np.abs(late_s - tick_s[np.maximum(after - 1, 0)]),
-        np.abs(late_s - tick_s[np.minimum(after, len(tick_s) - 1)]),
+    ticks = np.maximum(np.ceil(np.diff(stamps) / loop_s - SAME_S / loop_s), 1.0).astype(int)
+    tick_s = np.repeat(stamps[:-1], ticks) + _rank(ticks) * loop_s
+    # Times at which commands begin to act, unless a tick is at the same time.
+    acting_s = stamps[:-1] + delay_s
+    acting_s = acting_s[acting_s < stamps[-1]]
+    after = np.searchsorted(tick_s, acting_s)
+    distance_s = np.minimum(
+        np.abs(acting_s - tick_s[np.maximum(after - 1, 0)]),
+        np.abs(acting_s - tick_s[np.minimum(after, len(tick_s) - 1)]),
     )
-    event_s = np.concatenate([tick_s, late_s[gap > SAME_S]])
+    event_s = np.concatenate([tick_s, acting_s[distance_s > SAME_S]])
     is_tick = np.arange(len(event_s)) < len(tick_s)
     order = np.argsort(event_s, kind="stable")
     event_s, is_tick = event_s[order], is_tick[order]
-    whole = np.diff(np.append(event_s, stamps[-1]))
-    pieces = np.maximum(np.ceil(whole / step_s - 1e-6), 1.0).astype(int)
-    begin = np.concatenate([[0], np.cumsum(pieces)])[:-1]
-    rank = np.arange(pieces.sum()) - np.repeat(begin, pieces)
-    length = np.repeat(whole / pieces, pieces)
-    start = np.repeat(event_s, pieces) + rank * length
+    # The time between two events is divided into equal steps.
+    between_s = np.diff(np.append(event_s, stamps[-1]))
+    steps = np.maximum(np.ceil(between_s / step_s - 1e-6), 1.0).astype(int)
+    rank = _rank(steps)
+    length = np.repeat(between_s / steps, steps)
+    start = np.repeat(event_s, steps) + rank * length
     row = np.searchsorted(stamps[:-1], start + SAME_S, side="right") - 1
     acting = np.searchsorted(stamps[:-1] + delay_s, start + SAME_S, side="right") - 1
-    return row, start, length, np.repeat(is_tick, pieces) & (rank == 0), acting
+    return row, start, length, np.repeat(is_tick, steps) & (rank == 0), acting
+
+
+def _rank(counts: np.ndarray) -> np.ndarray:
+    """Return 0, 1, ..., count - 1 for each of `counts`, one after the other."""
+    first = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    return np.arange(counts.sum()) - np.repeat(first, counts)
 
 
 LOOP_HZ = (200.0, 2000.0)
@@ -145,27 +152,28 @@ class Conditions:
     dropped: float
     """Share of lost rows; their commands act."""
     coloured: float
-    """Coloured share (first-order Gauss-Markov) of the noise of poses and velocities; the other
-    part is white."""
+    """Share of the noise of poses and velocities that is coloured (first-order Gauss-Markov); the
+    other part is white."""
     colour_s: float
-    """Its correlation time [s]."""
+    """Correlation time of the coloured noise [s]."""
 
 
 def draw_conditions(rng: np.random.Generator) -> Conditions:
-    """Return the conditions of a case: half of them with coloured noise, some with even stamps."""
+    """Draw the conditions of a case: half have coloured noise, some have no jitter."""
     loop_hz = _rate(rng, USUAL_LOOPS, LOOP_HZ)
-    fastest = min(ROW_HZ[1], loop_hz)
-    usual = tuple(rate for rate in USUAL_ROWS if rate <= fastest)
-    row_hz = _rate(rng, usual, (ROW_HZ[0], fastest))
+    max_row_hz = min(ROW_HZ[1], loop_hz)
+    usual = tuple(rate for rate in USUAL_ROWS if rate <= max_row_hz)
+    row_hz = _rate(rng, usual, (ROW_HZ[0], max_row_hz))
     jitter, clock_s, dropped = rng.uniform(0.0, (JITTER, CLOCK_S, DROPPED))
-    keep = rng.random(3) < (0.8, 0.8, 0.6)
+    is_present = rng.random(3) < (0.8, 0.8, 0.6)
     is_coloured = rng.random() < 0.5
     coloured, colour_s = rng.uniform(0.5, 0.9), np.exp(rng.uniform(*np.log(COLOUR_S)))
-    jitter, clock_s, dropped = (float(value) for value in (jitter, clock_s, dropped) * keep)
+    jitter, clock_s, dropped = (float(value) for value in (jitter, clock_s, dropped) * is_present)
     share = float(coloured) if is_coloured else 0.0
     return Conditions(loop_hz, row_hz, jitter, clock_s, dropped, share, float(colour_s))
 
 
 def _rate(rng: np.random.Generator, usual: tuple[float, ...], span: tuple[float, float]) -> float:
-    one, between = float(rng.choice(usual)), float(np.exp(rng.uniform(*np.log(span))))
-    return one if rng.random() < 0.5 else round(between, 1)
+    """Draw a rate [Hz]: one of the usual ones, or log-uniform within the span."""
+    usual_hz, between_hz = float(rng.choice(usual)), float(np.exp(rng.uniform(*np.log(span))))
+    return usual_hz if rng.random() < 0.5 else round(between_hz, 1)

@@ -1,12 +1,13 @@
-"""The Fisher information of a case's flights about all parameters of the catalogue.
+"""The Fisher information of flights about all parameters of the catalogue of effects.
 
-g is the whitened Jacobian of all logged channels, and G = g^T g. To first order a parameter change
-theta from the given vehicle has the expected log-likelihood ratio theta^T G theta / 2. The part of
-it that remains after a fit of another effect is a Schur complement of G.
+With g the whitened Jacobian of all logged channels, the information is G = g^T g. To first order a
+parameter change theta from the nominal vehicle has the expected log-likelihood ratio
+theta^T G theta / 2. The part of it that remains after a fit of another effect is a Schur complement
+of G.
 
-g is the linearisation of the diagnosis's rollouts at the given vehicle, along flights without
-noise. The oracle shares errors of this linearisation; the simulators of the cases are independent
-of it.
+g is the linearisation of the diagnosis's rollouts at the nominal vehicle, along flights without
+noise. Its errors are therefore also errors of the oracle; the simulators of the cases do not depend
+on it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, sta
 from suite.diagnose.thresholds import THRESHOLDS
 
 SHORT_S, LONG_S = 0.5, LENGTH_S
-"""Lengths of rollouts [s]; an error of force grows with the square of time."""
+"""Lengths of short and long rollouts [s]; the effect of a force grows with the square of time."""
 THRESHOLD = 12.5
 """Expected log-likelihood ratio of a just detectable effect: five sigma."""
 REQUIRED = 0.125
@@ -41,47 +42,50 @@ rollouts of twice their length) must be among the alternatives."""
 ALLOWED = THRESHOLD
 """Only a name with a smaller remaining ratio in short rollouts may be among the alternatives."""
 MOSTLY = 0.25
-"""A name can replace another only if its remaining ratio is below this share of the explained
-one."""
+"""A name can replace another one only if its remaining ratio is below this share of the whole
+ratio."""
 GUST_DRAWS = 24
 """Number of flights with random wind on each trajectory."""
 LIMITS = replace(THRESHOLDS, most_windows=100_000)
-"""Every stretch counts."""
+"""Thresholds of the diagnosis, but with no limit on the number of windows."""
 
 
 class Column(NamedTuple):
-    """One component of one parameter."""
+    """One component of one parameter, which is a column of the Jacobian."""
 
     effect: str
+    """Name of the effect."""
     parameter: str
+    """Name of the parameter."""
     component: int
     """Index of the component; 0 for a plain number."""
 
     @property
     def spec(self) -> Parameter:
         """The parameter in the catalogue."""
-        found = EFFECTS[self.effect].parameters
-        return next(parameter for parameter in found if parameter.name == self.parameter)
+        parameters = EFFECTS[self.effect].parameters
+        return next(parameter for parameter in parameters if parameter.name == self.parameter)
 
     def value(self, values: Values) -> float:
-        """Return the component in `values` of its effect."""
+        """Return the component from the `values` of its effect."""
         return float(np.ravel(getattr(values, self.parameter))[self.component])
 
     def room(self, nominal: Vehicle) -> tuple[float, float]:
-        """Return the allowed change down and up from its value in the given vehicle."""
-        given = self.value(all_values(nominal)[self.effect])
-        return bound_value(self.spec.low, nominal) - given, bound_value(
+        """Return the allowed change down and up from the value in the nominal vehicle."""
+        value = self.value(all_values(nominal)[self.effect])
+        return bound_value(self.spec.low, nominal) - value, bound_value(
             self.spec.high, nominal
-        ) - given
+        ) - value
 
 
 @dataclass(frozen=True)
 class Information:
-    """G of a case's flights under one set of sensors."""
+    """The information G of flights with one set of sensors."""
 
     columns: tuple[Column, ...]
+    """The P parameters."""
     matrix: np.ndarray
-    """(P, P), in the order of `columns`, per unit of each parameter."""
+    """(P, P) G, in the order of `columns`, in units of the parameters."""
 
     def rows_of(self, effect: str) -> list[int]:
         """Return the indices of the columns of `effect`."""
@@ -94,7 +98,12 @@ class Information:
 
 
 def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
-    """Return all identifiable components of `names`, or of all effects, without random wind."""
+    """Return the identifiable components of the effects `names`, or of all; no random wind.
+
+    Args:
+        has_voltage: whether the battery's voltage is logged.
+        names: names of the effects; None: all.
+    """
     return tuple(
         Column(name, parameter.name, component)
         for name, effect in EFFECTS.items()
@@ -110,9 +119,9 @@ def information(
     names: Sequence[str] | None = None,
     horizon_s: float = SHORT_S,
 ) -> Information:
-    """Return the information of flights about effects (all, or `names`) at the `nominal` vehicle.
+    """Return the information of flights about the effects `names`, or about all effects.
 
-    Arguments are those of `linearised`.
+    The other arguments are those of `linearised`.
     """
     columns = columns_of(bool(sensors.voltage), names)
     matrix, _ = linearised(nominal, logs, sensors, columns, horizon_s).equations.sums()
@@ -126,61 +135,72 @@ def linearised(
     columns: Sequence[Column],
     horizon_s: float = SHORT_S,
 ) -> Block:
-    """Return whitened rollouts of `nominal` along logs, with unknown starts projected out.
+    """Return the residual and Jacobian of rollouts along logs, whitened.
+
+    The unknown states at the starts of the rollouts are projected out.
 
     Args:
-        nominal: the given vehicle.
-        logs: without noise.
+        nominal: the nominal vehicle, at which the rollouts are linearised.
+        logs: logs without noise.
         sensors: their noise; rows at another rate have the same weight per second.
         columns: parameters of the Jacobian.
-        horizon_s: length of a rollout, and distance of their starts [s].
+        horizon_s: length of a rollout, and time between their starts [s].
     """
     space = make_space(nominal)
-    place = [Column(entry.effect, entry.parameter, entry.component or 0) for entry in space.entries]
-    along = [place.index(column) for column in columns]
-    stepped = logs[0].integrator or "continuous"
-    model = RolloutModel(nominal, space, False, bool(sensors.voltage), stepped)
-    windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, stepped)
-    assert windows is not None, "flights of a case have a whole second"
+    entries = [Column(e.effect, e.parameter, e.component or 0) for e in space.entries]
+    along = [entries.index(column) for column in columns]
+    integrator = logs[0].integrator or "continuous"
+    model = RolloutModel(nominal, space, False, bool(sensors.voltage), integrator)
+    windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, integrator)
+    assert windows is not None, "flights of a case are longer than a second"
     row_s = np.asarray(windows.row_s)
     windows = windows._replace(valid=windows.valid & (row_s < horizon_s + 1e-6)[..., None])
     begin = start_estimate(model, windows)
     linear = model.linearise(begin.theta, begin.free, windows, [*along, *model.starts])
-    each = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
-    sigma = np.array([*np.repeat(each, 3), *[sensors.rotor] * 4])
-    rows = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
-    sigma = np.where(sigma > 0.0, sigma * np.sqrt(rows / sensors.rate_hz), np.nan)
+    vector_sigmas = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
+    sigma = np.array([*np.repeat(vector_sigmas, 3), *[sensors.rotor] * 4])
+    row_hz = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
+    sigma = np.where(sigma > 0.0, sigma * np.sqrt(row_hz / sensors.rate_hz), np.nan)
     return rollout_evidence(model, windows, linear, LIMITS, Noise(sigma, {}), along)[1]
 
 
 def gust_strength(
     nominal: Vehicle,
-    ways: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory],
     sensors: Sensors,
     name: str,
     rng: np.random.Generator,
 ) -> float:
-    """Return the size of random wind `name` at which the log-likelihood ratio is `THRESHOLD`.
+    """Return the size of a random wind at which the log-likelihood ratio is `THRESHOLD`.
 
-    Beyond the bound of its first parameter, the size s, it is infinite; the others are neutral.
-    It adds a covariance to the noise; with lambda its whitened eigenvalues for s = 1, a stretch
-    adds (s^2 lambda - log(1 + s^2 lambda)) / 2.
+    The wind adds a covariance to the noise. With lambda its whitened eigenvalues at size s = 1, a
+    window adds (s^2 lambda - log(1 + s^2 lambda)) / 2 to the ratio.
+
+    Args:
+        nominal: the nominal vehicle.
+        trajectories: trajectories of the flights.
+        sensors: logged channels and their noise.
+        name: the effect; s is its first parameter, and the others are neutral.
+        rng: random generator of the wind.
+
+    Returns:
+        The size s, infinite if it is beyond the bound of its parameter.
     """
     wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
-    blown = with_effects(nominal, {name: wind})
-    flights = fly(nominal, blown, [*ways] * GUST_DRAWS, sensors.rate_hz, rng=rng)
+    windy = with_effects(nominal, {name: wind})
+    flights = fly(nominal, windy, [*trajectories] * GUST_DRAWS, sensors.rate_hz, rng=rng)
     logs = [log_of(flight, nominal, sensors, None) for flight in flights]
-    left = linearised(nominal, logs, sensors, ()).residual
-    left = left.reshape(GUST_DRAWS, -1, left.shape[1])
-    gram = np.einsum("kwd,lwd->wkl", left, left) / GUST_DRAWS
+    residual = linearised(nominal, logs, sensors, ()).residual
+    residual = residual.reshape(GUST_DRAWS, -1, residual.shape[1])
+    gram = np.einsum("kwd,lwd->wkl", residual, residual) / GUST_DRAWS
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)
 
-    def beyond(log_size: float) -> float:
-        raised = np.exp(2.0 * log_size) * eigenvalues
-        return float(0.5 * (raised - np.log1p(raised)).sum()) - THRESHOLD
+    def excess(log_size: float) -> float:
+        scaled = np.exp(2.0 * log_size) * eigenvalues
+        return float(0.5 * (scaled - np.log1p(scaled)).sum()) - THRESHOLD
 
     ends = np.log((1e-4, bound_value(EFFECTS[name].parameters[0].high, nominal)))
-    return float(np.exp(root_scalar(beyond, bracket=ends).root)) if beyond(ends[1]) > 0 else np.inf
+    return float(np.exp(root_scalar(excess, bracket=ends).root)) if excess(ends[1]) > 0 else np.inf
 
 
 def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
@@ -194,35 +214,36 @@ def detectable(matrix: np.ndarray, direction: np.ndarray) -> float:
     return float(np.sqrt(THRESHOLD / ratio)) if ratio > 1e-12 else float("inf")
 
 
-def left_over(
+def remaining_ratio(
     info: Information,
     truth: Mapping[str, np.ndarray],
     instead_of: str,
     other: str,
     nominal: Vehicle,
-    one: int | None = None,
+    column: int | None = None,
 ) -> float:
     """Return the log-likelihood ratio that remains if `other` is fitted instead of `instead_of`.
 
     Args:
-        info: of the case's flights.
-        truth: change of each true effect's columns from the given vehicle, by name.
-        instead_of: the true effect that is left out; the other true ones are fitted too.
-        other: fitted in its place, within its physical bounds; only its column `one` if given.
-        nominal: the given vehicle.
-        one: number of a column.
+        info: information of the case's flights.
+        truth: true effect -> change of its columns from the nominal vehicle.
+        instead_of: the true effect that is left out; the other true effects are fitted too.
+        other: the effect that is fitted in its place, within its physical bounds.
+        nominal: the nominal vehicle.
+        column: index of the only fitted column of `other`; None: all.
     """
-    kept = [row for name in truth if name != instead_of for row in info.rows_of(name)]
-    mine, theirs = info.rows_of(instead_of), info.rows_of(other)
-    theirs = theirs if one is None else [theirs[one]]
-    used, count = [*mine, *theirs, *kept], len(mine)
+    others_true = [row for name in truth if name != instead_of for row in info.rows_of(name)]
+    replaced, fitted = info.rows_of(instead_of), info.rows_of(other)
+    fitted = fitted if column is None else [fitted[column]]
+    used, count = [*replaced, *fitted, *others_true], len(replaced)
+    # Least squares with a root of the information, whose parameters are scaled to unit diagonal.
     matrix = info.matrix[np.ix_(used, used)]
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     target = root[:, :count] @ (truth[instead_of] * scale[:count])
-    free = [(-np.inf, np.inf)] * len(kept)
-    room = np.array([*(info.columns[row].room(nominal) for row in theirs), *free]).T
+    free = [(-np.inf, np.inf)] * len(others_true)
+    room = np.array([*(info.columns[row].room(nominal) for row in fitted), *free]).T
     low, high = room * scale[count:] + np.array([[-1e-12], [1e-12]])
     return float(lsq_linear(root[:, count:], target, (low, high)).cost)
 
@@ -230,18 +251,24 @@ def left_over(
 def alternatives(
     info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle
 ) -> dict[str, dict[str, float]]:
-    """Return for each true effect the names that may replace it, with their remaining ratios."""
+    """Return true effect -> name that may replace it -> remaining log-likelihood ratio.
+
+    Arguments are those of `remaining_ratio`.
+    """
     found: dict[str, dict[str, float]] = {name: {} for name in truth}
     for other in nameable_effects():
         if other in truth or EFFECTS[other].random:
             continue
-        # All four rotors together imitate a thrust scale; a weak motor is one of them.
+        # Some effects change one component only: a weak motor is one rotor, and all four together
+        # would imitate a thrust scale.
         rows = info.rows_of(other)
-        alone = any(info.columns[row].spec.one_at_a_time for row in rows)
-        single = range(len(rows)) if alone else (None,)
+        one_at_a_time = any(info.columns[row].spec.one_at_a_time for row in rows)
+        columns = range(len(rows)) if one_at_a_time else (None,)
         for name in truth:
             whole = log_ratio(info.block(name), truth[name])
-            rest = min(left_over(info, truth, name, other, nominal, one) for one in single)
-            if rest < min(ALLOWED, MOSTLY * whole):
-                found[name][other] = rest
+            remaining = min(
+                remaining_ratio(info, truth, name, other, nominal, column) for column in columns
+            )
+            if remaining < min(ALLOWED, MOSTLY * whole):
+                found[name][other] = remaining
     return found

@@ -1,10 +1,10 @@
 """Prepares flights for the views: fills missing signals, smooths, splits off held-out flights.
 
-A view is one part of the dynamics, force or torque (`data/view.py`). Missing signals of a partial
-log are derived from others. Rates are derived from the attitude. Without an attitude, the body's z
-axis is set along the path's acceleration less gravity, since thrust is along body z and nearly all
-of the force in slow flight (differential flatness; Mellinger and Kumar 2011), and yaw is set to 0.
-A force across the thrust is not identifiable then, and rates only as means over 1 s.
+Missing signals of a partial log follow from others. Rates are derived from the attitude. Without an
+attitude, the body's z axis is along the path's acceleration less gravity, since thrust is along
+body z and nearly all of the force in slow flight (differential flatness; Mellinger and Kumar 2011);
+yaw is set to 0. A force across the thrust is not identifiable then, and rates only as means over 1
+s.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from suite.diagnose.data.view import (
     LEAST_ROWS,
     SPECIFIC,
     TORQUE,
+    FlightRows,
     SmoothedFlight,
     View,
     calibrated,
@@ -43,27 +44,27 @@ from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
-"""Width of the smoothing windows (bumps) where rates are derived from a path [s]."""
+"""Width of the bumps where rates come from a path, which gives them as means over a second [s]."""
 
 
 @dataclass(frozen=True)
 class ViewFlights:
-    """F flights, prepared for the views that all of them allow."""
+    """Flights, ready for the views that all of them allow."""
 
     views: tuple[View, ...]
-    """The views that all of them allow."""
+    """What all of them allow."""
     names: tuple[str, ...]
-    """(F,) names of the flights."""
+    """Of F flights."""
     smoothed: dict[str, list[SmoothedFlight]]
-    """By view, F flights each."""
+    """By view, F each."""
     floor: dict[str, np.ndarray]
-    """By view, noise (3,) of a mean acceleration, by that of velocity or rates."""
+    """By view: noise (3,) of a mean acceleration, from the noise of velocity or rates."""
     source: str
-    """Signal that gives the rotor speeds, in words."""
+    """Where the rotor speeds come from, in words."""
     kept: tuple[int, ...] = ()
-    """(F,) numbers of the logs of these flights; other logs have no usable stretch."""
+    """Numbers of the logs that these flights are of; others have no stretch."""
     notes: tuple[str, ...] = ()
-    """Parts of the logs that are not used, in words."""
+    """What was left out, in words."""
 
 
 def ready(
@@ -72,16 +73,12 @@ def ready(
     limits: Thresholds = THRESHOLDS,
     others: Sequence[FlightLog] = (),
 ) -> ViewFlights:
-    """Return those of `logs` that have a usable stretch, for the views that all of them allow.
+    """Return those of `logs` that have a stretch, for the views that all of them allow.
 
-    Args:
-        logs: flights of one vehicle.
-        vehicle: its vehicle file.
-        limits: longest hole, and most rows.
-        others: flights that are compared with these; views have only the axes that both allow.
+    `others` are flights that these are compared with: axes and means are what they allow too.
 
     Raises:
-        ValueError: for a log without any signal of thrust or rotors, or if none has a stretch.
+        ValueError: where a log has nothing that turns or pushes, or none has a stretch.
     """
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
@@ -90,9 +87,9 @@ def ready(
             needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
             raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
     acting = [one for one in rotors if one is not None]
-    filled = [on_every_row(completed(log), limits) for log in posed(logs)]
+    whole = [on_every_row(completed(log), limits) for log in posed(logs)]
     rows = [
-        rows_of(log, vehicle, one.speed, limits) for log, one in zip(filled, acting, strict=True)
+        rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
     ]
     inertial = [is_inertial(log) for log in logs]
     views = [SPECIFIC if all(inertial) else FORCE]
@@ -108,23 +105,23 @@ def ready(
             f"{', '.join(log.name for log in logs)}: no position, and no accelerometer or no motor "
             "of its own next to the gyro: nothing shows what moved"
         )
-    by_view = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
+    parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
     main = views[0]
-    if TORQUE.name in by_view:
-        by_view[TORQUE.name] = [
+    if TORQUE.name in parts:
+        parts[TORQUE.name] = [
             _calibrated(flight, one, vehicle)
-            for flight, one in zip(by_view[TORQUE.name], acting, strict=True)
+            for flight, one in zip(parts[TORQUE.name], acting, strict=True)
         ]
-    usable = [k for k, flight in enumerate(by_view[main.name]) if len(flight.form.middle_s)]
-    reason = f"no stretch of {main.width_s:g} s in flight without a hole"
-    if not usable:
-        raise ValueError(f"{', '.join(log.name for log in logs)}: {reason}")
-    notes += [f"{log.name}: {reason}" for k, log in enumerate(logs) if k not in usable]
-    by_view = {name: [flights[k] for k in usable] for name, flights in by_view.items()}
+    kept = [k for k, flight in enumerate(parts[main.name]) if len(flight.form.middle_s)]
+    without = f"no stretch of {main.width_s:g} s in flight without a hole"
+    if not kept:
+        raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
+    notes += [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
+    parts = {name: [flights[k] for k in kept] for name, flights in parts.items()}
     for view in views[1:]:
         empty = [
             logs[k].name
-            for k, flight in zip(usable, by_view[view.name], strict=True)
+            for k, flight in zip(kept, parts[view.name], strict=True)
             if not len(flight.form.middle_s)
         ]
         if empty:
@@ -132,74 +129,77 @@ def ready(
                 f"{view.name}: not examined, as {', '.join(empty)} has no {view.width_s:g} s "
                 f"with {LEAST_ROWS} rows; log faster"
             )
-            views, by_view = views[:1], {main.name: by_view[main.name]}
+            views, parts = views[:1], {main.name: parts[main.name]}
     return ViewFlights(
         tuple(views),
-        tuple(logs[k].name for k in usable),
-        by_view,
-        {view.name: _floor(view, by_view[view.name]) for view in views},
+        tuple(logs[k].name for k in kept),
+        parts,
+        {view.name: _floor(view, parts[view.name]) for view in views},
         acting[0].source,
-        tuple(usable),
+        tuple(kept),
         tuple(notes),
     )
 
 
 def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) -> SmoothedFlight:
-    """Return a flight in the torque view, corrected for noise and spacing of its rotor speeds."""
     if rotors.noise is None:
         return flight
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
-    _, acceleration = wrench_difference(speed, np.zeros_like(speed), vehicle)
-    _, by_noise = wrench_difference(speed + noise, speed, vehicle)
-    flight = calibrated(flight, acceleration, by_noise)
+    _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
+    _, noisy = wrench_difference(speed + noise, speed, vehicle)
+    flight = calibrated(flight, turned, noisy)
     step_s = float(np.median(np.diff(flight.rows.time_s)))
-    correction = 1.0 + torque_between_rows(vehicle, step_s)
-    return flight._replace(reliability=flight.reliability * correction)
+    between = 1.0 + torque_between_rows(vehicle, step_s)
+    return flight._replace(reliability=flight.reliability * between)
 
 
-def split_held_out(
+def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
-    """Return by view the fitted flights, and those at `held`; a single flight is split in time.
+    """Return the fitted and the `held` flights by view; a lone flight is split in time.
 
     Raises:
-        ValueError: for a single flight that is too short to split.
+        ValueError: for a lone flight that is too short to part.
     """
     count = len(flights.names)
     if count > 1:
-        fitted = [k for k in range(count) if k not in held]
+        inside = [k for k in range(count) if k not in held]
         return (
-            {name: [part[k] for k in fitted] for name, part in flights.smoothed.items()},
+            {name: [part[k] for k in inside] for name, part in flights.smoothed.items()},
             {name: [part[k] for k in held] for name, part in flights.smoothed.items()},
         )
     first, last = {}, {}
-    # A share of the time in flight, as a log may begin or end on the ground.
+    # Of what was flown: a log may begin or end on the ground.
     flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
     until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
-        rows, _, _, reliability = flights.smoothed[view.name][0]
-        early, good = rows.time_s <= until_s, np.asarray(rows.good)
+        whole = flights.smoothed[view.name][0]
+        rows, reliability = whole.rows, whole.reliability
+        early = rows.time_s <= until_s
         for part, chosen in ((first, early), (last, ~early)):
-            flight = smoothed(view, rows._replace(good=good & chosen), limits)
-            if not len(flight.form.middle_s):
+            some = smoothed(view, _only(rows, chosen), limits)
+            if not len(some.form.middle_s):
                 raise ValueError(
                     f"{flights.names[0]}: too short to hold a part of it out; fly longer"
                 )
-            part[view.name] = [flight._replace(reliability=reliability)]
+            part[view.name] = [some._replace(reliability=reliability)]
     return first, last
 
 
+def _only(rows: FlightRows, chosen: np.ndarray) -> FlightRows:
+    return rows._replace(good=np.asarray(rows.good) & chosen)
+
+
 def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
-    """Return the noise (3,) of the measured accelerations, from second differences of rows."""
+    """Return the noise (3,) of the measured accelerations, by that of neighbouring rows."""
     power = []
     for flight in flights:
         imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
         path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
         series = np.asarray(path if imu_acc_w is None else imu_acc_w)[np.asarray(flight.rows.good)]
-        second = series[2:] - 2.0 * series[1:-1] + series[:-2]
-        # A robust standard deviation: the median ignores occasional steps of an estimator. Noise of
-        # variance 1 has second differences of variance 6.
-        sigma = np.median(np.abs(second), axis=0) / 0.6745 / np.sqrt(6.0)
+        bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
+        # The median ignores the occasional steps of a filter or an estimator.
+        sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
         weights = flight.form.change if imu_acc_w is None else flight.form.mean
         gain = weights.power(2).sum(axis=1).mean()
         power.append(sigma**2 * gain)
@@ -208,14 +208,14 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
 
 
 SMOOTH_S = 0.1
-"""Standard deviation of the Gaussian that smooths the path's velocity [s]."""
+"""Standard deviation of what smooths the path's acceleration [s]."""
 
 
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without position and accelerometer gets a constant pose, as only its torque is used.
-    Flights without position that have an accelerometer get their pose by `posed`.
+    A flight without position and accelerometer gets a constant pose: only its rotation is used. See
+    `posed` for flights with an accelerometer.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -225,21 +225,17 @@ def completed(log: FlightLog) -> FlightLog:
     if "pos" in log.partial and "rate" in log.partial:
         raise ValueError(f"{log.name}: no position and no gyro: no signal shows its motion")
     if "pos" in log.partial:
-        level, zeros = np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1)), 0.0 * log.rate_b
-        return replace(log, pos_w=zeros, vel_w=zeros, quat_wxyz=level)
+        level, still = np.tile([1.0, 0.0, 0.0, 0.0], (len(log.time_s), 1)), 0.0 * log.rate_b
+        return replace(log, pos_w=still, vel_w=still, quat_wxyz=level)
     if "quat" in log.partial:
-        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(path_attitude(log))))
+        log = replace(log, quat_wxyz=np.asarray(rot_to_quat(leaning(log))))
     if "rate" in log.partial:
-        log = replace(log, rate_b=rates_of_attitude(log.time_s, log.quat_wxyz))
+        log = replace(log, rate_b=turning_of(log.time_s, log.quat_wxyz))
     return log
 
 
-def path_attitude(log: FlightLog) -> np.ndarray:
-    """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity.
-
-    Raises:
-        ValueError: for a log without a velocity.
-    """
+def leaning(log: FlightLog) -> np.ndarray:
+    """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity."""
     step = float(np.median(np.diff(log.time_s)))
     if not np.isfinite(log.vel_w).any(axis=0).all():
         raise ValueError(f"{log.name}: no velocity and no positions to derive it from")
@@ -252,14 +248,14 @@ def path_attitude(log: FlightLog) -> np.ndarray:
     return np.stack([np.cross(left, up), left, up], axis=-1)
 
 
-def rates_of_attitude(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) of attitudes (T, 4), by central differences [rad/s].
+def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
+    """Return the body rates (T, 3) of attitudes (T, 4), by each row's neighbours [rad/s].
 
-    NaN where a neighbouring row is missing, and in the first and the last row.
+    NaN where one of them is missing, and in the first and the last row.
     """
     rate_b = np.full((len(quat_wxyz), 3), np.nan)
-    complete = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
-    rows = 1 + np.flatnonzero(complete[:-2] & complete[2:])
+    whole = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
+    rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
     if len(rows):
         before, after = (
             Rotation.from_quat(quat_wxyz[rows + d], scalar_first=True) for d in (-1, 1)
@@ -276,43 +272,38 @@ def choose_held_out(
     information: np.ndarray,
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[np.ndarray, list[str]]:
-    """Return which windows are fitted, (W,) bool, and the names of the held-out flights.
+    """Return which windows are fitted, (W,) bool, and the names of what is held out.
 
-    Held out are the flights whose information the other flights contain best. The manoeuvres decide
-    this, not the errors: a single chirp or the only pass near the ground is fitted. Of a single
-    flight the end is held out.
+    `flight` (W,) is the number of each window's flight, `start_s` (W,) when it starts there.
 
-    Args:
-        logs: flights.
-        flight: (W,) number of each window's flight.
-        start_s: (W,) start of each window in its flight [s].
-        information: (W, K) of each window on each of K parameters.
-        limits: share that is held out.
+    The flights are held out whose `information` (W, K), of each window on each number, the others
+    contain best. Only the manoeuvres decide, not the errors: a single chirp or the only pass near
+    the ground is fitted.
     """
     flight = np.asarray(flight)
-    numbers = list(np.unique(flight))
-    if len(numbers) == 1:
-        log = logs[int(numbers[0])]
+    there = list(np.unique(flight))
+    if len(there) == 1:
+        log = logs[int(there[0])]
         cut_s = limits.lone_fitted_share * log.duration_s
         return np.asarray(start_s) + LENGTH_S <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
-    by_flight = {k: information[flight == k].sum(axis=0) for k in numbers}
+    by_flight = {k: information[flight == k].sum(axis=0) for k in there}
     held: list[int] = []
-    for _ in range(max(1, round(limits.held_out_share * len(numbers)))):
-        fitted = [k for k in numbers if k not in held]
-        total = np.sum([by_flight[k] for k in fitted], axis=0)
-        informed = total > 0.0
-        loss = {k: (by_flight[k][informed] / total[informed]).max(initial=0.0) for k in fitted}
-        held.append(min(reversed(fitted), key=lambda k: loss[k]))
+    for _ in range(max(1, round(limits.held_out_share * len(there)))):
+        kept = [k for k in there if k not in held]
+        whole = np.sum([by_flight[k] for k in kept], axis=0)
+        seen = whole > 0.0
+        lost = {k: (by_flight[k][seen] / whole[seen]).max(initial=0.0) for k in kept}
+        held.append(min(reversed(kept), key=lambda k: lost[k]))
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
 
 class ActingRotors(NamedTuple):
-    """Rotor speeds of a log, measured or from commands."""
+    """Rotor speeds of a log."""
 
     speed: np.ndarray
     """(N, 4) [rad/s]."""
     source: str
-    """Signal that they are from, for people."""
+    """For people."""
     each: bool
     """Whether each rotor's speed is known; a collective thrust gives only their sum."""
     noise: np.ndarray | None = None
@@ -322,10 +313,10 @@ class ActingRotors(NamedTuple):
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ActingRotors | None:
-    """Return the rotor speeds of `log`, measured or from commands; None without either.
+    """Return the rotor speeds of `log`, measured or from commands; None where neither is there.
 
     They are interpolated to every row, but not across holes. Commanded speeds pass through the
-    vehicle's delay and rotor lag.
+    vehicle's delay and lag.
     """
     noise = None
     if log.rotor_speed is not None:
@@ -347,29 +338,26 @@ def acting_rotors(
     force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
     torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
     nominal, _ = nominal_quadrotor(vehicle)
-    thrust = mix(nominal.unmixer, nominal.thrust_max, force, torque_b)
-    speed = np.sqrt(np.maximum(thrust, 0.0) / vehicle.rotors.thrust_coefficient)
+    each = mix(nominal.unmixer, nominal.thrust_max, force, torque_b)
+    speed = np.sqrt(np.maximum(each, 0.0) / vehicle.rotors.thrust_coefficient)
     if log.torque_cmd_b is None:
         return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust", False)
     return ActingRotors(_lagged(log, vehicle, speed), "commanded thrust and torques", True)
 
 
-def _lagged(log: FlightLog, vehicle: Vehicle, commanded: np.ndarray) -> np.ndarray:
-    """Return rotor speeds (N, 4) that follow `commanded` ones (N, 4) behind delay and lag.
-
-    A command is held until the next row; NaN where it is missing.
-    """
+def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
+    """Return commanded speeds `wanted` (N, 4), held until the next row, behind delay and lag."""
     constants = make_plant(vehicle, LONGEST_S).constants
-    acting_s = log.time_s - float(constants.delay)
-    row = np.searchsorted(log.time_s, acting_s + 1e-9, side="right") - 1
-    target = commanded[np.maximum(row, 0)]
-    lag_s = float(constants.time_constant)
-    if lag_s <= 0.0:
-        return target
-    decay = np.exp(-np.diff(log.time_s) / lag_s)[:, None]
-    speed = target.copy()
-    for row in range(1, len(target)):
-        before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], target[row])
-        goal = np.where(np.isfinite(target[row - 1]), target[row - 1], before)
-        speed[row] = goal + decay[row - 1] * (before - goal)
-    return np.where(np.isfinite(target), speed, np.nan)
+    since = log.time_s - float(constants.delay)
+    row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
+    wanted = wanted[np.maximum(row, 0)]  # with its gaps
+    lag = float(constants.time_constant)
+    if lag <= 0.0:
+        return wanted
+    left = np.exp(-np.diff(log.time_s) / lag)[:, None]
+    speed = wanted.copy()
+    for row in range(1, len(wanted)):
+        before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
+        target = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
+        speed[row] = target + left[row - 1] * (before - target)
+    return np.where(np.isfinite(wanted), speed, np.nan)

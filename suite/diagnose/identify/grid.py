@@ -14,7 +14,7 @@ import numpy as np
 from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.flights import path_attitude, rates_of_attitude
+from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import specific_force_w
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import sign_continuous
@@ -122,11 +122,11 @@ def grid_of(log: FlightLog) -> FlightGrid:
         signals[PATH_VELOCITY] = _path_velocity(signals["pos_w"])
     if _complete_rows(log.quat_wxyz) > 1:
         signals["rot_w"] = attitude_at(time_s, log.quat_wxyz, grid_s)
-        rate_b = rates_of_attitude(time_s, log.quat_wxyz)
+        rate_b = turning_of(time_s, log.quat_wxyz)
         if "rate_b" not in signals and _enough(rate_b):
             signals["rate_b"] = interpolated(time_s, rate_b, grid_s)
     elif {"pos_w", "vel_w"} & {*signals}:
-        signals[LEANING] = attitude_at(time_s, np.asarray(rot_to_quat(path_attitude(log))), grid_s)
+        signals[LEANING] = attitude_at(time_s, np.asarray(rot_to_quat(leaning(log))), grid_s)
     if log.voltage is not None and _enough(log.voltage):
         good = np.isfinite(log.voltage)
         volts = np.interp(grid_s, time_s[good], log.voltage[good])

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from eval.logs.flight_log import FlightLog
-from eval.view.comparison import Compared, Simulation, Track, write_comparison
+from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
 from suite.common.charts import png, titled
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.estimate.permutation import CandidateScore
@@ -177,19 +177,19 @@ def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Pa
                 errors.append(error)
             simulations.append(Simulation(label, tracks, errors))
         log = flown.logs[int(number)]
-        flights.append(Compared(log.name, _measured(log, flown.since_s), simulations))
+        flights.append(ComparedFlight(log.name, _measured(log, flown.since_s), simulations))
     return write_comparison(path, flights, flown.vehicle.body.half_size)
 
 
-def _measured(log: FlightLog, first_s: float) -> Track:
+def _measured(log: FlightLog, first_s: float) -> States:
     """Return the measured state of a flight from `first_s` on."""
     time_s = log.time_s - log.time_s[0]
     rows = time_s >= first_s - 1e-6
     fields = (time_s, log.pos_w, log.quat_wxyz, log.vel_w, log.rate_b)
-    return Track(*(field[rows] for field in fields))
+    return States(*(field[rows] for field in fields))
 
 
-def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[Track, np.ndarray] | None:
+def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.ndarray] | None:
     """Return one rollout at its T rows with a pose, and its errors (T, 4); None if it diverged.
 
     The errors are those of position [m], velocity [m/s], attitude [deg] and rates [rad/s].
@@ -204,7 +204,7 @@ def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[Track, np.nda
     sine = np.linalg.norm(attitude_b, axis=1, keepdims=True)
     angle = np.arcsin(np.clip(sine, 0.0, 1.0))
     turn = -attitude_b * angle / np.maximum(sine, 1e-12)
-    track = Track(
+    track = States(
         window.start_s + np.asarray(window.row_s)[rows],
         np.asarray(window.row_pos_w)[rows] - pos_w,
         rot_to_quat(np.asarray(window.row_rot_w)[rows] @ exp_rot(turn)),

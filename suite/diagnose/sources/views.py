@@ -14,7 +14,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.data.flights import ViewFlights, choose_held_out, ready, split_held_out
+from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
 from suite.diagnose.data.view import FORCE, View
 from suite.diagnose.estimate.composites import composites
@@ -68,7 +68,7 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
     held_numbers, held_names = _choose_held_out(logs, flights, model, limits)
-    fitted, held = split_held_out(flights, held_numbers, limits)
+    fitted, held = parted(flights, held_numbers, limits)
     partial = any(log.partial for log in [*logs, *references])
     sources = []
     for view in flights.views:

@@ -58,7 +58,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     from eval.flights.follow import FlightFailed
     from eval.flights.simulate import SENSORS, fly, log_of
     from eval.flights.trajectory import ordinary_flights
-    from suite.blind.oracle.strength import given_vehicle
+    from suite.blind.oracle.strength import nominal_vehicle
 
     def attempt(number: int) -> Task:
         rng = np.random.default_rng([seed, number])
@@ -73,7 +73,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
             nominal, space, indices, make_space(truth).array("start")[list(indices)], windows
         )
 
-    nominal, sensors = given_vehicle("bare"), SENSORS["full"]
+    nominal, sensors = nominal_vehicle("bare"), SENSORS["full"]
     space = make_space(nominal)
     indices = tuple(i for i, entry in enumerate(space.entries) if entry.effect in REFITTED)
     number = 0

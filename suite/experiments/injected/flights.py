@@ -9,7 +9,7 @@ import numpy as np
 
 from eval.effects import EFFECTS
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, turn
+from eval.importers.frames import conjugate, rotate
 from eval.logs.columns import GROUPS
 from eval.logs.flight_log import FlightLog, log_from_columns
 from eval.logs.velocity import velocity_from_position
@@ -35,7 +35,7 @@ def flight_parts(
         "quat": log.quat_wxyz,
         "vel": log.vel_w,
         "rate": log.rate_b,
-        "acc": turn(conjugate(log.quat_wxyz), change + [0.0, 0.0, GRAVITY]),
+        "acc": rotate(conjugate(log.quat_wxyz), change + [0.0, 0.0, GRAVITY]),
         "cmd_thrust": log.thrust_cmd[:, None],
         "cmd_rate": log.rate_cmd_b,
         "motor": log.rotor_speed,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, turn
+from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.reading import parse_readings, read_rows
 from eval.vehicles.vehicle import Vehicle
 
@@ -63,7 +63,7 @@ def inject(kind: Kind, parts: Mapping[str, np.ndarray], vehicle: Vehicle) -> Par
 
 
 def _without_gravity(parts: Parts, _: Vehicle) -> Parts:
-    down = turn(conjugate(parts["quat"]), np.array([0.0, 0.0, GRAVITY]))
+    down = rotate(conjugate(parts["quat"]), np.array([0.0, 0.0, GRAVITY]))
     return {**parts, "acc": parts["acc"] - down}
 
 

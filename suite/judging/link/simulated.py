@@ -14,8 +14,8 @@ from eval.quadrotor.autopilot import make_autopilot, start_autopilot
 from eval.quadrotor.plant import Command, Motion, uses_noise
 from eval.quadrotor.stepper import Inputs, plant_step
 from eval.vehicles.vehicle import Vehicle
-from eval.worlds.engine import Eye, compile_model, contact_name, motion_of, start_state
-from eval.worlds.slots import layout_of, noise_of
+from eval.worlds.engine import DepthCamera, compile_model, contact_name, motion_of, start_state
+from eval.worlds.slots import gust_draws, layout_of
 from eval.worlds.trial import (
     DIVERGED,
     ENDINGS,
@@ -78,7 +78,7 @@ class SimulatedVehicle:
         mujoco.mj_step1(self._model, self._data)
         self._draws = None
         if uses_noise(self._autopilot.plant):
-            self._draws = noise_of(trial, round(self._rules.time_limit_s / self.dt) + 2)
+            self._draws = gust_draws(trial, round(self._rules.time_limit_s / self.dt) + 2)
         motion = motion_of(self._data)
         first = None if self._draws is None else self._draws[:1]
         self._plant = start_autopilot(self._autopilot, motion, first).plant
@@ -86,7 +86,7 @@ class SimulatedVehicle:
         count = np.array([len(gates.center_w)], np.int32)
         self._course = Course(Gates(*(x[None] for x in gates)), count)
         self._progress = start_progress(motion.pos_w)
-        self._eye, self._steps_an_image = Eye(camera), 1 / (image_hz * self.dt)
+        self._eye, self._steps_an_image = DepthCamera(camera), 1 / (image_hz * self.dt)
         self._command: Command | None = None
         self._heard_step = self._ticks = 0
         self.images = 0

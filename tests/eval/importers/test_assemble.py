@@ -71,7 +71,7 @@ def test_start_and_end_cut_more_than_the_time_on_the_ground():
     ("missing", "reason"),
     [
         (["rate"], r"log\.bin: holds no gyro; --partial keeps"),
-        (["pos", "quat"], "holds no position and no attitude; --pose FILE brings"),
+        (["pos", "quat"], "holds no position and no attitude; --pose FILE adds"),
     ],
 )
 def test_what_a_log_needs_is_asked_for(missing, reason):
@@ -125,4 +125,4 @@ def test_motor_commands_and_positions_tell_weight_and_balance():
 
 def test_a_path_alone_tells_nothing_more():
     text = usable_for({"pos": np.zeros((3, 3))}, ["quat", "rate", "command"]).evidence
-    assert text.endswith("nothing but its path")
+    assert text.endswith("only its path")

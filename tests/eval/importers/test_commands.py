@@ -39,7 +39,7 @@ def test_full_throttle_is_what_is_told_or_built_or_felt(felt, options, full, by)
 def test_a_vehicle_that_does_not_fit_what_was_felt_is_doubted():
     findings = thrust_command(thrust_rows(37.632 / 2), ImportOptions(vehicle=PLAIN))
     assert [finding.status for finding in findings] == ["note", "doubt"]
-    assert "2.00 times what the accelerometer felt" in findings[1].evidence
+    assert "2.00 times the accelerometer's mean" in findings[1].evidence
 
 
 @pytest.mark.parametrize("found", [thrust_rows(), thrust_rows(25.0, count=50)])

@@ -16,7 +16,7 @@ import pytest
 from eval.importers import import_log
 from eval.importers.formats import px4
 from eval.importers.options import ImportOptions
-from eval.importers.signals import signal
+from eval.importers.signals import make_signal
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight, raw_logs, ros_messages
@@ -83,11 +83,11 @@ def test_a_message_without_a_length_is_no_circle(tmp_path, monkeypatch):
 def test_dropouts_are_counted_and_their_time_is_in_seconds():
     lost: Any = [SimpleNamespace(duration=ms) for ms in (200, 300)]
     log = SimpleNamespace(file_corruption=False, dropouts=lost, initial_parameters={})
-    assert "2 dropouts, 0.5 s in all" in text(px4._health(log), "file")
+    assert "2 dropouts, 0.5 s in all" in text(px4._check_file(log), "file")
 
 
 def test_only_a_step_back_over_a_cut_body_is_shortened():
-    file = px4._Forward(io.BytesIO(bytes(10)))  # type: ignore[arg-type]
+    file = px4._TruncationSafeReader(io.BytesIO(bytes(10)))  # type: ignore[arg-type]
     file.read(20)
     assert file.seek(-20, 1) == 0
     file.seek(8)
@@ -164,7 +164,7 @@ def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, befor
         return (lambda data: Odd(decode(data))) if schema.name.endswith("Imu") else decode
 
     monkeypatch.setattr(DecoderFactory, "decoder_for", other)
-    with pytest.raises(FlightLogError, match="another definition than sensor_msgs/Imu"):
+    with pytest.raises(FlightLogError, match="differ from the definition of sensor_msgs/Imu"):
         import_log(path)
 
 
@@ -187,7 +187,7 @@ def test_numbers_beyond_any_unit_are_refused_without_a_warning(tmp_path, column,
 
 def test_steps_of_time_that_nothing_can_be_divided_by_are_no_steps():
     time = np.array([0.0, 1e-310, 1.0, 2.0, *range(3, 60)])
-    found, finding = signal(time, np.zeros(len(time)), "log", "gyro")
+    found, finding = make_signal(time, np.zeros(len(time)), "log", "gyro")
     assert found is not None and len(found.time_s) == len(time) - 1 and finding is not None
 
 
@@ -198,5 +198,5 @@ def test_a_variable_without_a_name_of_its_own_is_a_broken_header(tmp_path, name)
     for old in (b"gyro.x(", b"stateEstimateZ.rateRoll("):
         whole = whole.replace(old, name + b"(")
     path.write_bytes(whole)
-    with pytest.raises(FlightLogError, match="header is broken .*has no name of its own"):
+    with pytest.raises(FlightLogError, match="header is broken .*with no name or a repeated one"):
         import_log(path, "crazyflie", ImportOptions(partial=True))

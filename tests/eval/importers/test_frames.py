@@ -10,8 +10,8 @@ from eval.importers.frames import (
     conjugate,
     from_euler,
     multiply,
+    rotate,
     rotation_vector,
-    turn,
     world_vector,
 )
 from eval.importers.mapping_file import UNITS
@@ -42,11 +42,11 @@ def test_body_axes():
 
 def test_turns_follow_one_another_from_right_to_left():
     forward = np.array([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(turn(LEFT_TURN, forward), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(rotate(LEFT_TURN, forward), [0, 1, 0], atol=1e-15)
     # Nose up first, which the turn about the vertical then leaves up.
     both = multiply(LEFT_TURN, NOSE_UP)
-    np.testing.assert_allclose(turn(both, forward), [0, 0, 1], atol=1e-15)
-    np.testing.assert_allclose(turn(multiply(NOSE_UP, LEFT_TURN), forward), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(rotate(both, forward), [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(rotate(multiply(NOSE_UP, LEFT_TURN), forward), [0, 1, 0], atol=1e-15)
     np.testing.assert_allclose(multiply(both, conjugate(both)), [1, 0, 0, 0], atol=1e-15)
 
 

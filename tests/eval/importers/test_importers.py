@@ -39,7 +39,7 @@ def test_start_and_end_cut_the_flight(tmp_path):
     log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, start_s=2.0, end_s=5.0))
     assert log.duration_s == pytest.approx(3.0, abs=0.02)
     near(log.pos_w, known_flight.fly(log.time_s + 2.0).pos, 1e-5)
-    with pytest.raises(FlightLogError, match="--start and --end leave nothing of .* first sample"):
+    with pytest.raises(FlightLogError, match="no row between --start and --end; .* first sample"):
         import_log(path, None, ImportOptions(start_s=50.0))
 
 
@@ -48,7 +48,7 @@ def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
     ours = write_flight(tmp_path / "ours.csv", import_log(made.write_usd(tmp_path / "log00"))[0])
     with pytest.raises(ValueError, match="--source mocap: the mapping of .* names no source"):
         import_log(ours, None, asked)
-    with pytest.raises(ValueError, match="'px4', whose pose is of one source: leave --source"):
+    with pytest.raises(ValueError, match="'px4', which has one source of the pose: leave --source"):
         import_log(made.write_ulog(tmp_path / "log.ulg"), None, asked)
 
 

@@ -145,7 +145,7 @@ def test_the_firmwares_mixer_turns_the_body_the_way_that_it_says():
     assert list(yaw > 0) == [True, False, True, False]
     column = Column(("thrust", "roll", "pitch", "yaw"), (1.0,) * 4, mixer="crazyflie")
     asked = np.array([[0.5, 0.0, 0.0, 0.0], [1.2, 0.0, 0.0, 0.0], [-0.2, 0.0, 0.0, 0.0]])
-    motors = mapping._values((np.arange(3.0), asked), column, "log")[1]
+    motors = mapping._in_log_unit((np.arange(3.0), asked), column, "log")[1]
     np.testing.assert_allclose(motors, [[0.5] * 4, [1.0] * 4, [0.0] * 4])
 
 
@@ -229,8 +229,8 @@ def test_every_shipped_mapping_is_read_by_its_name():
         ('[pos]\ncolumn = "a"\nscale = -1.0', "pos.scale is -1.0"),
         ("[frames]\nmotors = [[1, 1]]", "frames.motors"),
         ("[frames]\nmotors = [[1, 1], [0, 0], [1, -1], [-1, -1]]", "motors is .*off the middle"),
-        ('[about]\nfile = "{log}.yaml"', "about.file is '{log}.yaml'.*{stem} and {number} alone"),
-        ('[about]\nfile = "{stem.yaml"', "about.file is .*{stem} and {number} alone"),
+        ('[about]\nfile = "{log}.yaml"', "about.file is '{log}.yaml'.*but {stem} and {number}"),
+        ('[about]\nfile = "{stem.yaml"', "about.file is .*but {stem} and {number}"),
         ('keep = ["flight"]', "keep is .*not a flight log's own, as 'flight' is"),
         ('keep = ["other", "motor_1"]', "keep is .*not a flight log's own, as 'motor_1' is"),
         ('optional = "maybe"', "optional is 'maybe', allowed is 'no' or 'yes'"),

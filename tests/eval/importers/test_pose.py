@@ -59,7 +59,7 @@ def test_noise_widens_the_reported_error():
 def test_a_turn_between_the_bodies_is_found():
     turn = Rotation.from_rotvec([0.4, -0.8, 1.9])
     found = align(_poses((1, 19), 120.0, 2.0, 0.0, turn=turn), _gyro((0, 20)), "pose")
-    np.testing.assert_allclose(found.turn, turn.as_matrix(), atol=1e-3)
+    np.testing.assert_allclose(found.rotation, turn.as_matrix(), atol=1e-3)
 
 
 def _import(tmp_path, text=None, **options):

@@ -7,7 +7,7 @@ from eval.importers import import_log
 from eval.importers.options import ImportOptions
 from eval.importers.pose import grid
 from eval.importers.rows import averaged, row_times, smoothed
-from eval.importers.signals import Recording, median_step, signal
+from eval.importers.signals import Recording, make_signal, median_step
 from eval.logs.columns import FlightLogError
 from tests.support import known_flight
 from tests.support.imported import flight, of, write
@@ -92,7 +92,7 @@ def test_a_command_that_stops_is_not_held_for_long(tmp_path):
 def test_samples_that_are_ages_apart_are_no_rows():
     """Of a damaged clock: rows between them would fill any memory."""
     time = 1e7 * np.arange(200.0)
-    pose, _ = signal(time, np.zeros((200, 3)), "log", "position")
+    pose, _ = make_signal(time, np.zeros((200, 3)), "log", "position")
     assert pose is not None
     with pytest.raises(FlightLogError, match=r"1e\+07 s apart.* at most 4,000,000: is its clock"):
         row_times(Recording("log", {"pos": pose}), 100.0, 0.0, None)
@@ -112,7 +112,7 @@ def test_unknown_samples_and_a_step_back_are_left_out():
     time[7] = 5.5  # goes back once
     value = np.arange(40.0)
     value[20], time[30] = np.nan, np.nan
-    found, finding = signal(time, value, "log", "gyro")
+    found, finding = make_signal(time, value, "log", "gyro")
     assert found is not None and finding is not None
     kept = np.delete(np.arange(40), [7, 20, 30])
     np.testing.assert_array_equal(found.time_s, kept)
@@ -122,11 +122,11 @@ def test_unknown_samples_and_a_step_back_are_left_out():
 
 def test_a_time_that_goes_back_often_is_refused_with_its_first_row():
     with pytest.raises(FlightLogError, match=r"row 2: .* 9 of 10 samples of 'gyro'"):
-        signal(np.arange(10.0)[::-1], np.zeros((10, 3)), "log", "gyro")
+        make_signal(np.arange(10.0)[::-1], np.zeros((10, 3)), "log", "gyro")
 
 
 def test_nothing_known_is_no_signal():
-    assert signal(np.full(3, np.nan), np.zeros(3), "log", "gyro") == (None, None)
+    assert make_signal(np.full(3, np.nan), np.zeros(3), "log", "gyro") == (None, None)
 
 
 def test_the_median_step_is_that_of_most_samples():

@@ -92,7 +92,7 @@ def test_a_world_without_other_kinds_refuses_them(monkeypatch):
     from eval.worlds.mujoco import MujocoWorld
 
     monkeypatch.setattr(MujocoWorld, "actions", ())
-    with pytest.raises(ValueError, match="flies no actions of kind 'ctbr'"):
+    with pytest.raises(ValueError, match="supports no actions of kind 'ctbr'"):
         flown(Steady((9.81, 0, 0, 0), PolicySpec(action=ActionSpec("ctbr"))))
 
 

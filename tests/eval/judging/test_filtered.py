@@ -109,7 +109,7 @@ def test_a_trials_outcome_is_the_same_at_any_batch(monkeypatch):
 
 def test_what_has_no_estimator_refuses_it(monkeypatch):
     wanted = load_sensors("imu+gates")
-    with pytest.raises(ValueError, match="world 'reference' has no estimator in the loop"):
+    with pytest.raises(ValueError, match="world 'reference' has no state estimator"):
         fly(Pursuit(spec=SPEC), TRIALS[:1], VEHICLE, "reference", JudgeOptions(sensors=wanted))
     models = {name: values._asdict() for name, values in wanted.models.items()}
     late = sensor_set({**models, "delay": {"state": 0.02}})

@@ -10,7 +10,7 @@ from eval.judging import judge as module
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.sensors import Sensors
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.sensors.sensors_file import PERFECT, grown, load_sensors, sensor_set
+from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sensor_set
 from eval.worlds import View
 from eval.worlds.trial import Rules, TrialSpec
 from tests.support.pilots import RandomNetwork
@@ -47,7 +47,7 @@ def many(count):
 def test_perfect_sensors_are_none(monkeypatch):
     monkeypatch.setattr(module, "Sensors", None)
     assert load_sensors("perfect") == PERFECT
-    options = JudgeOptions(rules=Rules(time_limit_s=0.2), sensors=grown(SET, 0.0))
+    options = JudgeOptions(rules=Rules(time_limit_s=0.2), sensors=scale_sensors(SET, 0.0))
     fly(RandomNetwork(), TRIALS[:1], VEHICLE, options=options)
 
 
@@ -56,7 +56,7 @@ def test_two_magnitudes_have_the_same_draws(factor, seed, slot):
     trials = many(4)
     trials[slot] = TrialSpec("circular", 7, seed)
     alone = watched(SET, [trials[slot]], 3)[-1]
-    among = watched(grown(SET, factor), trials, 3)[-1]
+    among = watched(scale_sensors(SET, factor), trials, 3)[-1]
     truth = view(1)
     for field in ("gate_w", "pos_w"):
         expected = factor * (getattr(alone, field) - getattr(truth, field))[0]
@@ -96,7 +96,7 @@ def test_every_model_reaches_the_policy():
         flying |= load_sensors(name).models
     for model in set(flying) - {"imu"}:
         # Grown, as rare faults would not come within so short a flight.
-        strong = grown(sensor_set({model: flying[model]._asdict()}), 1e3)
+        strong = scale_sensors(sensor_set({model: flying[model]._asdict()}), 1e3)
         changed = zip(results(few, strong), true, strict=True)
         assert any(one.v_mean != two.v_mean for one, two in changed), model
 
@@ -113,5 +113,5 @@ def test_the_reference_simulator_shows_the_same():
     prompt = sensor_set({name: v for name, v in models.items() if name != "delay"})
     one, two = (results(TRIALS[:2], prompt, world=world) for world in ("mujoco", "reference"))
     assert [row._replace(world="mujoco") for row in two] == one
-    with pytest.raises(ValueError, match="shows nothing late"):
+    with pytest.raises(ValueError, match="has no delay of observations"):
         results(TRIALS[:1], sensor_set({"delay": {"state": 0.1}}), world="reference")

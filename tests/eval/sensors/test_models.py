@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from eval import sensors
 from eval.effects.interface import as_arrays
-from eval.sensors import SENSORS, sensing
+from eval.sensors import SENSORS, view_models
 from eval.sensors.draws import blank_draws
 from eval.sensors.gate_map import GATES
-from eval.sensors.interface import Draws, Inertial, Moment, sticky
+from eval.sensors.interface import Draws, Inertial, Moment, markov_step
 from eval.sensors.sensors_file import load_sensors, sensor_set
 from policies.observation import View
 from tracks.geometry.camera import Camera
@@ -45,7 +45,7 @@ def draws_of(needs, **numbers):
 
 def seen_through(name, values, views, trial=None, **numbers):
     """Return what a model shows of views one after the other, with the same draws for each."""
-    models, sensor = sensing(sensor_set({name: values}).models), SENSORS[name]
+    models, sensor = view_models(sensor_set({name: values}).models), SENSORS[name]
     first, each = draws_of(sensor.trial, **(trial or {})), draws_of(sensor.observation, **numbers)
     memory = sensors.start(models, views[0], {name: first}, DT_S, CAMERA)
     shown = []
@@ -147,7 +147,7 @@ def test_neglected_drag_tilts_the_estimate_against_the_velocity():
 
 def test_a_lost_estimate_runs_away_and_jumps_as_it_is_found():
     values = {"share": 0.5, "length": 1.0, "acceleration": 2.0, "jump": 0.3}
-    sensor, models = SENSORS["state_loss"], sensing(sensor_set({"state_loss": values}).models)
+    sensor, models = SENSORS["state_loss"], view_models(sensor_set({"state_loss": values}).models)
     memory = sensors.start(models, view(), {"state_loss": draws_of(sensor.trial)}, DT_S, CAMERA)
     errors = []
     for chance in (0.0, 1.0, 0.0, 1.0):  # lost, still lost, found, not lost
@@ -178,7 +178,7 @@ def test_corners_noise_becomes_an_error_that_grows_with_the_range():
 def test_a_gate_that_is_not_found_stays_where_it_was_last_seen():
     start, passed = view(), view(pos=(5.0, 0.0, 0.0), gate=(8.0, 2.0, 0.0), number=1)
     behind = view(pos=(0.0, 0.0, 0.0), gate=(-3.0, 0.0, 0.0))
-    models = sensing(sensor_set({"gate_detection": {"pixels": 0.0, "missed": 0.5}}).models)
+    models = view_models(sensor_set({"gate_detection": {"pixels": 0.0, "missed": 0.5}}).models)
     sensor, name = SENSORS["gate_detection"], "gate_detection"
     memory = sensors.start(models, start, {name: draws_of(sensor.trial)}, DT_S, CAMERA)
 
@@ -292,7 +292,7 @@ def test_a_fault_is_there_for_its_share_and_lasts_its_length(share, length):
     draws = np.random.default_rng(0).random((4000, 50))
     on, found = np.zeros(50, bool), []
     for chance in draws:
-        on = sticky(on, chance, np.array(share), np.array(length), DT_S)
+        on = markov_step(on, chance, np.array(share), np.array(length), DT_S)
         found.append(on)
     found = np.array(found)
     assert found.mean() == pytest.approx(share, abs=0.02)

@@ -6,9 +6,9 @@ from eval.sensors import SENSORS
 from eval.sensors.sensors_file import (
     PERFECT,
     SensorsFileError,
-    grown,
     load_sensors,
     save_sensors,
+    scale_sensors,
     sensor_set,
     shipped_sensors,
 )
@@ -22,8 +22,8 @@ def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_p
     assert sensors.name == name
     save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
     assert load_sensors(tmp_path / "again.toml") == sensors
-    assert grown(sensors, 0.0) == PERFECT
-    for model, values in grown(sensors, 1e6).models.items():
+    assert scale_sensors(sensors, 0.0) == PERFECT
+    for model, values in scale_sensors(sensors, 1e6).models.items():
         sensor, own = SENSORS[model], sensors.models[model]
         for parameter, value in zip(sensor.parameters, values, strict=True):
             usual = getattr(own, parameter.name)

@@ -8,7 +8,7 @@ import pytest
 import rerun.chunk
 
 from eval.view import colours
-from eval.view.comparison import Compared, Simulation, Track, write_comparison
+from eval.view.comparison import ComparedFlight, Simulation, States, write_comparison
 from eval.view.recording import write_recording
 from tests.support.flights import rollout
 from tests.support.recordings import columns
@@ -161,14 +161,14 @@ def track(first_s, last_s, shift=0.0):
     time_s = np.arange(first_s, last_s, 0.01)
     ahead = np.stack([time_s, np.sin(time_s) + shift, 0 * time_s + 1.0], axis=1)
     quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_s), 1))
-    return Track(time_s, ahead, quat, np.gradient(ahead, 0.01, axis=0), 0.1 * ahead)
+    return States(time_s, ahead, quat, np.gradient(ahead, 0.01, axis=0), 0.1 * ahead)
 
 
 def flight(name="first", simulations=2):
     rollouts = [track(0.0, 1.0, 0.1), track(1.0, 2.0, 0.2)]
     errors = [np.full((len(r.time_s), 4), 0.1 * (k + 1)) for k, r in enumerate(rollouts)]
     labels = ["as given", "as named"][:simulations]
-    return Compared(name, track(0.0, 2.0), [Simulation(k, rollouts, errors) for k in labels])
+    return ComparedFlight(name, track(0.0, 2.0), [Simulation(k, rollouts, errors) for k in labels])
 
 
 def test_all_that_was_given_is_in_the_recording(tmp_path):

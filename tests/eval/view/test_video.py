@@ -8,7 +8,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from eval.view import colours
-from eval.view.chase import _beyond
+from eval.view.chase import _not_between
 from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
 from eval.view.video_file import write_gif
 from tests.support.flights import rollout
@@ -41,7 +41,7 @@ def test_what_stands_before_the_drone_is_not_painted():
     before = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0]])
     faces = np.stack([before, before + [2.0, 0.0, 0.0], before * [3.0, 1.0, 1.0] - [1.5, 0, 0]])
     faces[2, 0, 0] = 2.5  # one corner beyond is enough
-    assert _beyond(faces, eye, drone).tolist() == [False, True, True]
+    assert _not_between(faces, eye, drone).tolist() == [False, True, True]
 
 
 def test_bad_video_requests_are_refused(tmp_path):

@@ -17,13 +17,13 @@ from eval.view.scene3d import (
     MOST_FACES,
     Faces,
     Lines,
-    cut_up,
+    divide_faces,
     look_at,
     paint,
     to_camera,
     to_pixels,
 )
-from eval.view.solids import flat_normals, joined, outline, track_solids
+from eval.view.solids import flat_normals, join_solids, outline, track_solids
 from eval.view.video import VideoOptions, write_video
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
@@ -59,7 +59,7 @@ def test_a_trial_without_a_row_can_still_be_seen(tmp_path):
 
 
 def test_the_fastest_and_the_nearest_have_the_ends_of_their_colours():
-    assert colours.hexed((1, 16, 255)) == "#0110ff"
+    assert colours.hex_text((1, 16, 255)) == "#0110ff"
     speed = np.array([0.0, 4.0, 9.0])
     slow, fast, faster = colours.speed_colours(speed, 4.0).tolist()
     assert fast == faster != slow
@@ -145,7 +145,7 @@ def test_a_large_floor_does_not_hide_what_stands_on_it():
     red, blue = [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]
     seen = []
     for cut in (False, True):
-        parts = cut_up(floor)[0] if cut else floor
+        parts = divide_faces(floor)[0] if cut else floor
         colour = np.array([blue] * len(parts) + [red] * 2)
         painted = paint(view, Faces(np.concatenate([parts, front]), colour), NO_LINES)
         pixels = np.asarray(painted).astype(int)
@@ -156,7 +156,7 @@ def test_a_large_floor_does_not_hide_what_stands_on_it():
 def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
     floor, front = sheet_and_box()
     corners = np.concatenate([front, floor])
-    parts, whose = cut_up(corners)
+    parts, whose = divide_faces(corners)
     side = np.linalg.norm(parts - np.roll(parts, -1, axis=1), axis=-1)
     assert side.max() <= LONGEST_M and (whose == 0).sum() >= 1
 
@@ -166,7 +166,7 @@ def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
 
     for number, whole in enumerate(areas(corners)):
         np.testing.assert_allclose(areas(parts[whose == number]).sum(0), whole, atol=1e-9)
-    assert len(cut_up(1e4 * floor)[0]) <= MOST_FACES
+    assert len(divide_faces(1e4 * floor)[0]) <= MOST_FACES
 
 
 def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
@@ -177,7 +177,7 @@ def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
         corners = solid.vertices[solid.faces]
         outward = corners.mean(axis=1) - solid.vertices.mean(axis=0)
         assert (np.einsum("fi,fi->f", flat_normals(corners), outward) > 0).all()
-    vertices, faces = joined(solids[:4])
+    vertices, faces = join_solids(solids[:4])
     np.testing.assert_array_equal(vertices[faces][:12], solids[0].vertices[solids[0].faces])
     assert len(faces) == 48 and faces.max() == len(vertices) - 1
 

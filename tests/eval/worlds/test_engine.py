@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.engine import BODY, Eye, compile_model, contact_name, motion_of, start_state
+from eval.worlds.engine import (
+    BODY,
+    DepthCamera,
+    compile_model,
+    contact_name,
+    motion_of,
+    start_state,
+)
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.scene_slots import TO_CONTACTS
 from eval.worlds.slots import layout_of
@@ -59,7 +66,7 @@ def test_depth_is_planar_and_ends_at_the_range(wall):
     track, model, data = wall
     data.qpos[:] = start_state(track)
     mujoco.mj_step1(model, data)
-    image = Eye(Camera(pitch_deg=0.0)).image(model, data, data.qpos[:3], np.eye(3))
+    image = DepthCamera(Camera(pitch_deg=0.0)).image(model, data, data.qpos[:3], np.eye(3))
     middle = image[image.shape[0] // 2 - 1, image.shape[1] // 2]
     assert middle == pytest.approx(2.95)
     assert image.max() == Camera().range_m
@@ -75,7 +82,7 @@ def test_a_plate_on_edge_between_two_rays_is_seen_by_finer_ones(rays, seen):
     model = compile_model(track, VEHICLE, 0.002, layout_of([track]).solids)
     data = mujoco.MjData(model)
     mujoco.mj_step1(model, data)
-    eye = Eye(Camera(pitch_deg=0.0, rays=rays))
+    eye = DepthCamera(Camera(pitch_deg=0.0, rays=rays))
     image = eye.image(model, data, track.start_pos_w, np.eye(3))
     assert image.shape == (24, 32) and bool((abs(image - 2.0) < 1e-6).any()) == seen
 
@@ -85,7 +92,7 @@ def test_the_ground_is_seen_wherever_the_world_is_flown(wall, away):
     """MuJoCo's rays leave a plane out whose origin is beyond their cut-off."""
     _, model, data = wall
     camera, height = Camera(pitch_deg=0.0), 1.5
-    image = Eye(camera).image(model, data, np.array([-away, -away, height]), np.eye(3))
+    image = DepthCamera(camera).image(model, data, np.array([-away, -away, height]), np.eye(3))
     down = -pixel_rays_b(camera)[:, 2].reshape(image.shape)
     ground = height / np.maximum(down, 1e-9)
     seen = (ground < camera.range_m) & (image > ground - 0.01)
@@ -118,8 +125,8 @@ def test_a_world_sees_what_mujocos_rays_see_meshes_too(root):
     mujoco.mj_kinematics(model, data)
     for slot in np.flatnonzero(wanted):
         pose = world._qpos[slot, :3].copy(), world._xmat[slot, BODY].reshape(3, 3).copy()
-        expected = Eye(camera).image(model, data, *pose)
+        expected = DepthCamera(camera).image(model, data, *pose)
         assert (np.abs(images[slot] - expected) > 1e-9).mean() < 2e-3  # rays that graze an edge
-        meshes += (Eye(camera).image(model, data, *pose, MESH_GROUP) < camera.range_m).sum()
+        meshes += (DepthCamera(camera).image(model, data, *pose, MESH_GROUP) < camera.range_m).sum()
     assert meshes > 50
     assert (images[~wanted] == camera.range_m).all()

@@ -12,7 +12,7 @@ from eval.judging.judge import JudgeOptions, Record, fly
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import differences, world_class
 from eval.worlds import rotorpy as rotorpy_world
-from eval.worlds.rotorpy import Multirotor, Push
+from eval.worlds.rotorpy import Multirotor, StepInput
 from eval.worlds.trial import Rules, TrialSpec
 from suite.cli import main
 from tests.support.courses import straight
@@ -166,10 +166,10 @@ def test_a_row_is_stepped_by_itself(installed, count):
     qpos = rng.normal(size=(64, 7))
     qpos[:, 3:] /= np.linalg.norm(qpos[:, 3:], axis=1, keepdims=True)
     qvel, speed = rng.normal(0, 4, (64, 6)), rng.uniform(300, 1800, (64, 4))
-    push = Push(rng.uniform(300, 1800, (64, 4)), rng.normal(size=(64, 3)))
+    push = StepInput(rng.uniform(300, 1800, (64, 4)), rng.normal(size=(64, 3)))
     whole = Multirotor(VEHICLE, 0.002, 64).step(qpos, qvel, speed, push)
     few = Multirotor(VEHICLE, 0.002, count).step(
-        qpos[:count], qvel[:count], speed[:count], Push(*(part[:count] for part in push))
+        qpos[:count], qvel[:count], speed[:count], StepInput(*(part[:count] for part in push))
     )
     for part, of_few in zip(whole, few, strict=True):
         np.testing.assert_array_equal(part[:count], of_few)

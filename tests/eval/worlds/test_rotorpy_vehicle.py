@@ -67,7 +67,7 @@ def test_every_difference_is_said_and_nothing_else():
         "rotor_gyroscopic", "ground_effect", "battery_sag", "angular_damping", "thrust_tilt",
         "torque_trim", "frame_tilt", "weak_motor", "rotor_spin_up", "slung_load",
     }  # fmt: skip
-    assert "linear_drag: RotorPy's drag goes with the rotors' speed" in said
+    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in said
     assert "gusts" not in said and "gyro_bias" not in said
 
 

@@ -8,13 +8,13 @@ from eval.quadrotor.plant import Motion, Wrench
 from eval.worlds import slots
 from eval.worlds.slots import (
     GUSTS_AT_ONCE,
-    Gusts,
+    GustDraws,
     empty_course,
-    fitting,
     generator_of,
+    gust_draws,
     layout_of,
-    noise_of,
     pad_gates,
+    slot_groups,
 )
 from eval.worlds.trial import (
     COLLISION,
@@ -120,8 +120,8 @@ def test_a_track_with_meshes_is_a_group_of_its_own():
     plain = straight((1.0, 2.0))
     tracks = {"a.toml": plain, "m.toml": replace(plain, mesh_sizes=(12,))}
     trials = [TRIAL._replace(track=name) for name in ("zigzag", "m.toml", "a.toml", "m.toml")]
-    assert fitting(trials, tracks) == [[0, 2], [1, 3]]
-    assert fitting([], {}) == []
+    assert slot_groups(trials, tracks) == [[0, 2], [1, 3]]
+    assert slot_groups([], {}) == []
 
 
 def test_padding_repeats_the_last_gate():
@@ -138,22 +138,22 @@ def test_an_empty_course_has_room_for_every_gate():
 
 
 def test_a_trials_random_numbers_are_its_own_for_each_use():
-    np.testing.assert_array_equal(noise_of(TRIAL, 5), noise_of(TRIAL, 9)[:5])
+    np.testing.assert_array_equal(gust_draws(TRIAL, 5), gust_draws(TRIAL, 9)[:5])
     others = TRIAL._replace(seed=8), TRIAL._replace(difficulty=4), TRIAL._replace(track="circular")
     for other in others:
-        assert (noise_of(other, 5) != noise_of(TRIAL, 5)).all()
+        assert (gust_draws(other, 5) != gust_draws(TRIAL, 5)).all()
     here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
-    np.testing.assert_array_equal(noise_of(here, 5), noise_of(there, 5))
-    assert generator_of(TRIAL, slots.SENSED).standard_normal() != noise_of(TRIAL, 1)[0, 0]
+    np.testing.assert_array_equal(gust_draws(here, 5), gust_draws(there, 5))
+    assert generator_of(TRIAL, slots.SENSED).standard_normal() != gust_draws(TRIAL, 1)[0, 0]
 
 
 def test_gusts_are_drawn_as_the_flight_goes_on():
-    gusts, whole = Gusts(TRIAL), noise_of(TRIAL, 4 * GUSTS_AT_ONCE)
+    gusts, whole = GustDraws(TRIAL), gust_draws(TRIAL, 4 * GUSTS_AT_ONCE)
     last = GUSTS_AT_ONCE - 1
     for step, count in ((0, 1), (1, 5), (last, 3), (3 * last, 2 * last), (2, 4)):
         wanted = whole[step : step + count]
         np.testing.assert_array_equal(gusts.at(step, count)[: len(wanted)], wanted)
-    kept = Gusts(TRIAL)
+    kept = GustDraws(TRIAL)
     for step in range(0, 100 * GUSTS_AT_ONCE, 50):
         kept.at(step, 60)
     assert len(kept._rows) < 3 * GUSTS_AT_ONCE, "an hour's are not kept"

@@ -11,7 +11,7 @@ from suite.blind import build as module
 from suite.blind.build import build
 from suite.blind.cases import Case
 from suite.blind.make import open_answers
-from suite.blind.oracle.strength import columns_in_table, detectable_along, given_vehicle
+from suite.blind.oracle.strength import columns_in_table, detectable_along, nominal_vehicle
 from suite.blind.outside import KINDS as OUTSIDE
 from suite.blind.outside import changed_values, draw_change, make_outside
 from tests.support.blind import SINGLE
@@ -48,7 +48,7 @@ def test_outside_cases_say_how_much_the_catalogue_cannot_explain():
     assert outside["multiple"] == pytest.approx(6.0, rel=0.25) or outside["strength"] == 0.3
 
 
-BARE = given_vehicle("bare")
+BARE = nominal_vehicle("bare")
 
 
 def test_physics_outside_the_catalogue_moves_the_vehicle():
@@ -69,9 +69,9 @@ def test_a_hanging_load_weighs_what_it_weighs():
 
 
 def test_a_strength_is_the_multiple_of_the_table_or_cut_at_a_bound():
-    nominal = given_vehicle("bare")
+    nominal = nominal_vehicle("bare")
     for name in nameable_effects():
-        vehicle = nominal if name not in ("constant_wind", "gusts") else given_vehicle("dragged")
+        vehicle = nominal if name not in ("constant_wind", "gusts") else nominal_vehicle("dragged")
         rng = np.random.default_rng(3)
         change, multiple = draw_change(rng, vehicle, "full", name, 2.0)
         values = changed_values(vehicle, "full", name, change, rng)

@@ -9,7 +9,7 @@ from eval.flights.simulate import SENSORS
 from eval.flights.trajectory import Trajectory
 from suite.blind.continuous.body import POS, QUAT
 from suite.blind.continuous.timing import Conditions
-from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop
+from suite.blind.continuous_flight import fly_continuous, logs_of, with_loop_frequency
 from suite.blind.outside import make_outside
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -77,4 +77,4 @@ def test_the_loop_of_the_conditions_is_the_one_that_flies():
     flown, _ = run(5, conditions=slow)
     ticks = flown.schedule.start_s[flown.schedule.is_tick[:, 0], 0]
     np.testing.assert_allclose(np.diff(ticks), 0.005, atol=1e-9)
-    assert with_loop(LAGGED, 321.0).controller.frequency == 321.0
+    assert with_loop_frequency(LAGGED, 321.0).controller.frequency == 321.0

@@ -7,7 +7,7 @@ from eval.flights.follow import FlightFailed
 from eval.flights.simulate import fly
 from eval.flights.trajectory import Trajectory
 from eval.quadrotor.plant import Motion
-from suite.blind.rotorpy_flight import check_effects, damping_of_hubs, fly_rotorpy
+from suite.blind.rotorpy_flight import check_effects, fly_rotorpy, hub_damping
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.rotation import to_world
 
@@ -62,5 +62,5 @@ def test_torque_of_hubs_in_a_turning_body(name, plane):
     rate_b = np.array([0.7, -1.1, 2.0])
     force = -K * speed * np.cross(rate_b, place) * plane
     torque = np.cross(place, force).sum(axis=0)
-    found = damping_of_hubs([{"name": name, "parameters": {"coefficient": K}}], PLAIN)
+    found = hub_damping([{"name": name, "parameters": {"coefficient": K}}], PLAIN)
     np.testing.assert_allclose(-found * rate_b * PLAIN.inertia, torque, rtol=1e-3, atol=1e-9)

@@ -54,7 +54,7 @@ def test_conditions_are_drawn_from_the_cases_seed():
     simulator = simulator_for(NULL, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
-    assert simulator.given.controller.frequency == drawn.loop_hz
+    assert simulator.nominal.controller.frequency == drawn.loop_hz
     assert not simulator_for(
         Case("null", (), 0.0, "bare", "full", (1, 1)), np.random.default_rng()
     ).conditions

@@ -96,7 +96,7 @@ def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
     text, numbers = page(tmp_path, "simulators")
     labels = [entry["column"] for entry in numbers["success"]]
     assert labels == ["mujoco", "mujoco, the air of rotorpy", "rotorpy"]
-    assert "| rotorpy | linear_drag: RotorPy's drag goes with the rotors' speed" in text
+    assert "| rotorpy | linear_drag: RotorPy's drag is proportional to the rotors' speed" in text
     assert "ends alike" in text and numbers["changed"] == []
 
 

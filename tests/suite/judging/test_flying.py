@@ -113,10 +113,12 @@ def test_what_a_world_flies_otherwise_is_said_once_and_written(
     ]
     assert _eval(tmp_path / "out", *args) == 0
     said = capsys.readouterr().err
-    assert said.count("rotorpy: linear_drag: RotorPy's drag goes with the rotors' speed") == 1
+    assert (
+        said.count("rotorpy: linear_drag: RotorPy's drag is proportional to the rotors' speed") == 1
+    )
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [text.split(":")[0] for text in summary["flown_otherwise"]] == [
-        "linear_drag", "the rotors' drag acts at each hub, by the hub's own airspeed",
+        "linear_drag", "the rotors' drag acts at each hub and depends on the hub's airspeed",
     ]  # fmt: skip
     assert {row.world for row in read_trials(tmp_path / "out" / "trials.parquet")} == {"rotorpy"}
 

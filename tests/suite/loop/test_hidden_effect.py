@@ -227,7 +227,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     assert isinstance(same, HiddenLoopConfig)
     plain = what_is_hidden(same)
     assert plain[0] == "The hidden vehicle's file is the simulation's."
-    assert "linear_drag: RotorPy's drag goes with the rotors' speed" in plain[1]
+    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in plain[1]
 
 
 @pytest.mark.parametrize(

@@ -98,4 +98,4 @@ def test_without_motors_nothing_is_cut_and_that_is_said():
     lone = Recording("log", {"pos": recording().signals["pos"]})
     (start, stop), findings = airborne(lone)
     assert (start, stop) == (-np.inf, np.inf)
-    assert "nothing says when the motors run" in findings[0].evidence
+    assert "no signal shows when the motors run" in findings[0].evidence

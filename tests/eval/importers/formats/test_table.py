@@ -145,10 +145,10 @@ def test_text_among_numbers_is_refused_with_its_row(tmp_path):
 def test_dates_are_refused_as_such_and_empty_cells_are_no_lists():
     dates = {"t": np.array(["2026-01-01T00:00:01"], "M8[ns]")}
     with pytest.raises(FlightLogError, match=r"column t: a date or a span .*write it as a number"):
-        table._cells(dates, "t", "log")
+        table._values(dates, "t", "log")
     texts = {"names": np.array(["", None, " "], object), "lists": np.array(["[1 2]", ""], object)}
-    assert np.isnan(table._cells(texts, "names", "log")).tolist() == [[True]] * 3
-    np.testing.assert_array_equal(table._cells(texts, "lists", "log"), [[1, 2], [np.nan] * 2])
+    assert np.isnan(table._values(texts, "names", "log")).tolist() == [[True]] * 3
+    np.testing.assert_array_equal(table._values(texts, "lists", "log"), [[1, 2], [np.nan] * 2])
 
 
 def test_a_table_without_a_map_says_what_it_needs(tmp_path):

@@ -20,7 +20,7 @@ from suite.blind.continuous.timing import (
     jittered_stamps,
     schedule,
 )
-from suite.blind.continuous_flight import fly_continuous, with_loop
+from suite.blind.continuous_flight import fly_continuous, with_loop_frequency
 from tests.suite.test_imports import imported
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -79,7 +79,7 @@ def test_the_error_falls_with_the_fourth_power_of_the_step():
 
     def last(step_s):
         flown = fly_continuous(
-            with_loop(PLAIN, 50.0), truth, WAYS[:1], conditions, np.random.default_rng(3),
+            with_loop_frequency(PLAIN, 50.0), truth, WAYS[:1], conditions, np.random.default_rng(3),
             step_s=step_s,
         )  # fmt: skip
         return flown.state[-1, 0, VEL]

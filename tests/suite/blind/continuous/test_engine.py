@@ -107,7 +107,7 @@ def test_a_spin_without_torque_keeps_its_momentum():
         # What the loop then asks for is no torque: the rates of a free body.
         rate_b, inertia = seen.rate_b[0], quadrotor.inertia
         turning = np.cross(rate_b, inertia * rate_b)
-        command = np.append(0.0, rate_b - turning / (inertia * quadrotor.believed.rate_gain))
+        command = np.append(0.0, rate_b - turning / (inertia * quadrotor.nominal.rate_gain))
         return command[None], command[None]
 
     def momentum(state):
@@ -170,7 +170,7 @@ def state_of(vel=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0), rate=(0.0, 0.0, 0.0
 
 def wrench(vehicle=PLAIN, **state):
     body = body_of(vehicle)
-    force_b, torque_b, _ = body.forces(state_of(**state), SPEED, NOW, body.blowing)
+    force_b, torque_b, _ = body.forces(state_of(**state), SPEED, NOW, body.wind_at_start_w)
     return force_b[0], torque_b[0]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from suite.blind.continuous.body import POS, QUAT, RATE, VEL, Battery
 from suite.blind.continuous.engine import fly
-from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, state_at, turned
+from suite.blind.continuous.log import Noise, gauss_markov, log_of_flight, rotate_attitude, state_at
 from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import Conditions, jittered_stamps, schedule
 from tests.support.vehicles import PLAIN, with_effects
@@ -148,7 +148,7 @@ def test_a_channel_that_is_not_measured_is_not_there(flown):
 def test_small_turns_are_about_body_axes():
     # From 90 degrees about z, a turn about body x is one about world y.
     quarter = np.sqrt([[0.5, 0.0, 0.0, 0.5]])
-    turn = turned(quarter, np.array([[0.2, 0.0, 0.0]]))
+    turn = rotate_attitude(quarter, np.array([[0.2, 0.0, 0.0]]))
     about_y = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])
     w, x, y, z = about_y
     root = np.sqrt(0.5)

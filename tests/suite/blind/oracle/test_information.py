@@ -16,7 +16,7 @@ from suite.blind.oracle.information import (
     columns_of,
     detectable,
     information,
-    left_over,
+    remaining_ratio,
 )
 from suite.blind.oracle.strength import columns_in_table, detectable_along, strengths
 from tests.support.ways import BARE, bare_flights
@@ -48,8 +48,8 @@ def test_information_grows_with_flights_and_knows_hand_worked_parts(flights, inf
 
 def test_lookalikes_look_alike_and_strangers_do_not(info):
     change = {"rotor_drag": 6.0 * detectable(info.block("rotor_drag"), np.ones(1)) * np.ones(1)}
-    near = left_over(info, change, "rotor_drag", "linear_drag", BARE)
-    far = left_over(info, change, "rotor_drag", "com_offset", BARE)
+    near = remaining_ratio(info, change, "rotor_drag", "linear_drag", BARE)
+    far = remaining_ratio(info, change, "rotor_drag", "com_offset", BARE)
     whole = 36.0 * 12.5
     assert near < 0.05 * whole and 0.5 * whole < far <= whole * (1 + 1e-6)
     (found,) = alternatives(info, change, BARE).values()

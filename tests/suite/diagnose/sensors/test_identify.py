@@ -52,7 +52,7 @@ def flown(
     between_b = np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1) / STEP_S
     rate_b = np.concatenate([between_b[:1], 0.5 * (between_b[:-1] + between_b[1:])])
     wanted = {"measured_state": {**TRUE, **changed}, "drag_tilt": {"drag": drag, "lasts": 0.8}}
-    models = sensors.sensing(sensor_set(wanted).models)
+    models = sensors.view_models(sensor_set(wanted).models)
     sensor, camera, rng = sensors.SENSORS["measured_state"], Camera(), np.random.default_rng(99)
     none: Any = np.zeros((len(numbers), 0))
 

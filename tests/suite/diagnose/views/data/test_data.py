@@ -8,7 +8,7 @@ import pytest
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
-from suite.diagnose.data.flights import acting_rotors, completed, ready, split_held_out
+from suite.diagnose.data.flights import acting_rotors, completed, parted, ready
 from suite.diagnose.data.view import FORCE, TORQUE, rows_of, smoothed, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
@@ -125,7 +125,7 @@ def test_a_path_says_how_a_quadrotor_leaned():
 
 def test_a_lone_flights_end_is_held_out():
     both = ready(flights(1), VEHICLE)
-    fitted, held = split_held_out(both, [])
+    fitted, held = parted(both, [])
     last = fitted[FORCE.name][0].form.middle_s.max()
     assert held[FORCE.name][0].form.middle_s.min() > last
     assert last < THRESHOLDS.lone_fitted_share * 8.0
@@ -149,7 +149,7 @@ def on_the_ground(log, before_s, after_s):
 @pytest.mark.parametrize("ground_s", [(0.0, 6.0), (30.0, 0.0)])
 def test_of_a_lone_flight_that_stood_on_the_ground_a_part_of_what_flew_is_held_out(ground_s):
     (log,) = flights(1)
-    fitted, held = split_held_out(ready([on_the_ground(log, *ground_s)], VEHICLE), [])
+    fitted, held = parted(ready([on_the_ground(log, *ground_s)], VEHICLE), [])
     for name in (FORCE.name, TORQUE.name):
         first, last = (len(part[name][0].form.middle_s) for part in (fitted, held))
         assert first / (first + last) == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
