@@ -1,6 +1,6 @@
-"""PPO in one file, as CleanRL has it, on many races at once; at the end a file for the judge.
+"""Train a racing policy with PPO in one file, in the style of CleanRL, and export it for judging.
 
-Run: python examples/cleanrl_ppo.py runs/ppo [MINUTES]; then
+Many races run at once. Run: python examples/cleanrl_ppo.py runs/ppo [MINUTES]; then
 suite eval --policy runs/ppo/policy.onnx --track random --vehicle racer5 --trials 100
 """
 
@@ -23,11 +23,12 @@ from tracks.geometry.camera import Camera
 
 EPOCHS, MINIBATCHES, GAMMA, LAMBDA, CLIP = 8, 12, 0.97, 0.95, 0.2
 SPEC = PolicySpec(rate_hz=15.0, camera=Camera(width=12, height=8))
-SCALE = torch.tensor([0.2] * 3 + [1.0] * 3 + [0.2] * 3 + [0.1] * 3)  # of m/s, 1, m and m/s^2
+SCALE = torch.tensor([0.2] * 3 + [1.0] * 3 + [0.2] * 3 + [0.1] * 3)
+"""Factors on the state: velocity [m/s], world z [1], next gate [m] and last action [m/s^2]."""
 
 
 class Agent(nn.Module):
-    """Actor and critic; called as the judge does, it returns the mean action."""
+    """Actor and critic; a call returns the mean action, as the exported policy does."""
 
     def __init__(self) -> None:
         """Make networks whose first actions are nearly zero."""
@@ -43,21 +44,22 @@ class Agent(nn.Module):
 
     def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         """Return mean actions (N, 3) of -1 to 1 for states (N, 12) and images (N, H, W)."""
-        return self.actor(seen_by(state, image))
+        return self.actor(network_input(state, image))
 
 
-def seen_by(state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+def network_input(state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
     """Return the input of both networks (N, 12 + H W), scaled to about one."""
     return torch.cat([SCALE * state, 0.3 * image.flatten(1)], 1)
 
 
-def tensors(seen: dict[str, np.ndarray]) -> torch.Tensor:
-    """Return an observation of all environments as the networks take it."""
-    return seen_by(torch.as_tensor(seen["state"]), torch.as_tensor(seen["image"]))
+def tensors(observation: dict[str, np.ndarray]) -> torch.Tensor:
+    """Return the observation of all environments as the input of the networks."""
+    state, image = torch.as_tensor(observation["state"]), torch.as_tensor(observation["image"])
+    return network_input(state, image)
 
 
 def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
-    """Train for some minutes and return the file."""
+    """Train for some minutes, and return the path of the exported policy."""
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the networks are small
     race = gymnasium.make_vec(ID, num_envs=envs, spec=SPEC)  # tracks: random at level 0
@@ -72,7 +74,7 @@ def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
             x[t] = now
             with torch.no_grad():
                 actions[t] = Normal(agent.actor(now), agent.log_deviation.exp()).sample()
-            seen, reward, terminated, truncated, info = race.step(actions[t].numpy())
+            observation, reward, terminated, truncated, info = race.step(actions[t].numpy())
             ended = terminated | truncated
             for k in np.flatnonzero(ended):
                 gates.append(int(info["final_info"]["gates"][k]))
@@ -80,7 +82,8 @@ def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
                     last = {key: part[None] for key, part in info["final_obs"][k].items()}
                     with torch.no_grad():
                         reward[k] += GAMMA * float(agent.critic(tensors(last)))
-            now, rewards[t], over[t] = tensors(seen), torch.tensor(reward), torch.tensor(ended)
+            now, over[t] = tensors(observation), torch.tensor(ended)
+            rewards[t] = torch.tensor(reward)
         with torch.no_grad():
             value = agent.critic(torch.cat([x, now[None]]))[..., 0]
             before = Normal(agent.actor(x), agent.log_deviation.exp()).log_prob(actions).sum(-1)
@@ -94,12 +97,12 @@ def main(out: Path, minutes: float, envs: int = 128, steps: int = 24) -> Path:
         for rows in (
             r for _ in range(EPOCHS) for r in torch.randperm(steps * envs).chunk(MINIBATCHES)
         ):
-            seen_, action, old, gain, wanted = (part[rows] for part in flat)
+            inputs, action, old, gain, target = (part[rows] for part in flat)
             gain = (gain - gain.mean()) / (gain.std() + 1e-8)
-            log = Normal(agent.actor(seen_), agent.log_deviation.exp()).log_prob(action).sum(-1)
+            log = Normal(agent.actor(inputs), agent.log_deviation.exp()).log_prob(action).sum(-1)
             ratio = (log - old).exp()
             policy = -torch.minimum(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean()
-            loss = policy + 0.5 * ((agent.critic(seen_)[:, 0] - wanted) ** 2).mean() / goal.var()
+            loss = policy + 0.5 * ((agent.critic(inputs)[:, 0] - target) ** 2).mean() / goal.var()
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(agent.parameters(), 0.5)

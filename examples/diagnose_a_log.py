@@ -1,8 +1,8 @@
-"""Diagnose which effects a simulation lacks, from three flight logs shipped with the suite.
+"""Diagnose which physical effects a simulation lacks, from three flight logs of the suite.
 
-They were flown with a battery strapped on, so that the centre of mass is off. Run: python
-examples/diagnose_a_log.py [FOLDER]; it writes report.html, diagnosis.json and vehicle.toml. Logs of
-your own: `suite import` makes them of PX4, Betaflight, Crazyflie, MCAP and CSV files.
+They are simulated flights with a displaced battery, so the centre of mass is off. Run: python
+examples/diagnose_a_log.py [FOLDER]; it writes report.html, diagnosis.json and vehicle.toml. For
+your own flights, `suite import` converts logs of PX4, Betaflight, Crazyflie, MCAP and CSV files.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ def main(folder: Path) -> None:
     flight = read_flight(logs / "flight_1.parquet")
     print(f"flight 1: {len(flight.time_s)} rows over {flight.time_s[-1] - flight.time_s[0]:.1f} s")
 
-    found = diagnose_flights([logs], logs / "vehicle.toml", folder)
-    print(f"verdict: {found['verdict']}")
-    for effect in found["effects"]:
+    diagnosis = diagnose_flights([logs], logs / "vehicle.toml", folder)
+    print(f"verdict: {diagnosis['verdict']}")
+    for effect in diagnosis["effects"]:
         for name, entry in effect["parameters"].items():
             print(f"{effect['name']}.{name}: {entry['value']}, 95 %: {entry['ci95']}")
     print(f"report: {folder / 'report.html'}")
-    print(f"the vehicle with the effect in it: {folder / 'vehicle.toml'}")
+    print(f"vehicle file with the effect: {folder / 'vehicle.toml'}")
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(Path(given[0]) if given else Path(tempfile.mkdtemp()))
+    arguments = sys.argv[1:]
+    main(Path(arguments[0]) if arguments else Path(tempfile.mkdtemp()))

@@ -1,4 +1,4 @@
-"""Fly the shipped policy once and draw the flight.
+"""Fly the shipped policy race once in MuJoCo, and draw the flight.
 
 Run: python examples/fly_and_plot.py [FOLDER]; it writes trial.png, trial.gif and trial.rrd.
 """
@@ -28,7 +28,7 @@ def main(folder: Path) -> None:
     (result,) = fly(
         load_policy("race"),
         [trial],
-        load_vehicle("reference"),  # the vehicle of the tables; no training reads it
+        load_vehicle("reference"),  # the vehicle of the result tables; no training uses it
         options=JudgeOptions(workers=1),
         on_result=lambda result, flight: flights.append(flight),
         record=Record(depth=True),
@@ -46,5 +46,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(Path(given[0]) if given else Path(tempfile.mkdtemp()))
+    arguments = sys.argv[1:]
+    main(Path(arguments[0]) if arguments else Path(tempfile.mkdtemp()))

@@ -1,7 +1,7 @@
-"""Judge a plain function: a policy of rsl_rl, brax or your own, as it is in memory, without a file.
+"""Judge a policy that is a Python function in memory, such as one of rsl_rl or brax.
 
-The function here is a small network of JAX with random weights on top of a line that pulls to the
-gate. Run: python examples/jax_policy.py [TRIALS]
+The function here accelerates towards the next gate, and adds a small JAX network with random
+weights. Run: python examples/jax_policy.py [TRIALS]
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ SPEC = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,), clip=1.0))  # a
 def network(weights: jax.Array, state: jax.Array, image: jax.Array) -> jax.Array:
     """Return actions (N, 3), -1 to 1, from state (N, 12) and image (N, 24, 32)."""
     vel_b, gate_b = state[:, 0:3], state[:, 6:9]
-    ahead = gate_b / jnp.maximum(jnp.linalg.norm(gate_b, axis=-1, keepdims=True), 0.1)
-    seen = jnp.tanh(image.reshape(len(image), -1) @ weights)
-    return (2.5 * ahead - vel_b) / 10.0 + 0.01 * seen
+    direction_b = gate_b / jnp.maximum(jnp.linalg.norm(gate_b, axis=-1, keepdims=True), 0.1)
+    from_image = jnp.tanh(image.reshape(len(image), -1) @ weights)
+    return (2.5 * direction_b - vel_b) / 10.0 + 0.01 * from_image
 
 
 def main(trials: int) -> None:

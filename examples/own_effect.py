@@ -1,7 +1,7 @@
-"""Add a physical effect of your own: a tether that pulls the drone back to the start.
+"""Add a physical effect to the suite: a tether that pulls the drone back to the world's origin.
 
-The judge, the MJX world, the differentiable quadrotor and the diagnosis take it as it stands here.
-To have it in every command, put the file into a package with an entry point of the group
+Simulators, the differentiable quadrotor of the trainer and the diagnosis use it without further
+code. To have it in every command, put the file into a package with an entry point of the group
 `diffracing_suite.effects` (examples/plugin). Run: python examples/own_effect.py
 """
 
@@ -16,14 +16,14 @@ from tracks.geometry.rotation import to_local
 
 
 class Tether(NamedTuple):
-    """Values of `tether`."""
+    """Parameters of the effect `tether`."""
 
     stiffness: Array
     """(...,) [N/m]."""
 
 
 def pull(values: Tether, flow: Flow) -> Array:
-    """Return R^T (-k p) (..., 3) [N], for numpy and JAX arrays of any leading shape."""
+    """Return the force R^T (-k p) (..., 3) in body axes [N], for numpy and JAX arrays."""
     return to_local(flow.rot_w, -values.stiffness[..., None] * flow.pos_w)
 
 
@@ -41,7 +41,7 @@ TETHER = Effect(
 
 
 def main() -> None:
-    """Register the effect, and fly with tethers of growing stiffness."""
+    """Register the effect, and fly without a tether and with one."""
     register_effect(TETHER)
     vehicle, policy = load_vehicle("reference"), load_policy("race")
     for stiffness in (0.0, 0.4):

@@ -1,6 +1,6 @@
-"""Write a track of your own with a mesh on it, draw it, and fly it.
+"""Write a track file with gates, a pole and a mesh, draw the track, and fly it.
 
-tracks/examples/yard.toml has every key that such a file may have. Run: python
+tracks/examples/yard.toml shows every key of such a file. Run: python
 examples/own_track.py [FOLDER]; then `suite eval --track FOLDER/course.toml`.
 """
 
@@ -24,8 +24,8 @@ height = 1.1
 
 [[gates]]
 center = [8.0, 1.5, 1.6]
-yaw_deg = 20.0             # flown through along its own x axis
-radius = 0.6               # a round one
+yaw_deg = 20.0             # of the gate's x axis, the direction of flight
+radius = 0.6               # a round opening
 
 [[cylinders]]
 name = "pole"
@@ -42,7 +42,7 @@ yaw_deg = 30.0
 
 
 def main(folder: Path) -> None:
-    """Write course.toml, roof.stl and course.png to `folder`, and fly the course once."""
+    """Write course.toml, roof.stl and course.png to `folder`, and fly the track once."""
     folder.mkdir(parents=True, exist_ok=True)
     corners = [(x, y, 0.0) for x in (-1, 1) for y in (-0.5, 0.5)] + [(-1, 0, 1.2), (1, 0, 1.2)]
     trimesh.convex.convex_hull(np.array(corners)).export(folder / "roof.stl")
@@ -58,5 +58,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(Path(given[0]) if given else Path(tempfile.mkdtemp()))
+    arguments = sys.argv[1:]
+    main(Path(arguments[0]) if arguments else Path(tempfile.mkdtemp()))

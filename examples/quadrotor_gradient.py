@@ -1,7 +1,7 @@
-"""Differentiate the judge's quadrotor: which way a flight moves with a number of its vehicle.
+"""Differentiate a simulated flight with respect to a parameter of the vehicle, here its mass.
 
-One second of commands is flown; the gradient of the squared distance to where a heavier drone ends
-finds that drone's mass. Run: python examples/quadrotor_gradient.py [STEPS]
+One second of commands is simulated. Newton's method finds the mass with which the flight ends where
+that of a heavier drone ended. Run: python examples/quadrotor_gradient.py [STEPS]
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ def main(steps: int) -> None:
         plant = fit_plant(vehicle, {"mass_offset": MassOffset(mass)}, DT)
         return rollout(plant, rest, inputs).motion.pos_w[-1]
 
-    truth = 0.06
-    goal_w = last_pos_w(jnp.asarray(truth))
+    true_mass = 0.06
+    goal_w = last_pos_w(jnp.asarray(true_mass))
     residual = jax.jit(lambda mass: last_pos_w(mass) - goal_w)
-    slope = jax.jit(jax.jacfwd(residual))
+    jacobian = jax.jit(jax.jacfwd(residual))
     mass = jnp.asarray(0.0)
     for step in range(steps):
-        error, gradient = residual(mass), slope(mass)
+        error, slope = residual(mass), jacobian(mass)
         print(f"{step}: {float(mass):.5f} kg, {float(jnp.linalg.norm(error)):.2e} m off")
-        mass = mass - gradient @ error / (gradient @ gradient)
-    by_hand = (residual(mass + 1e-2) - residual(mass - 1e-2)) / 2e-2
-    print(f"{float(mass):.5f} kg; the truth is {truth} kg")
-    print(f"d z / d mass: {float(slope(mass)[2]):.3f} m/kg, by differences {float(by_hand[2]):.3f}")
+        mass = mass - slope @ error / (slope @ slope)
+    differences = (residual(mass + 1e-2) - residual(mass - 1e-2)) / 2e-2
+    exact, approximate = float(jacobian(mass)[2]), float(differences[2])
+    print(f"{float(mass):.5f} kg; the truth is {true_mass} kg")
+    print(f"d z / d mass: {exact:.3f} m/kg, by differences {approximate:.3f}")
 
 
 if __name__ == "__main__":

@@ -26,8 +26,8 @@ def main(folder: Path, iterations: int) -> None:
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
+    arguments = sys.argv[1:]
     main(
-        Path(given[0]) if given else Path(tempfile.mkdtemp()),
-        int(given[1]) if given[1:] else 100,
+        Path(arguments[0]) if arguments else Path(tempfile.mkdtemp()),
+        int(arguments[1]) if arguments[1:] else 100,
     )

@@ -1,7 +1,7 @@
 """Train, judge and diagnose drone racing policies: the command line and the Python interface.
 
-The names in `__all__` are the interface that stays stable; everything deeper is for contributors.
-What a name needs is imported when it is first used, so that `import suite` costs nothing.
+The names in `__all__` are the stable interface; all other modules may change between versions.
+Other packages are imported at the first use of a name, so that `import suite` takes no time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
     "write_flight",
 ]
 
-_ELSEWHERE = {
+_MODULES = {
     "load_policy": "policies.policy",
     "load_track": "tracks.formats.custom",
     "load_vehicle": "eval.quadrotor.vehicle_file",
@@ -51,7 +51,7 @@ _ELSEWHERE = {
     "save_vehicle": "eval.quadrotor.vehicle_file",
     "write_flight": "eval.logs.flight_log",
 }
-"""Name -> the module that it is re-exported from."""
+"""Name -> the module that defines it."""
 
 Source = str | Path
 """A shipped name or a path."""
@@ -83,31 +83,31 @@ def evaluate_policy(
         workers: number of processes; None takes as many cores as give a gain.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
+        ValueError: for an argument that cannot be used, before the first flight.
     """
     from eval.judging.judge import JudgeOptions, fly
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.sensors.sensors_file import load_sensors
     from eval.worlds.trial import TrialSpec
     from policies.policy import load_policy
-    from suite.judging.requests import parse_levels, parse_tracks
+    from suite.judging.trials import parse_levels, parse_tracks
 
-    flown = load_policy(policy) if isinstance(policy, str | Path) else policy
-    if lacking := [name for name in ("name", "spec", "start", "act") if not hasattr(flown, name)]:
+    loaded = load_policy(policy) if isinstance(policy, str | Path) else policy
+    if missing := [name for name in ("name", "spec", "start", "act") if not hasattr(loaded, name)]:
         raise ValueError(
-            f"policy {flown!r} has no {', '.join(lacking)}; a policy object has name, spec, "
+            f"policy {loaded!r} has no {', '.join(missing)}; a policy object has name, spec, "
             "start(n) and act(hidden, state, image, fresh): docs/policies.md"
         )
-    body = load_vehicle(vehicle) if isinstance(vehicle, str | Path) else vehicle
-    seeds, own = range(seed, seed + trials), {}
+    loaded_vehicle = load_vehicle(vehicle) if isinstance(vehicle, str | Path) else vehicle
+    seeds, custom_tracks = range(seed, seed + trials), {}
     if isinstance(track, str):
         levels = parse_levels(str(difficulty))
         specs = [TrialSpec(t, d, s) for t in parse_tracks(track) for d in levels for s in seeds]
     else:
-        own = {track.family: track}
+        custom_tracks = {track.family: track}
         specs = [TrialSpec(track.family, 0, s) for s in seeds]
     options = JudgeOptions(workers=workers, sensors=load_sensors(sensors))
-    return fly(flown, specs, body, simulator, options, tracks=own)
+    return fly(loaded, specs, loaded_vehicle, simulator, options, tracks=custom_tracks)
 
 
 def train_policy(
@@ -148,14 +148,14 @@ def diagnose_flights(
     reference: Sequence[Source] = (),
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Name the effect that a vehicle file lacks, and return what diagnosis.json holds.
+    """Name the physical effect that a vehicle file lacks; return the contents of diagnosis.json.
 
     Args:
         flights: flight logs, or folders of them.
         vehicle: a vehicle file or a shipped name.
         out: folder for diagnosis.json, vehicle.toml and report.html.
-        reference: flights from before a change: find what has changed since.
-        progress: print progress.
+        reference: earlier flights; with them the diagnosis names what has changed since.
+        progress: whether to print progress.
 
     Raises:
         ValueError: for flights or a vehicle that cannot be used.
@@ -175,7 +175,7 @@ def identify_vehicle(
         flights: flight logs, or folders of them.
         vehicle: the file or shipped name to start from.
         out: the vehicle file to write.
-        progress: print progress.
+        progress: whether to print progress.
 
     Raises:
         ValueError: for flights or a vehicle that cannot be used.
@@ -199,7 +199,7 @@ def register_effect(effect: Effect) -> None:
     """Add a physical effect to the catalogue, for this process.
 
     Raises:
-        ValueError: for a name that is taken, or an effect that contradicts itself.
+        ValueError: for a name in use, or an effect with inconsistent parts.
     """
     from eval.effects import EFFECTS
 
@@ -210,7 +210,7 @@ def register_track(name: str, make: Any) -> None:
     """Add a track family for this process: a function make(difficulty, rng) -> Layout.
 
     Raises:
-        ValueError: for a name that is taken, or something that makes no tracks.
+        ValueError: for a name in use, or a `make` that is no such function.
     """
     from tracks.families import FAMILIES
 
@@ -221,7 +221,7 @@ def register_simulator(name: str, simulator: Any) -> None:
     """Add a simulator, a class as `eval.worlds.World` describes it, for this process.
 
     Raises:
-        ValueError: for a name that is taken, or something that is no class.
+        ValueError: for a name in use, or a simulator that is no class.
     """
     from eval.worlds import WORLDS
 
@@ -236,12 +236,12 @@ def _console(progress: bool) -> Console:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _ELSEWHERE:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
-    return getattr(importlib.import_module(_ELSEWHERE[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_ELSEWHERE])
+    return sorted([*globals(), *_MODULES])

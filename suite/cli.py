@@ -1,9 +1,10 @@
-"""The command line: a table of subcommands, each imported only when it is called.
+"""The program `suite`: reads the command line, runs a command and returns its exit code.
 
-A command is a module with `Config`, a frozen dataclass whose fields become its options (the text
-under a field is its help), and `run(config, console)`, which does the work and returns what --json
-prints. If it has `config_of(args)`, this returns the configuration that the first word selects,
-that word, and the other words.
+A command NAME is the module suite/commands/NAME.py, imported only when it is called. It has
+`Config`, a frozen dataclass whose fields become its options (the text under a field is its help),
+and `run(config, console)`, which does the work and returns the object that --json prints. If it has
+`config_of(args)`, this returns the configuration that the first word selects, that word, and the
+other words.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from typing import Any
 
 from suite.common.errors import DONE, FAILED, INTERRUPTED, UNUSABLE, explain
 from suite.common.running.interrupts import end_at_once, ends_in_seconds
-from suite.common.startup import check_names, hush, keep_compiled, open_streams, pin
+from suite.common.startup import (
+    check_names,
+    clean_jax_environment,
+    keep_compiled,
+    open_streams,
+    suppress_warnings,
+)
 from suite.common.usage import (
     COMMANDS,
     JOINED,
@@ -41,37 +48,36 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return code
     except KeyboardInterrupt as error:
-        # Held until the process ends: with its frames would go what XLA's threads may still use.
+        # Kept until the process ends: XLA's threads may still use data of the error's frames.
         sys.last_value = error
-        _complain("interrupted; what was finished is kept")
+        _print_message("interrupted; finished work is kept")
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output has left: nothing to say, and no one to say it to.
-        _output_fails()
+        # Nobody reads the output any more, so no message is printed.
+        _drop_unwritable_output()
         return FAILED
     except Exception as error:
-        _output_fails()
-        known = explain(error)
-        if known is None:
+        _drop_unwritable_output()
+        explanation = explain(error)
+        if explanation is None:
             traceback.print_exc()
-            _complain("this is a bug; please report the lines above and those of `suite info`")
+            _print_message("this is a bug; please report the lines above and those of `suite info`")
             return FAILED
-        code, message = known
-        _complain(message)
+        code, message = explanation
+        _print_message(message)
         return code
 
 
-def _output_fails() -> bool:
-    """Say whether standard output takes nothing more; what it holds goes to the null device."""
+def _drop_unwritable_output() -> None:
+    """Send buffered text that standard output does not accept to the null device."""
     try:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
 
 
 def _dispatch(args: list[str]) -> int:
+    """Print the general help or the version, or run the command that the first word names."""
     if args[:1] == ["help"]:
         args = [*args[1:2], "--help"]
     if not args or args[0] in ("-h", "--help"):
@@ -96,7 +102,7 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     """Return the module of the command `name` and its configuration from `args`.
 
     Raises:
-        ValueError: for an option that is given twice, and for a word that belongs to none.
+        ValueError: for an option that is given twice, and for a word that belongs to no option.
         SystemExit: after --help (code 0), and for options that cannot be read (code 2).
     """
     from suite.common.options import options, read_options
@@ -106,26 +112,27 @@ def parse(name: str, args: Sequence[str]) -> tuple[ModuleType, Any]:
     if hasattr(command, "config_of"):
         kind, word, args = command.config_of(args)
         prog = f"{prog} {word}".rstrip()
-    found = list(options(kind))
-    listed, repeated = ({o.flag for o in found if getattr(o, f)} for f in ("listed", "repeated"))
-    if any(option.positional for option in found):
-        # A word behind an option may be a positional one.
+    all_options = list(options(kind))
+    listed = {option.flag for option in all_options if option.listed}
+    repeated = {option.flag for option in all_options if option.repeated}
+    if any(option.positional for option in all_options):
+        # A word after an option's value may be a positional one.
         args = with_lists(args, listed)
     else:
         args = with_lists(args, listed, JOINED, repeated)
-    _refuse_twice(args, repeated)
+    _refuse_repetition(args, repeated)
     about = description(name, kind.__doc__ or "")
-    config, left = read_options(kind, prog, about, args)
-    if left and not any(word.startswith("-") for word in left):
-        raise ValueError(f"{left[0]!r} belongs to no option; {prog} --help lists them")
-    if left:
+    config, unknown = read_options(kind, prog, about, args)
+    if unknown and not any(word.startswith("-") for word in unknown):
+        raise ValueError(f"{unknown[0]!r} belongs to no option; {prog} --help lists them")
+    if unknown:
         # Read again only to end with a message that lists similar options.
         read_options(kind, prog, about, args, all_known=True)
     return command, config
 
 
-def _refuse_twice(args: Sequence[str], repeated: set[str]) -> None:
-    """Refuse an option that is given twice: of two `--set` the first would be left out silently."""
+def _refuse_repetition(args: Sequence[str], repeated: set[str]) -> None:
+    """Refuse an option that is given twice: the first of two `--set` would be ignored silently."""
     flags = [arg.partition("=")[0].replace("_", "-") for arg in args if arg.startswith("--")]
     twice = {flag for flag in flags if flags.count(flag) > 1}
     for flag in sorted(twice - repeated):
@@ -133,14 +140,15 @@ def _refuse_twice(args: Sequence[str], repeated: set[str]) -> None:
 
 
 def _run(name: str, args: list[str]) -> int:
+    """Run a command with its output folders locked, print its answer under --json; return 0."""
     from suite.common.console import Console, stdout_kept_clean
     from tracks.common.work.threads import one_thread_a_product, set_threads
 
-    for variable in pin():
-        _complain(f"{variable} of the environment is set aside: it might change results")
+    for variable in clean_jax_environment():
+        _print_message(f"{variable} of the environment is ignored: it might change results")
     args, notes = renamed(name, args)
     for note in notes:
-        _complain(note)
+        _print_message(note)
     keep_compiled()
     os.environ["MPLBACKEND"] = "agg"  # charts become files; a notebook's backend may be missing
     set_threads()
@@ -164,37 +172,38 @@ def _run(name: str, args: list[str]) -> int:
     return DONE
 
 
-def _complain(message: str) -> None:
+def _print_message(message: str) -> None:
+    """Print a message on standard error."""
     from tracks.common.names import printable
 
     print(f"suite: {printable(message)}", file=sys.stderr)
 
 
 def _without_working_folder() -> None:
-    """Keep the working folder off the module path: its eval.py would stand for our package.
+    """Remove the working folder from the module path, here and in worker processes.
 
-    That of processes of ours as well, which begin with Python's own socket.py.
+    A user's file eval.py in it would be imported instead of our package.
     """
     os.environ["PYTHONSAFEPATH"] = "1"
     root = Path(__file__).resolve().parents[1]
     try:
-        here = Path.cwd()
-    except FileNotFoundError:  # removed meanwhile: what is relative to it is refused by its name
+        folder = Path.cwd()
+    except FileNotFoundError:  # it was removed; relative paths give an error that names them
         return
-    if here != root:
-        sys.path[:] = [path for path in sys.path if path and Path(path).absolute() != here]
+    if folder != root:
+        sys.path[:] = [path for path in sys.path if path and Path(path).absolute() != folder]
 
 
 def entry() -> None:
-    """Be the program `suite`."""
+    """Run the program `suite`, and end the process with its exit code."""
     _without_working_folder()
-    from suite.common.running.hosts import several
+    from suite.common.running.hosts import is_distributed
 
     open_streams()
-    hush()
+    suppress_warnings()
     code = main()
-    # Whoever leaves others early would wait for them, as for a cluster that does not answer.
-    if code == INTERRUPTED or (code and (several() or "distributed" in sys.modules)):
+    # A normal exit would wait for the other processes, or for a cluster that does not answer.
+    if code == INTERRUPTED or (code and (is_distributed() or "distributed" in sys.modules)):
         end_at_once(code)
     raise SystemExit(code)
 

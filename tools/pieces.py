@@ -142,7 +142,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import TrialSpec
     from suite.experiments.study import judging
-    from suite.experiments.study.cache import Place
+    from suite.experiments.study.cache import Workspace
 
     def piece(
         loaders: judging.Loaders, shares: Sequence[judging.Share]
@@ -155,10 +155,10 @@ def sweep(count: int, args: argparse.Namespace) -> None:
     setups = (
         judging.Setup("race", replace(vehicle, mass=vehicle.mass + 1e-6 * k)) for k in range(count)
     )
-    orders = {k: judging.Order(setup, [trial]) for k, setup in enumerate(setups)}
+    orders = {k: judging.TrialRequest(setup, [trial]) for k, setup in enumerate(setups)}
     with tempfile.TemporaryDirectory() as folder:
         for action in ("flown and stored", "read from the store"):
-            judging.flown(orders, Place(Path(folder), Path(folder), 1), Silent(), "flying")
+            judging.fly_trials(orders, Workspace(Path(folder), Path(folder), 1), Silent(), "flying")
             clock.say(f"{count} vehicles {action}", count)
 
 

@@ -104,8 +104,8 @@ FAULTS = (
     # suite: losses, gradient, point mass
     Fault("suite/train", "jnp.maximum(1.0 - step.gap, 0.0) ** 2",
           "jnp.maximum(1.0 + step.gap, 0.0) ** 2", "test_losses"),
-    Fault("suite/train", "-(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos))",
-          "(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos))", "test_losses"),
+    Fault("suite/train", "-(jax.lax.stop_gradient(pull) * (step.pos_w - fixed_pos))",
+          "(jax.lax.stop_gradient(pull) * (step.pos_w - fixed_pos))", "test_losses"),
     Fault("suite/train", "return x * factor + jax.lax.stop_gradient(x * (1 - factor))",
           "return x * (1 - factor) + jax.lax.stop_gradient(x * factor)", "test_point_mass"),
     Fault("suite/train", "stride * cotangents)", "1.0 * cotangents)", "test_rollout"),
@@ -116,7 +116,7 @@ FAULTS = (
           "mean_norm(pos - windows.pos_w[:, :-1])", "delta/test_fit"),
     Fault("suite/delta", "optax.adam(optax.cosine_decay_schedule(config.rate, iterations))",
           "optax.adam(config.rate)", "delta/test_fit"),
-    Fault("suite/delta", "np.where(up[..., 2:] < 0, -ahead, ahead)", "ahead",
+    Fault("suite/delta", "np.where(up[..., 2:] < 0, -forward, forward)", "forward",
           "delta/test_windows"),
     # suite: diagnosis
     Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))",

@@ -1,4 +1,7 @@
-"""An effect, a track family, a log format and a world that a package adds to the suite."""
+"""A plugin: a package that adds a physical effect, a track family, a log format and a simulator.
+
+Entry points in its pyproject.toml make them available in all commands of the suite.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from tracks.geometry.obstacles import straight_sites
 
 
 class FinDrag(NamedTuple):
-    """Values of `fin_drag`."""
+    """Parameters of the effect `fin_drag`."""
 
     coefficient: Array
     """(...,) c [kg/m]."""
@@ -27,9 +30,9 @@ class FinDrag(NamedTuple):
 def fin_force(values: FinDrag, flow: Flow) -> Array:
     """Return -c |v_y| v_y along body y (..., 3) [N], for numpy and JAX arrays."""
     xp = flow.air_vel_b.__array_namespace__()
-    across = flow.air_vel_b[..., 1]
-    push = -values.coefficient * xp.abs(across) * across
-    return push[..., None] * xp.asarray([0.0, 1.0, 0.0])
+    sideways = flow.air_vel_b[..., 1]
+    force = -values.coefficient * xp.abs(sideways) * sideways
+    return force[..., None] * xp.asarray([0.0, 1.0, 0.0])
 
 
 FIN_DRAG = Effect(
@@ -59,7 +62,7 @@ def staircase(d: float, rng: np.random.Generator) -> Layout:
 
 
 SUMMARY = "simlog: numbers in lines, t x y z qw qx qy qz p q r m1 m2 m3 m4"
-"""Summary of the log format; with `detect` and `read` it makes this module a format."""
+"""Summary of the log format. A module with SUMMARY, `detect` and `read` is a log format."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:
@@ -70,9 +73,10 @@ def detect(head: bytes, options: ImportOptions) -> bool:
 def read(path: Path, options: ImportOptions) -> Recording:
     """Return the file's signals in SI units, z-up world and forward-left-up body."""
     table = np.loadtxt(path)
-    places = {"pos": slice(1, 4), "quat": slice(4, 8), "rate": slice(8, 11), "motor": slice(11, 15)}
-    parts = {name: (table[:, 0], table[:, place]) for name, place in places.items()}
-    signals, findings = collect(parts, str(path))
+    columns = {"pos": slice(1, 4), "quat": slice(4, 8), "rate": slice(8, 11),
+               "motor": slice(11, 15)}  # fmt: skip
+    samples = {name: (table[:, 0], table[:, column]) for name, column in columns.items()}
+    signals, findings = collect(samples, str(path))
     return Recording(str(path), signals, findings)
 
 

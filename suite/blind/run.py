@@ -14,8 +14,8 @@ from pathlib import Path
 from suite.blind.make import load_manifest
 from suite.common.console import Console
 from suite.common.errors import INTERRUPTED, WorkFailed
-from suite.common.running.apart import Job
-from suite.common.work import all_done
+from suite.common.running.remote import Job
+from suite.common.work import do_jobs
 from tracks.common.files import write_json
 from tracks.common.work import Workers
 
@@ -59,7 +59,7 @@ def run_set(
                 _diagnose_case(diagnose, job, console)
                 update(done + 1, job.task)
         else:
-            all_done(partial(_diagnose_case, diagnose), jobs, workers, console, "diagnoses")
+            do_jobs(partial(_diagnose_case, diagnose), jobs, workers, console, "diagnoses")
     return sum((results / name / TIMED).is_file() for name in names)
 
 

@@ -1,1 +1,1 @@
-"""The subcommands of `suite`, one file each, imported when called."""
+"""The commands of `suite`, one module each, imported when the command is called."""

@@ -1,4 +1,4 @@
-"""`suite bench NAME`: a hot path of ours against a plain implementation of the same."""
+"""The command `suite bench`: compare the speed of a core part with a plain implementation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Config(Command):
     """Compare the speed of a core function with a plain implementation; without NAME, list all."""
 
     name: tyro.conf.Positional[str] = ""
-    """Which benchmark. Without it all are listed."""
+    """The benchmark to run. Without it all are listed."""
     policy: str | None = None
     """For the benchmark `policy`: a shipped policy's name or a checkpoint's folder. Without it the
     policy race."""
@@ -31,13 +31,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Run the benchmark `config.name`, both sides in turn, and show figures and ratio.
 
     Raises:
-        ValueError: for a name that is not in the table, or a policy where none is timed.
+        ValueError: for an unknown benchmark, or a policy for one that measures no policy.
     """
     if not config.name:
         if config.policy is not None:
             raise ValueError(
-                f"--policy is {config.policy}, but no benchmark is named: suite bench policy takes "
-                "it"
+                f"--policy is {config.policy}, but no benchmark is named; write suite bench policy"
             )
         for name, summary in BENCHES.items():
             console.say(f"{name:<12} {summary}")
@@ -45,13 +44,16 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.name not in BENCHES:
         raise unknown_name("benchmark", config.name, BENCHES)
     if config.policy is not None and config.name != "policy":
-        raise ValueError(f"--policy is {config.policy}, but {config.name} times none: leave it out")
+        raise ValueError(
+            f"--policy is {config.policy}, but the benchmark {config.name} measures no policy; "
+            "leave it out"
+        )
     from suite.experiments.bench.compare import load_warnings
 
-    busy = load_warnings()
+    load = load_warnings()
     bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
     result = bench.run() if config.policy is None else bench.run(config.policy)
-    answer = {**plain(result), "ratio": result.ratio, "warnings": [*busy, *result.warnings]}
+    answer = {**plain(result), "ratio": result.ratio, "warnings": [*load, *result.warnings]}
     del answer["grid"]
     for side, figure in (("ours", result.ours), ("baseline", result.baseline)):
         console.say(f"{side:<9} {figure.value:.4g} {figure.unit}")

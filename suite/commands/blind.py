@@ -1,4 +1,8 @@
-"""`suite blind`: test cases with hidden effects for the diagnosis, made, diagnosed and scored."""
+"""The command `suite blind`: make test cases with hidden effects, diagnose them, score the answers.
+
+An effect is one physical cause of a mismatch, such as drag. The cases' answers are kept in a folder
+that the diagnosis does not read.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import tyro
 
 from suite.common.console import Console
 from suite.common.options import Command
-from suite.common.work import WorkersOption, workers_given
+from suite.common.work import WorkersOption, read_workers_option
 from tracks.input.ranges import Range, Seed
 
 if TYPE_CHECKING:
@@ -28,27 +32,27 @@ class Config(Command):
     out: Path = Path("runs/blind")
     """Folder of the set; the same command again continues where it stopped."""
     set: Literal["tuning", "published"] = "tuning"
-    """Which seeds: tuning ones for development, published ones for the results page."""
+    """Seeds of the cases: tuning for development, published for the results page."""
     seed: Seed | None = None
-    """Seed of a set of your own, in place of --set."""
+    """Seed of another set, instead of --set."""
     count: Annotated[int, Range(1, 100_000)] | None = None
-    """About how many cases, at least one of every kind. Without it all 244, or 60 with another
-    simulator."""
+    """Approximate number of cases, at least one of every kind. Without it all 244, or 60 with
+    another simulator."""
     simulator: Literal["mujoco", "rotorpy", "continuous"] = "mujoco"
     """What simulates the cases: mujoco, rotorpy (needs pip install 'diffracing-suite[rotorpy]'), or
     continuous, an engine in continuous time that shares no code with the fitted model."""
     effects: tuple[str, ...] = ()
-    """For plan: effects that your flights do not separate."""
+    """For plan: two or more effects that your flights do not separate."""
     workers: WorkersOption = None
     """For make and run: share the cases among N processes of this machine, or on the cluster at
     HOST:PORT, whose owner can run code here. Without it one case follows the other."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write meanwhile."""
+        """Return the folders into which no other command may write at that time."""
         return [self.out] if self.what in ("make", "run") else []
 
 
-TAKEN = {
+USED_BY = {
     "out": ("make", "run", "score"),
     "set": ("make",),
     "seed": ("make",),
@@ -57,25 +61,25 @@ TAKEN = {
     "effects": ("plan",),
     "workers": ("make", "run"),
 }
-"""Which of the command's works take an option."""
+"""Option -> the actions (`what`) that use it."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Do `config.what`.
 
     Raises:
-        ValueError: for an option of another work, a folder that holds another set, or names that
+        ValueError: for an option of another action, a folder that holds another set, or names that
             are not in the catalogue.
     """
-    for name, works in TAKEN.items():
-        given = getattr(config, name)
-        if config.what not in works and given != getattr(Config, name):
-            shown = " ".join(given) if isinstance(given, tuple) else given
+    for name, actions in USED_BY.items():
+        value = getattr(config, name)
+        if config.what not in actions and value != getattr(Config, name):
+            shown = " ".join(value) if isinstance(value, tuple) else value
             raise ValueError(
                 f"--{name} is {shown}, but `suite blind {config.what}` does not take it, only "
-                f"{' and '.join(works)}; leave it out"
+                f"{' and '.join(actions)}; leave it out"
             )
-    workers = workers_given(config.workers, whole_cores=True)
+    workers = read_workers_option(config.workers, whole_cores=True)
     if config.what == "plan":
         return _plan(config, console)
     if config.what == "strengths":
@@ -85,8 +89,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         from suite.blind.make import make_set
 
         seed = SETS[config.set] if config.seed is None else config.seed
-        made = make_set(config.out, seed, config.count, console, config.simulator, workers)
-        return _made(made, config, console)
+        manifest = make_set(config.out, seed, config.count, console, config.simulator, workers)
+        return _show_manifest(manifest, config, console)
     if config.what == "run":
         from suite.blind.run import diagnose_by_command, run_set
         from suite.cli import COMMANDS
@@ -109,13 +113,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     }
 
 
-def _made(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
+def _show_manifest(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
+    """Print the numbers of made and failed cases, and return them for --json."""
     from tracks.common.files import plain
 
     count = len(manifest.cases)
     console.say(f"{count} cases in {config.out / 'cases'}, answers in {config.out / 'answers'}")
     for name in manifest.failed:
-        console.note(f"warning: {name} could not be made; why is in answers/failed.json")
+        console.note(f"warning: {name} could not be made; answers/failed.json has the reason")
     return {"out": str(config.out), "made": count, "failed": plain(manifest.failed)}
 
 
@@ -128,15 +133,18 @@ def _strengths(console: Console) -> dict[str, Any]:
 
 
 def _plan(config: Config, console: Console) -> dict[str, Any]:
+    """Print flights that separate `config.effects`, and return them for --json."""
     from eval.effects import find_effect
     from suite.diagnose.plan import plan_for, separations_of
     from tracks.common.files import plain
 
     names = [find_effect(name).name for name in config.effects]
     if len(names) < 2:
-        raise ValueError(f"--effects {names}: give at least two names that are to be separated")
+        raise ValueError(f"--effects {names}: give at least two names of effects to separate")
     for entry in separations_of(names):
         console.say(f"{' or '.join(entry.pair)}: {entry.words}")
-    for way in plan_for(names):
-        console.say(f"  {way.kind}, {way.duration_s:g} s, to {way.speed:g} m/s, yaw {way.turn}")
-    return {"flights": plain(plan_for(names))}
+    flights = plan_for(names)
+    for flight in flights:
+        yaw = f"yaw {flight.turn}"
+        console.say(f"  {flight.kind}, {flight.duration_s:g} s, to {flight.speed:g} m/s, {yaw}")
+    return {"flights": plain(flights)}

@@ -1,4 +1,7 @@
-"""`suite check`: faults of an interface, before anything is concluded from flights."""
+"""The command `suite check`: find faults of an interface in logs, vehicle and policy files.
+
+A fault is a wrong unit, sign, scale, order, delay or rate; a finding is a record of one.
+"""
 
 from __future__ import annotations
 
@@ -18,31 +21,31 @@ class Config(Command):
     """Check flights, a vehicle file and a policy for mistakes of unit, frame, sign and scale."""
 
     flights: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Flight logs, or folders of them; `suite import` makes them of other programs' logs."""
+    """Flight logs, or folders of them; `suite import` converts the logs of other programs."""
     vehicle: str = ""
-    """Compare the flights with this vehicle: a vehicle file or a shipped name. Without it the
-    flights are checked alone."""
+    """Compare the flights with this vehicle: a vehicle file or a shipped name. Without it only the
+    flights are checked."""
     policy: str = ""
     """Check this policy: a shipped name, a checkpoint's folder, or a file (.onnx, .pt2, .c)."""
     fix: bool = False
-    """Write the flights into --out, with what is certain and unambiguous corrected."""
+    """Write the flights into --out, with certain and unambiguous faults corrected."""
     out: Path = Path("checked")
-    """Folder for the flights of --fix."""
+    """Folder for the corrected flights of --fix."""
     trials: Advanced[Annotated[int, Range(0, 1000)]] = 4
     """Short flights of --policy on easy tracks, which show the size of its actions."""
     trust: Advanced[bool] = False
     """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write meanwhile."""
+        """Return the folders into which no other command may write at that time."""
         return [self.out] if self.fix else []
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """List what is assumed and what looks wrong.
+    """List the assumptions about the interface, and probable faults.
 
     Raises:
-        ValueError: where there is nothing to check, or something is refused.
+        ValueError: if there is nothing to check, or a file is refused.
     """
     from suite.judging.checking import check_flight_files, check_policy
 
@@ -51,13 +54,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     answer: dict[str, Any] = {"findings": [], "not_identifiable": []}
     policy = None
     if config.policy:
-        policy, found = check_policy(config.policy, config.trust, config.trials, console)
-        answer |= found
+        policy, result = check_policy(config.policy, config.trust, config.trials, console)
+        answer |= result
     if config.flights or config.vehicle:
         out = config.out if config.fix else None
-        found = check_flight_files(config.flights, config.vehicle, policy, out, console)
-        found["findings"] = [*answer["findings"], *found["findings"]]
-        answer |= found
+        result = check_flight_files(config.flights, config.vehicle, policy, out, console)
+        result["findings"] = [*answer["findings"], *result["findings"]]
+        answer |= result
     if not any(finding["status"] in ("doubt", "corrected") for finding in answer["findings"]):
         console.say("nothing to report")
     return answer

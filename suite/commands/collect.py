@@ -1,4 +1,8 @@
-"""`suite collect`: record flights for fitting the Delta Action Model or for a diagnosis."""
+"""The command `suite collect`: record simulated flights as logs.
+
+They are for the diagnosis, or for fitting a Delta Action Model, a network that corrects actions so
+that simulated flights match measured ones.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from typing import Any
 
 from suite.common.console import Console
 from suite.common.options import Command
-from suite.common.work import WorkersOption, workers_given
+from suite.common.work import WorkersOption, read_workers_option
 from suite.judging.requests import Collection
 
 
@@ -17,22 +21,22 @@ class Config(Command):
     """Fly a policy and record every flight as a log (Parquet)."""
 
     flown: Collection = Collection()
-    """What is flown."""
+    """The flights: policy, tracks, vehicle and simulator."""
     out: Path = Path("runs/flights")
     """Folder for the flights, and for flights.json, which lists them."""
     workers: WorkersOption = None
     """Share the flights among N processes of this machine, or on the cluster at HOST:PORT, whose
-    owner can run code here. Without it as many cores are used as give a gain."""
+    owner can run code here. Without it as many cores are used as shorten the work."""
 
     LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Record as `config` says; flights that are there already are not flown again.
+    """Record the flights; existing logs of an interrupted call are kept.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
+        ValueError: for an option that cannot be used, before the first flight.
     """
     from suite.judging.collect import collect
 
-    return collect(config.flown, config.out, console, workers_given(config.workers))
+    return collect(config.flown, config.out, console, read_workers_option(config.workers))

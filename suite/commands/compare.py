@@ -1,4 +1,4 @@
-"""`suite compare`: evaluations that were made apart, compared as a publication wants it."""
+"""The command `suite compare`: compare the success rates of separate evaluations, with a test."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ class Config(Command):
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Folders (--out) of suite eval, two or more."""
     against: tuple[Path, ...] = ()
-    """Folders with training seeds of another method; the differences are to it."""
+    """Folders with training seeds of another method, whose success rate is subtracted."""
     seeds: bool = False
-    """Take the runs as training seeds of one method: print mean, spread and interval."""
+    """Treat the runs as training seeds of one method: print mean, spread and interval."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Compare and print a sentence each.
+    """Compare the runs and print a sentence about each comparison.
 
     Raises:
-        ValueError: for too few runs, or runs under other conditions.
+        ValueError: for too few runs, or runs under different conditions.
     """
-    from suite.judging.comparing import paired, read_runs, seeds_of
+    from suite.judging.comparing import compare_runs, compare_seeds, read_runs
 
     runs = [run for folder in config.runs for run in read_runs(folder)]
     others = [run for folder in config.against for run in read_runs(folder)]
     if len(runs) < 2 and not (runs and others):
         raise ValueError("RUN is given less than twice; give two folders or more of suite eval")
     if config.seeds or (others and max(len(runs), len(others)) > 1):
-        found = [seeds_of(runs, others)]
+        comparisons = [compare_seeds(runs, others)]
     else:
-        found = [paired(runs[0], other) for other in (others or runs[1:])]
-    for each in found:
-        console.say(each["sentence"])
-    return {"comparisons": found}
+        comparisons = [compare_runs(runs[0], other) for other in (others or runs[1:])]
+    for comparison in comparisons:
+        console.say(comparison["sentence"])
+    return {"comparisons": comparisons}

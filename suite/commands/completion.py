@@ -1,4 +1,4 @@
-"""`suite completion`: what a shell needs to complete commands and options."""
+"""The command `suite completion`: print the script with which a shell completes commands."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ complete -o default -F _suite suite
 """
 """A function of bash that completes commands and options, and files elsewhere."""
 ZSH = "#compdef suite\nautoload -U +X bashcompinit && bashcompinit\n"
-"""How zsh runs a function of bash."""
+"""Lines with which zsh runs a function of bash."""
 
 
 @dataclass(frozen=True)
 class Config(Command):
     """Print a script that completes commands and options, for bash or zsh.
 
-    Put what it prints into ~/.local/share/bash-completion/completions/suite (bash), or into a file
-    _suite in a folder of fpath (zsh).
+    Write its output to ~/.local/share/bash-completion/completions/suite (bash), or to a file _suite
+    in a folder of fpath (zsh).
     """
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
-    """bash or zsh."""
+    """The shell: bash or zsh."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""`suite delta`: fit the Delta Action Model to recorded flights."""
+"""The command `suite delta`: fit a Delta Action Model to recorded flights.
+
+It is a network that adds a correction to the action, so that simulated flights match measured ones.
+"""
 
 from __future__ import annotations
 
@@ -24,28 +27,28 @@ class Config(Command):
     recipe: Advanced[str] = "race"
     """The training recipe whose point mass is corrected."""
     model: Literal["point", "quad"] = "point"
-    """What is corrected: the point mass, or the quadrotor of --vehicle with its effects."""
+    """The corrected dynamics: the point mass, or the quadrotor of --vehicle with its effects."""
     vehicle: str | None = None
     """The vehicle of --model quad: a shipped name or a vehicle file (.toml)."""
     held_out: Advanced[Annotated[float, Range(0.0, 1.0, above=True, below=True)]] = 0.25
-    """Share of the flights that take no part in the fit."""
+    """Share of the flights that are held out: the fit does not use them."""
     iterations: Iterations = 1500
-    """Gradient steps."""
+    """Number of gradient steps."""
     seed: Seed = 0
-    """Seed of the network, the split and the batches."""
+    """Seed of the network, the split of the flights and the batches."""
 
     LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fit, and show the errors on held-out flights next to those of the plain point mass.
+    """Fit, and show the errors on held-out flights with the model and without.
 
     Raises:
         ValueError: for an unknown recipe or logs that cannot be used.
     """
     from suite.delta.fit import FitConfig
     from suite.delta.run import errors, fit_delta, table
-    from suite.train.recipes import chosen_model, named_recipe
+    from suite.train.recipes import named_recipe, with_model
     from tracks.common.files import plain
 
     fitting = replace(
@@ -54,7 +57,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         iterations=config.iterations,
         seed=config.seed,
     )
-    recipe = chosen_model(named_recipe(config.recipe), config.model, config.vehicle)
+    recipe = with_model(named_recipe(config.recipe), config.model, config.vehicle)
     dynamics = recipe.quadrotor or recipe.physics
     result = fit_delta(fitting, dynamics, config.flights, config.out, console)
     console.say(table(result, fitting.horizon_s))

@@ -1,4 +1,7 @@
-"""`suite diagnose`: which physical effect is missing from a vehicle, by its flights."""
+"""The command `suite diagnose`: name the physical effects that a vehicle file lacks, from flights.
+
+An effect is one physical cause of a mismatch between simulation and flights, such as drag.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Diagnose, and say what was found.
+    """Diagnose, and print the verdict, the named effects and the next steps.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
@@ -86,29 +89,32 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     console.say(result["headline"])
     for effect in result["effects"]:
         rivals = ", ".join(effect["alternatives"])
-        same = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
-        console.say(f"  {effect['name']}{same}")
-        for one in sorted(components(effect), key=lambda one: not one.is_significant):
-            shown, between = one.texts()
-            console.say(f"    {one.label}: {shown}" + (f", 95 %: {between}" if between else ""))
+        note = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
+        console.say(f"  {effect['name']}{note}")
+        for component in sorted(
+            components(effect), key=lambda component: not component.is_significant
+        ):
+            value, interval = component.texts()
+            suffix = f", 95 %: {interval}" if interval else ""
+            console.say(f"    {component.label}: {value}{suffix}")
     if result["warnings"]:
         console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")
     for step in next_steps(result):
         console.say(f"next: {step}")
     for side in ("held_out", "outside"):
-        compared = (result.get("black_box") or {}).get(side)
-        if compared:
-            named = compared["named"]
+        comparison = (result.get("black_box") or {}).get(side)
+        if comparison:
+            named = comparison["named"]
             named_gap = f"{named['gap']:.2f} with the names, " if named else ""
             console.say(
-                f"on {compared['judged_on']}: {compared['before']['gap']:.2f} before, {named_gap}"
-                f"{compared['black_box']['gap']:.2f} with a Delta Action Model"
+                f"on {comparison['judged_on']}: {comparison['before']['gap']:.2f} before, "
+                f"{named_gap}{comparison['black_box']['gap']:.2f} with a Delta Action Model"
             )
     plan = result.get("plan")
     if plan:
         count = len(plan["flights"])
-        where = f": {config.out / 'plan'}" if count else ""
-        console.say(f"plan: {count} flights{where}")
+        folder = f": {config.out / 'plan'}" if count else ""
+        console.say(f"plan: {count} flights{folder}")
         if any(flight["flown"] for flight in plan["flights"]):
             console.say(f"flown in simulation: {config.out / 'plan' / 'flights'}")
     console.say(f"report: {config.out / 'report.html'}")

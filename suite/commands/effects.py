@@ -1,4 +1,8 @@
-"""`suite effects`: the catalogue of physical effects that a vehicle file may hold."""
+"""The command `suite effects`: list the catalogue of physical effects, or describe one.
+
+An effect is one physical cause of a mismatch between simulation and flights; a vehicle file may
+have any number of them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ class Config(Command):
     """List the physical effects that a vehicle file may hold, or describe one."""
 
     name: tyro.conf.Positional[str] = ""
-    """Name of an effect; without it, all are listed."""
+    """Name of an effect. Without it all are listed."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
@@ -46,19 +50,20 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         count = f" x {parameter.size}" if parameter.size else ""
         low, high = parameter.typical
         neutral = bound_value(parameter.neutral, vehicle)
-        off = f" away from {neutral:g}" if neutral and not parameter.whole else ""
+        reference = f" away from {neutral:g}" if neutral and not parameter.whole else ""
         by_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
-        whose = f" (for vehicle {vehicle.name})" if by_vehicle else ""
-        given = "" if parameter.required else "; optional"
+        condition = f" (for vehicle {vehicle.name})" if by_vehicle else ""
+        optional = "" if parameter.required else "; optional"
         least, most = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
         console.say(
-            f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}{off}; "
-            f"allowed {least:g} to {most:g}{whose}{given}"
+            f"  {parameter.name}{count} [{parameter.unit}]: usually {low:g} to {high:g}"
+            f"{reference}; allowed {least:g} to {most:g}{condition}{optional}"
         )
     return {"effects": {effect.name: _facts(effect)}}
 
 
 def _facts(effect: Effect) -> dict[str, Any]:
+    """Return an effect's description for --json."""
     return {
         "summary": effect.summary,
         "equation": effect.equation,

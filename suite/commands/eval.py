@@ -1,4 +1,4 @@
-"""`suite eval`: judge policies on tracks they have not seen, in a quadrotor they do not know."""
+"""The command `suite eval`: judge policies in a simulator, on tracks that no training uses."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from typing import Any
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from suite.common.work import WorkersOption, workers_given
+from suite.common.work import WorkersOption, read_workers_option
 from suite.judging.requests import Evaluation
 from tracks.common.files import check_place
 
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Fly trials and write the result tables; two policies or more are compared in pairs."""
+    """Fly trials and write tables of the results; further policies are compared with the first."""
 
     flown: Evaluation = Evaluation()
-    """What is flown."""
+    """The flights: policies, tracks, vehicle and simulator."""
     out: Path = Path("runs/eval")
     """Folder for trials.parquet, table.md, summary.json and run.json."""
     rerun: Advanced[Path | None] = None
     """Also write this recording (.rrd, for rerun) of the first trial of every track and level."""
     workers: WorkersOption = None
     """Share the trials among N processes of this machine, or on the cluster at HOST:PORT, whose
-    owner can run code here. Without it as many cores are used as give a gain."""
+    owner can run code here. Without it as many cores are used as shorten the work."""
 
     LOCKED = ("out",)
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Judge as `config` says.
+    """Judge the policies, write the tables, and a recording if there is --rerun.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
+        ValueError: for an option that cannot be used, before the first flight.
     """
     from suite.judging.evaluate import evaluate
 
@@ -45,7 +45,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
         check_records(config.flown.simulator)
         check_place(config.rerun)
-    answer = evaluate(config.flown, config.out, console, workers_given(config.workers))
+    answer = evaluate(config.flown, config.out, console, read_workers_option(config.workers))
     if config.rerun:
         from suite.judging.replay import record_first_trials
 

@@ -1,4 +1,4 @@
-"""`suite example`: flights to try `suite diagnose` on, simulated or of a real quadrotor."""
+"""The command `suite example`: copy example flights into a folder, simulated or real ones."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ class Config(Command):
     """Copy short flights into a folder, to try suite diagnose, import and identify on."""
 
     out: Path = Path("example")
-    """Folder for flight_1.parquet to flight_3.parquet and vehicle.toml, or for what is real."""
+    """Folder for flight_1.parquet to flight_3.parquet and vehicle.toml, or for the real logs."""
     real: bool = False
     """Instead: two raw logs of a real quadrotor with their mapping, licence and a README."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Copy the example, and say what to do with it.
+    """Copy the example, and print the next command.
 
     Raises:
-        OSError: where the folder cannot be written.
+        OSError: if the folder cannot be written.
     """
     from suite.diagnose.example.real import real_files
     from tracks.common.files import replacing_file
 
     config.out.mkdir(parents=True, exist_ok=True)
-    copied = real_files() if config.real else _simulated()
-    for name, whole in copied.items():
+    contents = real_files() if config.real else _simulated_files()
+    for name, content in contents.items():
         with replacing_file(config.out / name) as new:
-            new.write_bytes(whole)
-    names = sorted(copied)
+            new.write_bytes(content)
+    names = sorted(contents)
     console.say(f"wrote {', '.join(names)} to {config.out}")
     if config.real:
         console.say(f"next: follow {config.out / 'README.md'} or the tutorial of docs/measure.md")
@@ -44,7 +44,8 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     return {"folder": str(config.out), "files": names}
 
 
-def _simulated() -> dict[str, bytes]:
+def _simulated_files() -> dict[str, bytes]:
+    """Return the content of the simulated flights and their vehicle file, by name."""
     from importlib.resources import files
 
     folder = files("suite.diagnose.example").iterdir()

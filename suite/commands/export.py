@@ -1,4 +1,4 @@
-"""`suite export`: a policy of ours for other programs."""
+"""The command `suite export`: write a policy of the suite as torch program, ONNX or C."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from suite.common.options import Advanced, Command
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Write a policy of ours as torch program (.pt2), ONNX (.onnx) and C (policy.h, policy.c)."""
+    """Write a policy of the suite as torch program (.pt2), ONNX (.onnx) or C (policy.h, .c)."""
 
     name: tyro.conf.Positional[str] = ""
     """A shipped policy's name or a checkpoint's folder. Without it the policy race."""
     policy: str = ""
     """The same as NAME."""
     formats: Annotated[tuple[str, ...], tyro.conf.arg(name="format")] = ("torch", "onnx")
-    """Which of torch, onnx and c."""
+    """One or more of torch, onnx and c."""
     dtype: Advanced[str] = "float32"
     """Type of the weights in C: float32 or int8."""
     out: Path = Path("runs/export")
@@ -29,10 +29,10 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Write the files and say where they are.
+    """Write the files and print their paths.
 
     Raises:
-        ValueError: where the policy is not ours, or a format or type is unknown.
+        ValueError: if the policy is not the suite's, or a format or type is unknown.
     """
     from policies import shipped
     from suite.judging.deploy.exporting import export
@@ -40,11 +40,11 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
     if config.name and config.policy and config.name != config.policy:
         raise ValueError(f"--policy {config.policy}: NAME is {config.name}; give one of them")
-    given, formats = config.policy or config.name, config.formats
-    if not given and (formats[-1] in shipped.names() or Path(formats[-1]).exists()):
-        # `--format c race`: a list takes the words behind it, the policy's name too.
-        *formats, given = formats
-    answer = export(given or default_policy(), config.out, formats, config.dtype, console)
+    policy, formats = config.policy or config.name, config.formats
+    if not policy and (formats[-1] in shipped.names() or Path(formats[-1]).exists()):
+        # In `--format c race` the list takes all words after it, also the policy's name.
+        *formats, policy = formats
+    answer = export(policy or default_policy(), config.out, formats, config.dtype, console)
     for path in answer["written"]:
         console.say(f"written: {path} ({size(path.stat().st_size)})")
     return answer

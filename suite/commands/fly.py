@@ -1,4 +1,4 @@
-"""`suite fly`: a policy in real time over MAVLink, as a companion computer flies it."""
+"""The command `suite fly`: fly a policy in real time over MAVLink, as on a companion computer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Config(Command):
     """A shipped policy's name, a checkpoint's folder, or a policy file. Without it the policy race
     flies."""
     flown: Flights = Flights(track="zigzag", difficulty="0", trials=1)
-    """What is flown."""
+    """The flights: tracks and vehicle."""
     speed: Annotated[float, Range(0.0, 1.0)] | None = None
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     monitor: bool = False
@@ -43,25 +43,25 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fly as `config` says.
+    """Fly, and write the flight logs.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
-        WorkFailed: where no vehicle answered.
+        ValueError: for an option that cannot be used, before the first flight.
+        WorkFailed: if no vehicle answers.
     """
-    from suite.judging.link.commanded import fly_commanded
+    from suite.judging.link.fly import fly_over_link
     from suite.judging.link.messages import signing_key
 
     speed = () if config.speed is None else (config.speed,)
     evaluation = Evaluation(**vars(config.flown), speed=speed, monitor=config.monitor)
     if config.link and not config.confirm:
         raise ValueError(
-            f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do what it "
-            "asks for, then give --confirm as well"
+            f"--link {config.link}: set points would move a vehicle; read docs/fly.md, do its "
+            "checks, then add --confirm"
         )
     if config.signing_key and not config.link:
-        raise ValueError("--signing-key is of a real link, and no --link is given")
-    return fly_commanded(
+        raise ValueError("--signing-key needs --link: only a real link is signed")
+    return fly_over_link(
         evaluation, config.policy, config.link, config.limits, config.out, console,
         signing_key(config.signing_key),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`suite identify`: the numbers of a vehicle file, or of a sensors file, from flights."""
+"""The command `suite identify`: estimate parameters of a vehicle or sensors file from flights."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Config(Command):
     flights: tyro.conf.Positional[tuple[Path, ...]]
     """Flight logs of one vehicle, or folders of them."""
     vehicle: str = ""
-    """Start from this vehicle file or shipped vehicle: it gives the mass, the arms and all that
-    flights do not show. Required without --sensors."""
+    """Start from this vehicle file or shipped vehicle: mass, arms and all parameters that are not
+    identifiable come from it. Required without --sensors."""
     sensors: bool = False
     """Write a sensors file instead: the errors of an on-board estimate against the reference in
     the logs."""
@@ -37,17 +37,17 @@ class Config(Command):
     prints."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write meanwhile."""
-        return [_out(self).parent]
+        """Return the folders into which no other command may write at that time."""
+        return [_out_path(self).parent]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Identify, and report what is identifiable and what is not.
+    """Estimate, and print the parameters that are identifiable and those that are not.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
     """
-    out = _out(config)
+    out = _out_path(config)
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     if config.sensors:
@@ -56,9 +56,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
         result = of_sensors.identify_sensors(config.flights, out, console)
-        _say_parameters(result, console)
+        _show_parameters(result, console)
         of_sensors.say_held_out(result, console)
-        return _say_end(result, out, console)
+        return _show_end(result, out, console)
     from suite.diagnose.identify.run import identify_files
 
     if not config.vehicle:
@@ -67,43 +67,48 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     result = identify_files(
         config.flights, config.vehicle, out, config.leave, console, config.accept
     )
-    console.say(f"driven by {DRIVEN[result['drive']]}")
-    _say_parameters(result, console)
+    console.say(f"driven by {MODEL_INPUTS[result['drive']]}")
+    _show_parameters(result, console)
     for text in result["not_identified"]:
         console.say(f"  not identifiable from these flights, {text}")
-    return _say_end(result, out, console)
+    return _show_end(result, out, console)
 
 
-def _say_parameters(result: dict[str, Any], console: Console) -> None:
+def _show_parameters(result: dict[str, Any], console: Console) -> None:
+    """Print each parameter with its 95 % interval, or a note if it is not identifiable."""
     for key, entry in result["parameters"].items():
-        values, spans = entry["value"], entry["ci95"]
+        values, intervals = entry["value"], entry["ci95"]
         if not isinstance(values, list):
-            values, spans = [values], [spans]
+            values, intervals = [values], [intervals]
         # Inertia about z is scaled with those about x and y, of which one is identifiable then.
-        left = {2: "goes with the others"} if key == "inertia" else {}
+        notes = {2: "goes with the others"} if key == "inertia" else {}
         shown = [
-            f"{v:.4g} ({s[0]:.4g} to {s[1]:.4g})" if s else f"{v:.4g} ({left.get(k, 'as it was')})"
-            for k, (v, s) in enumerate(zip(values, spans, strict=True))
+            f"{value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})"
+            if interval
+            else f"{value:.4g} ({notes.get(k, 'as it was')})"
+            for k, (value, interval) in enumerate(zip(values, intervals, strict=True))
         ]
         console.say(f"  {key}: {', '.join(shown)} {entry['unit']}")
 
 
-def _say_end(result: dict[str, Any], out: Path, console: Console) -> dict[str, Any]:
+def _show_end(result: dict[str, Any], out: Path, console: Console) -> dict[str, Any]:
+    """Print the warnings and the written file; return `result`."""
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
     console.say(f"written: {out}")
     return result
 
 
-def _out(config: Config) -> Path:
+def _out_path(config: Config) -> Path:
     """Return the file to write."""
     return config.out or Path("sensors.toml" if config.sensors else "vehicle.toml")
 
 
-DRIVEN = {
+MODEL_INPUTS = {
     "rotors": "measured rotor speeds",
     "pwm": "motor commands and the battery",
     "torques": "commanded thrust and torques",
     "rates": "commanded thrust and body rates",
     "thrust": "commanded thrust alone",
 }
+"""The model's input in the result -> its description."""

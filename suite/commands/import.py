@@ -1,4 +1,4 @@
-"""`suite import`: flight logs of other programs as flight logs of ours."""
+"""The command `suite import`: convert a log of another program to a flight log, and check it."""
 
 from __future__ import annotations
 
@@ -29,42 +29,42 @@ class Config(Command):
     """Columns, units and frames of a table or a Crazyflie's log, or topics of an MCAP file: a
     mapping file (TOML), or nanobench, crazypad, crazyswarm2 or crazyflie."""
     source: Advanced[Literal["mocap", "estimate"] | None] = None
-    """Where the file holds raw motion capture and an estimate: take the pose from this one.
-    Without it in the mapping's order."""
+    """For a file with raw motion capture and an estimate: take the pose from this one. Without it
+    in the mapping's order."""
     pose: Path | None = None
-    """CSV or Parquet with position and attitude from elsewhere, such as motion capture; its clock
-    is aligned with the log's."""
+    """CSV or Parquet file with position and attitude from another source, such as motion capture;
+    its clock is aligned with the log's."""
     pose_map: Advanced[Path | None] = None
     """Mapping file (TOML) of --pose."""
     vehicle: str = ""
     """A shipped vehicle's name or a vehicle file, for the order of the motors and the full
     thrust."""
     full_thrust: Annotated[float, Range(0.0, 1000.0, above=True, below=True)] | None = None
-    """Thrust per mass at full throttle [m/s^2], for a log with normalised thrust; else that of
-    --vehicle."""
+    """Thrust per mass at full throttle [m/s^2], for a log with normalised thrust. Without it that
+    of --vehicle."""
     mass: Annotated[float, Range(0.0, 10_000.0, above=True)] | None = None
-    """Nominal mass [kg], for a log with thrust in N; else that of --vehicle."""
+    """Nominal mass [kg], for a log with thrust in N. Without it that of --vehicle."""
     motor_poles: Advanced[Annotated[int, Range(2, 1000)]] = 14
     """Number of magnets in a motor, for Betaflight's eRPM."""
     rate: Advanced[Annotated[float, Range(1.0, 10_000.0)]] = 250.0
-    """At most this many rows a second."""
+    """Largest number of rows per second."""
     start: Advanced[Annotated[float, Range(0.0, 1e9)]] = 0.0
-    """Leave out what is earlier [s after the file's first sample]."""
+    """Leave out earlier samples [s after the file's first sample]."""
     end: Advanced[Annotated[float, Range(0.0, 1e9)] | None] = None
     """Leave out rows after this time [s after the file's first sample]. Without it none."""
     keep_ground: Advanced[bool] = False
     """Keep the time before take-off and after landing."""
     partial: bool = False
-    """Accept a log without position, attitude, rates or commands, and keep what is there."""
+    """Accept a log without position, attitude, rates or commands, and keep all other signals."""
     read: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Read a signal differently, as suite check prints it as a fix: rate=x,-y,-z+0.0610352,
     quat=xyzw, time=ms or motor=2,1,4,3; may be given several times."""
     no_fix: Advanced[bool] = False
-    """Print what looks wrong, but correct nothing."""
+    """Print probable faults, but correct none."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Import as `config` says, and say what was found.
+    """Convert the log, and print the findings, records of probable faults.
 
     Raises:
         ValueError: for a file, a mapping or an option that cannot be used.
@@ -100,9 +100,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(line)
     for warning in log.warnings:
         console.say(f"note      file: {warning}")
-    rows, top = len(log.time_s), _top(log.speed)
-    speed = "no speed" if top is None else f"up to {top:.1f} m/s"
-    console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed}: {config.out}")
+    rows, speed = len(log.time_s), _largest(log.speed)
+    speed_text = "no speed" if speed is None else f"up to {speed:.1f} m/s"
+    console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed_text}: {config.out}")
     return {
         "flight": str(config.out),
         "rows": rows,
@@ -114,6 +114,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _check(config: Config) -> None:
+    """Refuse options that contradict each other, and an output that would replace an input."""
     if config.out.suffix.lower() not in (".parquet", ".csv"):
         raise ValueError(f"--out is {str(config.out)!r}; its ending must be .parquet or .csv")
     if config.end is not None and config.end <= config.start:
@@ -123,7 +124,8 @@ def _check(config: Config) -> None:
     check_no_input(config.out, [config.file, config.pose], "--out")
 
 
-def _top(speed: Any) -> float | None:
+def _largest(speed: Any) -> float | None:
+    """Return the largest finite value of an array; None without any."""
     import numpy as np
 
     return float(np.nanmax(speed)) if np.isfinite(speed).any() else None

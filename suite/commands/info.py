@@ -1,4 +1,4 @@
-"""`suite info`: what a bug report needs."""
+"""The command `suite info`: print versions, devices and memory, for a bug report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Collect and show the facts; a device that cannot be asked says why."""
+    """Collect and print the facts; if JAX cannot find its devices, its error is printed."""
     facts: dict[str, Any] = {
         "suite": VERSION,
         "git_commit": git_commit(),
@@ -30,12 +30,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         "jax_devices": _jax_devices(),
         "packages": package_versions(),
     }
-    about = facts["machine"]
+    computer = facts["machine"]
     console.say(f"suite      {VERSION}, commit {facts['git_commit'] or 'unknown'}")
     console.say(f"python     {facts['python']}")
-    console.say(f"system     {about['system']}")
-    console.say(f"processor  {about['processor']}, {about['cores']} usable cores")
-    free, total = size(facts["memory_free_bytes"]), size(about["memory_bytes"])
+    console.say(f"system     {computer['system']}")
+    console.say(f"processor  {computer['processor']}, {computer['cores']} usable cores")
+    free, total = size(facts["memory_free_bytes"]), size(computer["memory_bytes"])
     console.say(f"memory     {free} free of {total}")
     console.say(f"jax        {', '.join(facts['jax_devices'])}")
     for name, version in facts["packages"].items():
@@ -48,5 +48,5 @@ def _jax_devices() -> list[str]:
         import jax
 
         return [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()]
-    except Exception as error:  # a broken driver is what the report is about
+    except Exception as error:  # the report may be about a broken driver
         return [f"not usable: {error}"]

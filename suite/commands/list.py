@@ -1,4 +1,4 @@
-"""`suite list`: what can be named in other commands, by kind."""
+"""The command `suite list`: print the names that other commands accept, such as all tracks."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from tracks.common.names import unknown_name
 
 @dataclass(frozen=True)
 class Config(Command):
-    """List what other commands take by name.
+    """List the names that other commands accept.
 
     Kinds: tracks, vehicles, policies, recipes, effects, sensors (files), sensor-models, simulators,
     benchmarks, settings (of suite train --set).
     """
 
     kind: tyro.conf.Positional[str] = ""
-    """Which kind. Without it the names of all kinds but the settings."""
+    """The kind of names. Without it the names of all kinds but the settings."""
     recipe: str = "race"
-    """For the kind settings: of which recipe."""
+    """For the kind settings: the recipe whose settings are listed."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
@@ -39,20 +39,20 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if config.kind == "settings":
         return {"settings": list_settings(config.recipe, console)}
     if not config.kind:
-        found = {kind: sorted(of.names()) for kind, of in KINDS.items()}
-        width = max(map(len, found))
-        for kind, names in found.items():
-            console.say(f"{kind:<{width}}  {', '.join(names)}")
+        all_names = {name: sorted(kind.names()) for name, kind in KINDS.items()}
+        width = max(map(len, all_names))
+        for kind_name, names in all_names.items():
+            console.say(f"{kind_name:<{width}}  {', '.join(names)}")
         console.say("suite list KIND has a line about each; suite list settings: of suite train")
-        return found
+        return all_names
     if config.kind not in KINDS:
         raise unknown_name("kind", config.kind, [*KINDS, "settings"])
-    of = KINDS[config.kind]
-    abouts = {name: of.about(name) for name in of.names()}
-    width = max(map(len, abouts))
-    for name, about in abouts.items():
-        console.say(f"{name:<{width}}  {about}")
-    return {config.kind: abouts}
+    kind = KINDS[config.kind]
+    descriptions = {name: kind.describe(name) for name in kind.names()}
+    width = max(map(len, descriptions))
+    for name, text in descriptions.items():
+        console.say(f"{name:<{width}}  {text}")
+    return {config.kind: descriptions}
 
 
 def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
@@ -60,64 +60,68 @@ def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
     from suite.common.options import settings
     from suite.train.recipes import named_recipe
 
-    found = list(settings(named_recipe(recipe)))
-    for one in found:
-        allowed = f", allowed {one.allowed}" if one.allowed else ""
-        console.say(f"{one.path} = {one.default!r}{allowed}\n    {one.about}")
-    return [one._asdict() for one in found]
+    all_settings = list(settings(named_recipe(recipe)))
+    for setting in all_settings:
+        allowed = f", allowed {setting.allowed}" if setting.allowed else ""
+        console.say(f"{setting.path} = {setting.default!r}{allowed}\n    {setting.about}")
+    return [setting._asdict() for setting in all_settings]
 
 
 class Kind(NamedTuple):
-    """Entries of one kind; what only an entry's text needs is loaded when that text is printed."""
+    """A kind of names; packages that only the descriptions need are loaded with these."""
 
     names: Callable[[], Iterable[str]]
-    about: Callable[[str], str]
+    """Returns all names."""
+    describe: Callable[[str], str]
+    """Returns a line about a name."""
 
 
-def _of(module: str) -> Any:
+def _module(name: str) -> Any:
     """Return a module, imported at the first list that needs it."""
-    return importlib.import_module(module)
+    return importlib.import_module(name)
 
 
 def _vehicle(name: str) -> str:
-    vehicle = _of("eval.quadrotor.vehicle_file").load_vehicle(name)
+    vehicle = _module("eval.quadrotor.vehicle_file").load_vehicle(name)
     effects = ", ".join(vehicle.effects) or "no effects"
     return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
 
 
 def _policy(name: str) -> str:
-    spec = _of("policies.policy").load_policy(name).spec
+    spec = _module("policies.policy").load_policy(name).spec
     return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
 
 
 def _recipe(name: str) -> str:
-    return first_paragraph(_of("suite.train.recipes").RECIPES[name].__doc__)
+    return first_paragraph(_module("suite.train.recipes").RECIPES[name].__doc__)
 
 
 def _sensors(name: str) -> str:
-    return ", ".join(_of("eval.sensors.sensors_file").load_sensors(name).models) or "the truth"
+    return ", ".join(_module("eval.sensors.sensors_file").load_sensors(name).models) or "no errors"
 
 
 def _simulator(name: str) -> str:
-    return first_paragraph(_of("eval.worlds").WORLDS.find(name).__doc__)
+    return first_paragraph(_module("eval.worlds").WORLDS.find(name).__doc__)
 
 
 KINDS: dict[str, Kind] = {
-    "tracks": Kind(lambda: _of("tracks.families").FAMILIES, family_text),
-    "vehicles": Kind(lambda: _of("eval.quadrotor.vehicle_file").shipped_vehicles(), _vehicle),
-    "policies": Kind(lambda: _of("policies.shipped").names(), _policy),
-    "recipes": Kind(lambda: _of("suite.train.recipes").RECIPES, _recipe),
+    "tracks": Kind(lambda: _module("tracks.families").FAMILIES, family_text),
+    "vehicles": Kind(lambda: _module("eval.quadrotor.vehicle_file").shipped_vehicles(), _vehicle),
+    "policies": Kind(lambda: _module("policies.shipped").names(), _policy),
+    "recipes": Kind(lambda: _module("suite.train.recipes").RECIPES, _recipe),
     "effects": Kind(
-        lambda: _of("eval.effects").EFFECTS, lambda name: _of("eval.effects").EFFECTS[name].summary
+        lambda: _module("eval.effects").EFFECTS,
+        lambda name: _module("eval.effects").EFFECTS[name].summary,
     ),
-    "sensors": Kind(lambda: _of("eval.sensors.sensors_file").shipped_sensors(), _sensors),
+    "sensors": Kind(lambda: _module("eval.sensors.sensors_file").shipped_sensors(), _sensors),
     "sensor-models": Kind(
-        lambda: _of("eval.sensors").SENSORS, lambda name: _of("eval.sensors").SENSORS[name].summary
+        lambda: _module("eval.sensors").SENSORS,
+        lambda name: _module("eval.sensors").SENSORS[name].summary,
     ),
-    "simulators": Kind(lambda: _of("eval.worlds").WORLDS, _simulator),
+    "simulators": Kind(lambda: _module("eval.worlds").WORLDS, _simulator),
     "benchmarks": Kind(
-        lambda: _of("suite.experiments.bench").BENCHES,
-        lambda name: _of("suite.experiments.bench").BENCHES[name],
+        lambda: _module("suite.experiments.bench").BENCHES,
+        lambda name: _module("suite.experiments.bench").BENCHES[name],
     ),
 }
-"""What can be listed."""
+"""Name of a kind -> the kind."""

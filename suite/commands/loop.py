@@ -1,4 +1,9 @@
-"""`suite loop`: train, fly, record, fit the Delta Action Model, fine-tune, fly again."""
+"""The command `suite loop`: correct a simulation from flights, and fine-tune a policy in it.
+
+The stages are: train, fly, record, fit a Delta Action Model or name the hidden effect, fine-tune,
+fly again. A Delta Action Model is a network that corrects actions so that simulated flights match
+measured ones.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from typing import Annotated, Any
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from suite.common.work import WorkersOption, workers_given
+from suite.common.work import WorkersOption, read_workers_option
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials
 
 
@@ -40,8 +45,8 @@ class Config(Command):
     """A vehicle file with an effect that --vehicle lacks: fly it, name the effect, fine-tune
     through the corrected quadrotor. Without it flights of --vehicle are recorded."""
     simulator: str = "mujoco"
-    """What simulates the hidden vehicle. With another simulator than mujoco (such as rotorpy) and
-    no --hidden-vehicle, the hidden difference is that between the simulators."""
+    """The simulator of the hidden vehicle. With another one than mujoco (such as rotorpy) and no
+    --hidden-vehicle, the hidden difference is that between the simulators."""
     sensors: Advanced[str] = "perfect"
     """Errors in what the policies see, in every flight: a shipped name or a sensors file."""
     seed: Annotated[int, Range(0, SEED_MOST - 10**6)] = 0
@@ -60,29 +65,29 @@ class Config(Command):
     set: Advanced[tuple[str, ...]] = ()
     """Change settings of the recipe by name, such as loss.progress=0.4 episode.batch=128."""
     out: Path = Path("runs/loop")
-    """Folder of the loop; a loop that is there already continues."""
+    """Folder of the loop; an unfinished loop in it continues."""
     workers: WorkersOption = None
     """Share flights and fine-tunings among N processes of this machine, or on the cluster at
-    HOST:PORT, whose owner can run code here. Without it flights use as many cores as give a gain,
-    and one process fine-tunes."""
+    HOST:PORT, whose owner can run code here. Without it flights use as many cores as shorten the
+    work, and one process fine-tunes."""
 
     LOCKED = ("out",)
 
 
-OTHER = ("set", "no_delta", "out", "workers", "json")
-"""Options that `suite.loop.config.resolve` does not take by these names."""
+OTHER_OPTIONS = ("set", "no_delta", "out", "workers", "json")
+"""Options that are no arguments of `suite.loop.config.resolve`, or have another name there."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Run the loop, or the rest of it.
+    """Run the loop, or its unfinished stages.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first stage.
+        ValueError: for an option that cannot be used, before the first stage.
     """
     from suite.loop.config import resolve
     from suite.loop.run import run_loop
 
-    workers = workers_given(config.workers, whole_cores=True)
-    about_loop = {name: value for name, value in vars(config).items() if name not in OTHER}
-    resolved = resolve(**about_loop, delta=not config.no_delta, changes=config.set)
+    workers = read_workers_option(config.workers, whole_cores=True)
+    options = {name: value for name, value in vars(config).items() if name not in OTHER_OPTIONS}
+    resolved = resolve(**options, delta=not config.no_delta, changes=config.set)
     return run_loop(resolved, config.out, console, workers)

@@ -1,4 +1,4 @@
-"""`suite reproduce PAGE`: the paper's tables and more, made by one command each."""
+"""The command `suite reproduce PAGE`: make a page of docs/results, such as the paper's table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from suite.common.console import Console
 from suite.common.options import Advanced, Command
-from suite.common.work import WorkersOption, workers_given
+from suite.common.work import WorkersOption, read_workers_option
 from suite.experiments import EXPERIMENTS, OVER_ALL
 from tracks.common.grid import rich_table
 from tracks.common.names import unknown_name
@@ -21,8 +21,8 @@ class Config(Command):
     """Make one of the pages of docs/results; the same command again continues where it stopped.
 
     Pages: table2, robustness, perception, ablation, schemes, faults, gpu, simulators. `all` makes
-    the published ones, `status` lists what is newer than they are. suite reproduce alone has a line
-    about each, suite reproduce PAGE --help the options of a page.
+    the published ones, `status` lists the policies and code that are newer. suite reproduce alone
+    prints a line about each, suite reproduce PAGE --help the options of a page.
 
     PAGE.json with the numbers, charts, and PAGE.md with the tables go to --out. If PAGE.md exists,
     only the part between its two comments is replaced.
@@ -38,42 +38,42 @@ class Config(Command):
     follows the other."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write meanwhile."""
+        """Return the folders into which no other command may write at that time."""
         return [self.out, self.cache] if hasattr(self, "experiment") else []
 
 
 def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
     """Return the options of the page that `args` name, its name, and the other words.
 
-    Only that page's module is loaded: what it needs takes longer to load than a command line.
+    Only the module of that page is loaded, because loading all of them takes seconds.
 
     Raises:
         ValueError: for an unknown page.
     """
-    known = {**EXPERIMENTS, **OVER_ALL}
-    name = next((word for word in args if word in known), "")
+    pages = {**EXPERIMENTS, **OVER_ALL}
+    name = next((word for word in args if word in pages), "")
     if not name:
         if args and not args[0].startswith("-"):
-            raise unknown_name("page", args[0], known)
+            raise unknown_name("page", args[0], pages)
         return Config, "", list(args)
     if name in OVER_ALL:
         from suite.experiments import published
 
-        chosen = getattr(published, name.capitalize())
+        experiment = getattr(published, name.capitalize())
     else:
-        chosen = importlib.import_module(f"suite.experiments.{name}").Config
-    field = ("experiment", chosen, chosen())
-    about = {"__doc__": chosen.__doc__}
-    kind = make_dataclass("Config", [field], bases=(Config,), namespace=about, frozen=True)
-    at = list(args).index(name)
-    return kind, name, [*args[:at], *args[at + 1 :]]
+        experiment = importlib.import_module(f"suite.experiments.{name}").Config
+    field = ("experiment", experiment, experiment())
+    namespace = {"__doc__": experiment.__doc__}
+    kind = make_dataclass("Config", [field], bases=(Config,), namespace=namespace, frozen=True)
+    index = list(args).index(name)
+    return kind, name, [*args[:index], *args[index + 1 :]]
 
 
 def run(config: Any, console: Console) -> dict[str, Any]:
-    """Make the page, or what is left of it; without a page list them.
+    """Make the page, or continue an interrupted call; without a page list them.
 
     Raises:
-        ValueError: for anything that cannot be used, before the first flight.
+        ValueError: for an option that cannot be used, before the first flight.
     """
     from suite.experiments import published
 
@@ -92,20 +92,21 @@ def run(config: Any, console: Console) -> dict[str, Any]:
 
         def make(name: str, options: Sequence[str]) -> dict[str, Any]:
             _, page = parse("reproduce", [name, *options])
-            return _made(replace(config, experiment=page.experiment), console)
+            return _make_page(replace(config, experiment=page.experiment), console)
 
         return published.make_all(make, console)
-    return _made(config, console)
+    return _make_page(config, console)
 
 
-def _made(config: Any, console: Console) -> dict[str, Any]:
-    from suite.experiments.pages.document import Place, check_page, write_document
+def _make_page(config: Any, console: Console) -> dict[str, Any]:
+    """Run the experiment of a page and write its files; return its numbers for --json."""
+    from suite.experiments.pages.document import Workspace, check_page, write_document
     from suite.experiments.study.options import check
 
-    workers = workers_given(config.workers, whole_cores=True)
+    workers = read_workers_option(config.workers, whole_cores=True)
     check(config.experiment)
-    place, module = Place(config.out, config.cache, workers), type(config.experiment).__module__
+    place, module = Workspace(config.out, config.cache, workers), type(config.experiment).__module__
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
     check_page(place.out, name)
-    made = document(config.experiment, place, console)
-    return write_document(place, name, config.experiment, made, console)
+    contents = document(config.experiment, place, console)
+    return write_document(place, name, config.experiment, contents, console)

@@ -1,4 +1,7 @@
-"""`suite tracks`: the track families, or pictures of a track."""
+"""The command `suite tracks`: list the track families, or draw a track as a picture.
+
+A family is the rule that draws a track from a seed and a level of difficulty.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import tyro
 from suite.common.console import Console
 from suite.common.options import Command
 from suite.common.usage import first_paragraph
-from suite.judging.requests import is_track_file, parse_levels
+from suite.judging.trials import is_track_file, parse_levels
 from tracks.input.ranges import Seed
 
 
@@ -21,7 +24,7 @@ class Config(Command):
     """List the track families, or draw one track as a picture."""
 
     track: tyro.conf.Positional[str] = ""
-    """A family's name or a track file (.toml); without it, the families are listed."""
+    """A family's name or a track file (.toml). Without it the families are listed."""
     difficulty: str = "0"
     """Level, 0 to 9; several as 0,3,9 or 0-3 or all."""
     seed: Seed = 0
@@ -34,14 +37,14 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """List the families, or draw `config.track` at each level.
 
     Raises:
-        ValueError: for an unknown family, a level out of range, or a bad track file.
+        ValueError: for an unknown family, a level out of range, or an invalid track file.
     """
     if not config.track:
-        return _list(console)
+        return _list_families(console)
     from eval.view.picture import write_grid, write_picture
     from tracks.families import check_family, make_track
 
-    drawn = []
+    pictures = []
     if is_track_file(config.track):
         from tracks.formats.custom import load_track
 
@@ -56,16 +59,17 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         write_picture(picture, track)
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))
         console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
-        drawn.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
-    found: dict[str, Any] = {"tracks": drawn}
+        pictures.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
+    answer: dict[str, Any] = {"tracks": pictures}
     if len(tracks) > 1:
-        found["picture"] = config.out / f"{config.track}-{config.seed}.png"
-        write_grid(found["picture"], [(track, None, None) for track in tracks], columns=2)
-        console.say(f"{found['picture']}: all of them")
-    return found
+        answer["picture"] = config.out / f"{config.track}-{config.seed}.png"
+        write_grid(answer["picture"], [(track, None, None) for track in tracks], columns=2)
+        console.say(f"{answer['picture']}: all of them")
+    return answer
 
 
-def _list(console: Console) -> dict[str, Any]:
+def _list_families(console: Console) -> dict[str, Any]:
+    """Print a line about each family, and return them for --json."""
     from tracks.families import FAMILIES, JUDGED
 
     families = {}
@@ -78,11 +82,11 @@ def _list(console: Console) -> dict[str, Any]:
 
 
 def family_text(name: str) -> str:
-    """Return what a track family is."""
+    """Return the description of a track family, from its source."""
     from tracks.families import FAMILIES
 
     make = FAMILIES.find(name)
-    # A file of its own is described at its head, a function among others in its docstring.
-    alone = getattr(make, "__name__", "") == "make"
-    text = first_paragraph((sys.modules[make.__module__] if alone else make).__doc__)
+    # A family with a module, whose function is called make, is described in the module's docstring.
+    has_module = getattr(make, "__name__", "") == "make"
+    text = first_paragraph((sys.modules[make.__module__] if has_module else make).__doc__)
     return text.removeprefix("Return ").removeprefix("Random: ")

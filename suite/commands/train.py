@@ -1,4 +1,7 @@
-"""`suite train`: a policy by backpropagation through quadrotors or a point mass."""
+"""The command `suite train`: train a policy by backpropagation through differentiable dynamics.
+
+The dynamics are those of a quadrotor or of a point mass. A recipe is a named set of settings.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,16 @@ from suite.commands.list import list_settings
 from suite.common.console import Console
 from suite.common.curve import tensorboard
 from suite.common.options import Advanced, Command
-from suite.common.running.hosts import Joined, join, member
+from suite.common.running.hosts import ProcessOptions, connect, read_member
 from suite.common.startup import use_device
 from suite.common.work import Silent
 from suite.train.config import TrainConfig
-from suite.train.overrides import changed, check_phases
+from suite.train.overrides import check_phases, with_changes
 from suite.train.recipes import (
-    chosen_model,
     finetune,
     named_recipe,
     with_iterations,
+    with_model,
     with_sensors,
 )
 from tracks.common.files import check_no_input, plain
@@ -28,24 +31,24 @@ from tracks.input.ranges import Iterations, Range, Seed
 
 @dataclass(frozen=True)
 class Config(Command):
-    """Train a policy; the same command again resumes where it was stopped."""
+    """Train a policy; the same command again resumes an interrupted training."""
 
     recipe: str = "race"
     """The settings to start from: race (makes the default policy, two hours on one core),
     race-small (a small network), race-paper (the paper's 12 state inputs, through the point mass),
     quick (6 minutes), paper (the paper's settings, days) or gpu (2,048 environments)."""
     model: Literal["point", "quad"] | None = None
-    """What flies in training: the point mass, or the quadrotor of --vehicle with its effects.
-    Without it the recipe decides."""
+    """The dynamics of the training: the point mass, or the quadrotor of --vehicle with its effects.
+    Without it those of the recipe."""
     vehicle: str | None = None
-    """Train around this vehicle: a shipped name or a vehicle file (.toml). Without it around
-    racer5. A recipe through the point mass (quick) needs --model quad as well."""
+    """Train with quadrotors around this vehicle: a shipped name or a vehicle file (.toml). Without
+    it around racer5. A recipe with the point mass (quick) needs --model quad as well."""
     sensors: str | None = None
     """Train with sensor errors: a shipped name (vio, gate-relative, stereo-depth, all, ...) or a
     sensors file (.toml). Without it sensors are perfect. Each environment draws the magnitude of
     every error evenly from 0 to 1; --set sensors.magnitude=(0,1.5) draws it up to 1.5."""
     out: Path = Path("runs/train")
-    """Folder of the run; a run that is there already is resumed."""
+    """Folder of the run; an unfinished run in it is resumed."""
     seed: Seed = 0
     """Seed of the parameters, the tracks and the randomisation."""
     iterations: Iterations | None = None
@@ -56,7 +59,7 @@ class Config(Command):
     """Peak learning rate of every phase, instead of the recipe's; the same as --set
     optimizer.rate."""
     device: Literal["cpu", "gpu"] | None = None
-    """Where to compute. Without it on a GPU if JAX finds one, else on the CPU."""
+    """The device that computes. Without it a GPU if JAX finds one, else the CPU."""
     init_from: str | None = None
     """Start from this policy instead of random weights: a checkpoint's folder or a shipped
     policy's name."""
@@ -64,7 +67,8 @@ class Config(Command):
     """Fine-tune the policy of --init-from: the recipe's last phase alone, a quarter of its gradient
     steps, 0.3 times its learning rate."""
     delta: Advanced[Path | None] = None
-    """Train under this frozen Delta Action Model (a checkpoint of `suite delta`)."""
+    """Correct the actions by this Delta Action Model (a checkpoint of `suite delta`), which is not
+    trained."""
     set: tuple[str, ...] = ()
     """Change settings by name, in every phase, such as loss.progress=0.4; from the second phase
     on: phases.2.loss.progress=0.4."""
@@ -72,24 +76,24 @@ class Config(Command):
     """Also write the curve for TensorBoard, into tensorboard/ of the run (extra `tensorboard`)."""
     list_settings: bool = False
     """Print every setting that --set takes, with value, range and meaning, and train nothing."""
-    joined: Advanced[Joined] = Joined()
-    """Which of several processes this one is."""
+    process_options: Advanced[ProcessOptions] = ProcessOptions()
+    """The place of this process among several."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write meanwhile."""
-        first = member(self.joined).number == 0
-        return [self.out] if first and not self.list_settings else []
+        """Return the folders into which no other command may write at that time."""
+        is_first = read_member(self.process_options).number == 0
+        return [self.out] if is_first and not self.list_settings else []
 
 
 def resolve(config: Config) -> TrainConfig:
-    """Return the run that the options ask for.
+    """Return the training that the options describe.
 
     Raises:
         ValueError: for an unknown recipe, setting or vehicle, or a vehicle without its model,
             naming what is allowed.
     """
     run = replace(named_recipe(config.recipe), seed=config.seed)
-    run = chosen_model(run, config.model, config.vehicle)
+    run = with_model(run, config.model, config.vehicle)
     if config.finetune:
         if config.init_from is None:
             raise ValueError("--finetune needs --init-from: the policy to fine-tune")
@@ -98,25 +102,25 @@ def resolve(config: Config) -> TrainConfig:
         run = with_sensors(run, config.sensors)
     if config.iterations is not None:
         run = with_iterations(run, config.iterations)
-    named = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}
-    changes = [f"{path}={value}" for path, value in named.items() if value is not None]
-    run = changed(run, [*changes, *config.set])
+    options = {"episode.batch": config.num_envs, "optimizer.rate": config.lr}
+    changes = [f"{path}={value}" for path, value in options.items() if value is not None]
+    run = with_changes(run, [*changes, *config.set])
     check_phases(run)
     return run
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Train and say where the policy is and how the curve ended.
+    """Train; print the policy's folder and the last numbers of the curve.
 
     Raises:
         ValueError: for options that cannot be used or do not go together.
     """
     if config.list_settings:
         return {"settings": list_settings(config.recipe, console)}
-    one = member(config.joined)
+    member = read_member(config.process_options)
     use_device(config.device)
-    join(one)
-    if one.number:
+    connect(member)
+    if member.number:
         console = Silent()
 
     import jax
@@ -125,25 +129,29 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     from policies.formats.policy_file import load_delta
     from policies.shipped import locate
     from suite.delta.replay import check_corrects
-    from suite.train.run import started_from, train
+    from suite.train.run import load_start_params, train
 
     resolved = resolve(config)
     params, delta = None, None
     if config.init_from is not None:
-        # What is trained is written to out/policy, which nothing there may yet say is another run.
+        # The trained policy goes to out/policy, which must not be the one to start from.
         start, trained = locate(config.init_from) / CONFIG, config.out / "policy" / CONFIG
         check_no_input(trained, [start], "--out")
-        params = started_from(config.init_from, resolved.spec)
+        params = load_start_params(config.init_from, resolved.spec)
     if config.delta is not None:
         stored = load_delta(config.delta)
         dynamics = resolved.quadrotor or resolved.physics
         fit = stored.config.get("fit", {})
         check_corrects(fit, dynamics, resolved.spec.rate_hz, config.delta)
         delta = jax.tree.map(jax.numpy.asarray, stored.params)
-    mirror = tensorboard(config.out) if config.tensorboard and not one.number else None
+    mirror = tensorboard(config.out) if config.tensorboard and not member.number else None
     outcome = train(resolved, config.out, console, params, delta, mirror=mirror)
-    if one.number:
-        return {"process": one.number, "processes": one.of, "iterations": outcome.iterations}
+    if member.number:
+        return {
+            "process": member.number,
+            "processes": member.processes,
+            "iterations": outcome.iterations,
+        }
     last = outcome.last
     console.say(
         f"{outcome.iterations} iterations; at the end {last['gates']:.2f} gates a rollout, "

@@ -1,4 +1,7 @@
-"""`suite view`: look at the trials of a run, or at a policy's."""
+"""The command `suite view`: fly trials again, and write a recording, pictures and a video.
+
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ class Config(Command):
     pick: Literal["first", "failed", "passed"] = "first"
     """Which trials of the run: the first ones, or the first that failed or that succeeded."""
     count: Annotated[int, Range(1, 1000)] = 3
-    """How many trials at most."""
+    """Largest number of trials."""
     track: str = "all"
     """If RUN is a policy: zigzag, circular, ellipse, all of these, a track file, or several."""
     difficulty: str = "3"
@@ -54,46 +57,46 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fly the chosen trials again and write what there is to see.
+    """Fly the chosen trials again and write the files.
 
     Raises:
-        ValueError: where `config.run` is neither a run nor a policy, or no trial is to be seen.
+        ValueError: if `config.run` is neither a run nor a policy, or no trial is left to show.
     """
     recording = config.rerun or config.out / "trials.rrd"
     if recording.suffix != ".rrd":
         raise ValueError(f"--rerun {recording}: a recording's name must end in .rrd")
     check_place(recording)
     check_place(config.out / "picture.png")
-    evaluation, trials, judged = _chosen(config)
+    evaluation, trials, digests = _choose_trials(config)
     from eval.view.picture import write_picture
     from eval.view.recording import write_recording
-    from suite.judging.flying import refuse_one_name
     from suite.judging.replay import fly_again
+    from suite.judging.trials import refuse_equal_names
 
-    refuse_one_name({trial.track for trial in trials})
+    refuse_equal_names({trial.track for trial in trials})
     console.note(f"flying {len(trials)} trial{'s' * (len(trials) != 1)} again")
-    rollouts, drone = fly_again(evaluation, trials, judged=judged)
+    rollouts, drone = fly_again(evaluation, trials, judged=digests)
     write_recording(recording, rollouts, drone)
     written = [recording]
     for rollout in rollouts:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
         result = rollout[2]
-        hit = f" with {result.collided_with}" if result.collided_with else ""
+        solid = f" with {result.collided_with}" if result.collided_with else ""
         console.say(
-            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{hit} after "
+            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{solid} after "
             f"{result.time_s:.1f} s"
         )
-    for ending, wanted in ((".mp4", config.video), (".gif", config.gif)):
-        if wanted:
+    for ending, is_requested in ((".mp4", config.video), (".gif", config.gif)):
+        if is_requested:
             name = f"{_name(rollouts[0])}{ending}"
-            written.append(_video(config.out / name, rollouts[0], console))
+            written.append(_write_video(config.out / name, rollouts[0], console))
     for path in written:
         console.say(f"written: {path}")
     console.say(f"open the recording with: rerun {recording}")
     return {"written": written, "trials": [result for _, _, result in rollouts]}
 
 
-def _video(path: Path, rollout: Rollout, console: Console) -> Path:
+def _write_video(path: Path, rollout: Rollout, console: Console) -> Path:
     from eval.view.video import SMALL, VideoOptions, frame_times, write_video
 
     options, flight = SMALL if path.suffix == ".gif" else VideoOptions(), rollout[1]
@@ -103,26 +106,27 @@ def _video(path: Path, rollout: Rollout, console: Console) -> Path:
 
 
 def _name(rollout: Rollout) -> str:
+    """Return a trial's name for its files."""
     result = rollout[2]
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
-def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
-    """Return what is flown, which trials of it, and of a run the digests of what was judged."""
+def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
+    """Return the settings, the chosen trials and, for a run, the SHA-256 of its inputs."""
     from suite.judging.replay import first_trials, read_digests, read_evaluation
     from suite.judging.requests import Evaluation
 
     folder = Path(config.run)
     if any(folder.glob("journal-*.jsonl")):
         raise ValueError(
-            f"{folder}: this suite eval is not finished; give its command again to fly the rest, "
-            "then view it"
+            f"{folder}: this suite eval is not finished; repeat its command to fly the remaining "
+            "trials, then view it"
         )
     if not (folder / "trials.parquet").is_file():
         if config.pick != "first":
             raise ValueError(
-                f"--pick is {config.pick}, but {folder} is no run of suite eval whose trials have "
-                "ended; leave it out"
+                f"--pick is {config.pick}, but {folder} is not a finished run of suite eval; leave "
+                "it out"
             )
         evaluation = Evaluation(
             policies=(config.run,),
@@ -137,13 +141,13 @@ def _chosen(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str]
     from eval.judging.results import read_trials
 
     for name in ("track", "difficulty", "vehicle", "seed", "speed"):
-        given = getattr(config, name)
-        if given != getattr(Config, name):
+        value = getattr(config, name)
+        if value != getattr(Config, name):
             raise ValueError(
-                f"--{name} is {given}, but {folder} is a run, whose trials are flown again as they "
-                "were; leave it out, or give a policy in the place of the run"
+                f"--{name} is {value}, but {folder} is a run, whose trials are flown again "
+                "unchanged; leave it out, or give a policy instead of the run"
             )
-    # What a folder says of itself is no reason to trust what it names.
+    # A folder's record must not decide that the files that it names may run code.
     evaluation = replace(read_evaluation(folder), trust=config.trust)
     results = read_trials(folder / "trials.parquet")
     results = [result for result in results if result.policy == results[0].policy]

@@ -1,1 +1,1 @@
-"""What commands share: console, errors, reports, charts, work."""
+"""Parts that several commands use: console, options, errors, reports, charts, parallel work."""

@@ -1,4 +1,4 @@
-"""What all charts share: colours, plain axes, intervals, legends, training curves, PNG bytes."""
+"""Drawing functions that all charts use: axes, intervals, legends, training curves, PNG bytes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from matplotlib.figure import Figure
 from suite.common.curve import METRICS
 
 GRID = "#e6e9ee"
+"""Colour of the grid."""
 LINES = ("#2463c9", "#e0892b", "#2e8b57", "#b0413e", "#7a5cb8", "#8b93a1")
-"""Colours of what is compared, in order."""
+"""Colours of the compared policies or methods, in order."""
 DPI = 130
+"""Resolution of the pictures [dots per inch]."""
 DRAWN = ("gates", "collided", "speed")
-"""Numbers of a training's curve that are drawn."""
+"""Numbers of a training's curve that `curves_chart` draws."""
 
 
 def titled(axes: Axes, title: str) -> None:
-    """Put `title` above the axes and draw plain axes."""
+    """Write `title` above the axes and draw plain axes."""
     axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
     plain_axes(axes)
 
@@ -38,18 +40,18 @@ def plain_axes(axes: Axes) -> None:
 def legend(figure: Figure, axes: Axes, columns: int = 3, size: float = 9) -> None:
     """Draw the legend of `axes` below the figure."""
     handles, labels = axes.get_legend_handles_labels()
-    place = "outside lower center"
-    drawn = figure.legend(handles, labels, loc=place, ncols=columns, frameon=False, fontsize=size)
-    for text in drawn.get_texts():
-        text.set_parse_math(False)  # a policy's name may hold dollar signs
+    location = "outside lower center"
+    box = figure.legend(handles, labels, loc=location, ncols=columns, frameon=False, fontsize=size)
+    for text in box.get_texts():
+        text.set_parse_math(False)  # a policy's name may contain dollar signs
 
 
 def dots(
-    axes: Axes, at: Any, intervals: Sequence[Any], scale: float = 1, fmt: str = "o", **style: Any
+    axes: Axes, x: Any, intervals: Sequence[Any], scale: float = 1, fmt: str = "o", **style: Any
 ) -> None:
-    """Draw values with their intervals (value, low, high) as dots with error bars."""
+    """Draw values with their intervals (value, low, high), times `scale`, as dots with bars."""
     value, low, high = scale * np.array(intervals).T
-    axes.errorbar(at, value, np.maximum([value - low, high - value], 0), fmt=fmt, **style)
+    axes.errorbar(x, value, np.maximum([value - low, high - value], 0), fmt=fmt, **style)
 
 
 def curves_chart(
@@ -57,13 +59,13 @@ def curves_chart(
     colours: Sequence[str] = LINES,
     follow: bool = False,
 ) -> bytes:
-    """Return gates, collisions and speed over gradient steps, a column each.
+    """Return a PNG of gates, collisions and speed over gradient steps, a panel each.
 
     Thick lines are running means, thin ones single steps.
 
     Args:
         curves: rows of metrics.jsonl by label; an empty one is left out.
-        colours: by curve.
+        colours: one for each curve.
         follow: whether the curves after the first begin where the first one ends.
     """
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
@@ -75,9 +77,9 @@ def curves_chart(
             if not rows:
                 continue
             values = METRICS[name].scale * np.array([row[name] for row in rows], float)
-            at = start + np.array([row["iteration"] for row in rows])
-            axes.plot(at, values, color=colour, lw=0.7, alpha=0.25)
-            axes.plot(at, _running_mean(values), color=colour, lw=1.8, label=label)
+            steps = start + np.array([row["iteration"] for row in rows])
+            axes.plot(steps, values, color=colour, lw=0.7, alpha=0.25)
+            axes.plot(steps, _running_mean(values), color=colour, lw=1.8, label=label)
             start = first
         titled(axes, METRICS[name].heading)
         axes.set_xlabel("gradient steps", fontsize=9)
@@ -89,10 +91,10 @@ def curves_chart(
 
 def _running_mean(values: np.ndarray) -> np.ndarray:
     """Return means over a twentieth of the values, shorter at the ends."""
-    half = max(1, len(values) // 40)
+    half_width = max(1, len(values) // 40)
     total = np.concatenate([[0.0], np.cumsum(values)])
-    first = np.maximum(np.arange(len(values)) - half, 0)
-    last = np.minimum(np.arange(len(values)) + half + 1, len(values))
+    first = np.maximum(np.arange(len(values)) - half_width, 0)
+    last = np.minimum(np.arange(len(values)) + half_width + 1, len(values))
     return (total[last] - total[first]) / (last - first)
 
 

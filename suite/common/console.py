@@ -39,11 +39,11 @@ class Console:
         """Print a rich table; its width is not limited if standard output is no terminal."""
         from rich.console import Console as RichConsole
 
-        wide = None if sys.stdout.isatty() else 200
-        RichConsole(file=sys.stdout, width=wide).print(_Printable(table))
+        width = None if sys.stdout.isatty() else 200
+        RichConsole(file=sys.stdout, width=width).print(_Printable(table))
 
     def note(self, text: str) -> None:
-        """Print a line about the progress, on standard error."""
+        """Print a line about the progress, or a warning, on standard error."""
         print(printable(text), file=sys.stderr, flush=True)
 
     @contextmanager
@@ -58,9 +58,10 @@ class Console:
 
         Args:
             label: a short description of the work.
-            total: the `done` at its end, in any unit.
-            clock: seconds, increasing.
-            begun: the `done` at its beginning, which does not count for the remaining time.
+            total: the value of `done` at its end, in any unit.
+            clock: returns the time [s].
+            begun: the value of `done` at its beginning, which does not count for the remaining
+                time.
         """
         if sys.stderr.isatty():
             with _bar(label, total, begun) as update:
@@ -75,8 +76,8 @@ class Console:
                 return
             last = now
             new = done - begun
-            left = duration((now - started) * (total - done) / new) if new else "unknown"
-            self.note(f"{label}: {done:g} of {total:g}, {left} left{note and ', ' + note}")
+            remaining = duration((now - started) * (total - done) / new) if new else "unknown"
+            self.note(f"{label}: {done:g} of {total:g}, {remaining} left{note and ', ' + note}")
 
         yield update
 
@@ -93,7 +94,7 @@ class _Printable:
 
 
 class Quiet(Console):
-    """Prints progress only: the caller prints the results itself."""
+    """A console that prints progress only: the caller prints the results itself."""
 
     def say(self, text: str = "") -> None:
         """Print nothing."""
@@ -104,6 +105,7 @@ class Quiet(Console):
 
 @contextmanager
 def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
+    """Show a progress bar on a terminal; yields the function that updates it."""
     from rich.console import Console as RichConsole
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -126,17 +128,17 @@ def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
 
 @contextmanager
 def stdout_kept_clean() -> Iterator[None]:
-    """Send all output to standard error meanwhile, including that of native libraries."""
+    """Send all output to standard error in the meantime, including that of native libraries."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    stdout_copy = os.dup(1)
     os.dup2(2, 1)
     try:
         with redirect_stdout(sys.stderr):
             yield
     finally:
         sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)
 
 
 def duration(seconds: float) -> str:

@@ -1,4 +1,7 @@
-"""The curve of a run: one JSON object a line, truncated at the checkpoint when a run resumes."""
+"""Read and write the curve of a training run: a file with a JSON object per gradient step.
+
+A resumed run truncates it at the checkpoint that it continues from.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,21 @@ from typing import Any, NamedTuple
 from tracks.common.files import naming, to_json, write_text
 
 CURVE = "metrics.jsonl"
-"""A row a gradient step."""
+"""File with a row per gradient step."""
 WATCHED = "validation.jsonl"
-"""A row per measurement of the policy; `iteration` is the number of gradient steps before it."""
+"""File with a row per measurement of the policy during the training; `iteration` is the number of
+gradient steps before it."""
 
 
 class Metric(NamedTuple):
-    """A number of a training, as tables and charts show it."""
+    """How tables and charts show a number of a training."""
 
     title: str
+    """Name with its unit."""
     scale: float
+    """Factor from the stored to the shown number."""
     digits: int
+    """Decimal places."""
 
     @property
     def heading(self) -> str:
@@ -73,8 +80,8 @@ def cut(folder: Path, iteration: int, name: str = CURVE) -> None:
     """Remove the rows from `iteration` on, which are computed again."""
     if not (folder / name).exists():
         return
-    kept = [row for row in read(folder, name) if row["iteration"] < iteration]
-    write_text(folder / name, "".join(to_json(row) + "\n" for row in kept))
+    rows = [row for row in read(folder, name) if row["iteration"] < iteration]
+    write_text(folder / name, "".join(to_json(row) + "\n" for row in rows))
 
 
 def tensorboard(folder: Path) -> Mirror:

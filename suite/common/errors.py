@@ -1,7 +1,7 @@
-"""Exit codes, and the messages of failed commands.
+"""Exit codes of commands, and the messages of failed ones.
 
-A user's mistake gives one message and no traceback. An unexpected error is a bug and keeps its
-traceback.
+A user's mistake, or a failure of the machine, gives one message and no traceback. Any other error
+is a bug of the suite and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 
 SHOWN = 300
-"""Characters of a name in a message."""
+"""Most characters of a name in a message."""
 DONE = 0
 """The work is done."""
 FAILED = 1
@@ -25,17 +25,17 @@ INTERRUPTED = 130
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-_UNUSABLE = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
-_OURS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, errno.ECHILD)
-"""Errors of the operating system that are caused by a mistake in the program."""
+"""Folders of the suite's four packages."""
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_BAD_PATH = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
+"""Errors of the operating system about a path that cannot be used."""
+_BUGS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, errno.ECHILD)
+"""Errors of the operating system that a mistake in the program causes."""
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
 _NUL = "embedded null"
 """Part of Python's message about a name with a NUL character."""
 _NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
 """Beginnings of JAX's message if JAX_PLATFORMS names a missing backend."""
-
-
 _NO_SETTING = "invalid value for environment variable"
 """Beginning of MuJoCo's message about MUJOCO_GL."""
 
@@ -57,16 +57,16 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, OSError):
         return _explain_os(error)
     if isinstance(error, ValueError) and _NUL in str(error):
-        return UNUSABLE, "the name of a file or folder holds a NUL character; give another name"
-    if isinstance(error, ValueError) and _raised_on_purpose(error):
+        return UNUSABLE, "the name of a file or folder has a NUL character; give another name"
+    if isinstance(error, ValueError) and _is_message(error):
         return UNUSABLE, str(error)
-    if isinstance(error, ModuleNotFoundError) and not _is_ours(error.name):
+    if isinstance(error, ModuleNotFoundError) and not _is_suite_module(error.name):
         hint = "install the suite with its requirements (make env, or pip install -e .)"
         return FAILED, f"the package {error.name!r} is missing: {hint}"
     if isinstance(error, RuntimeError) and str(error).startswith(_NO_BACKEND):
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        first = str(error).splitlines()[0][:SHOWN]
-        return UNUSABLE, f"JAX_PLATFORMS is {asked!r} in the environment: {first}; unset it"
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error).splitlines()[0][:SHOWN]
+        return UNUSABLE, f"JAX_PLATFORMS is {platforms!r} in the environment: {reason}; unset it"
     if isinstance(error, RuntimeError) and str(error).startswith(_NO_SETTING):
         return UNUSABLE, f"{error}; unset it"
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
@@ -75,27 +75,29 @@ def explain(error: BaseException) -> tuple[int, str] | None:
 
 
 def _explain_os(error: OSError) -> tuple[int, str] | None:
-    where = f": {str(error.filename)[:SHOWN]}" if error.filename else ""
-    if error.errno in _FULL:
-        hint = "free some space or give another --out; what was finished before is kept"
-        return FAILED, f"the disk is full{where}; {hint}"
-    if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _UNUSABLE:
-        return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{where}"
-    if error.errno and error.errno not in _OURS:
-        return FAILED, f"{(error.strerror or 'the system refuses').lower()}{where}"
+    """Return (exit code, message) for an error of the operating system, None for a bug."""
+    file = f": {str(error.filename)[:SHOWN]}" if error.filename else ""
+    if error.errno in _DISK_FULL:
+        hint = "free some space or give another --out; finished work is kept"
+        return FAILED, f"the disk is full{file}; {hint}"
+    if isinstance(error, (*_NO_SUCH_INPUT, PermissionError)) or error.errno in _BAD_PATH:
+        return UNUSABLE, f"{(error.strerror or 'cannot be used').lower()}{file}"
+    if error.errno and error.errno not in _BUGS:
+        return FAILED, f"{(error.strerror or 'the system refuses').lower()}{file}"
     return None
 
 
-def _is_ours(module: str | None) -> bool:
+def _is_suite_module(module: str | None) -> bool:
     return (module or "").split(".")[0] in {Path(room).name for room in _ROOMS}
 
 
-def _raised_on_purpose(error: ValueError) -> bool:
-    if _is_ours(type(error).__module__):
+def _is_message(error: ValueError) -> bool:
+    """Return whether the suite raised the error on purpose, by a raise statement or its class."""
+    if _is_suite_module(type(error).__module__):
         return True
     remote = error.__cause__
     if type(remote).__name__ == "_RemoteTraceback":
-        return _remote_raise(str(remote))
+        return _ends_at_raise(str(remote))
     last: TracebackType | None = error.__traceback__
     while last is not None and last.tb_next is not None:
         last = last.tb_next
@@ -106,7 +108,7 @@ def _raised_on_purpose(error: ValueError) -> bool:
     return dis.opname[opcode] == "RAISE_VARARGS"
 
 
-def _remote_raise(text: str) -> bool:
+def _ends_at_raise(text: str) -> bool:
     """Return whether a worker process's traceback (text) ends at a raise statement of the suite."""
     lines = text.splitlines()
     frames = [i for i, line in enumerate(lines) if line.startswith('  File "')]

@@ -1,7 +1,8 @@
-"""A command's options and a training's settings: the fields of a configuration, and their texts.
+"""Make command-line options from the fields of a dataclass, with the texts below the fields.
 
-Rare options are annotated `Advanced[...]` and are at the end of the help. A nested dataclass only
-groups options in the code: its fields are options of the command like all others.
+The parser is tyro. Rare options are annotated `Advanced[...]` and are at the end of the help. A
+nested dataclass only groups options in the code: its fields are options of the command like all
+others. `settings` lists the settings of a training in the same way.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ T = TypeVar("T")
 GROUP = "advanced"
 """Title of the rare options, and the mark of each."""
 Advanced = Annotated[T, GROUP]
-"""A rare option."""
+"""Type of a rare option."""
 VALUES = {str: "STR", int: "INT", float: "FLOAT", Path: "PATH"}
 """Type -> placeholder of a value in the help."""
 NUMBERS = {int: "a whole number", float: "a number"}
@@ -34,16 +35,16 @@ SILENT = ("", "''", "None", "False")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Command:
-    """The options of a command; its `Config` adds its own."""
+    """The options of all commands; the `Config` class of each command adds further ones."""
 
     json: bool = False
     """Print one JSON object to standard output and nothing else."""
 
     LOCKED = ()
-    """Names of the options with folders into which no other command may write meanwhile."""
+    """Names of the options with folders into which no other command may write at that time."""
 
     def written(self) -> list[Path]:
-        """Return these folders."""
+        """Return the folders of the options in `LOCKED`."""
         return [getattr(self, name) for name in self.LOCKED]
 
 
@@ -63,22 +64,22 @@ class Option(NamedTuple):
 
     @property
     def notes(self) -> tuple[Any, ...]:
-        """Return the annotations of its type."""
+        """The annotations of its type."""
         return getattr(self.kind, "__metadata__", ())
 
     @property
     def bare(self) -> Any:
-        """Return its type without annotations."""
+        """The type without annotations."""
         return _bare(self.kind)
 
     @property
     def repeated(self) -> bool:
-        """Return whether it is repeated for each value."""
+        """Whether the option is repeated for each value."""
         return tyro.conf.UseAppendAction in self.notes
 
     @property
     def listed(self) -> bool:
-        """Return whether it takes several values at once, none of them a path."""
+        """Whether the option takes several values at once, none of them a path."""
         return (
             get_origin(self.bare) is tuple
             and not self.repeated
@@ -87,42 +88,44 @@ class Option(NamedTuple):
 
     @property
     def positional(self) -> bool:
-        """Return whether it is given without a name."""
+        """Whether the value is written without the option's name."""
         return tyro.conf.Positional in self.notes
 
     @property
     def flag(self) -> str:
-        """Return the option as it is written, such as --track; a positional one is in capitals."""
+        """The option as it is written, such as --track; a positional one is in capitals."""
         if self.positional:
             return self.field.upper()
-        named = next((note.name for note in self.notes if getattr(note, "name", None)), self.field)
-        return f"--{named.replace('_', '-')}"
+        name = next((note.name for note in self.notes if getattr(note, "name", None)), self.field)
+        return f"--{name.replace('_', '-')}"
 
 
 def _bare(kind: Any) -> Any:
+    """Return a type without annotations."""
     return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
 
 
 def options(command: type, default: Any = None, advanced: bool = False) -> Iterator[Option]:
-    """Yield the options of a command's configuration and of the dataclasses within.
+    """Yield the options of a command's configuration and of the dataclasses in its fields.
 
-    Inherited ones follow the class's own.
+    Inherited options come last.
 
     Args:
         command: the dataclass.
         default: an instance with the defaults, in place of those of `command`.
-        advanced: whether all of them are rare.
+        advanced: whether all of its options are rare.
     """
-    hints, texts = get_type_hints(command, include_extras=True), texts_of(command)
-    own = command.__dict__.get("__annotations__", {})
-    for field in sorted(dataclasses.fields(command), key=lambda field: field.name not in own):
+    hints, texts = get_type_hints(command, include_extras=True), all_field_texts(command)
+    not_inherited = command.__dict__.get("__annotations__", {})
+    fields = sorted(dataclasses.fields(command), key=lambda field: field.name not in not_inherited)
+    for field in fields:
         kind = hints[field.name]
-        rare = advanced or GROUP in getattr(kind, "__metadata__", ())
+        is_rare = advanced or GROUP in getattr(kind, "__metadata__", ())
         value = field.default if default is None else getattr(default, field.name)
-        if _within(value):
-            yield from options(type(value), value, rare)
+        if _is_instance_of_dataclass(value):
+            yield from options(type(value), value, is_rare)
         else:
-            yield Option(field.name, kind, value, texts.get(field.name, ""), rare)
+            yield Option(field.name, kind, value, texts.get(field.name, ""), is_rare)
 
 
 def read_options(
@@ -135,7 +138,7 @@ def read_options(
         prog: name of the program in the help.
         about: beginning of the help.
         args: the words of the command line.
-        all_known: exit with a list of similar options if a word belongs to none.
+        all_known: if a word belongs to no option, exit with a list of similar options.
 
     Raises:
         SystemExit: after --help (code 0), and for invalid options (code 2).
@@ -152,7 +155,7 @@ def read_options(
         )
 
 
-def _within(value: Any) -> bool:
+def _is_instance_of_dataclass(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
@@ -163,20 +166,20 @@ def _read(
     command: Any = info.type
     if not hasattr(command, "__dataclass_fields__") or command.__name__ == GROUP:
         return None
-    found = list(options(command))
-    fields = [_field(option) for option in found if not option.advanced]
-    rare = [_field(option) for option in found if option.advanced]
+    all_options = list(options(command))
+    fields = [_field(option) for option in all_options if not option.advanced]
+    rare = [_field(option) for option in all_options if option.advanced]
     if rare:
-        parts = list[Any]()
-        for one in rare:
-            field = dataclasses.field(default=one.default, metadata={"help": one.helptext})
-            parts.append((one.name, one.type, field))
-        group = dataclasses.make_dataclass(GROUP, parts, namespace={"__doc__": "Seldom needed."})
+        members = list[Any]()
+        for spec in rare:
+            field = dataclasses.field(default=spec.default, metadata={"help": spec.helptext})
+            members.append((spec.name, spec.type, field))
+        group = dataclasses.make_dataclass(GROUP, members, namespace={"__doc__": "Seldom needed."})
         kind = tyro.conf.OmitArgPrefixes[group]
         fields.append(tyro.constructors.StructFieldSpec(GROUP, kind, group()))
 
     def build(**values: Any) -> Any:
-        return _built(command, {**values, **(vars(values[GROUP]) if rare else {})})
+        return _build(command, {**values, **(vars(values[GROUP]) if rare else {})})
 
     return tyro.constructors.StructConstructorSpec(build, tuple(fields))
 
@@ -184,30 +187,30 @@ def _read(
 def _number(
     info: tyro.constructors.PrimitiveTypeInfo,
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """Return the specification of a number for tyro, with a plain message for other words."""
+    """Return the specification of a number for tyro, with a plain message for other text."""
     kinds = {_bare(kind) for kind in get_args(info.type) or (info.type,)} - {type(None)}
     kind: Any = kinds.pop() if len(kinds) == 1 else None
     if kind not in NUMBERS or get_origin(info.type) is tuple:
         return None
-    wanted = NUMBERS[kind]
+    expected = NUMBERS[kind]
 
     def read(words: list[str]) -> Any:
         try:
             return kind(words[0])
         except ValueError:
-            raise ValueError(f"{words[0]!r} is not {wanted}") from None
+            raise ValueError(f"{words[0]!r} is not {expected}") from None
 
     return tyro.constructors.PrimitiveConstructorSpec(
         1, VALUES[kind], read, lambda v: v is None or isinstance(v, kind), lambda v: [str(v)]
     )
 
 
-def _built(command: Any, values: dict[str, Any]) -> Any:
-    """Return an instance of `command`, and of the dataclasses within, by their fields' names."""
+def _build(command: Any, values: dict[str, Any]) -> Any:
+    """Return an instance of `command`, and of the dataclasses in it, from values by field name."""
     return command(
         **{
-            field.name: _built(type(field.default), values)
-            if _within(field.default)
+            field.name: _build(type(field.default), values)
+            if _is_instance_of_dataclass(field.default)
             else values[field.name]
             for field in dataclasses.fields(command)
         }
@@ -217,19 +220,19 @@ def _built(command: Any, values: dict[str, Any]) -> Any:
 def _field(option: Option) -> tyro.constructors.StructFieldSpec:
     """Return the specification of an option for tyro, with its placeholder and default."""
     required, metavar = option.default is dataclasses.MISSING, None
-    part = get_args(option.bare)[:1]
-    many = part and get_origin(option.bare) is tuple and get_args(option.bare)[-1] is Ellipsis
-    if tyro.conf.Positional in option.notes:
-        metavar = f"{option.flag} ..." if many else option.flag
+    types = get_args(option.bare)
+    takes_many = types and get_origin(option.bare) is tuple and types[-1] is Ellipsis
+    if option.positional:
+        metavar = f"{option.flag} ..." if takes_many else option.flag
         metavar = metavar if required else f"[{metavar}]"
-    elif many and not option.repeated:
-        metavar = f"{VALUES[_bare(part[0])]} ..."
-    shown = tyro.conf.arg(
+    elif takes_many and not option.repeated:
+        metavar = f"{VALUES[_bare(types[0])]} ..."
+    display = tyro.conf.arg(
         metavar=metavar,
         help_behavior_hint=lambda default: "" if default in SILENT else f"(default: {default})",
     )
     default = tyro.MISSING if required else option.default
-    kind: Any = Annotated[option.kind, shown]
+    kind: Any = Annotated[option.kind, display]
     return tyro.constructors.StructFieldSpec(option.field, kind, default, option.about)
 
 
@@ -237,7 +240,7 @@ class Setting(NamedTuple):
     """One setting of a training."""
 
     path: str
-    """The setting in `--set`, such as loss.progress."""
+    """Its name in `--set`, such as loss.progress."""
     default: Any
     """Its value in this configuration."""
     allowed: str
@@ -247,13 +250,13 @@ class Setting(NamedTuple):
 
 
 def settings(config: Any) -> Iterator[Setting]:
-    """Yield every setting of a dataclass and of the dataclasses within, in their order."""
+    """Yield every setting of a dataclass and of the dataclasses in its fields, in their order."""
     allowed = {".".join(path): str(limits) for path, _, limits in ranged(config)}
     yield from _settings(config, "", allowed)
 
 
 def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
-    texts = texts_of(type(config))
+    texts = all_field_texts(type(config))
     for field in dataclasses.fields(config):
         path, value = f"{prefix}{field.name}", getattr(config, field.name)
         if dataclasses.is_dataclass(value):
@@ -263,13 +266,13 @@ def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Set
 
 
 @functools.cache
-def texts_of(cls: type) -> dict[str, str]:
+def all_field_texts(cls: type) -> dict[str, str]:
     """Return the text below each field of a dataclass, read from the source."""
-    found = dict[str, str]()
+    texts = dict[str, str]()
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
-            found.update(field_texts(base))
-    return found
+            texts.update(field_texts(base))
+    return texts
 
 
 def field_texts(cls: type) -> dict[str, str]:
@@ -278,12 +281,12 @@ def field_texts(cls: type) -> dict[str, str]:
         source = inspect.getsource(cls)
     except OSError:
         return {}  # a class without source, made at run time
-    (body,) = ast.parse(textwrap.dedent(source)).body
-    assert isinstance(body, ast.ClassDef)
-    found = {}
-    for field, after in zip(body.body, body.body[1:], strict=False):
+    (definition,) = ast.parse(textwrap.dedent(source)).body
+    assert isinstance(definition, ast.ClassDef)
+    texts = {}
+    for field, after in zip(definition.body, definition.body[1:], strict=False):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
             text = after.value if isinstance(after, ast.Expr) else None
             if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                found[field.target.id] = " ".join(text.value.split())
-    return found
+                texts[field.target.id] = " ".join(text.value.split())
+    return texts

@@ -1,4 +1,4 @@
-"""Records of a run: versions, machine, command and resolved configuration."""
+"""Write run.json, the record of a run: versions, machine, command and resolved configuration."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
+    """Return the processor's model name."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
@@ -58,7 +59,7 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
 
     Args:
         config: the resolved configuration, a dataclass.
-        seed: of the run; None for none.
+        seed: the run's seed; None if it has none.
     """
     return {
         **stamp(schema=1, seed=seed),
@@ -66,12 +67,12 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
         "packages": package_versions(),
         "machine": machine(),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "config_type": _kind_of(config),
+        "config_type": _type_name(config),
         "config": config,
     }
 
 
-def _kind_of(config: Any) -> str:
+def _type_name(config: Any) -> str:
     return f"{type(config).__module__}.{type(config).__qualname__}"
 
 
@@ -83,11 +84,11 @@ def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
     """
     path = Path(folder) / "run.json"
     try:
-        before = read_json(path)
-        kind, command = before["config_type"], " ".join(map(str, before["command"][:2]))
+        record = read_json(path)
+        kind, command = record["config_type"], " ".join(map(str, record["command"][:2]))
     except (OSError, ValueError, KeyError, TypeError):
         return
-    if kind != _kind_of(config):
+    if kind != _type_name(config):
         raise ValueError(
             f"{folder} holds a run of another kind (made by {command}), whose run.json would be "
             "overwritten; give another --out"
@@ -95,23 +96,23 @@ def refuse_other_run(folder: str | os.PathLike[str], config: Any) -> None:
 
 
 def write_run_record(
-    folder: str | os.PathLike[str], config: Any, seed: int | None, goes_on: bool = False
+    folder: str | os.PathLike[str], config: Any, seed: int | None, resumed: bool = False
 ) -> None:
     """Write `run_record` to `folder`/run.json.
 
     Args:
-        folder: of the run.
+        folder: the run's folder.
         config: the resolved configuration, a dataclass.
-        seed: of the run; None for none.
-        goes_on: whether the folder's run continues; the commits of its record are then kept as
-            `earlier_commits`, since they made a part of the run.
+        seed: the run's seed; None if it has none.
+        resumed: whether the folder's run continues. The git commits of its record are then kept
+            as `earlier_commits`, since their code made a part of the run.
     """
     path, record = Path(folder) / "run.json", run_record(config, seed)
     commits: set[str] = set()
-    if goes_on and path.is_file():
+    if resumed and path.is_file():
         try:
-            before = read_json(path)
-            commits = {*before.get("earlier_commits", []), before["git_commit"] or "unknown"}
+            old = read_json(path)
+            commits = {*old.get("earlier_commits", []), old["git_commit"] or "unknown"}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     earlier = sorted(commits - {record["git_commit"]})

@@ -1,4 +1,4 @@
-"""Reports: one HTML file that needs nothing else."""
+"""Write a report as one HTML file that needs no other files, scripts or network."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from tracks.common.files import write_text
 from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
+"""The page around a report's contents, with its style."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture, embedded."""
+    """A picture that is embedded in the page."""
 
     png: bytes
-    """The file's bytes."""
+    """The PNG file's bytes."""
     caption: str
-    """Text below it, and its alternative text; may be empty."""
+    """Text below the picture, and its alternative text; may be empty."""
 
 
 @dataclass(frozen=True)
 class Links:
-    """Files next to the report."""
+    """A list of links to files next to the report."""
 
     entries: Sequence[tuple[str, str]]
     """Path relative to the report's folder, and a description."""
@@ -36,12 +37,12 @@ class Links:
 
 @dataclass(frozen=True)
 class Details:
-    """Long text that is folded."""
+    """A long text that is folded at first."""
 
     summary: str
-    """Shown while it is folded."""
+    """The line above it, always visible."""
     text: str
-    """Shown unchanged when it is unfolded."""
+    """The text, shown as it is when unfolded."""
 
 
 @dataclass(frozen=True)
@@ -49,27 +50,28 @@ class Steps:
     """A numbered list."""
 
     texts: Sequence[str]
+    """Its items."""
 
 
 Part = str | Grid | Picture | Links | Details | Steps
-"""A text is a paragraph."""
+"""An item of a section; a text is a paragraph."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A headed part of a report."""
+    """A part of a report with a heading."""
 
     title: str
     """The heading."""
     parts: Sequence[Part]
-    """From top to bottom."""
+    """Its items, from top to bottom."""
     folded: bool = False
     """Whether only the heading is shown at first."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """A report."""
+    """The contents of a report."""
 
     title: str
     """The heading."""
@@ -82,10 +84,10 @@ class Report:
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> Path:
-    """Write `report` as one HTML file without scripts or anything from a network.
+    """Write `report` to `path` and return it as a Path.
 
     Raises:
-        OSError: where the file cannot be written; nothing is left under its name.
+        OSError: if the file cannot be written; then no partial file exists under its name.
     """
     write_text(path, html(report))
     return Path(path)

@@ -1,6 +1,7 @@
-"""Stages of a run, each in its own folder: done once, then reused with the same configuration.
+"""Run a long command in stages, each with a folder: a finished stage is not repeated.
 
-Time and memory of the work are estimated and printed before it starts.
+The same command with the same configuration continues at the first unfinished stage. Time and
+memory of the remaining work are estimated and printed before it starts.
 """
 
 from __future__ import annotations
@@ -32,29 +33,29 @@ def claim(out: Path, config: Any, seed: int) -> None:
         write_run_record(out, config, seed)
         return
     try:
-        theirs = read_json(path)["config"]
+        stored = read_json(path)["config"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
-    changes = differences(theirs, plain(config))
+    changes = differences(stored, plain(config))
     if changes:
         raise ValueError(
-            f"{out} holds a run of another configuration ({first_of(changes)}); give another "
+            f"{out} holds a run of another configuration ({first_changes(changes)}); give another "
             "--out, or move the folder away to start over"
         )
 
 
-def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
+def differences(stored: Any, new: Any, name: str = "") -> list[str]:
     """Return the differences of two plain values, as "name is X there, Y here"."""
-    if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
-        found = []
-        for key in dict.fromkeys([*ours, *theirs]):
-            below = f"{name}.{key}" if name else str(key)
-            found += differences(theirs.get(key), ours.get(key), below)
-        return found
-    return [] if theirs == ours else [f"{name} is {theirs!r} there, {ours!r} here"]
+    if isinstance(stored, Mapping) and isinstance(new, Mapping):
+        changes = []
+        for key in dict.fromkeys([*new, *stored]):
+            path = f"{name}.{key}" if name else str(key)
+            changes += differences(stored.get(key), new.get(key), path)
+        return changes
+    return [] if stored == new else [f"{name} is {stored!r} there, {new!r} here"]
 
 
-def first_of(changes: Sequence[str]) -> str:
+def first_changes(changes: Sequence[str]) -> str:
     """Return the first four changes and the number of further ones, for a message."""
     more = f"; and {len(changes) - 4} more" if changes[4:] else ""
     return "; ".join(changes[:4]) + more
@@ -66,37 +67,41 @@ class Stage:
 
     name: str
     """Name of its folder in the run's folder."""
-    words: str
+    title: str
     """Description for the console."""
-    needs: Estimate
-    """Time and memory."""
+    estimate: Estimate
+    """Time and memory of its work."""
     work: Callable[[Path], Any]
-    """Called with the folder; must continue an interrupted earlier call."""
-    tell: Callable[[Path], None] = lambda folder: None
-    """Called with the folder of every finished stage, to print its result."""
+    """Does the stage in the given folder; must continue an interrupted earlier call."""
+    show_result: Callable[[Path], None] = lambda folder: None
+    """Prints the result of the finished stage in the given folder."""
 
 
-def do_stages(out: Path, stages: Sequence[Stage], console: Console, what: str) -> dict[str, float]:
+def run_stages(
+    out: Path, stages: Sequence[Stage], console: Console, title: str
+) -> dict[str, float]:
     """Do the unfinished stages one after the other, each in its folder.
 
     Args:
         out: the run's folder.
-        stages: all of the run's, in order.
+        stages: all stages of the run, in order.
         console: shows the estimate of the remaining work, and each stage.
-        what: short description of the run.
+        title: short description of the run.
 
     Returns:
         The time that each stage took, by its name [s].
     """
-    left = [stage.needs for stage in stages if not is_done(out / stage.name)]
-    seconds = sum(need.seconds for need in left)
+    remaining = [stage.estimate for stage in stages if not is_done(out / stage.name)]
+    seconds = sum(estimate.seconds for estimate in remaining)
     if seconds:
-        announce(console, what, Estimate(seconds, max(need.memory_bytes for need in left)))
-    took = {}
+        memory_bytes = max(estimate.memory_bytes for estimate in remaining)
+        announce(console, title, Estimate(seconds, memory_bytes))
+    durations_s = {}
     for number, stage in enumerate(stages, 1):
-        took[stage.name] = _do(stage, out / stage.name, f"[{number}/{len(stages)}]", console)
-        stage.tell(out / stage.name)
-    return took
+        folder, count = out / stage.name, f"[{number}/{len(stages)}]"
+        durations_s[stage.name] = _run_stage(stage, folder, count, console)
+        stage.show_result(folder)
+    return durations_s
 
 
 def is_done(folder: Path) -> bool:
@@ -104,10 +109,10 @@ def is_done(folder: Path) -> bool:
     return (folder / MARK).is_file()
 
 
-def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
+def _run_stage(stage: Stage, folder: Path, number: str, console: Console) -> float:
     """Do a stage unless it is finished, and return the time that it took [s]."""
     if is_done(folder):
-        console.note(f"{number} {stage.words}: done before, in {folder}")
+        console.note(f"{number} {stage.title}: done before, in {folder}")
         try:
             return float(read_json(folder / MARK)["seconds"])
         except (ValueError, KeyError, TypeError) as error:
@@ -115,12 +120,12 @@ def _do(stage: Stage, folder: Path, number: str, console: Console) -> float:
                 f"{folder / MARK}: not the mark of a finished stage ({error}); remove the file to "
                 "do the stage again"
             ) from error
-    console.note(f"{number} {stage.words}")
+    console.note(f"{number} {stage.title}")
     started = time.monotonic()
     stage.work(folder)
     seconds = time.monotonic() - started
     # Written last, when all other files are on the disk.
-    write_json(folder / MARK, {"stage": stage.words, "seconds": seconds})
+    write_json(folder / MARK, {"stage": stage.title, "seconds": seconds})
     console.note(f"{number} took {duration(seconds)}")
     return seconds
 
@@ -144,10 +149,10 @@ def available_memory_bytes() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def announce(console: Console, what: str, estimate: Estimate) -> None:
-    """Print the estimate of `what`, and a warning if it exceeds the free memory."""
+def announce(console: Console, title: str, estimate: Estimate) -> None:
+    """Print the estimate of a piece of work, and a warning if it exceeds the free memory."""
     free = available_memory_bytes()
     need = size(estimate.memory_bytes)
-    console.note(f"{what}: about {duration(estimate.seconds)} and {need} of memory")
+    console.note(f"{title}: about {duration(estimate.seconds)} and {need} of memory")
     if estimate.memory_bytes > free:
         console.note(f"warning: only {size(free)} of memory is free; expect it to fail or to swap")

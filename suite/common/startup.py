@@ -1,4 +1,4 @@
-"""The start of a command: standard streams, environment variables and names are checked and set.
+"""Prepare a command's process: standard streams, environment variables of JAX, and file names.
 
 This happens before anything slow is imported: JAX reads its settings at import, and a file that
 gets the number of a closed stream would receive the printed text.
@@ -18,24 +18,26 @@ from typing import Any, TextIO
 
 from tracks.common.files import user_cache
 
-KEPT = (
+KEPT_PREFIXES = (
     *("JAX_PLATFORM", "JAX_CUDA_", "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_"),
     *("JAX_TRACEBACK_", "JAX_LOGGING_LEVEL"),
 )
-"""Prefixes of JAX's variables on devices, caches and logging, which are kept."""
-SWITCHES = (
+"""Prefixes of JAX's environment variables on devices, caches and logging, which are kept."""
+DEBUG_SWITCHES = (
     *("JAX_DISABLE_JIT", "JAX_DEBUG_NANS", "JAX_DEBUG_INFS", "JAX_LOG_COMPILES"),
     *("JAX_EXPLAIN_CACHE_MISSES", "JAX_ENABLE_COMPILATION_CACHE", "JAX_CHECK_TRACER_LEAKS"),
     "JAX_DISABLE_MOST_OPTIMIZATIONS",
 )
-"""JAX's variables for debugging; 0 or 1."""
-PRECISE = ("JAX_DEFAULT_MATMUL_PRECISION", "highest")
+"""JAX's variables for debugging, 0 or 1, which are kept."""
+FULL_PRECISION = ("JAX_DEFAULT_MATMUL_PRECISION", "highest")
 """Unrounded float32: accelerators multiply with fewer bits by default, too few for a rotation."""
-UNKEPT = tuple(f"Error {what} persistent compilation cache" for what in ("reading", "writing"))
+CACHE_WARNINGS = tuple(
+    f"Error {action} persistent compilation cache" for action in ("reading", "writing")
+)
 """Beginnings of JAX's warnings if its cache of compiled programs cannot be used."""
 
 
-class _Unfailing(io.FileIO):
+class _UnfailingStderr(io.FileIO):
     """Standard error that ignores a full disk or a missing reader, so that work continues."""
 
     def write(self, data: Any) -> int:
@@ -46,8 +48,8 @@ class _Unfailing(io.FileIO):
         return len(memoryview(data).cast("B"))
 
 
-class _Named(io.FileIO):
-    """Standard output: an error of writing names it, as one of a file names that."""
+class _NamedStdout(io.FileIO):
+    """Standard output whose name is in the message of a failed write."""
 
     def write(self, data: Any) -> int:
         try:
@@ -69,37 +71,39 @@ def open_streams() -> None:
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
     sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)
-    sys.stdout = _text(_Named(1, "w", closefd=False), sys.stdout)
-    sys.stderr = _text(_Unfailing(2, "w", closefd=False), sys.stderr)
+    sys.stdout = _text_stream(_NamedStdout(1, "w", closefd=False), sys.stdout)
+    sys.stderr = _text_stream(_UnfailingStderr(2, "w", closefd=False), sys.stderr)
 
 
-def _text(raw: io.FileIO, old: TextIO | None) -> TextIO:
+def _text_stream(raw: io.FileIO, old: TextIO | None) -> TextIO:
+    """Return a text stream on `raw` with the encoding and the buffering of the `old` one."""
     encoding = old.encoding if old else "utf-8"
     unbuffered = getattr(old, "write_through", False)  # python -u, PYTHONUNBUFFERED
-    lines = raw.isatty() or unbuffered or isinstance(raw, _Unfailing)
+    by_line = raw.isatty() or unbuffered or isinstance(raw, _UnfailingStderr)
     return io.TextIOWrapper(
-        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=lines
+        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=by_line
     )
 
 
-def hush() -> None:
-    """Suppress warnings without use for the user, here and in worker processes.
+def suppress_warnings() -> None:
+    """Suppress warnings that do not help the user, here and in worker processes.
 
     They are numpy's runtime warnings, and JAX's about its cache of compiled programs.
     """
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
         warnings.simplefilter("ignore", RuntimeWarning)
-        for cache in UNKEPT:
-            warnings.filterwarnings("ignore", cache, UserWarning)
-        found = ["ignore::RuntimeWarning", *(f"ignore:{cache}:UserWarning" for cache in UNKEPT)]
-        os.environ["PYTHONWARNINGS"] = ",".join(found)
+        filters = ["ignore::RuntimeWarning"]
+        for message in CACHE_WARNINGS:
+            warnings.filterwarnings("ignore", message, UserWarning)
+            filters.append(f"ignore:{message}:UserWarning")
+        os.environ["PYTHONWARNINGS"] = ",".join(filters)
 
 
 def check_names(args: Iterable[str]) -> None:
     """Refuse words of a command line that no result file could name, and folders called ~.
 
     Raises:
-        ValueError: for one that is not UTF-8, or holds a ~ that the shell left.
+        ValueError: for a word that is not UTF-8, or begins with a ~ that the shell did not replace.
     """
     for arg in args:
         if arg.partition("=")[2].startswith("~/") or arg.startswith("~/"):
@@ -118,32 +122,38 @@ def check_names(args: Iterable[str]) -> None:
             ) from None
 
 
-def pin(environment: MutableMapping[str, str] | None = None) -> list[str]:
+def clean_jax_environment(environment: MutableMapping[str, str] | None = None) -> list[str]:
     """Remove variables of JAX that could change results or end the command, in place.
 
     JAX has about a hundred variables, so the harmless ones are listed here. Products of matrices
     are computed in full precision.
 
+    Args:
+        environment: changed in place; by default that of this process.
+
     Returns:
         The names of the removed variables.
     """
     values = os.environ if environment is None else environment
-    known = ("0", "1", "true", "false")
-    fine = {name for name in SWITCHES if values.get(name, "0").lower() in known}
-    found = [
+    allowed = ("0", "1", "true", "false")
+    switches = {name for name in DEBUG_SWITCHES if values.get(name, "0").lower() in allowed}
+    removed = [
         name
         for name, value in values.items()
-        if name.startswith("JAX_") and value and (name, value) != PRECISE
+        if name.startswith("JAX_")
+        and value
+        and (name, value) != FULL_PRECISION
+        and name not in switches
+        and not name.startswith(KEPT_PREFIXES)
     ]
-    aside = [name for name in found if name not in fine and not name.startswith(KEPT)]
-    for name in aside:
+    for name in removed:
         del values[name]
-    values.update([PRECISE])
-    return sorted(aside)
+    values.update([FULL_PRECISION])
+    return sorted(removed)
 
 
 def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
-    """Let JAX keep compiled programs in the user's cache, unless another folder is set.
+    """Make JAX keep compiled programs in the user's cache, unless another folder is set.
 
     XLA compiles the model of a diagnosis for 15 s and a trainer for longer; a second call of the
     same command reads the compiled programs.
@@ -158,14 +168,14 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
         folder = user_cache(values) / "jax" / (platform.node() or "here")
         values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     if values["JAX_COMPILATION_CACHE_DIR"]:
-        drop_cut_entries(Path(values["JAX_COMPILATION_CACHE_DIR"]))
+        remove_empty_entries(Path(values["JAX_COMPILATION_CACHE_DIR"]))
     # XLA warns about its own tuning hints at every program that it loads; real errors are raised
     # as exceptions.
     values.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def use_device(device: str | None) -> None:
-    """Let JAX compute on the CPU ("cpu") or on a GPU ("gpu"); None: on a GPU if it finds one.
+    """Make JAX compute on the CPU ("cpu") or on a GPU ("gpu"); None: on a GPU if it finds one.
 
     Raises:
         ValueError: if JAX cannot use a GPU.
@@ -184,8 +194,8 @@ def use_device(device: str | None) -> None:
         ) from None
 
 
-def drop_cut_entries(folder: Path) -> None:
-    """Remove empty files of compiled programs, which a kill leaves and JAX does not replace."""
+def remove_empty_entries(folder: Path) -> None:
+    """Remove the cache's empty files, which a killed process leaves and JAX does not replace."""
     for entry in folder.glob("*-cache"):
         with contextlib.suppress(OSError):
             if not entry.stat().st_size:

@@ -1,4 +1,7 @@
-"""The text of `suite --help`: commands in groups, examples; and lists and old options in `args`."""
+"""The help texts of `suite` and its commands, and what happens to arguments before parsing.
+
+`with_lists` accepts lists with commas or spaces, `renamed` replaces options of earlier versions.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +116,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 """Command -> examples that its help begins with."""
 
 JOINED = ("--track", "--difficulty")
-"""Options that read a list from one text."""
+"""Options whose value is one text with a list."""
 
 
 def overview() -> str:
@@ -146,12 +149,12 @@ def first_paragraph(text: str | None) -> str:
 
 
 def description(name: str, about: str) -> str:
-    """Return the head of a command's help: its purpose, its examples, then what more there is."""
+    """Return the head of a command's help: its purpose, its examples, then further notes."""
     first, *more = [" ".join(part.split()) for part in about.split("\n\n")]
     # A line that begins with a space keeps its break; others are joined, and not wrapped.
     notes = [line for part in more for line in textwrap.wrap(part, 76, break_on_hyphens=False)]
-    parts = {"Examples": EXAMPLES.get(name, ()), "Notes": notes}
-    texts = ["\n  ".join([f"{title}:", *lines]) for title, lines in parts.items() if lines]
+    sections = {"Examples": EXAMPLES.get(name, ()), "Notes": notes}
+    texts = ["\n  ".join([f"{title}:", *lines]) for title, lines in sections.items() if lines]
     return "\n\n".join([first, *texts])
 
 
@@ -169,23 +172,23 @@ def with_lists(
         args: the words of a command line.
         listed: options that read one word for each value: `--speed 0.3,1` becomes `--speed 0.3 1`.
         joined: options that read one text: `--track a b` becomes `--track a,b`.
-        repeated: options that are given again for each value: `--policy a b`, which a shell makes
-            of `--policy runs/*`, becomes `--policy a --policy b`.
+        repeated: options that are repeated for each value: `--policy a b`, which a shell makes of
+            `--policy runs/*`, becomes `--policy a --policy b`.
     """
-    out, option, values = list[str](), "", 0
+    out, option, count = list[str](), "", 0
     for word in args:
         flag, equal, value = word.partition("=")
         if word.startswith("--") or (word.startswith("-") and option not in listed):
-            option, values = flag, int(bool(equal))
+            option, count = flag, int(bool(equal))
             out += [flag, *value.split(",")] if equal and option in listed else [word]
             continue
-        values += 1
+        count += 1
         if option in listed:
             out += [word] if equal else word.split(",")
-        elif values > 1 and option in joined:
+        elif count > 1 and option in joined:
             out[-1] += f",{word}"
         else:
-            out += [option, word] if values > 1 and option in repeated else [word]
+            out += [option, word] if count > 1 and option in repeated else [word]
     return out
 
 
@@ -194,7 +197,7 @@ def _simulator(value: str) -> list[str]:
 
 
 def _hidden(value: str) -> list[str]:
-    """Return what `suite loop --world` meant: SIMULATOR, FILE, or SIMULATOR:FILE."""
+    """Return the options for `suite loop --world`, whose value was SIMULATOR, FILE or both."""
     from eval.worlds import WORLDS
 
     simulator, _, vehicle = value.partition(":")
@@ -210,7 +213,8 @@ RENAMED: dict[str, dict[str, Callable[[str], list[str]]]] = {
     "loop": {"--world": _hidden},
     "export": {"--formats": lambda value: ["--format", value]},
 }
-"""Command -> option of an earlier version -> what it means now; they go with version 0.2."""
+"""Command -> option of an earlier version -> function that returns its replacement. Version 0.2
+removes them."""
 
 
 def renamed(name: str, args: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -224,5 +228,5 @@ def renamed(name: str, args: Sequence[str]) -> tuple[list[str], list[str]]:
             continue
         new = old[option](value or next(words, ""))
         out += new
-        notes.append(f"{option} is now {' '.join(new)}; {option} goes with version 0.2")
+        notes.append(f"{option} is now {' '.join(new)}; version 0.2 removes {option}")
     return out, notes

@@ -1,4 +1,7 @@
-"""Long pieces of work in parallel: the option `--workers`, and jobs whose product is a folder."""
+"""Do long jobs in parallel: in processes of this machine, or on a cluster (option `--workers`).
+
+A job is work whose product is a folder, such as one training.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import tyro
 from suite.common.console import Console, Quiet, Update
 from suite.common.errors import WorkFailed
 from suite.common.options import Advanced
-from suite.common.running.apart import Job, do_apart, fill, parcels
+from suite.common.running.remote import Job, do_remotely, parcels, replace_content
 from tracks.common.work import WorkerDied, Workers, read_workers, run_pieces, usable_cores
 from tracks.common.work.threads import share_threads
 
@@ -21,11 +24,11 @@ Result = TypeVar("Result")
 WorkersOption = Advanced[
     Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint="")]
 ]
-"""As a command's option; `workers_given` reads it."""
+"""Type of the option `--workers`; `read_workers_option` reads it."""
 
 
 class Silent(Quiet):
-    """Prints nothing: lines of parallel jobs would mix."""
+    """A console that prints nothing, for parallel jobs, whose lines would mix."""
 
     def note(self, text: str) -> None:
         """Print nothing."""
@@ -42,11 +45,11 @@ class Silent(Quiet):
         yield update
 
 
-def workers_given(text: str | None, whole_cores: bool = False) -> Workers | None:
-    """Return the workers of the option `--workers`; None if it was not given.
+def read_workers_option(text: str | None, whole_cores: bool = False) -> Workers | None:
+    """Return the workers of the option `--workers`; None without it.
 
     Args:
-        text: the option.
+        text: the option's value.
         whole_cores: refuse more processes than this machine has cores, for work that keeps its
             cores busy.
 
@@ -56,31 +59,31 @@ def workers_given(text: str | None, whole_cores: bool = False) -> Workers | None
     workers, cores = read_workers(text), usable_cores()
     if whole_cores and isinstance(workers, int) and workers > cores:
         raise ValueError(
-            f"--workers is {workers}; allowed is 1 to {cores}, the cores there are, or the address "
+            f"--workers is {workers}; allowed is 1 to {cores}, the number of cores, or the address "
             "of a cluster's scheduler"
         )
     return workers
 
 
-def all_done(
+def do_jobs(
     do: Callable[[Job, Console], Result],
     jobs: Sequence[Job],
     workers: Workers | None,
     console: Console,
-    what: str,
+    title: str,
 ) -> list[Result]:
-    """Return do(job, console) of every job in order; the jobs' folders are as `do` leaves them.
+    """Do all jobs, and return the result do(job, console) of each in order.
 
     Args:
         do: a function at the top of a module, or a `functools.partial` of one. It saves finished
             work in the job's folder, so that the call can be repeated after an interrupt. Its
             result must contain no path.
-        jobs: the work.
+        jobs: the jobs; afterwards their folders have the products.
         workers: None or 1 is this process, on all cores. Several processes of this machine are
             pinned to separate cores; those of a cluster get folders as content.
         console: shows the number of finished jobs; `do` gets it in this process, and a silent one
             in others.
-        what: short description of the jobs.
+        title: short description of the jobs.
 
     Raises:
         WorkFailed: if a process dies twice at the same job.
@@ -89,34 +92,34 @@ def all_done(
     """
     if workers is None or workers == 1:
         return [do(job, console) for job in jobs]
-    found: dict[int, Result] = {}
-    with console.progress(what, len(jobs)) as update:
+    results: dict[int, Result] = {}
+    with console.progress(title, len(jobs)) as update:
 
         def keep(number: int, result: Any) -> None:
             if isinstance(workers, str):
                 result, files = result
-                fill(jobs[number].folder, files)
-            found[number] = result
-            update(len(found))
+                replace_content(jobs[number].folder, files)
+            results[number] = result
+            update(len(results))
 
         try:
             if isinstance(workers, str):
-                work = partial(do_apart, partial(_silently, do))
+                work = partial(do_remotely, partial(_do_silently, do))
                 run_pieces(work, parcels(jobs), workers, keep)
             else:
-                run_pieces(partial(_yielded, do), jobs, workers, keep, pinned=True)
+                run_pieces(partial(_yield_result, do), jobs, workers, keep, pinned=True)
         except WorkerDied as error:
             raise WorkFailed(
-                f"{what}: a process ended badly, what the others finished is kept; the same "
-                f"command goes on, with --workers 1 in one process. It said: {error}"
+                f"{title}: a process died; the products of the others are kept. Repeat the command "
+                f"to continue, with --workers 1 in one process. Its message: {error}"
             ) from error
-    return [found[number] for number in range(len(jobs))]
+    return [results[number] for number in range(len(jobs))]
 
 
-def _silently(do: Callable[[Job, Console], Result], job: Job) -> Result:
+def _do_silently(do: Callable[[Job, Console], Result], job: Job) -> Result:
     share_threads()
     return do(job, Silent())
 
 
-def _yielded(do: Callable[[Job, Console], Result], job: Job) -> Iterator[Result]:
-    yield _silently(do, job)
+def _yield_result(do: Callable[[Job, Console], Result], job: Job) -> Iterator[Result]:
+    yield _do_silently(do, job)

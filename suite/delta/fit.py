@@ -1,15 +1,15 @@
-"""The Delta Action Model fitted by gradients through the point mass, and its rivals.
+"""Fit a Delta Action Model by gradients through the dynamics that it corrects.
 
-Held-out flights take no part in any fit. The model is compared with the trainer's point mass, and
-with one whose lag, drag and delay are fitted to the same flights: a network is only useful if it is
-better than plain system identification.
+The model is a network that adds a correction to the action, so that simulated flights match
+measured ones. No fit uses the held-out flights, on which the errors are measured. The model is
+compared with the trainer's point mass, and with one whose lag, drag and delay are fitted to the
+same flights: a network is only useful if it is better than plain system identification.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from dataclasses import replace as changed
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from typing import Annotated, Any, NamedTuple
@@ -20,14 +20,14 @@ import numpy as np
 import optax
 
 from policies.networks import delta_network
-from suite.delta.replay import PointMassModel, nominal_model, replay
-from suite.delta.windows import PointMassWindows, forgotten
+from suite.delta.replay import PointMassModel, nominal_model, replay_point_mass
+from suite.delta.windows import PointMassWindows, without_memory
 from suite.train.config import PointMassConfig
 from tracks.input.ranges import Iterations, Range, Seed
 
 IDENTIFY_RATE = 3e-2
 """Least learning rate of lag, drag and delay, which change more than a network's weights."""
-WATCHED = 512
+CURVE_WINDOWS = 512
 """Approximate number of fitted windows, evenly selected, for the curve's fit error."""
 
 
@@ -40,7 +40,7 @@ class FitConfig:
     stride_s: Annotated[float, Range(0.001, 60.0)] = 0.2
     """Time between the starts of windows [s]."""
     held_out: Annotated[float, Range(0.0, 1.0, above=True, below=True)] = 0.25
-    """Share of the flights that take no part in the fit."""
+    """Share of the flights that are held out: the fit does not use them."""
     iterations: Iterations = 1500
     """Gradient steps."""
     batch: Annotated[int, Range(1, 10**6)] = 256
@@ -83,12 +83,12 @@ class DeltaFit:
 
 @dataclass(frozen=True)
 class PointMassFit(DeltaFit):
-    """A network fitted through the point mass, and its rival."""
+    """A network fitted through the point mass, and a fitted point mass for comparison."""
 
     identified: PointMassModel
     """The point mass whose lag, drag and delay were fitted."""
-    rival: ReplayErrors
-    """Its held-out errors."""
+    identified_errors: ReplayErrors
+    """Held-out errors of that point mass, without a network."""
 
 
 Replay = Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]
@@ -105,14 +105,15 @@ def window_errors(replay: Replay, windows: Any, delta: Any) -> tuple[jax.Array, 
 
 
 def _loss(config: FitConfig, replay: Replay, windows: Any, delta: Any) -> jax.Array:
+    """Return the mean distance between replay and record, plus the weighted correction [m]."""
     pos, vel, correction = replay(windows, delta)
 
     def mean_norm(vector: jax.Array) -> jax.Array:
         return jnp.sqrt((vector * vector).sum(-1) + 1e-8).mean()
 
-    apart = mean_norm(pos - windows.pos_w[:, 1:])
-    apart += config.velocity_weight * mean_norm(vel - windows.vel_w[:, 1:])
-    return apart + config.size_weight * (correction * correction).sum(-1).mean()
+    error = mean_norm(pos - windows.pos_w[:, 1:])
+    error += config.velocity_weight * mean_norm(vel - windows.vel_w[:, 1:])
+    return error + config.size_weight * (correction * correction).sum(-1).mean()
 
 
 def _descend(
@@ -121,8 +122,18 @@ def _descend(
     start: Any,
     windows: Any,
     iterations: int,
-    watch: Callable[[int, Any], None],
+    after_step: Callable[[int, Any], None],
 ) -> Any:
+    """Return the variables that minimise `loss` on batches of `windows`, by Adam.
+
+    Args:
+        config: batch size, learning rate and seed.
+        loss: (variables, batch of windows) -> the loss.
+        start: the initial variables.
+        windows: the windows of the fit.
+        iterations: number of gradient steps.
+        after_step: called with (iteration, variables) after every step.
+    """
     optimizer = optax.adam(optax.cosine_decay_schedule(config.rate, iterations))
 
     @jax.jit
@@ -138,7 +149,7 @@ def _descend(
         chosen = rng.choice(count, min(config.batch, count), replace=False)
         batch = jax.tree.map(itemgetter(chosen), windows)
         variables, state = update(variables, state, batch)
-        watch(iteration, variables)
+        after_step(iteration, variables)
     return variables
 
 
@@ -146,18 +157,18 @@ def identify(
     config: FitConfig, physics: PointMassConfig, windows: PointMassWindows
 ) -> PointMassModel:
     """Return the point mass whose lag, drag and delay replay `windows` best."""
-    middle = nominal_model(physics)
-    start = (jnp.log(middle.lag), middle.drag, middle.delay)
+    nominal = nominal_model(physics)
+    start = (jnp.log(nominal.lag), nominal.drag, nominal.delay)
 
     def as_model(variables: Any) -> PointMassModel:
         lag, drag, delay = variables
         return PointMassModel(jnp.exp(lag), drag, jnp.clip(delay, 0.0, 2.0))
 
     def loss(variables: Any, batch: PointMassWindows) -> jax.Array:
-        return _loss(config, partial(replay, as_model(variables)), batch, None)
+        return _loss(config, partial(replay_point_mass, as_model(variables)), batch, None)
 
     iterations = max(1, config.iterations // 3)
-    faster = changed(config, rate=max(config.rate, IDENTIFY_RATE))
+    faster = replace(config, rate=max(config.rate, IDENTIFY_RATE))
     best = _descend(faster, loss, start, windows, iterations, lambda *_: None)
     return as_model(best)
 
@@ -165,45 +176,45 @@ def identify(
 def fit_network(
     config: FitConfig,
     replay: Replay,
-    known: Any,
+    fit_windows: Any,
     held_out: Any,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> DeltaFit:
-    """Fit a network by gradients through `replay` to `known` and evaluate it on `held_out`.
+    """Fit a network by gradients through `replay` to `fit_windows`; evaluate it on `held_out`.
 
     Args:
         config: the fit.
         replay: simulates windows; differentiable.
-        known: windows of the flights that are fitted.
+        fit_windows: windows of the flights of the fit.
         held_out: windows of held-out flights.
         show: called with (iteration, text) during the fit.
     """
     errors = jax.jit(partial(window_errors, replay))
-    stride = -(-len(known.pos_w) // WATCHED)
-    watched = jax.tree.map(itemgetter(slice(None, None, stride)), known)
+    stride = -(-len(fit_windows.pos_w) // CURVE_WINDOWS)
+    curve_windows = jax.tree.map(itemgetter(slice(None, None, stride)), fit_windows)
     curve: list[dict[str, float]] = []
-    every = max(1, config.iterations // 50)
+    period = max(1, config.iterations // 50)
 
-    def watch(iteration: int, params: delta_network.Params) -> None:
-        if iteration % every and iteration + 1 < config.iterations:
+    def add_to_curve(iteration: int, params: delta_network.Params) -> None:
+        if iteration % period and iteration + 1 < config.iterations:
             return
         row = {
             "iteration": iteration,
-            "fit_m": float(errors(watched, params)[0].mean()),
+            "fit_m": float(errors(curve_windows, params)[0].mean()),
             "held_out_m": float(errors(held_out, params)[0].mean()),
         }
         curve.append(row)
-        after = f"error after {config.horizon_s:g} s"
-        show(iteration + 1, f"{after} {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
+        label = f"error after {config.horizon_s:g} s"
+        show(iteration + 1, f"{label} {row['fit_m']:.3f} m, held out {row['held_out_m']:.3f} m")
 
     start = delta_network.init(jax.random.key(config.seed))
 
     def loss(params: delta_network.Params, batch: Any) -> jax.Array:
         # Batches are in random order, so the first windows are a random selection.
-        burn_in = forgotten(batch.burn_in, config.blank_share)
+        burn_in = without_memory(batch.burn_in, config.blank_share)
         return _loss(config, replay, batch._replace(burn_in=burn_in), params)
 
-    params = _descend(config, loss, start, known, config.iterations, watch)
+    params = _descend(config, loss, start, fit_windows, config.iterations, add_to_curve)
     return DeltaFit(
         params={name: np.asarray(value) for name, value in params.items()},
         without=_means(errors(held_out, None)),
@@ -216,24 +227,26 @@ def _means(errors: tuple[jax.Array, jax.Array]) -> ReplayErrors:
     return ReplayErrors(*(float(error.mean()) for error in errors))
 
 
-def fit(
+def fit_point_mass(
     config: FitConfig,
     physics: PointMassConfig,
-    known: PointMassWindows,
+    fit_windows: PointMassWindows,
     held_out: PointMassWindows,
     show: Callable[[int, str], None] = lambda *_: None,
 ) -> PointMassFit:
-    """Fit the Delta Action Model of the point mass to `known` and evaluate it on `held_out`.
+    """Fit the Delta Action Model of the point mass, and a point mass for comparison.
 
     Args:
         config: the fit.
         physics: the trainer's point mass; the middle of its ranges is corrected.
-        known: windows of the flights that are fitted.
+        fit_windows: windows of the flights of the fit.
         held_out: windows of held-out flights.
         show: called with (iteration, text) during the fit.
     """
-    nominal = partial(replay, nominal_model(physics))
-    network = fit_network(config, nominal, known, held_out, show)
-    identified = identify(config, physics, known)
-    rival = jax.jit(partial(window_errors, partial(replay, identified)))
-    return PointMassFit(**vars(network), identified=identified, rival=_means(rival(held_out, None)))
+    nominal = partial(replay_point_mass, nominal_model(physics))
+    network = fit_network(config, nominal, fit_windows, held_out, show)
+    identified = identify(config, physics, fit_windows)
+    errors = jax.jit(partial(window_errors, partial(replay_point_mass, identified)))
+    return PointMassFit(
+        **vars(network), identified=identified, identified_errors=_means(errors(held_out, None))
+    )

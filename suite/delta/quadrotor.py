@@ -1,8 +1,9 @@
-"""Replay of recorded actions in the trainer's quadrotor, with or without corrections.
+"""Replay recorded actions in the trainer's quadrotor, with or without a Delta Action Model.
 
-A window starts from the measured state, with rotor speeds and commands that are still delayed. Each
-row of the log is one step of the attitude loop. The commanded yaw rate is the recorded one, because
-an action does not set the heading.
+The model is a network that corrects the actions. A window is a part of a flight; it starts from the
+measured state, with rotor speeds and commands that are still delayed. Each row of the log is one
+step of the attitude loop. The commanded yaw rate is the recorded one, because an action does not
+set the heading.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from suite.delta.windows import (
     BurnIn,
     burn_in_before,
     decision_period,
-    decisions_of,
-    refuse_none,
-    stacked,
+    log_decisions,
+    refuse_no_windows,
+    stack_windows,
     state_after,
 )
 from suite.train.config import QuadrotorConfig
@@ -38,7 +39,7 @@ from suite.train.dynamics.quadrotor import (
 from tracks.geometry.rotation import to_local
 
 LEAST_PHYSICS_HZ = 250.0
-"""Lowest physics rate of a replay, about, even if training steps are longer [Hz]."""
+"""Approximate lowest physics rate of a replay, even if training steps are longer [Hz]."""
 
 
 class QuadrotorWindows(NamedTuple):
@@ -86,80 +87,99 @@ def cut_quadrotor_windows(
     stride_s: float,
     row_s: float | None = None,
 ) -> tuple[QuadrotorWindows, Substeps]:
-    """Return windows of `duration_s`, about one per `stride_s` of each flight, and `row_substeps`.
+    """Return windows of all flights, and the physics steps of a row.
 
-    A window is left out if a value is missing or a row is not `row_s` long. `row_s` [s] is by
-    default `row_period` of these logs.
+    A window is left out if a value is missing or a row is not `row_s` long.
+
+    Args:
+        logs: the flights.
+        config: the vehicle and its physics rate.
+        duration_s: length of a window [s].
+        stride_s: approximate time between the starts of windows [s].
+        row_s: time between rows [s]; by default `row_period` of these logs.
 
     Raises:
         ValueError: if a log has no actions, or all flights are shorter than a window.
     """
     for log in logs:
-        decisions_of(log)
+        log_decisions(log)
         if log.rate_cmd_b is None or log.thrust_cmd is None:
             raise ValueError(
                 f"{log.name}: columns cmd_thrust and cmd_rate_x, cmd_rate_y, cmd_rate_z are needed "
                 "to fit the Delta Action Model of a quadrotor; record flights with suite collect"
             )
     row_s = row_period(logs) if row_s is None else row_s
-    cut = row_substeps(config, row_s)
-    plant = plant_of(config, {}, cut.dt, varies=False)
+    substeps = row_substeps(config, row_s)
+    plant = plant_of(config, {}, substeps.dt, varies=False)
     length = plant.delay_weight.shape[-1]
-    found = [
+    windows = [
         window
         for log in logs
-        for window in _flight_windows(log, cut, length, row_s, duration_s, stride_s)
+        for window in _flight_windows(log, substeps, length, row_s, duration_s, stride_s)
     ]
-    refuse_none(found, logs, duration_s)
-    return stacked(found), cut
+    refuse_no_windows(windows, logs, duration_s)
+    return stack_windows(windows), substeps
 
 
 def _flight_windows(
-    log: FlightLog, cut: Substeps, length: int, row_s: float, duration_s: float, stride_s: float
+    log: FlightLog,
+    substeps: Substeps,
+    length: int,
+    row_s: float,
+    duration_s: float,
+    stride_s: float,
 ) -> list[QuadrotorWindows]:
-    action, decides = decisions_of(log)
+    """Return the windows of one flight; `length` is the longest delay in physics steps."""
+    action, decides = log_decisions(log)
     assert log.rate_cmd_b is not None and log.thrust_cmd is not None
-    rows, time = round(duration_s / row_s), log.time_s
-    rot_w = log.rot_w
-    commanded = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    ages_s = cut.dt * (np.arange(length) + 0.5)
-    speed = np.full((len(time), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
-    at = np.flatnonzero(decides & log.whole)
-    if len(at) < 2:
+    rows, time_s, rot_w = round(duration_s / row_s), log.time_s, log.rot_w
+    commands = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
+    ages_s = substeps.dt * (np.arange(length) + 0.5)
+    speed = np.full((len(time_s), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
+    decision_rows = np.flatnonzero(decides & log.whole)
+    if len(decision_rows) < 2:
         return []
-    before = round(BURN_IN_S / decision_period(time[at], row_s))
-    back = int(np.ceil(length * cut.dt / row_s - 1e-9))
-    found, next_s = [], time[0]
-    for number, first in enumerate(at.tolist()):
+    burn_in_count = round(BURN_IN_S / decision_period(time_s[decision_rows], row_s))
+    rows_before = int(np.ceil(length * substeps.dt / row_s - 1e-9))
+    windows, next_s = [], time_s[0]
+    for number, first in enumerate(decision_rows.tolist()):
+        if time_s[first] < next_s or first < rows_before or first + rows >= len(time_s):
+            continue
+        used = slice(first - rows_before, first + rows + 1)
+        is_steady = np.abs(np.diff(time_s[used]) - row_s) < 0.2 * row_s
+        if not (log.whole[used].all() and is_steady.all()):
+            continue
+        next_s = time_s[first] + stride_s
         span = slice(first, first + rows + 1)
-        if time[first] < next_s or first < back or first + rows >= len(time):
-            continue
-        steady = np.abs(np.diff(time[first - back : first + rows + 1]) - row_s) < 0.2 * row_s
-        if not (log.whole[first - back : first + rows + 1].all() and steady.all()):
-            continue
-        next_s = time[first] + stride_s
-        held = np.searchsorted(time, time[first] - ages_s, side="right") - 1
-        found.append(
+        delayed_rows = np.searchsorted(time_s, time_s[first] - ages_s, side="right") - 1
+        burn_in = burn_in_before(
+            rot_w[decision_rows],
+            log.vel_w[decision_rows],
+            action[decision_rows],
+            number,
+            burn_in_count,
+        )
+        windows.append(
             QuadrotorWindows(
                 log.pos_w[span],
                 log.vel_w[span],
                 rot_w[first],
                 log.rate_b[first],
                 speed[first],
-                commanded[held],
-                np.asarray(time[first] - time[0]),
+                commands[delayed_rows],
+                np.asarray(time_s[first] - time_s[0]),
                 action[span][:-1],
                 decides[span][:-1],
                 log.rate_cmd_b[span][:-1, 2],
-                burn_in_before(rot_w[at], log.vel_w[at], action[at], number, before),
+                burn_in,
             )
         )
-    return found
+    return windows
 
 
 def replay_quadrotor(
     config: QuadrotorConfig,
-    cut: Substeps,
+    substeps: Substeps,
     windows: QuadrotorWindows,
     delta: delta_network.Params | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -167,11 +187,11 @@ def replay_quadrotor(
 
     Args:
         config: the vehicle; its randomisation is not used.
-        cut: physics steps of one row.
+        substeps: physics steps of one row.
         windows: the recorded flights.
         delta: parameters of the Delta Action network; None for no correction.
     """
-    plant = plant_of(config, {}, cut.dt, varies=False)
+    plant = plant_of(config, {}, substeps.dt, varies=False)
     count = windows.pos_w.shape[0]
     hover = hover_state(plant, (count,), jnp)
     speed = jnp.asarray(windows.rotor_speed)
@@ -197,14 +217,16 @@ def replay_quadrotor(
         action, decides, yaw_rate = row
         if delta is not None:
             vel_b = to_local(body.rot_w, body.vel_w)
-            fresh, after = delta_network.step(delta, hidden, vel_b, body.rot_w[:, 2], action)
-            now = decides[:, None] > 0
-            correction = jnp.where(now, fresh, correction)
-            hidden = jnp.where(now, after, hidden)
+            new_correction, new_hidden = delta_network.step(
+                delta, hidden, vel_b, body.rot_w[:, 2], action
+            )
+            is_decision = decides[:, None] > 0
+            correction = jnp.where(is_decision, new_correction, correction)
+            hidden = jnp.where(is_decision, new_hidden, hidden)
         body = fly_period(
             config.vehicle,
             plant,
-            cut,
+            substeps,
             body,
             action + correction,
             lambda heading_w, _: heading_w,
@@ -215,6 +237,6 @@ def replay_quadrotor(
     hidden = state_after(delta, windows.burn_in)
     by_row = (windows.action_b, windows.decides, windows.yaw_rate)
     by_row = tuple(jnp.swapaxes(jnp.asarray(x), 0, 1) for x in by_row)
-    _, flown = jax.lax.scan(step, (body, hidden, zero), by_row)
-    pos_w, vel_w, correction_b = (jnp.swapaxes(x, 0, 1) for x in flown)
+    _, results = jax.lax.scan(step, (body, hidden, zero), by_row)
+    pos_w, vel_w, correction_b = (jnp.swapaxes(x, 0, 1) for x in results)
     return pos_w, vel_w, correction_b

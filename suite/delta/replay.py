@@ -1,6 +1,7 @@
-"""Replay of recorded actions in the point mass, with or without corrections.
+"""Replay recorded actions in the trainer's point mass, with or without a Delta Action Model.
 
-The checkpoint of a Delta Action Model names the dynamics that it corrects; trainings check it.
+The model is a network that corrects the actions. Its checkpoint describes the dynamics that it
+corrects, and `check_corrects` compares them with those of a training.
 """
 
 from __future__ import annotations
@@ -22,43 +23,43 @@ from tracks.geometry.scene import Array
 
 
 class PointMassModel(NamedTuple):
-    """Constants of the replayed point mass, scalars and one vector."""
+    """Parameters of the replayed point mass."""
 
     lag: Array
     """Rate at which the acceleration follows the command [1/s]."""
     drag: Array
     """(3,) linear drag in body axes [1/s]."""
     delay: Array
-    """Delay of a command in decisions."""
+    """Delay of a command [decisions]."""
 
 
 def nominal_model(config: PointMassConfig) -> PointMassModel:
     """Return the point mass at the middle of the trainer's ranges."""
-    along = (config.drag, config.drag, config.drag_up)
+    drag_ranges = (config.drag, config.drag, config.drag_up)
     return PointMassModel(
         jnp.asarray(config.lag_mean),
-        jnp.asarray([(low + high) / 2 for low, high in along]),
+        jnp.asarray([(low + high) / 2 for low, high in drag_ranges]),
         jnp.asarray(sum(config.action_delay) / 2),
     )
 
 
-def replay(
+def replay_point_mass(
     model: PointMassModel, windows: PointMassWindows, delta: delta_network.Params | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return pos_w, vel_w (N, T, 3) after every decision, and the corrections (N, T, 3).
 
-    The state is the simulated one in all steps (Eq. delta_action_loss); only the heading, which the
-    point mass does not determine, is the recorded one.
+    The state is the simulated one in all steps (Su et al. 2026, Eq. delta_action_loss). Only the
+    heading, which the point mass does not determine, is the recorded one.
 
     Args:
-        model: constants of the point mass.
-        windows: the record, N windows of T decisions.
+        model: parameters of the point mass.
+        windows: the recorded flights, N windows of T decisions.
         delta: parameters of the Delta Action network; None for no correction.
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
-    air_b = to_local(rot_w, windows.vel_w[:, 0])
-    thrust_w = windows.acc_w + to_world(rot_w, model.drag * air_b)
+    vel_b = to_local(rot_w, windows.vel_w[:, 0])
+    thrust_w = windows.acc_w + to_world(rot_w, model.drag * vel_b)
     body = point_mass.PointMassState(
         pos_w=jnp.asarray(windows.pos_w[:, 0]),
         vel_w=jnp.asarray(windows.vel_w[:, 0]),
@@ -98,8 +99,8 @@ def replay(
         jnp.swapaxes(windows.time_step, 0, 1),
     )
     start = (body, state_after(delta, windows.burn_in))
-    _, flown = jax.lax.scan(step, start, by_step)
-    pos_w, vel_w, correction_b = (jnp.swapaxes(x, 0, 1) for x in flown)
+    _, results = jax.lax.scan(step, start, by_step)
+    pos_w, vel_w, correction_b = (jnp.swapaxes(x, 0, 1) for x in results)
     return pos_w, vel_w, correction_b
 
 
@@ -107,7 +108,7 @@ POINT, QUAD = "point", "quad"
 """Names of the two models in `suite train --model`."""
 
 
-def corrected(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
+def describe_dynamics(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
     """Return the description of the corrected dynamics for a checkpoint.
 
     It has the middle of the point mass's ranges, or the vehicle file without its name.
@@ -121,50 +122,50 @@ def check_corrects(
     fit: Mapping[str, Any],
     dynamics: PointMassConfig | QuadrotorConfig,
     rate_hz: float,
-    where: Path,
+    checkpoint: Path,
 ) -> None:
     """Refuse a Delta Action Model of other dynamics than the training's.
 
     Args:
-        fit: from the checkpoint; without a model it counts as that of a point mass, and without a
-            rate it fits any.
+        fit: the model's description from its checkpoint. Without a model it counts as that of a
+            point mass, and without a rate it is valid for any.
         dynamics: of the training.
-        rate_hz: of the trained policy, since the network makes one step per decision.
-        where: the checkpoint, for the message.
+        rate_hz: decisions of the trained policy [Hz]; the network makes one step per decision.
+        checkpoint: the model's folder, for the message.
 
     Raises:
         ValueError: if they differ.
     """
-    mine = corrected(dynamics)
+    training = describe_dynamics(dynamics)
     model = fit.get("model", POINT)
-    if model != mine["model"]:
+    if model != training["model"]:
         raise ValueError(
-            f"--delta {where} corrects --model {model}, and this run has --model "
-            f"{mine['model']}; train with the model that it was fitted to"
+            f"--delta {checkpoint} corrects --model {model}, and this run has --model "
+            f"{training['model']}; train with the model that it was fitted to"
         )
     rate = fit.get("rate_hz", rate_hz)
     if abs(rate - rate_hz) > RATE_SHARE * rate_hz:
         raise ValueError(
-            f"--delta {where} was fitted to flights of {rate:.3g} decisions a second, and this "
-            f"run has {rate_hz:g}: it remembers from one to the next; fit again to flights of a "
-            f"policy of {rate_hz:g} Hz, or give --set spec.rate_hz={round(rate)}"
+            f"--delta {checkpoint} was fitted to flights with {rate:.3g} decisions a second, and "
+            f"this run has {rate_hz:g}: its memory is updated at each decision; fit again to "
+            f"flights of a policy of {rate_hz:g} Hz, or give --set spec.rate_hz={round(rate)}"
         )
-    plant = fit.get("plant", mine["plant"])
-    if plant == mine["plant"]:
+    plant = fit.get("plant", training["plant"])
+    if plant == training["plant"]:
         return
     if isinstance(dynamics, QuadrotorConfig):
         name = dynamics.vehicle.name
         raise ValueError(
-            f"--delta {where} was fitted to another vehicle than {name!r}; take its "
+            f"--delta {checkpoint} was fitted to another vehicle than {name!r}; take its "
             f"--vehicle, or fit again with suite delta --model {QUAD} --vehicle"
         )
     raise ValueError(
-        f"--delta {where} corrects a point mass with {_words(plant)}, and this run's has "
-        f"{_words(mine['plant'])}; take the --recipe it was fitted to, or fit again with suite "
-        "delta --recipe"
+        f"--delta {checkpoint} corrects a point mass with {_plant_text(plant)}, and this run's has "
+        f"{_plant_text(training['plant'])}; take the --recipe it was fitted to, or fit again with "
+        "suite delta --recipe"
     )
 
 
-def _words(plant: Mapping[str, Any]) -> str:
+def _plant_text(plant: Mapping[str, Any]) -> str:
     drag = " ".join(f"{axis:.3g}" for axis in plant["drag"])
     return f"lag {plant['lag']:.3g} 1/s, drag {drag} 1/s, delay {plant['delay']:.3g} decisions"

@@ -1,4 +1,8 @@
-"""Fit the Delta Action Model to flight logs and write its checkpoint and tables."""
+"""Fit a Delta Action Model to flight logs, and write its checkpoint and tables (`suite delta`).
+
+The model is a network that corrects the actions, so that simulated flights match measured ones. It
+is compared with the uncorrected dynamics on held-out flights, which the fit does not use.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +18,37 @@ from policies.formats.policy_file import save_delta
 from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import Estimate, announce
-from suite.delta.fit import DeltaFit, FitConfig, PointMassFit, ReplayErrors, fit, fit_network
-from suite.delta.replay import QUAD, corrected
+from suite.delta.fit import (
+    DeltaFit,
+    FitConfig,
+    PointMassFit,
+    ReplayErrors,
+    fit_network,
+    fit_point_mass,
+)
+from suite.delta.replay import QUAD, describe_dynamics
 from suite.delta.windows import cut_windows, decision_rate
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
 """Steps a second of the quadrotor and of the point mass in a fit, for the estimate."""
-FLOWN = {
+MODEL_NAMES = {
     "point_mass": "point mass as trained in",
     "without": "quadrotor of the vehicle file",
     "fitted_point_mass": "point mass, lag, drag and delay fitted",
     "delta_action": "with Delta Action Model",
 }
-"""Models that replay the held-out flights, by their keys in delta.json: the corrected dynamics
-first, the Delta Action Model last."""
+"""Key in delta.json -> name of a model that replays the held-out flights. The uncorrected dynamics
+are first, the Delta Action Model is last."""
 
 
 def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
-    """Return the approximate time and memory of a fit with windows of `steps`."""
-    work = config.iterations * config.batch * steps
+    """Return the approximate time and memory of a fit with `steps` steps in each window."""
+    total = config.iterations * config.batch * steps
     if through_quadrotor:
-        return Estimate(40 + work / PLANT_STEPS_S, 1.5e9)
-    return Estimate(20 + work / POINT_STEPS_S, 8e8)
+        return Estimate(40 + total / PLANT_STEPS_S, 1.5e9)
+    return Estimate(20 + total / POINT_STEPS_S, 8e8)
 
 
 def flight_files(paths: Sequence[Path]) -> list[Path]:
@@ -48,11 +59,11 @@ def flight_files(paths: Sequence[Path]) -> list[Path]:
     """
     files = []
     for path in paths:
-        inside = [*path.glob("*.parquet"), *path.glob("*.csv")] if path.is_dir() else [path]
-        files += sorted(inside)
+        logs = [*path.glob("*.parquet"), *path.glob("*.csv")] if path.is_dir() else [path]
+        files += sorted(logs)
     if not files:
-        where = ", ".join(map(str, paths)) or "nowhere"
-        raise ValueError(f"no flight logs in {where}; record some with suite collect")
+        folders = ", ".join(map(str, paths)) or "nowhere"
+        raise ValueError(f"no flight logs in {folders}; record some with suite collect")
     return list({path.resolve(): path for path in reversed(files)}.values())[::-1]
 
 
@@ -70,10 +81,10 @@ def split(
         raise ValueError(f"{len(logs)} flight given, at least 2 are needed: one is held out")
     order = np.random.default_rng(seed).permutation(len(logs))
     count = min(len(logs) - 1, max(1, round(share * len(logs))))
-    held = {int(i) for i in order[:count]}
+    held_out = {int(i) for i in order[:count]}
     return (
-        [log for i, log in enumerate(logs) if i not in held],
-        [log for i, log in enumerate(logs) if i in held],
+        [log for i, log in enumerate(logs) if i not in held_out],
+        [log for i, log in enumerate(logs) if i in held_out],
     )
 
 
@@ -117,44 +128,47 @@ def fit_delta(
     logs, short = long_enough(logs, config.horizon_s)
     for warning in [*warnings, *short]:
         console.note(f"warning: {warning}")
-    parts, about = split(logs, config.held_out, config.seed), corrected(dynamics)
-    work: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]
-    known: Any
+    groups = split(logs, config.held_out, config.seed)
+    description = describe_dynamics(dynamics)
+    run_fit: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]
+    fit_windows: Any
     held_out: Any
     if isinstance(dynamics, QuadrotorConfig):
         from suite.delta.quadrotor import cut_quadrotor_windows, replay_quadrotor, row_period
 
         row_s = row_period(logs)
         cuts = [
-            cut_quadrotor_windows(part, dynamics, config.horizon_s, config.stride_s, row_s)
-            for part in parts
+            cut_quadrotor_windows(group, dynamics, config.horizon_s, config.stride_s, row_s)
+            for group in groups
         ]
-        known, held_out = (windows for windows, _ in cuts)
-        grid = cuts[0][1]
-        words, steps = "fitting the Delta Action Model through the quadrotor", grid.physics
-        work = partial(fit_network, config, partial(replay_quadrotor, dynamics, grid))
+        fit_windows, held_out = (windows for windows, _ in cuts)
+        substeps = cuts[0][1]
+        title, steps = "fitting the Delta Action Model through the quadrotor", substeps.physics
+        run_fit = partial(fit_network, config, partial(replay_quadrotor, dynamics, substeps))
     else:
-        known, held_out = (cut_windows(part, config.horizon_s, config.stride_s) for part in parts)
-        words, steps = "fitting the Delta Action Model", 1
-        work = partial(fit, config, dynamics)
+        fit_windows, held_out = (
+            cut_windows(group, config.horizon_s, config.stride_s) for group in groups
+        )
+        title, steps = "fitting the Delta Action Model", 1
+        run_fit = partial(fit_point_mass, config, dynamics)
     rate_hz = decision_rate(logs)
-    steps *= known.action_b.shape[1]
-    announce(console, words, fitting_estimate(config, steps, about["model"] == QUAD))
+    steps *= fit_windows.action_b.shape[1]
+    announce(console, title, fitting_estimate(config, steps, description["model"] == QUAD))
     with console.progress("fitting", config.iterations) as show:
-        result = work(known, held_out, show)
+        result = run_fit(fit_windows, held_out, show)
     summary = {
-        "model": about["model"],
+        "model": description["model"],
         "horizon_s": config.horizon_s,
-        "held_out": [log.name for log in parts[1]],
+        "held_out": [log.name for log in groups[1]],
         **({"vehicle": dynamics.vehicle} if isinstance(dynamics, QuadrotorConfig) else {}),
-        "windows": {"fit": len(known.pos_w), "held_out": len(held_out.pos_w)},
+        "windows": {"fit": len(fit_windows.pos_w), "held_out": len(held_out.pos_w)},
         **errors(result),
         **({"identified": result.identified} if isinstance(result, PointMassFit) else {}),
         "curve": result.curve,
     }
     write_run_record(out, config, config.seed)
-    fitted = {**plain(config), **about, "rate_hz": rate_hz}
-    save_delta(out / "delta", result.params, seed=config.seed, fit=fitted)
+    stored = {**plain(config), **description, "rate_hz": rate_hz}
+    save_delta(out / "delta", result.params, seed=config.seed, fit=stored)
     write_json(out / "delta.json", plain(summary))
     write_text(out / "table.md", table(result, config.horizon_s))
     return result
@@ -165,24 +179,24 @@ def errors(result: DeltaFit) -> dict[str, ReplayErrors]:
     if isinstance(result, PointMassFit):
         return {
             "point_mass": result.without,
-            "fitted_point_mass": result.rival,
+            "fitted_point_mass": result.identified_errors,
             "delta_action": result.with_delta,
         }
     return {"without": result.without, "delta_action": result.with_delta}
 
 
 def errors_by_name(fitted: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
-    """Return the held-out errors in delta.json by model, in the order of `FLOWN`."""
-    return {name: fitted[key] for key, name in FLOWN.items() if key in fitted}
+    """Return the held-out errors in delta.json by the model's name, as in `MODEL_NAMES`."""
+    return {name: fitted[key] for key, name in MODEL_NAMES.items() if key in fitted}
 
 
 def table(result: DeltaFit, horizon_s: float) -> str:
     """Return the held-out errors as a Markdown table."""
-    whose = "point mass" if isinstance(result, PointMassFit) else "quadrotor"
-    names = {**FLOWN, "delta_action": f"{whose} {FLOWN['delta_action']}"}
+    dynamics = "point mass" if isinstance(result, PointMassFit) else "quadrotor"
+    names = {**MODEL_NAMES, "delta_action": f"{dynamics} {MODEL_NAMES['delta_action']}"}
     lines = [
         f"| held-out flights, after {horizon_s:g} s | position error [m] "
-        f"| velocity error [m/s] | of the {whose}'s |",
+        f"| velocity error [m/s] | of the {dynamics}'s |",
         "|---|---|---|---|",
     ]
     for key, (position_m, velocity_m_s) in errors(result).items():

@@ -1,8 +1,9 @@
-"""Recorded flights as windows at the policy's decisions, cut for replay in the point mass.
+"""Cut recorded flights into windows that start at a policy's decision, for replay in simulation.
 
-In fine-tuning the network runs for seconds, so it is also fitted from states with memory: before a
-window it runs over the measurements since the flight's start, up to a few seconds (burn-in). Some
-windows start without memory, like the trainer's worlds that start between two gates.
+A Delta Action Model, a recurrent network that corrects actions, is fitted to them. In fine-tuning
+it runs for seconds, so it is also fitted from states with memory: before a window it runs over the
+measurements since the flight's start, up to a few seconds (burn-in). Some windows start without
+memory, like the trainer's flights that start between two gates.
 """
 
 from __future__ import annotations
@@ -56,10 +57,10 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
     body is rolled.
     """
     left, up = rot_w[..., 1], rot_w[..., 2]
-    ahead = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
-    ahead = np.where(up[..., 2:] < 0, -ahead, ahead)
-    size = np.linalg.norm(ahead, axis=-1, keepdims=True)
-    return np.where(size > 1e-3, ahead / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
+    forward = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
+    forward = np.where(up[..., 2:] < 0, -forward, forward)
+    size = np.linalg.norm(forward, axis=-1, keepdims=True)
+    return np.where(size > 1e-3, forward / np.maximum(size, 1e-3), [1.0, 0.0, 0.0])
 
 
 def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> PointMassWindows:
@@ -71,28 +72,28 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     Raises:
         ValueError: if a log has no actions, or all flights are shorter than a window.
     """
-    parts = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
-    refuse_none(parts, logs, duration_s)
-    steps = min(len(part.action_b) for part in parts)
+    windows = [window for log in logs for window in _flight_windows(log, duration_s, stride_s)]
+    refuse_no_windows(windows, logs, duration_s)
+    steps = min(len(window.action_b) for window in windows)
 
-    def alike(part: PointMassWindows) -> PointMassWindows:
+    def truncated(window: PointMassWindows) -> PointMassWindows:
         """Truncate a window to the number of decisions that all have."""
-        return part._replace(
-            pos_w=part.pos_w[: steps + 1],
-            vel_w=part.vel_w[: steps + 1],
-            heading_w=part.heading_w[: steps + 1],
-            action_b=part.action_b[:steps],
-            time_step=part.time_step[:steps],
+        return window._replace(
+            pos_w=window.pos_w[: steps + 1],
+            vel_w=window.vel_w[: steps + 1],
+            heading_w=window.heading_w[: steps + 1],
+            action_b=window.action_b[:steps],
+            time_step=window.time_step[:steps],
         )
 
-    return stacked([alike(part) for part in parts])
+    return stack_windows([truncated(window) for window in windows])
 
 
-def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
-    """Refuse flights without a window.
+def refuse_no_windows(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: float) -> None:
+    """Refuse flights that give no window.
 
     Raises:
-        ValueError: with some of them, and what to do.
+        ValueError: naming some of the flights, and what to do.
     """
     if not windows:
         names = ", ".join(log.name for log in logs[:3])
@@ -102,26 +103,26 @@ def refuse_none(windows: Sequence[Any], logs: Sequence[FlightLog], duration_s: f
         )
 
 
-def stacked(windows: Sequence[T]) -> T:
+def stack_windows(windows: Sequence[T]) -> T:
     """Return windows of one shape along a new first axis, as 32-bit numbers.
 
     Their burn-ins are truncated to the number of decisions that all have, since flights with
     slightly shorter periods have more decisions in the same time.
     """
-    parts: Sequence[Any] = windows
-    back = min(len(part.burn_in.seen) for part in parts)
-    alike = [
-        part._replace(burn_in=BurnIn(*(array[len(array) - back :] for array in part.burn_in)))
-        for part in parts
+    items: Sequence[Any] = windows
+    count = min(len(item.burn_in.seen) for item in items)
+    truncated = [
+        item._replace(burn_in=BurnIn(*(array[len(array) - count :] for array in item.burn_in)))
+        for item in items
     ]
-    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *alike)
+    return jax.tree.map(lambda *arrays: np.stack(arrays).astype(np.float32), *truncated)
 
 
-def decisions_of(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return a log's actions (T, 3) [m/s^2] and the rows (T,) in which the policy decided.
+def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
+    """Return a log's actions (T, 3) [m/s^2], and (T,) bool: rows in which the policy decided.
 
     Raises:
-        ValueError: if it has none.
+        ValueError: if the log has no actions.
     """
     if log.action_b is None or log.policy_step is None:
         raise ValueError(
@@ -132,19 +133,19 @@ def decisions_of(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def decision_period(time_s: np.ndarray, row_s: float) -> float:
-    """Return the time between a policy's decisions [s], NaN where there are fewer than two.
+    """Return the time between a policy's decisions [s], NaN for fewer than two decisions.
 
     It is a mean, because decisions are at a log's rows: with rows every 10 ms and 15 Hz, periods
     are 60 or 70 ms. Gaps in the record are left out.
 
     Args:
-        time_s: (T,) of the rows with a decision.
-        row_s: between rows.
+        time_s: (T,) times of the rows with a decision [s].
+        row_s: time between rows [s].
     """
-    gaps = np.diff(time_s)
-    if not len(gaps):
+    gaps_s = np.diff(time_s)
+    if not len(gaps_s):
         return float("nan")
-    return float(gaps[in_a_row(gaps, float(np.median(gaps)), row_s)].mean())
+    return float(gaps_s[are_consecutive(gaps_s, float(np.median(gaps_s)), row_s)].mean())
 
 
 def decision_rate(logs: Sequence[FlightLog]) -> float:
@@ -154,71 +155,74 @@ def decision_rate(logs: Sequence[FlightLog]) -> float:
         ValueError: if the rates differ, since the network makes one step per decision, or a log has
             no decisions.
     """
-    found = []
+    rates_hz = []
     for log in logs:
-        at = np.flatnonzero(decisions_of(log)[1] & log.whole)
+        rows = np.flatnonzero(log_decisions(log)[1] & log.whole)
         row_s = float(np.median(np.diff(log.time_s)))
-        found.append(1.0 / decision_period(log.time_s[at], row_s))
-    if np.isnan(found).all():
+        rates_hz.append(1.0 / decision_period(log.time_s[rows], row_s))
+    if np.isnan(rates_hz).all():
         raise ValueError(
-            f"{logs[0].name}: column policy_step marks no two decisions, nor does that of another "
-            "flight; record longer flights with suite collect"
+            f"{logs[0].name}: column policy_step marks fewer than two decisions, as in all other "
+            "flights; record longer flights with suite collect"
         )
-    median = float(np.nanmedian(found))
-    for log, rate in zip(logs, found, strict=True):
+    median = float(np.nanmedian(rates_hz))
+    for log, rate in zip(logs, rates_hz, strict=True):
         if abs(rate - median) > RATE_SHARE * median:
             raise ValueError(
                 f"{log.name} has {rate:.3g} decisions a second, and most flights {median:.3g}: the "
-                "Delta Action network remembers from one to the next; fit to flights of one rate"
+                "memory of the Delta Action network is updated at each decision; fit to flights of "
+                "one rate"
             )
     return median
 
 
-def in_a_row(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.ndarray:
-    """Return which gaps are between two decisions in a row, below 1.5 periods and a row of a log.
+def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.ndarray:
+    """Return (T,) bool: whether a gap is between consecutive decisions, without a lost one.
 
     Args:
-        gaps_s: (T,) between decisions.
-        period_s: of decisions.
-        row_s: between rows.
+        gaps_s: (T,) times between recorded decisions [s].
+        period_s: time between decisions [s].
+        row_s: time between rows, by which a recorded decision may be late [s].
     """
     return gaps_s < 1.5 * period_s + row_s
 
 
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
-    action, decides = decisions_of(log)
-    at = np.flatnonzero(decides & log.whole)
-    at = at[at + 1 < len(log.time_s)]
-    time, rot = log.time_s[at], quat_to_rot(log.quat_wxyz[at])
-    gap = (log.time_s[at + 1] - time)[:, None]
-    acc = (log.vel_w[at + 1] - log.vel_w[at]) / gap
-    command = (rot @ action[at][:, :, None])[:, :, 0]
+    """Return the windows of one flight."""
+    action, decides = log_decisions(log)
+    rows = np.flatnonzero(decides & log.whole)
+    rows = rows[rows + 1 < len(log.time_s)]
+    time, rot = log.time_s[rows], quat_to_rot(log.quat_wxyz[rows])
+    time_to_next = (log.time_s[rows + 1] - time)[:, None]
+    acc = (log.vel_w[rows + 1] - log.vel_w[rows]) / time_to_next
+    command = (rot @ action[rows][:, :, None])[:, :, 0]
     heading = _heading(rot)
     row_s = float(np.median(np.diff(log.time_s)))
     period = decision_period(time, row_s)
     if np.isnan(period):
         return []
     steps, stride = round(duration_s / period), max(1, round(stride_s / period))
-    found = []
-    for first in range(HISTORY, len(at) - steps, stride):
+    burn_in_count = round(BURN_IN_S / period)
+    windows = []
+    for first in range(HISTORY, len(rows) - steps, stride):
         span = slice(first, first + steps + 1)
         gaps = np.diff(time[first - HISTORY : first + steps + 1])
-        if not in_a_row(gaps, period, row_s).all() or not np.isfinite(acc[first]).all():
+        if not are_consecutive(gaps, period, row_s).all() or not np.isfinite(acc[first]).all():
             continue
-        found.append(
+        windows.append(
             PointMassWindows(
-                log.pos_w[at[span]],
-                log.vel_w[at[span]],
+                log.pos_w[rows[span]],
+                log.vel_w[rows[span]],
                 acc[first],
                 rot[first],
                 heading[span],
-                action[at[span]][:-1],
+                action[rows[span]][:-1],
                 command[first - HISTORY : first][::-1],
                 np.diff(time[span]),
-                burn_in_before(rot, log.vel_w[at], action[at], first, round(BURN_IN_S / period)),
+                burn_in_before(rot, log.vel_w[rows], action[rows], first, burn_in_count),
             )
         )
-    return found
+    return windows
 
 
 BURN_IN_S = 3.0
@@ -250,29 +254,29 @@ def burn_in_before(
     start = max(0, first - count)
     rows = slice(start, first)
     if first > start:
-        before = [to_local(rot_w[rows], vel_w[rows]), rot_w[rows, 2], action_b[rows]]
-        inputs[count - (first - start) :] = np.concatenate(before, axis=-1)
+        columns = [to_local(rot_w[rows], vel_w[rows]), rot_w[rows, 2], action_b[rows]]
+        inputs[count - (first - start) :] = np.concatenate(columns, axis=-1)
         seen[count - (first - start) :] = 1.0
     return BurnIn(inputs, seen)
 
 
-def forgotten(burn_in: BurnIn, share: float) -> BurnIn:
+def without_memory(burn_in: BurnIn, share: float) -> BurnIn:
     """Return burn-ins without inputs for the first `share` (0 to 1) of the windows."""
     count = len(burn_in.seen)
-    knows = (jnp.arange(count) >= round(share * count))[:, None]
-    return burn_in._replace(seen=jnp.where(knows, jnp.asarray(burn_in.seen), 0.0))
+    has_memory = (jnp.arange(count) >= round(share * count))[:, None]
+    return burn_in._replace(seen=jnp.where(has_memory, jnp.asarray(burn_in.seen), 0.0))
 
 
 def state_after(params: delta_network.Params | None, burn_in: BurnIn) -> jax.Array:
     """Return the network's recurrent state (N, 32) after a burn-in; zero without a network."""
-    blank = delta_network.start(len(burn_in.seen))
+    zero = delta_network.start(len(burn_in.seen))
     if params is None:
-        return blank
+        return zero
     inputs, seen = (jnp.swapaxes(jnp.asarray(array), 0, 1) for array in burn_in)
 
     def step(hidden: jax.Array, decision: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        values, is_there = decision
+        values, in_flight = decision
         after = delta_network.step(params, hidden, values[:, :3], values[:, 3:6], values[:, 6:])[1]
-        return jnp.where(is_there[:, None] > 0, after, hidden), None
+        return jnp.where(in_flight[:, None] > 0, after, hidden), None
 
-    return jax.lax.scan(step, blank, (inputs, seen))[0]
+    return jax.lax.scan(step, zero, (inputs, seen))[0]

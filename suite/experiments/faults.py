@@ -1,4 +1,4 @@
-"""Faults injected into simulated and real logs: detection rate and false-alarm rate.
+"""The page `faults`: how many injected faults are named in simulated and real logs.
 
 A fault is an error of interface or log: a unit, sign, scale, order, delay or rate. `suite check`
 and `suite import` should report it by name, and report nothing in logs without a fault.
@@ -25,11 +25,11 @@ from eval.logs.flight_log import FlightLog, read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.console import Console
-from suite.experiments.injected.flights import TRUE_EFFECTS, as_log, flight_parts, real_logs
+from suite.experiments.injected.flights import TRUE_EFFECTS, as_log, flight_signals, real_logs
 from suite.experiments.injected.kinds import KINDS, Kind, inject
 from suite.experiments.injected.writers import WRITERS
-from suite.experiments.pages.document import Made
-from suite.experiments.study.cache import Place, code_digest, digest
+from suite.experiments.pages.document import PageContents
+from suite.experiments.study.cache import Workspace, code_digest, digest
 from suite.judging.collect import collect
 from suite.judging.requests import Collection
 from tracks.common.grid import Grid, table
@@ -37,9 +37,12 @@ from tracks.common.provenance import git_commit
 from tracks.common.work import run_pieces
 from tracks.input.ranges import Range, Seed
 
-OWN = "flight log"
-FORMATS = (*WRITERS, OWN)
+FLIGHT_LOG = "flight log"
+"""Label of the suite's format of flight logs."""
+FORMATS = (*WRITERS, FLIGHT_LOG)
+"""Formats of the simulated logs."""
 POLICY_HZ = 30.0
+"""Rate of the policy with which the logs are compared [Hz]."""
 OUTCOMES = ("named", "not identifiable", "refused", "another name", "silent")
 """Outcomes of a faulty log: its fault is named, or reported as not identifiable; the log is refused
 with a reason; only another fault is named; or it is imported without a finding."""
@@ -67,38 +70,40 @@ class Case:
     """One log to check."""
 
     kind: str
-    """A key of `KINDS`; "" for none."""
+    """A key of `KINDS`, the injected fault; "" for none."""
     format: str
+    """One of `FORMATS`, or "real"."""
     path: Path
-    """The good flight."""
+    """The log of the flight without a fault."""
     number: int
     """Number of the flight, the seed of its noise."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return the tables; flights and logs that are missing are made first."""
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return the tables; missing flights and checks are made first."""
     vehicle = load_vehicle(config.vehicle)
-    same = [config.vehicle, config.seed, git_commit(), code_digest("eval")]
-    folder = place.cache / f"faults-{digest(same)}"
-    good = _flights(config, vehicle, folder, console)
-    faulty = list(_faulty(config, good))
+    inputs = [config.vehicle, config.seed, git_commit(), code_digest("eval")]
+    folder = workspace.cache / f"faults-{digest(inputs)}"
+    flights = _fly(config, vehicle, folder, console)
+    faulty = list(_simulated_cases(config, flights))
     clean = [
-        Case("", FORMATS[k % len(FORMATS)], path, k) for k, path in enumerate(good[: config.clean])
+        Case("", FORMATS[k % len(FORMATS)], path, k)
+        for k, path in enumerate(flights[: config.clean])
     ]
     real = real_logs(config.real)
-    on_real = list(_on_real(real, config.flights))
-    intact = [Case("", "real", path, 0) for path in real]
-    cases = [*faulty, *clean, *on_real, *intact]
-    done = _checked(cases, config, folder, console, place)
-    groups = {"simulated": faulty, "real": on_real}
+    faulty_real = list(_real_cases(real, config.flights))
+    clean_real = [Case("", "real", path, 0) for path in real]
+    cases = [*faulty, *clean, *faulty_real, *clean_real]
+    answers = _check_cases(cases, config, folder, console, workspace)
+    groups = {"simulated": faulty, "real": faulty_real}
     parts = {
-        f"Faults in {name} logs": [_kinds_grid([(c, done[c]) for c in held])]
-        for name, held in groups.items()
-        if held
+        f"Faults in {name} logs": [_kinds_grid([(c, answers[c]) for c in group])]
+        for name, group in groups.items()
+        if group
     }
-    parts["Logs without a fault"] = [_clean_grid([(c, done[c]) for c in (*clean, *intact)])]
+    parts["Logs without a fault"] = [_clean_grid([(c, answers[c]) for c in (*clean, *clean_real)])]
     facts = {
-        "flights": f"{len(good)} of the judge on all tracks, levels 0, 3 and 6, vehicle "
+        "flights": f"{len(flights)} simulated ones on all tracks, levels 0, 3 and 6, vehicle "
         f"{config.vehicle} with its centre of mass off by 6 and -3 mm, measured with noise; "
         f"checked against {config.vehicle} and a policy of {POLICY_HZ:g} Hz",
         "formats": ", ".join(FORMATS),
@@ -107,120 +112,131 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "seen in vision races, where they ended flights",
         "seed": str(config.seed),
     }
-    numbers = {name: Counter(_outcome(c, done[c]) for c in held) for name, held in groups.items()}
-    false_alarms = [c for c in clean if _reported(done[c])]
-    return Made(
+    numbers = {
+        name: Counter(_outcome(c, answers[c]) for c in group) for name, group in groups.items()
+    }
+    false_alarms = [c for c in clean if _reported_faults(answers[c])]
+    return PageContents(
         facts, parts, {"outcomes": numbers, "clean": len(clean), "accused": len(false_alarms)}
     )
 
 
-def _flights(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> list[Path]:
-    """Return good flights of at least 4 s; missing ones are flown first."""
+def _fly(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> list[Path]:
+    """Return logs of flights of more than 4 s, without faults; missing ones are flown first."""
     count = max(config.clean, config.flights * len(FORMATS))
-    true = with_effects(vehicle, TRUE_EFFECTS)
+    true_vehicle = with_effects(vehicle, TRUE_EFFECTS)
     folder.mkdir(parents=True, exist_ok=True)
-    save_vehicle(true, folder / "true.toml", "the nominal vehicle, its centre of mass moved")
+    title = "the nominal vehicle, its centre of mass moved"
+    save_vehicle(true_vehicle, folder / "true.toml", title)
     collection = Collection(
         difficulty="0,3,6",
-        # Trials for each of 9 tracks and levels: a fifth more flights than wanted, rounded up, as
-        # those under 4 s are left out.
+        # Trials for each of 9 tracks and levels: a fifth more flights than needed, rounded up,
+        # because those under 4 s are left out.
         trials=-(-count * 12 // (9 * 10)),
         vehicle=str(folder / "true.toml"),
         seed=config.seed,
     )
-    flown = collect(collection, folder / "flights", console, None)["flights"]
-    paths = [folder / "flights" / row["file"] for row in flown if row["file"] and row["time_s"] > 4]
+    flights = collect(collection, folder / "flights", console, None)["flights"]
+    paths = [
+        folder / "flights" / row["file"] for row in flights if row["file"] and row["time_s"] > 4
+    ]
     order = np.random.default_rng(config.seed).permutation(len(paths))
     return [paths[k] for k in order][:count]
 
 
-def _faulty(config: Config, good: Sequence[Path]) -> Iterator[Case]:
+def _simulated_cases(config: Config, flights: Sequence[Path]) -> Iterator[Case]:
+    """Yield `config.flights` cases per kind, in the formats that have the fault's signals."""
     for number, (name, kind) in enumerate(KINDS.items()):
-        able = [f for f in FORMATS if kind.fits(_holds(f))]
+        formats = [f for f in FORMATS if kind.fits(_signals_of(f))]
         for k in range(config.flights):
-            at = (number * config.flights + k) % len(good)
-            yield Case(name, able[k % len(able)], good[at], at)
+            index = (number * config.flights + k) % len(flights)
+            yield Case(name, formats[k % len(formats)], flights[index], index)
 
 
-def _holds(format: str) -> set[str]:
+def _signals_of(format: str) -> set[str]:
+    """Return the signals that a simulated log of this format has."""
     common = {"time", "pos", "quat", "rate", "acc", "motor", "cmd_rate", "throttle", "voltage"}
-    return common | {"betaflight": set(), OWN: {"vel", "baro", "cmd_thrust"}}.get(format, {"vel"})
+    further = {"betaflight": set(), FLIGHT_LOG: {"vel", "baro", "cmd_thrust"}}
+    return common | further.get(format, {"vel"})
 
 
-def _on_real(real: Sequence[Path], count: int) -> Iterator[Case]:
-    """Yield `count` real logs a kind, of all sets of logs that hold the signals of the fault."""
+def _real_cases(real: Sequence[Path], count: int) -> Iterator[Case]:
+    """Yield `count` cases per kind, from all sets of real logs that have the fault's signals."""
     sets: dict[Path, list[Path]] = {}
     for path in real:
         sets.setdefault(path.parent, []).append(path)
-    holds = {folder: set(rows_of(_real(paths[0])[0])) for folder, paths in sets.items()}
+    signals = {folder: set(rows_of(_import_real(paths[0])[0])) for folder, paths in sets.items()}
     for number, (name, kind) in enumerate(KINDS.items()):
-        able = [paths for folder, paths in sets.items() if kind.fits(holds[folder])]
-        for k in range(count if able else 0):
-            paths = able[(number + k) % len(able)]
-            yield Case(name, "real", paths[(3 * number + k // len(able)) % len(paths)], k)
+        suitable = [paths for folder, paths in sets.items() if kind.fits(signals[folder])]
+        for k in range(count if suitable else 0):
+            paths = suitable[(number + k) % len(suitable)]
+            index = (3 * number + k // len(suitable)) % len(paths)
+            yield Case(name, "real", paths[index], k)
 
 
 Answer = list[dict[str, Any]] | str
 """Records of findings, or the reason of a refusal."""
 
 
-def _checked(
-    cases: Sequence[Case], config: Config, folder: Path, console: Console, place: Place
+def _check_cases(
+    cases: Sequence[Case], config: Config, folder: Path, console: Console, workspace: Workspace
 ) -> dict[Case, Answer]:
     """Return the findings of every case; those of an interrupted run are reused."""
     path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
     keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}": c for c in cases}
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    done = {k: a for k, a in map(json.loads, lines) if k in keys}
-    left = [key for key in keys if key not in done]
+    answers = {k: a for k, a in map(json.loads, lines) if k in keys}
+    missing = [key for key in keys if key not in answers]
     with console.progress("logs", len(cases)) as show, path.open("a", encoding="utf-8") as file:
 
         def keep(number: int, answer: Answer) -> None:
-            done[left[number]] = answer
-            file.write(json.dumps([left[number], answer]) + "\n")
+            answers[missing[number]] = answer
+            file.write(json.dumps([missing[number], answer]) + "\n")
             file.flush()
-            show(len(done), left[number])
+            show(len(answers), missing[number])
 
         check = partial(_check, vehicle_name=config.vehicle, seed=config.seed)
-        run_pieces(check, [keys[key] for key in left], place.workers or 1, keep)
-    return {c: done[key] for key, c in keys.items()}
+        run_pieces(check, [keys[key] for key in missing], workspace.workers or 1, keep)
+    return {c: answers[key] for key, c in keys.items()}
 
 
 def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
-    """Yield the findings in one log."""
+    """Inject the fault of a case, and yield the findings in the log."""
     kind = KINDS.get(case.kind, Kind(()))
     rng = np.random.default_rng([seed, case.number, len(case.kind)])
     if case.format == "real":
-        log, vehicle = _real(case.path)
-        parts = rows_of(log)
+        log, vehicle = _import_real(case.path)
+        signals = rows_of(log)
     else:
         vehicle = load_vehicle(vehicle_name)
-        parts = flight_parts(read_flight(case.path), vehicle, rng)
-    wrong = inject(kind, parts, vehicle) if kind.names else parts
+        signals = flight_signals(read_flight(case.path), vehicle, rng)
+    faulty = inject(kind, signals, vehicle) if kind.names else signals
     vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
     fov = tuple(kind.fov * angle for angle in vehicle.camera.fov_deg)
-    hz = POLICY_HZ if case.format != "real" else None
-    context = CheckContext(vehicle, hz, (fov[0], fov[1]))
+    policy_hz = POLICY_HZ if case.format != "real" else None
+    context = CheckContext(vehicle, policy_hz, (fov[0], fov[1]))
     try:
-        found = _findings(case, wrong, vehicle, context)
+        findings = _findings(case, faulty, vehicle, context)
     except ValueError as error:
         yield str(error).splitlines()[0]
         return
-    yield [f._asdict() for f in found if f.fault and f.status != "ok"]
+    yield [f._asdict() for f in findings if f.fault and f.status != "ok"]
 
 
-def _findings(case: Case, parts: dict[str, np.ndarray], vehicle: Vehicle, context: CheckContext
-              ) -> list[Finding]:  # fmt: skip
+def _findings(
+    case: Case, signals: dict[str, np.ndarray], vehicle: Vehicle, context: CheckContext
+) -> list[Finding]:
+    """Return the findings of import and check in signals, as a log of the case's format."""
     if case.format in WRITERS:
         with tempfile.TemporaryDirectory() as folder:
-            written = WRITERS[case.format](Path(folder), parts, vehicle.full_thrust)
+            written = WRITERS[case.format](Path(folder), signals, vehicle.full_thrust)
             options = replace(written.options, vehicle=vehicle)
-            log, found = import_log(written.path, case.format, options)
-        return [*found, *check_log(log, context)[0], *check_files(context)]
-    return [*check_log(as_log(parts, case.path.name), context)[0], *check_files(context)]
+            log, findings = import_log(written.path, case.format, options)
+        return [*findings, *check_log(log, context)[0], *check_files(context)]
+    return [*check_log(as_log(signals, case.path.name), context)[0], *check_files(context)]
 
 
-def _real(path: Path) -> tuple[FlightLog, Vehicle]:
+def _import_real(path: Path) -> tuple[FlightLog, Vehicle]:
     """Return an imported real log, and the vehicle that it is compared with."""
     name = path.parent.name if path.parent.name in ("nanobench", "crazyswarm2") else "crazypad"
     vehicle = load_vehicle("crazyflie21")
@@ -228,7 +244,7 @@ def _real(path: Path) -> tuple[FlightLog, Vehicle]:
     return import_log(path, None, options)[0], vehicle
 
 
-def _reported(answer: Answer) -> list[str]:
+def _reported_faults(answer: Answer) -> list[str]:
     """Return the names of the reported faults, or "refused" for a log that was not imported."""
     if isinstance(answer, str):
         return ["refused"]
@@ -236,7 +252,8 @@ def _reported(answer: Answer) -> list[str]:
 
 
 def _outcome(case: Case, answer: Answer) -> str:
-    names, reported = set(KINDS[case.kind].names), set(_reported(answer))
+    """Return the outcome of a faulty log, one of `OUTCOMES`."""
+    names, reported = set(KINDS[case.kind].names), set(_reported_faults(answer))
     if isinstance(answer, str):
         return "refused"
     if reported & names:
@@ -246,8 +263,9 @@ def _outcome(case: Case, answer: Answer) -> str:
     return "another name" if reported else "silent"
 
 
-def _kinds_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
-    count = Counter((case.kind, _outcome(case, answer)) for case, answer in done)
+def _kinds_grid(answers: Iterable[tuple[Case, Answer]]) -> Grid:
+    """Return the number of logs by outcome, a row per kind of fault."""
+    count = Counter((case.kind, _outcome(case, answer)) for case, answer in answers)
     rows = [
         [("(race) " if KINDS[kind].race else "") + kind, " or ".join(KINDS[kind].names)]
         + [str(count[kind, outcome] or "") for outcome in OUTCOMES]
@@ -260,16 +278,17 @@ def _kinds_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
     return table(["fault", "name", *OUTCOMES], [*rows, ["all", f"{logs} logs", *shares]])
 
 
-def _clean_grid(done: Iterable[tuple[Case, Answer]]) -> Grid:
+def _clean_grid(answers: Iterable[tuple[Case, Answer]]) -> Grid:
+    """Return the false alarms in logs without a fault, a row per format."""
     logs, false_alarms, names = Counter[str](), Counter[str](), Counter[tuple[str, str]]()
-    for case, answer in done:
-        reported = _reported(answer)
+    for case, answer in answers:
+        reported = _reported_faults(answer)
         logs[case.format] += 1
         false_alarms[case.format] += bool(reported)
         names.update((case.format, name) for name in reported)
     rows = [
         [format, str(count), str(false_alarms[format]),
-         ", ".join(f"{name} {c}" for (where, name), c in names.items() if where == format)]
+         ", ".join(f"{name} {c}" for (of, name), c in names.items() if of == format)]
         for format, count in logs.items()
     ]  # fmt: skip
     simulated = [str(sum(c[f] for f in logs if f != "real")) for c in (logs, false_alarms)]

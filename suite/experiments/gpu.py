@@ -1,4 +1,8 @@
-"""Training and judging on an accelerator: speed, memory, a short training, the CPU's outcomes."""
+"""The page `gpu`: speed of training and judging on an accelerator, and a check against the CPU.
+
+A world is one simulated scene and drone of a batch. The judge is the simulator that scores
+policies; `mjx` is its version for accelerators.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ from suite.common.charts import DRAWN, curves_chart
 from suite.common.console import Console
 from suite.common.curve import read
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.pages.gpu_tables import (
     MODELS,
     judge_grid,
@@ -31,7 +35,7 @@ from suite.experiments.pages.gpu_tables import (
     training_grid,
 )
 from suite.experiments.study import judging
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
 from suite.judging.flying import default_policy
 from suite.train.config import TrainConfig
@@ -49,10 +53,10 @@ from tracks.input.ranges import Range, Seed, Trials
 LEVELS = (0, 3, 6, 9)
 """Levels of the trained policy's trials, and of the comparison with the CPU."""
 SAMPLED, COUNTED = 128, 8
-"""Number of different worlds in a speed measurement, which are repeated to its size; and of worlds
-whose operations are counted."""
+"""Number of different worlds in a speed measurement, which are repeated to its size; and number of
+worlds whose operations are counted."""
 CPU_MOST = 256
-"""Most worlds on a CPU: more take hours."""
+"""Largest number of worlds on a CPU: more take hours."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ class Row(NamedTuple):
     """Floating-point operations of a gradient step."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
     """Return tables, a chart and numbers.
 
     Raises:
@@ -112,19 +116,19 @@ def document(config: Config, place: Place, console: Console) -> Made:
     console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
     # Another process flies on the CPU at the same time.
     with worker_pool(1) as cpu_process:
-        theirs = cpu_process.submit(flown_on_cpu, config, vehicle)
-        programs = compiled(config, vehicle, console)
+        cpu_results = cpu_process.submit(fly_on_cpu, config, vehicle)
+        programs = compile_programs(config, vehicle, console)
         rows = trainer_speeds(config, programs.updates, console)
         judge = [judge_speed(config, vehicle, worlds, console) for worlds in config.worlds]
-        pairs = compared(programs.here, theirs.result(), console)
+        pairs = compare_with_cpu(programs.results, cpu_results.result(), console)
     step_s = {row.worlds: row.seconds for row in rows if row.model == "quadrotor"}
-    short = short_training(config, vehicle, step_s[config.train_worlds], place, console)
+    short = short_training(config, vehicle, step_s[config.train_worlds], workspace, console)
     trainer = [row._asdict() for row in rows]
     memory = peak_memory()
     facts = {
         "device": f"{len(jax.devices())} x {device.device_kind}",
         "a product of matrices": f"{best / 1e12:.1f} TFLOP/s, float32 unrounded",
-        "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions a world",
+        "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions per world",
         "most memory held": "unknown" if memory is None else f"{memory / 1e9:.1f} GB",
         "compiling": f"{programs.seconds:.0f} s, all programs at once",
     }
@@ -145,7 +149,7 @@ def document(config: Config, place: Place, console: Console) -> Made:
         "paired": pairs,
         "training": short,
     }
-    return Made(facts, parts, numbers)
+    return PageContents(facts, parts, numbers)
 
 
 def recipe(config: Config, worlds: int) -> TrainConfig:
@@ -162,6 +166,7 @@ def last_phase(config: Config, model: str, worlds: int) -> TrainConfig:
 
 
 def _steps(config: Config) -> int:
+    """Return the number of decisions of a world in a gradient step."""
     return last_phase(config, "quadrotor", 1).episode.steps
 
 
@@ -169,87 +174,89 @@ class Update(NamedTuple):
     """A compiled gradient step with its worlds."""
 
     phase: TrainConfig
+    """Its settings."""
     call: Callable[[], Any]
+    """Makes the step."""
 
 
 class Compiled(NamedTuple):
     """The compiled programs."""
 
     updates: Mapping[tuple[str, int], Update]
-    """By model and number of worlds."""
-    here: list[TrialResult]
-    """Results of the trials that the CPU flies as well."""
+    """Gradient steps by model and number of worlds."""
+    results: list[TrialResult]
+    """Results on this device of the trials that the CPU flies as well."""
     seconds: float
     """Time of compiling [s]."""
 
 
-def compiled(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
+def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
     """Run every program once, all at the same time, since compiling takes most of the time.
 
-    The programs of the short training are among them, so that it need not compile them again.
+    The programs of the short training are among them, so it does not compile them again.
     """
-    wanted = {
+    measured = {
         (model, worlds): last_phase(config, model, worlds)
         for worlds in config.worlds
         for model in MODELS
     }
     phases = phase_configs(recipe(config, config.train_worlds))
-    began = time.perf_counter()
-    with ThreadPoolExecutor(len(wanted) + len(phases) + len(config.worlds)) as pool:
-        judged = [pool.submit(_timed, config, vehicle, worlds) for worlds in config.worlds]
-        here = pool.submit(_flown, config, vehicle, "mjx")
-        others = [pool.submit(_update, phase) for phase in phases[:-1]]
-        updates = dict(zip(wanted, pool.map(_update, wanted.values()), strict=True))
-        for one in (*judged, *others):
-            one.result()
-        found = Compiled(updates, here.result(), time.perf_counter() - began)
-    console.say(f"every program compiled: {found.seconds:.0f} s")
-    return found
+    started = time.perf_counter()
+    with ThreadPoolExecutor(len(measured) + len(phases) + len(config.worlds)) as pool:
+        judged = [pool.submit(_fly_timed, config, vehicle, worlds) for worlds in config.worlds]
+        results = pool.submit(_fly_paired, config, vehicle, "mjx")
+        others = [pool.submit(_compile_update, phase) for phase in phases[:-1]]
+        updates = dict(zip(measured, pool.map(_compile_update, measured.values()), strict=True))
+        for future in (*judged, *others):
+            future.result()
+        programs = Compiled(updates, results.result(), time.perf_counter() - started)
+    console.say(f"every program compiled: {programs.seconds:.0f} s")
+    return programs
 
 
-def _update(phase: TrainConfig) -> Update:
+def _compile_update(phase: TrainConfig) -> Update:
     """Return a gradient step of a phase, after one call."""
-    update, worlds = make_update(phase), repeated(phase)
+    update, worlds = make_update(phase), repeated_worlds(phase)
     state = jax.device_put(start_state(phase), jax.devices()[0])
     jax.block_until_ready(update(state, worlds))
     return Update(phase, lambda: update(state, worlds))
 
 
-def repeated(config: TrainConfig) -> Worlds:
-    """Return the worlds of the first iteration, of which SAMPLED differ."""
+def repeated_worlds(config: TrainConfig) -> Worlds:
+    """Return the worlds of the first iteration; up to SAMPLED are different, the others copies."""
     batch = config.episode.batch
     few = replace(config, episode=replace(config.episode, batch=min(batch, SAMPLED)))
-    found = sample_worlds(few, 0)
+    worlds = sample_worlds(few, 0)
     order = np.resize(np.arange(few.episode.batch), batch)
-    return jax.tree.map(lambda leaf: leaf[order], found)._replace(number=np.arange(batch))
+    return jax.tree.map(lambda leaf: leaf[order], worlds)._replace(number=np.arange(batch))
 
 
 def trainer_speeds(
     config: Config, updates: Mapping[tuple[str, int], Update], console: Console
 ) -> list[Row]:
     """Return the speed of each gradient step, few worlds first."""
-    each = {model: _operations_a_world(config, model) for model in MODELS}
+    operations = {model: _operations_per_world(config, model) for model in MODELS}
     rows = []
     for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
         seconds = best_time(update.call)
-        rows.append(Row(model, worlds, seconds, worlds * each[model]))
-        console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s a gradient step")
+        rows.append(Row(model, worlds, seconds, worlds * operations[model]))
+        console.say(f"trainer, {worlds} {MODELS[model]}: {seconds:.3f} s per gradient step")
     return rows
 
 
-def _operations_a_world(config: Config, model: str) -> float:
+def _operations_per_world(config: Config, model: str) -> float:
     """Return the operations of the gradient for one world."""
     phase = last_phase(config, model, COUNTED)
     gradient = make_gradient(phase)
-    given = (start_state(phase).params, repeated(phase), jax.random.key(0))
-    return count_operations(lambda p, w, k: gradient(p, w, k, None)[0], *given) / COUNTED
+    arguments = (start_state(phase).params, repeated_worlds(phase), jax.random.key(0))
+    return count_operations(lambda p, w, k: gradient(p, w, k, None)[0], *arguments) / COUNTED
 
 
 def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console) -> dict[str, Any]:
-    """Return the speed of mjx with `worlds` trials at once; making their tracks counts."""
-    began = time.perf_counter()
-    results = _timed(config, vehicle, worlds)
-    seconds = time.perf_counter() - began
+    """Return the speed of mjx with `worlds` trials at once; the making of their tracks counts."""
+    started = time.perf_counter()
+    results = _fly_timed(config, vehicle, worlds)
+    seconds = time.perf_counter() - started
     flown_s = sum(result.time_s for result in results)
     console.say(f"judge, {worlds} trials at once: {seconds:.1f} s")
     return {
@@ -260,7 +267,8 @@ def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console)
     }
 
 
-def _timed(config: Config, vehicle: Vehicle, worlds: int) -> list[TrialResult]:
+def _fly_timed(config: Config, vehicle: Vehicle, worlds: int) -> list[TrialResult]:
+    """Fly short trials in mjx, all at once."""
     options = JudgeOptions(slots=worlds, workers=1, rules=Rules(time_limit_s=config.timed_s))
     trials = _trials(worlds, config.seed)
     return fly(load_policy(default_policy()), trials, vehicle, "mjx", options)
@@ -272,70 +280,73 @@ def _trials(count: int, seed: int) -> list[TrialSpec]:
     return [TrialSpec(*cells[k % len(cells)], seed + k // len(cells)) for k in range(count)]
 
 
-def _flown(config: Config, vehicle: Vehicle, world: str) -> list[TrialResult]:
+def _fly_paired(config: Config, vehicle: Vehicle, simulator: str) -> list[TrialResult]:
+    """Fly the trials of the comparison with the CPU."""
     options = JudgeOptions(slots=min(config.worlds), workers=1)
     trials = _trials(config.paired_trials, config.seed)
-    return fly(load_policy(default_policy()), trials, vehicle, world, options)
+    return fly(load_policy(default_policy()), trials, vehicle, simulator, options)
 
 
-def flown_on_cpu(config: Config, vehicle: Vehicle) -> dict[str, list[TrialResult]]:
+def fly_on_cpu(config: Config, vehicle: Vehicle) -> dict[str, list[TrialResult]]:
     """Return the shipped policy's trials, flown on the CPU, by simulator."""
     jax.config.update("jax_platforms", "cpu")
-    return {f"{world} on the CPU": _flown(config, vehicle, world) for world in ("mjx", "mujoco")}
+    return {f"{name} on the CPU": _fly_paired(config, vehicle, name) for name in ("mjx", "mujoco")}
 
 
-def compared(
-    here: Sequence[TrialResult], theirs: Mapping[str, Sequence[TrialResult]], console: Console
+def compare_with_cpu(
+    here: Sequence[TrialResult], on_cpu: Mapping[str, Sequence[TrialResult]], console: Console
 ) -> dict[str, Any]:
-    """Return how many of the shipped policy's trials end alike on the accelerator and the CPU."""
-    found = {}
-    for name, others in theirs.items():
-        won, lost = (np.array([r.success for r in rows]) for rows in (here, others))
-        found[name] = {
+    """Return how many trials have the same result on this device and on the CPU, by simulator."""
+    comparisons = {}
+    for name, others in on_cpu.items():
+        success, cpu_success = (np.array([r.success for r in rows]) for rows in (here, others))
+        same = int((success == cpu_success).sum())
+        comparisons[name] = {
             "trials": len(here),
-            "same_success": int((won == lost).sum()),
+            "same_success": same,
             "same_ending": sum(a.ended_by == b.ended_by for a, b in zip(here, others, strict=True)),
-            "difference": paired_success(won, lost),
+            "difference": paired_success(success, cpu_success),
         }
-        console.say(f"{found[name]['same_success']} of {len(here)} succeed or fail as in {name}")
-    return found
+        console.say(f"{same} of {len(here)} trials have the same success as in {name}")
+    return comparisons
 
 
 def short_training(
-    config: Config, vehicle: Vehicle, step_s: float, place: Place, console: Console
+    config: Config, vehicle: Vehicle, step_s: float, workspace: Workspace, console: Console
 ) -> dict[str, Any]:
     """Train by the recipe gpu for about `config.seconds`, and judge the policy.
 
     Args:
         config: of the experiment.
         vehicle: of the judged trials.
-        step_s: time of a gradient step of the last phase; it determines how many are made [s].
-        place: cache; an earlier run is removed, since the time is a result.
+        step_s: time of a gradient step of the last phase, from which the number of steps follows
+            [s].
+        workspace: cache; an earlier run is removed, since the time is a result.
         console: shows progress.
     """
-    wanted = recipe(config, config.train_worlds)
-    phases = phase_configs(with_iterations(wanted, 1000))
-    mean = sum(p.optimizer.iterations * p.episode.steps for p in phases) / 1000
-    iterations = max(len(phases), round(config.seconds / step_s * _steps(config) / mean))
-    folder = place.cache / "gpu"
+    base = recipe(config, config.train_worlds)
+    phases = phase_configs(with_iterations(base, 1000))
+    mean_steps = sum(p.optimizer.iterations * p.episode.steps for p in phases) / 1000
+    iterations = max(len(phases), round(config.seconds / step_s * _steps(config) / mean_steps))
+    folder = workspace.cache / "gpu"
     shutil.rmtree(folder, ignore_errors=True)
-    began = time.perf_counter()
-    outcome = train(with_iterations(wanted, iterations), folder, console)
-    seconds = time.perf_counter() - began
+    started = time.perf_counter()
+    outcome = train(with_iterations(base, iterations), folder, console)
+    seconds = time.perf_counter() - started
     curve = read(folder)
     warm = [row for row in curve if not row["cold"]] or curve
-    order = judging.Order(
+    request = judging.TrialRequest(
         judging.Setup(str(outcome.policy), vehicle),
         _trials(config.trials, config.seed),
     )
-    results = judging.flown({0: order}, place, console, "judging the short training")[0]
-    fast = [result.v_max for result in results if result.success]
+    results = judging.fly_trials({0: request}, workspace, console, "judging the short training")[0]
+    speeds = [result.v_max for result in results if result.success]
     return {
         "worlds": config.train_worlds,
         "iterations": iterations,
         "seconds": seconds,
         "decisions_per_s": float(np.median([row["steps_per_s"] for row in warm])),
         "success": wilson(sum(result.success for result in results), len(results)),
-        "v_max": float(np.median(fast)) if fast else None,
+        "v_max": float(np.median(speeds)) if speeds else None,
         "curve": [{key: row[key] for key in ("iteration", *DRAWN, "loss")} for row in curve],
     }

@@ -1,4 +1,8 @@
-"""Success and speed through sensor models: each preset, and each model as its magnitude grows."""
+"""The page `perception`: success and speed of policies through sensor models.
+
+A preset is a shipped sensors file with several models, such as `vio`. The magnitude is a factor on
+the errors of its file. All policies fly the same trials (a track, a level of difficulty, a seed).
+"""
 
 from __future__ import annotations
 
@@ -23,28 +27,28 @@ from eval.sensors.sensors_file import (
 from eval.vehicles.vehicle import Vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.study import disturbed, judging, options
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.conditions import Condition, Sweep, sweep_conditions
-from suite.experiments.study.disturbed import Tested
-from suite.loop.compare import difference_cell
+from suite.experiments.study.disturbed import ConditionResult
+from suite.loop.tables import difference_cell
 from tracks.common.grid import Cell, Grid, table
 from tracks.input.ranges import Trials
 
 PRESET_MAGNITUDES = (0.0, 0.5, 1.0, 1.5, 2.0)
-"""Factors of the magnitudes in the shipped files, for a whole preset."""
+"""Magnitudes at which every preset is flown."""
 MODEL_MAGNITUDES = (0.0, 1.0, 2.0)
-"""The same for one sensor model alone."""
+"""Magnitudes at which every single sensor model is flown."""
 
 
 @dataclass(frozen=True)
-class Config(options.Judged):
+class Config(options.JudgingOptions):
     """Judge policies through sensor models: all presets on every cell, and growing magnitudes.
 
     All policies fly the same trials under every condition. Give a policy that was trained with
-    sensor models as the second one to see the effect of that training. Models alone, one at a
-    time, are flown by the first policy only.
+    sensor models as the second one to see the effect of that training. Single models are flown by
+    the first policy only.
     """
 
     difficulty: str = "0,3,6,9"
@@ -57,56 +61,58 @@ class Config(options.Judged):
     """Only these presets and models, by name; all by default."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return tables and numbers; what is missing is flown first."""
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return tables and numbers; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import sweeps_chart
 
-    vehicle, presets, models = load_vehicle(config.vehicle), *chosen_sets(config.only)
+    vehicle, presets, models = load_vehicle(config.vehicle), *select_sensor_sets(config.only)
     policies = judging.named_policies(config.policy)
-    cells, growing = judging.trials_of(config), replace(config, trials=config.growing_trials)
+    trials, growing = judging.judged_trials(config), replace(config, trials=config.growing_trials)
     base = Condition("perfect", 0.0, "", vehicle)
     usual = [Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()]
-    tested, _ = disturbed.flown_under([base, *usual], {}, policies, cells, place, console)
-    again = judging.trials_of(growing, [3])
+    results, _ = disturbed.fly_conditions([base, *usual], {}, policies, trials, workspace, console)
+    sweep_trials = judging.judged_trials(growing, [3])
 
-    def grown_under(
+    def fly_sweeps(
         sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
-    ) -> disturbed.Grown:
-        sweeps = growing_sweeps(sets, magnitudes)
+    ) -> disturbed.SweepResults:
+        sweeps = magnitude_sweeps(sets, magnitudes)
         conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
-        return disturbed.flown_under([], conditions, policies, again, place, console)[1]
+        return disturbed.fly_conditions([], conditions, policies, sweep_trials, workspace, console)[
+            1
+        ]
 
     first_policy = dict([next(iter(policies.items()))])
-    grown_presets = grown_under(presets, PRESET_MAGNITUDES, policies)
-    grown_models = grown_under(models, MODEL_MAGNITUDES, first_policy)
+    preset_sweeps = fly_sweeps(presets, PRESET_MAGNITUDES, policies)
+    model_sweeps = fly_sweeps(models, MODEL_MAGNITUDES, first_policy)
     facts = {
         **judging.policy_facts(policies),
         "presets": f"three tracks, levels {config.difficulty}, seeds "
-        f"{options.judged_seeds(config)}: {len(cells)} trials a preset, the same in all",
+        f"{options.judged_seeds(config)}: {len(trials)} trials per preset, the same in all",
         "magnitudes": f"three tracks, level 3, seeds {options.judged_seeds(growing)}: "
-        f"{len(again)} trials a magnitude",
+        f"{len(sweep_trials)} trials per magnitude",
         "vehicle": config.vehicle,
     }
     parts: dict[str, list[Grid | Picture]] = {
-        "Presets on every cell": [preset_grid(tested), *gain_grids(tested)],
+        "Presets on every cell": [preset_grid(results), *gain_grids(results)],
     }
     for title, points in (
-        ("Presets of growing magnitude", grown_presets),
-        ("Single models of growing magnitude", grown_models),
+        ("Presets of growing magnitude", preset_sweeps),
+        ("Single models of growing magnitude", model_sweeps),
     ):
         if points:
             chart = Picture(sweeps_chart(points), "Success against the magnitude of each")
             parts[title] = [chart, magnitude_grid(points)]
     numbers = [
         disturbed.tested_numbers(entry, entries[0])
-        for entries in (tested, *grown_presets.values(), *grown_models.values())
+        for entries in (results, *preset_sweeps.values(), *model_sweeps.values())
         for entry in entries
     ]
-    return Made(facts, parts, {"conditions": numbers})
+    return PageContents(facts, parts, {"conditions": numbers})
 
 
-def chosen_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, SensorSet]]:
-    """Return the presets, and each model alone at its usual size: those in `only`, or all.
+def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, SensorSet]]:
+    """Return the presets, and the single models at their usual size: those in `only`, or all.
 
     Raises:
         ValueError: for an unknown name.
@@ -118,72 +124,75 @@ def chosen_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, Se
         for name, sensor in SENSORS.items()
         if name in usual and not sensor.measure
     }
-    names = options.chosen({**presets, **models}, only, "preset or sensor model")
+    names = options.select({**presets, **models}, only, "preset or sensor model")
     return (
         {name: presets[name] for name in names if name in presets},
         {name: models[name] for name in names if name in models},
     )
 
 
-def growing_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -> list[Sweep]:
-    """Return a sweep over `magnitudes` (times the usual) of each of `sets`."""
+def magnitude_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float]) -> list[Sweep]:
+    """Return a sweep over `magnitudes` of each of `sets`."""
 
-    def at(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
+    def make(sensors: SensorSet, vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
         return vehicle, scale_sensors(sensors, size)
 
     return [
-        Sweep(name, "magnitude, times the usual", magnitudes, partial(at, sensors))
+        Sweep(name, "magnitude, times the usual", magnitudes, partial(make, sensors))
         for name, sensors in sets.items()
     ]
 
 
-def _speed(entry: Tested, policy: str) -> float:
+def _speed(entry: ConditionResult, policy: str) -> float:
     """Return the median of the trials' mean speeds [m/s]."""
     return float(np.median([row.v_mean for row in entry.results[policy]]))
 
 
-def preset_grid(tested: Sequence[Tested]) -> Grid:
-    """Return a row a preset: success by level and over all, its change from perfect, speed."""
-    base, lines = tested[0], []
-    levels = list(dict.fromkeys(row.difficulty for row in next(iter(base.results.values()))))
-    for entry in tested:
-        for name, rows in entry.results.items():
-            line: list[str | Cell] = [entry.condition.name, name]
+def preset_grid(results: Sequence[ConditionResult]) -> Grid:
+    """Return success by level and over all, its change from perfect sensors, and speed.
+
+    There is a row for each preset and policy.
+    """
+    base, rows = results[0], []
+    levels = list(dict.fromkeys(trial.difficulty for trial in next(iter(base.results.values()))))
+    for entry in results:
+        for name, trials in entry.results.items():
+            row: list[str | Cell] = [entry.condition.name, name]
             for level in levels:
-                won = [row.success for row in rows if row.difficulty == level]
-                line.append(percent(wilson(sum(won), len(won))))
+                success = [trial.success for trial in trials if trial.difficulty == level]
+                row.append(percent(wilson(sum(success), len(success))))
             change = paired_success(entry.won(name), base.won(name))
-            speed, before = _speed(entry, name), _speed(base, name)
-            same = entry.condition.sensors == PERFECT
-            line += [percent(entry.success(name)), "" if same else difference_cell(change)]
-            line.append(f"{speed:.2f} ({speed / before - 1:+.1%})")
-            lines.append(line)
+            speed, base_speed = _speed(entry, name), _speed(base, name)
+            is_perfect = entry.condition.sensors == PERFECT
+            row += [percent(entry.success(name)), "" if is_perfect else difference_cell(change)]
+            row.append(f"{speed:.2f} ({speed / base_speed - 1:+.1%})")
+            rows.append(row)
     headers = ["sensors", "policy", *(f"level {level}" for level in levels)]
-    return table([*headers, "all", "change", "v_mean [m/s]"], lines)
+    return table([*headers, "all", "change", "v_mean [m/s]"], rows)
 
 
-def gain_grids(tested: Sequence[Tested]) -> list[Grid]:
+def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
     """Return the differences of the other policies to the first under each preset."""
-    first, *others = tested[0].results
-    lines = []
-    for entry in tested:
+    first, *others = results[0].results
+    rows = []
+    for entry in results:
         cells = []
         for name in others:
             change = difference_cell(paired_success(entry.won(name), entry.won(first)))
-            faster = _speed(entry, name) / _speed(entry, first) - 1
-            cells.append(Cell(f"{change.text}, {faster:+.1%}", change.tone))
-        lines.append([entry.condition.name, *cells])
+            speed_change = _speed(entry, name) / _speed(entry, first) - 1
+            cells.append(Cell(f"{change.text}, {speed_change:+.1%}", change.tone))
+        rows.append([entry.condition.name, *cells])
     title = f"Success in points and median v_mean against {first}, on the same trials"
-    return [table(["sensors", *others], lines, title)] if others else []
+    return [table(["sensors", *others], rows, title)] if others else []
 
 
-def magnitude_grid(grown_points: Mapping[Sweep, Sequence[Tested]]) -> Grid:
+def magnitude_grid(sweeps: Mapping[Sweep, Sequence[ConditionResult]]) -> Grid:
     """Return success and speed at every magnitude, a row for each set and policy."""
-    lines = []
-    for sweep, points in grown_points.items():
+    rows = []
+    for sweep, points in sweeps.items():
         for name in points[0].results:
             cells = (f"{percent(p.success(name))}, {_speed(p, name):.2f} m/s" for p in points)
-            lines.append([sweep.name, name, *cells])
-    magnitudes = next(iter(grown_points)).sizes
+            rows.append([sweep.name, name, *cells])
+    magnitudes = next(iter(sweeps)).sizes
     headers = ["sensors", "policy", *(f"x {size:g}" for size in magnitudes)]
-    return table(headers, lines, "Success with its 95 % interval, and the median of v_mean")
+    return table(headers, rows, "Success with its 95 % interval, and the median of v_mean")

@@ -1,4 +1,4 @@
-"""The published pages: how each is made, all of them in order, and which are out of date."""
+"""The published pages of docs/results: their options, making all of them, and finding old ones."""
 
 from __future__ import annotations
 
@@ -52,30 +52,31 @@ def make_all(make: Callable[[str, tuple[str, ...]], Any], console: Console) -> d
     seconds: dict[str, float] = {}
     for name, options in PUBLISHED.items():
         console.say(f"{len(seconds) + 1} of {len(PUBLISHED)}: {name}")
-        began = time.monotonic()
+        started = time.monotonic()
         make(name, options)
-        seconds[name] = round(time.monotonic() - began, 1)
+        seconds[name] = round(time.monotonic() - started, 1)
         console.say(f"{name}: {duration(seconds[name])}")
     return {"seconds": seconds}
 
 
 def page_states(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return for every published page in `folder` the commit that made it, and what is newer.
+    """Return `commit`, which made the page, and `newer` for every published page in `folder`.
 
     `newer` has "policy" if a shipped policy has other weights than the one that flew, and "code" if
     the code that flies (tracks, policies, eval) has changed; it is None if there is no page.
     """
-    return {name: _state(folder / f"{name}.json") for name in PUBLISHED}
+    return {name: _page_state(folder / f"{name}.json") for name in PUBLISHED}
 
 
-def _state(path: Path) -> dict[str, Any]:
+def _page_state(path: Path) -> dict[str, Any]:
+    """Return the state of one page from its JSON file."""
     if not path.is_file():
         return {"commit": "", "newer": None}
     page = json.loads(path.read_text(encoding="utf-8"))
-    flown = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
+    policies = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
     names = shipped.names()
-    stale = (name not in names or policy_digest(name)[:16] != digest for name, digest in flown)
-    newer = ["policy"] if any(stale) else []
+    is_old = (name not in names or policy_digest(name)[:16] != digest for name, digest in policies)
+    newer = ["policy"] if any(is_old) else []
     newer += ["code"] if page.get("code_sha256") != code_digest(*FLIES) else []
     return {"commit": page["git_commit"] or "", "newer": newer}
 
@@ -83,8 +84,8 @@ def _state(path: Path) -> dict[str, Any]:
 def status_grid(states: dict[str, dict[str, Any]]) -> Grid:
     """Return the states of the published pages as a table."""
 
-    def words(newer: list[str] | None) -> str:
+    def text(newer: list[str] | None) -> str:
         return "not made" if newer is None else ", ".join(newer) or "-"
 
-    lines = [[name, s["commit"][:10] or "-", words(s["newer"])] for name, s in states.items()]
+    lines = [[name, s["commit"][:10] or "-", text(s["newer"])] for name, s in states.items()]
     return table(["page", "made at commit", "newer than the page"], lines)

@@ -1,4 +1,8 @@
-"""Success under every effect of the catalogue and under growing disturbances, policies in pairs."""
+"""The page `robustness`: success of policies under physical effects and growing disturbances.
+
+An effect is one physical cause of a mismatch, such as drag or wind. A condition is a vehicle with
+an effect, or with other sensors; all policies fly the same trials under every condition.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +14,17 @@ from eval.judging.tables import percent
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.study import disturbed, judging, options
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.conditions import Condition
-from suite.experiments.study.disturbed import Tested
-from suite.loop.compare import difference_cell
+from suite.experiments.study.disturbed import ConditionResult
+from suite.loop.tables import difference_cell
 from tracks.common.grid import Cell, Grid, table
 
 
 @dataclass(frozen=True)
-class Config(options.Judged):
+class Config(options.JudgingOptions):
     """Judge policies under every physical effect and under growing disturbances.
 
     All policies fly the same trials under every condition. Give a policy that was trained with
@@ -31,22 +35,24 @@ class Config(options.Judged):
     """Only these effects and sweeps, by name; all by default."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return tables and numbers; what is missing is flown first."""
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return tables and numbers; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import effects_chart, sweeps_chart
 
     vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
-    alone, sweeps = disturbed.chosen_conditions(vehicle, config.only)
-    base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.trials_of(config)
-    effects, grown = disturbed.flown_under([base, *alone], sweeps, policies, trials, place, console)
+    singles, sweeps = disturbed.select_conditions(vehicle, config.only)
+    base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.judged_trials(config)
+    effects, grown = disturbed.fly_conditions(
+        [base, *singles], sweeps, policies, trials, workspace, console
+    )
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, level {config.difficulty}, seeds "
-        f"{options.judged_seeds(config)}: {len(trials)} trials a condition, the same in all",
+        f"{options.judged_seeds(config)}: {len(trials)} trials per condition, the same in all",
         "vehicle": config.vehicle,
     }
     parts: dict[str, list[Grid | Picture]] = {}
-    if alone:
+    if singles:
         parts["Every effect at its usual size"] = [
             Picture(effects_chart(effects), "Success under each effect; dashed: undisturbed"),
             condition_grid(effects, effects[0], ("effect", "size in this row")),
@@ -56,36 +62,39 @@ def document(config: Config, place: Place, console: Console) -> Made:
             Picture(sweeps_chart(grown), "Success against the size of each disturbance"),
             *(condition_grid(points, effects[0], (s.axis,), s.name) for s, points in grown.items()),
         ]
-    tested = [*effects, *(point for points in grown.values() for point in points)]
-    numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in tested]
-    return Made(facts, parts, {"conditions": numbers})
+    results = [*effects, *(point for points in grown.values() for point in points)]
+    numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in results]
+    return PageContents(facts, parts, {"conditions": numbers})
 
 
 def condition_grid(
-    entries: Sequence[Tested], base: Tested, first: Sequence[str], title: str = ""
+    entries: Sequence[ConditionResult], base: ConditionResult, first: Sequence[str], title: str = ""
 ) -> Grid:
     """Return success and change under each of `entries`, a row each.
 
     Args:
-        entries: tested conditions; the other policies are compared with the first.
-        base: the undisturbed condition.
+        entries: results under conditions; the other policies are compared with the first.
+        base: results under the undisturbed condition.
         first: headers of the first columns: the size, or the name and the size.
         title: of the table.
     """
     headers, names = list(first), list(base.results)
     for name in names:
-        mine = f"{name}: " if len(names) > 1 else ""
-        headers += [f"{mine}success", f"{mine}change"]
+        prefix = f"{name}: " if len(names) > 1 else ""
+        headers += [f"{prefix}success", f"{prefix}change"]
     headers += [f"{name} - {names[0]}" for name in names[1:]]
-    plain = (base.condition.vehicle, base.condition.sensors)
-    lines = []
+    undisturbed = base.condition
+    rows = []
     for entry in entries:
-        line: list[str | Cell] = [*(entry.condition.name, entry.condition.words)[-len(first) :]]
-        same = entry.condition.vehicle is plain[0] and entry.condition.sensors == plain[1]
+        condition = entry.condition
+        row: list[str | Cell] = [*(condition.name, condition.size_text)[-len(first) :]]
+        is_base = (
+            condition.vehicle is undisturbed.vehicle and condition.sensors == undisturbed.sensors
+        )
         for name in names:
             change = paired_success(entry.won(name), base.won(name))
-            line += [percent(entry.success(name)), "" if same else difference_cell(change)]
-        mine = entry.won(names[0])
-        line += [difference_cell(paired_success(entry.won(name), mine)) for name in names[1:]]
-        lines.append(line)
-    return table(headers, lines, title)
+            row += [percent(entry.success(name)), "" if is_base else difference_cell(change)]
+        reference = entry.won(names[0])
+        row += [difference_cell(paired_success(entry.won(name), reference)) for name in names[1:]]
+        rows.append(row)
+    return table(headers, rows, title)

@@ -1,4 +1,8 @@
-"""The paper's comparison of training schemes: PPO, ours, and ours without the vector field."""
+"""The page `schemes`: the paper's comparison of PPO, our method, and ours without the field.
+
+The field is the Attractive Vector Field, which guides the drone through gates. The schemes are
+trained in the same dynamics, and measured during the training on tracks that no training uses.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,9 @@ import numpy as np
 from suite.common.console import Console, duration
 from suite.common.curve import METRICS
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.study import options, training
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.summary import Summary, summaries
 from suite.train.overrides import check_owned, in_every_phase
 from suite.train.ppo.config import ppo_like
@@ -21,81 +25,84 @@ from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Trials
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
-"""lambda_proj and beta_3 of the paper's scheme without the field."""
+"""lambda_proj and beta_3 of L_proj, the paper's substitute for the field."""
 FIGURE = ("reward", "v_max", "collision_free", "gates")
-"""What the paper's figure shows."""
+"""Numbers of the chart, those of the paper's figure."""
 MEASURED = ("reward", "success_cross", "collision_free", "v_max", "gates")
-"""Numbers of `validation.measured` in the table and in schemes.json."""
-WANTED = (1, 2, 3)
-"""Mean gates a trial, of four: the table has the time at which each is first reached."""
+"""Numbers of `validation.mean_scores` in the table and in schemes.json."""
+GATE_COUNTS = (1, 2, 3)
+"""Mean gates per trial, of four: the table has the time at which each is first reached."""
 
 
 @dataclass(frozen=True)
-class Config(options.FourGates):
-    """Train by PPO, by our method, and by it without the field, and measure them as they learn.
+class Config(options.FourGateOptions):
+    """Train by PPO, by our method, and by ours without the field, and measure them as they learn.
 
     All three share policy, dynamics, worlds and the number of environment steps. A training is
     reused if its configuration and its measurements have the same hash.
     """
 
     progress: Annotated[float, Range(0.0, 1e6)] = 0.4
-    """lambda_p of both differentiable schemes; the paper's."""
+    """lambda_p, the weight of progress in both differentiable schemes; by default the paper's."""
     ppo_iterations: Iterations | None = None
-    """Rollouts of PPO; by default as many as the others' gradient steps."""
+    """Rollouts of PPO; by default the number of the others' gradient steps."""
     trials: Trials = 100
     """Unseen worlds flown at every measurement."""
     measurements: Annotated[int, Range(1, 10_000)] = 20
-    """About how many measurements a training has; their time does not count in the curves."""
+    """Approximate number of measurements of a training; their time does not count in the curves."""
     only: tuple[str, ...] = ()
     """Schemes: ppo, ours, projection; all by default."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return tables and numbers; train what is missing."""
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return tables and numbers; missing trainings are made first."""
     from suite.experiments.pages.charts import curves_chart
 
-    chosen = schemes(config)
-    unseen = training.Unseen(config.measurements, config.trials, config.seed, config.seconds)
-    study = training.Study(chosen, config.training_seeds, unseen, by_seed=True)
-    runs = training.trained(study, place, console)
-    rows, episode = summaries(chosen, runs), chosen[0].recipe.episode
-    compiling = {
-        row.key: float(np.mean([run.compile_s for run in runs if run.row == row.key]))
+    compared = schemes(config)
+    unseen = training.UnseenWorlds(config.measurements, config.trials, config.seed, config.seconds)
+    study = training.Study(compared, config.training_seeds, unseen, by_seed=True)
+    runs = training.train_all(study, workspace, console)
+    rows, episode = summaries(compared, runs), compared[0].recipe.episode
+    compile_s = {
+        row.key: float(np.mean([run.compile_s for run in runs if run.setting == row.key]))
         for row in rows
     }
     facts = {
-        "recipe": f"{' '.join([config.recipe, *config.set])} episode.gates={episode.gates} "
-        f"lambda_p={config.progress:g}",
+        "recipe": f"{options.recipe_fact(config)}, lambda_p={config.progress:g}",
         "an iteration": f"{episode.batch} worlds x {episode.steps} steps",
         **training.facts(config, runs),
-        "trainings at once": place.at_once,
+        "trainings at once": workspace.at_once,
     }
-    whole = [row for row in rows if row.at]
-    chart = [Picture(curves_chart(whole, FIGURE), "Learning curves over steps and over time")]
+    measured = [row for row in rows if row.at]
+    chart = [Picture(curves_chart(measured, FIGURE), "Learning curves over steps and over time")]
     parts = {
-        "Learning curves": [*chart[: len(whole)], _end(whole), _reached(whole, compiling)],
+        "Learning curves": [
+            *chart[: len(measured)],
+            _end_grid(measured),
+            _time_grid(measured, compile_s),
+        ],
     }
     numbers = [
         {
             "scheme": row.key,
-            "words": row.words,
+            "words": row.label,
             "seeds": row.seeds,
             "diverged": row.diverged,
             "steps": [int(point["steps"].mean) for point in row.at],
             "time": [point["time"].mean for point in row.at],
             "curves": {n: [point[n] for point in row.at] for n in MEASURED if row.at},
-            "reached": {gates: first_times(row, gates) for gates in WANTED},
-            "compile_s": compiling[row.key],
+            "reached": {gates: first_times(row, gates) for gates in GATE_COUNTS},
+            "compile_s": compile_s[row.key],
         }
         for row in rows
     ]
     fields = ("seed", "points", "compile_s", "commit", "diverged")
-    each = [{"scheme": run.row, **{f: getattr(run, f) for f in fields}} for run in runs]
-    return Made(facts, parts, {"rows": numbers, "runs": each})
+    trainings = [{"scheme": run.setting, **{f: getattr(run, f) for f in fields}} for run in runs]
+    return PageContents(facts, parts, {"rows": numbers, "runs": trainings})
 
 
-def schemes(config: Config) -> list[training.Row]:
-    """Return the chosen schemes, in the paper's order.
+def schemes(config: Config) -> list[training.Setting]:
+    """Return the selected schemes, in the paper's order.
 
     Raises:
         ValueError: for an unknown recipe, change or scheme, and for a number of worlds that is no
@@ -106,50 +113,52 @@ def schemes(config: Config) -> list[training.Row]:
     check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = options.four_gate_recipe(config)
     ours = in_every_phase(base, "loss", progress=config.progress, progress_norm=0.0, projection=0.0)
-    scalar = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
-    bare = in_every_phase(ours, "loss", field_gain=0.0, **scalar)
+    substitute = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
+    without_field = in_every_phase(ours, "loss", field_gain=0.0, **substitute)
     ppo = ppo_like(ours, config.ppo_iterations or ours.optimizer.iterations)
-    rows = [
-        training.Row("ppo", "PPO", ppo),
-        training.Row("ours", "ours", ours),
-        training.Row("projection", "ours without the field, with L_proj", bare),
+    known = [
+        training.Setting("ppo", "PPO", ppo),
+        training.Setting("ours", "ours", ours),
+        training.Setting("projection", "ours without the field, with L_proj", without_field),
     ]
-    rows = options.chosen({row.key: row for row in rows}, config.only, "scheme")
-    if ppo.episode.batch % ppo.minibatches and "ppo" in rows:
+    selected = options.select({scheme.key: scheme for scheme in known}, config.only, "scheme")
+    if ppo.episode.batch % ppo.minibatches and "ppo" in selected:
         raise ValueError(
             f"--worlds is {ppo.episode.batch}, allowed with PPO are multiples of its "
             f"{ppo.minibatches} minibatches"
         )
-    return list(rows.values())
+    return list(selected.values())
 
 
 def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:
-    """Return steps and seconds of each seed's first measurement with `gates`, where it has one."""
-    firsts = [next((p for p in points if p["gates"] >= gates), None) for points in row.whole]
+    """Return steps and time [s] at which each seed first passes `gates`; seeds that do not lack."""
+    firsts = [next((p for p in points if p["gates"] >= gates), None) for points in row.trainings]
     return [(point["steps"], point["time"]) for point in firsts if point is not None]
 
 
-def _end(rows: Sequence[Summary]) -> Grid:
+def _end_grid(rows: Sequence[Summary]) -> Grid:
+    """Return the numbers at the end of the trainings, a row per scheme."""
     headers = ["scheme", *(METRICS[name].title for name in MEASURED), "diverged"]
     lines = [
-        [row.words, *(row.text(name) for name in MEASURED), f"{row.diverged} of {row.seeds}"]
+        [row.label, *(row.text(name) for name in MEASURED), f"{row.diverged} of {row.seeds}"]
         for row in rows
     ]
     return table(headers, lines, "At the end of each budget: mean over seeds [least, most]")
 
 
-def _reached(rows: Sequence[Summary], compiling: Mapping[str, float]) -> Grid:
-    headers = ["scheme", *(f"{gates} gates" if gates > 1 else "1 gate" for gates in WANTED),
+def _time_grid(rows: Sequence[Summary], compile_s: Mapping[str, float]) -> Grid:
+    """Return the steps and times until `GATE_COUNTS` are reached, a row per scheme."""
+    headers = ["scheme", *(f"{gates} gates" if gates > 1 else "1 gate" for gates in GATE_COUNTS),
                "whole budget", "compilation"]  # fmt: skip
     lines = []
     for row in rows:
-        line = [row.words]
-        for gates in WANTED:
-            found = np.array(first_times(row, gates)).reshape(-1, 2)
-            steps, time = np.median(found, axis=0) if len(found) else (0, 0)
-            times = f"{steps:,.0f} steps, {duration(time)} ({len(found)} of {row.seeds})"
-            line.append(times if len(found) else "not reached")
+        line = [row.label]
+        for gates in GATE_COUNTS:
+            reached = np.array(first_times(row, gates)).reshape(-1, 2)
+            steps, time = np.median(reached, axis=0) if len(reached) else (0, 0)
+            text = f"{steps:,.0f} steps, {duration(time)} ({len(reached)} of {row.seeds})"
+            line.append(text if len(reached) else "not reached")
         end = row.at[-1]
         budget = f"{end['steps'].mean:,.0f} steps, {duration(end['time'].mean)}"
-        lines.append([*line, budget, duration(compiling[row.key])])
-    return table(headers, lines, "Steps and time of training to so many gates a trial")
+        lines.append([*line, budget, duration(compile_s[row.key])])
+    return table(headers, lines, "Training until a mean number of gates per trial: steps and time")

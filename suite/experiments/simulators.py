@@ -1,4 +1,8 @@
-"""The shipped policies on the same trials in every simulator: which trials differ, and why."""
+"""The page `simulators`: policies on the same trials in every simulator, and why results differ.
+
+A trial is one judged flight. Where a simulator has other aerodynamics than MuJoCo, a control flies
+MuJoCo with these aerodynamics, which separates their effect from other differences.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +19,12 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds import REFERENCE, WORLDS, differences, world_class
 from policies import shipped
 from suite.common.console import Console
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.study import judging, options
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.experiments.study.conditions import Condition
-from suite.experiments.study.disturbed import Tested, flown_under
-from suite.loop.compare import difference_cell
+from suite.experiments.study.disturbed import ConditionResult, fly_conditions
+from suite.loop.tables import difference_cell
 from tracks.common.grid import Grid, table
 from tracks.input.ranges import Trials
 
@@ -29,13 +33,13 @@ BASE = "mujoco"
 ROUNDING = "mjx"
 """This simulator differs from `BASE` in single precision, in contacts by signed distance, and in
 images from analytic rays."""
-WHY = ("rounding", "air", "rest")
-"""Why the success of a trial changes: `rounding`, it changes in mjx too; `air`, it changes in
-mujoco with that simulator's aerodynamics too; `rest`, for another reason."""
+REASONS = ("rounding", "air", "rest")
+"""Why the success of a trial changes. `rounding`: it also changes in mjx. `air`: it also changes in
+mujoco with that simulator's aerodynamics. `rest`: for another reason."""
 
 
 @dataclass(frozen=True)
-class Config(options.Judged):
+class Config(options.JudgingOptions):
     """Fly the shipped policies on the same trials in every simulator."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -46,10 +50,10 @@ class Config(options.Judged):
     trials: Trials = 20
     """Trials of every policy on every track at every level in every simulator."""
     simulator: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A simulator besides mujoco; may be given several times. Without it mjx and rotorpy."""
+    """A simulator other than mujoco; may be given several times. Without it mjx and rotorpy."""
 
 
-def air_of(simulator: str) -> str:
+def control_label(simulator: str) -> str:
     """Return the label of the control of a simulator: mujoco with that simulator's aerodynamics."""
     return f"{BASE}, the air of {simulator}"
 
@@ -61,106 +65,111 @@ def conditions(config: Config) -> list[Condition]:
         ValueError: for an unknown simulator, or one whose package is not installed.
     """
     vehicle = load_vehicle(config.vehicle)
-    twice = next((n for n in config.simulator if config.simulator.count(n) > 1), None)
-    if twice is not None:
-        raise ValueError(f"--simulator {twice} is given twice; give each simulator once")
-    found = [Condition(BASE, 1.0, "", vehicle)]
+    repeated = next((n for n in config.simulator if config.simulator.count(n) > 1), None)
+    if repeated is not None:
+        raise ValueError(f"--simulator {repeated} is given twice; give each simulator once")
+    entries = [Condition(BASE, 1.0, "", vehicle)]
     for name in config.simulator or (ROUNDING, "rotorpy"):
         simulator = world_class(name)
         if name in (BASE, REFERENCE):
             others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
             raise ValueError(
-                f"--simulator {name}: flies as {BASE} does, with which others are paired; give "
-                f"one of {others}"
+                f"--simulator {name}: all simulators are compared with {BASE}, which flies as "
+                f"{name}; give one of {others}"
             )
         if hasattr(simulator, "nearest"):
-            found.append(Condition(air_of(name), 1.0, "", simulator.nearest(vehicle)))
-        found.append(Condition(name, 1.0, "", vehicle, simulator=name))
-    return found
+            entries.append(Condition(control_label(name), 1.0, "", simulator.nearest(vehicle)))
+        entries.append(Condition(name, 1.0, "", vehicle, simulator=name))
+    return entries
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return tables and numbers; what is missing is flown first."""
-    flown_in = conditions(config)
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return tables and numbers; trials that are not in the cache are flown first."""
+    simulators = conditions(config)
     policies = judging.named_policies(config.policy or tuple(shipped.names()))
-    trials = judging.trials_of(config)
-    tested, _ = flown_under(flown_in, {}, policies, trials, place, console)
-    changed = changes(tested)
+    trials = judging.judged_trials(config)
+    results, _ = fly_conditions(simulators, {}, policies, trials, workspace, console)
+    changed = changed_trials(results)
     facts = {
         **judging.policy_facts(policies),
         "trials": f"three tracks, levels {config.difficulty}, seeds "
         f"{options.judged_seeds(config)}: {len(trials)} of each policy in each simulator",
         "vehicle": config.vehicle,
     }
-    otherwise = [
+    simulator_differences = [
         [entry.name, sentence]
-        for entry in flown_in
+        for entry in simulators
         for sentence in differences(entry.simulator, entry.vehicle)
     ]
     parts = {
-        "Success by simulator": [_overall(tested)],
-        "Trials that change their success": [_each(changed, tested)],
-        "What the simulators fly otherwise": [
-            table(["simulator", "difference to the vehicle's file"], otherwise)
+        "Success by simulator": [_success_grid(results)],
+        "Trials that change their success": [_changes_grid(changed, results)],
+        "Differences of the simulators to the vehicle file": [
+            table(["simulator", "difference to the vehicle file"], simulator_differences)
         ],
     }
     numbers = {
         "success": [
-            {"policy": name, "column": entry.condition.name, **_numbers(entry, tested[0], name)}
+            {"policy": name, "column": entry.condition.name, **_numbers(entry, results[0], name)}
             for name in policies
-            for entry in tested
+            for entry in results
         ],
         "changed": changed,
     }
-    return Made(facts, parts, numbers)
+    return PageContents(facts, parts, numbers)
 
 
-def _numbers(entry: Tested, base: Tested, policy: str) -> dict[str, Any]:
+def _numbers(entry: ConditionResult, base: ConditionResult, policy: str) -> dict[str, Any]:
     """Return one policy's results in a simulator, and their difference to those in mujoco."""
-    rows, others = entry.results[policy], base.results[policy]
-    pairs = [(a, b) for a, b in zip(rows, others, strict=True) if a.success and b.success]
+    rows, base_rows = entry.results[policy], base.results[policy]
+    pairs = list(zip(rows, base_rows, strict=True))
 
-    def apart(field: str) -> float | None:
-        gaps = [abs(getattr(a, field) - getattr(b, field)) for a, b in pairs]
-        return float(np.median(gaps)) if gaps else None
+    def median_difference(field: str) -> float | None:
+        """Return the median absolute difference of a field over trials that succeed in both."""
+        both = [(a, b) for a, b in pairs if a.success and b.success]
+        values = [abs(getattr(a, field) - getattr(b, field)) for a, b in both]
+        return float(np.median(values)) if values else None
 
     return {
         "success": entry.success(policy),
         "minus_mujoco": paired_success(entry.won(policy), base.won(policy)),
-        "ends_alike": sum(a.ended_by == b.ended_by for a, b in zip(rows, others, strict=True)),
+        "ends_alike": sum(a.ended_by == b.ended_by for a, b in pairs),
         "trials": len(rows),
-        "lap_apart_s": apart("time_s"),
-        "v_mean_apart": apart("v_mean"),
+        "lap_apart_s": median_difference("time_s"),
+        "v_mean_apart": median_difference("v_mean"),
     }
 
 
-def _overall(tested: Sequence[Tested]) -> Grid:
-    headers = ["policy", "simulator", "success", "minus mujoco", "p", "ends alike"]
-    headers += ["lap apart [s]", "mean speed apart [m/s]"]
-    lines = []
-    for name in tested[0].results:
-        for entry in tested:
-            found = _numbers(entry, tested[0], name)
-            line = [name, entry.condition.name, percent(found["success"])]
-            if entry is tested[0]:
-                lines.append([*line, *[""] * 5])
+def _success_grid(results: Sequence[ConditionResult]) -> Grid:
+    """Return success and its difference to mujoco, a row per policy and simulator."""
+    headers = ["policy", "simulator", "success", "minus mujoco", "p", "same ending"]
+    headers += ["lap time difference [s]", "mean speed difference [m/s]"]
+    rows = []
+    for name in results[0].results:
+        for entry in results:
+            numbers = _numbers(entry, results[0], name)
+            row = [name, entry.condition.name, percent(numbers["success"])]
+            if entry is results[0]:
+                rows.append([*row, *[""] * 5])
                 continue
-            less = found["minus_mujoco"]
-            gaps = (found["lap_apart_s"], found["v_mean_apart"])
-            alike = f"{found['ends_alike']} of {found['trials']}"
-            shown = ["-" if gap is None else f"{gap:.3f}" for gap in gaps]
-            lines.append([*line, difference_cell(less), f"{less.p_value:.2g}", alike, *shown])
-    return table(headers, lines)
+            difference = numbers["minus_mujoco"]
+            medians = (numbers["lap_apart_s"], numbers["v_mean_apart"])
+            texts = ["-" if value is None else f"{value:.3f}" for value in medians]
+            same = f"{numbers['ends_alike']} of {numbers['trials']}"
+            p_value = f"{difference.p_value:.2g}"
+            rows.append([*row, difference_cell(difference), p_value, same, *texts])
+    return table(headers, rows)
 
 
-def changes(tested: Sequence[Tested]) -> list[dict[str, Any]]:
-    """Return the trials whose success in a simulator is not that in mujoco.
+def changed_trials(results: Sequence[ConditionResult]) -> list[dict[str, Any]]:
+    """Return the trials whose success in a simulator differs from that in mujoco.
 
-    Each has the endings by simulator, and `why`, one of `WHY`; it is None in mjx and in controls.
+    Each has the endings by simulator, and `why`, one of `REASONS`; that is None in mjx and in
+    controls.
     """
-    by_name = {entry.condition.name: entry for entry in tested}
-    base, *others = tested
-    found = []
+    by_name = {entry.condition.name: entry for entry in results}
+    base, *others = results
+    changed = []
     for policy, rows in base.results.items():
         for entry in others:
             simulator = entry.condition.simulator
@@ -172,10 +181,10 @@ def changes(tested: Sequence[Tested]) -> list[dict[str, Any]]:
                 rounding, air = (
                     name in by_name
                     and by_name[name].results[policy][number].success == result.success
-                    for name in (ROUNDING, air_of(simulator))
+                    for name in (ROUNDING, control_label(simulator))
                 )
                 why = "rounding" if rounding else "air" if air else "rest"
-                found.append(
+                changed.append(
                     {
                         "policy": policy,
                         "column": entry.condition.name,
@@ -187,12 +196,12 @@ def changes(tested: Sequence[Tested]) -> list[dict[str, Any]]:
                         },
                     }
                 )
-    return found
+    return changed
 
 
-def _each(changed: Sequence[Mapping[str, Any]], tested: Sequence[Tested]) -> Grid:
-    """Return the trials that change for a reason of `WHY`, one by one."""
-    names = [entry.condition.name for entry in tested]
+def _changes_grid(changed: Sequence[Mapping[str, Any]], results: Sequence[ConditionResult]) -> Grid:
+    """Return the changed trials that have a reason, a row each."""
+    names = [entry.condition.name for entry in results]
     lines = [
         [c["policy"], c["trial"].track, str(c["trial"].difficulty), str(c["trial"].seed)]
         + [c["endings"][name] for name in names]

@@ -1,4 +1,7 @@
-"""The paper's table of judged policies, ours next to the printed rows; then all ten levels."""
+"""The page `table2`: a policy on three tracks at all ten levels, next to the paper's table.
+
+A cell is the trials of one track and level of difficulty; a trial is one judged flight.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,12 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import load_sensors
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import Made
+from suite.experiments.pages.document import PageContents
 from suite.experiments.pages.paper import goal_grid, goals, sim_to_sim
 from suite.experiments.study import judging, options
-from suite.experiments.study.cache import Place
+from suite.experiments.study.cache import Workspace
 from suite.judging.flying import default_policy
-from suite.judging.requests import LEVELS
+from suite.judging.trials import LEVELS
 from tracks.common.grid import Grid, table
 from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
@@ -48,25 +51,26 @@ class Config:
     """Errors in what the policy sees: a shipped name or a sensors file (.toml)."""
 
 
-def document(config: Config, place: Place, console: Console) -> Made:
-    """Return tables and numbers; what is missing is flown first."""
+def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
+    """Return tables and numbers; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import level_chart
 
     policy = config.policy or default_policy()
-    name, about = judging.name_of(policy), judging.policy_facts({OURS: policy})
+    name, policies = judging.policy_name(policy), judging.policy_facts({OURS: policy})
     setup = judging.Setup(policy, load_vehicle(config.vehicle), load_sensors(config.sensors))
-    order = judging.Order(setup, judging.trials_of(config, LEVELS))
-    rows = judging.flown({OURS: order}, place, console, "judging all levels")[OURS]
+    request = judging.TrialRequest(setup, judging.judged_trials(config, LEVELS))
+    rows = judging.fly_trials({OURS: request}, workspace, console, "judging all levels")[OURS]
     cells = summarise([row._replace(policy=OURS) for row in rows])["cells"]
+    seeds = options.judged_seeds(config)
     facts = {
-        **about,
+        **policies,
         "vehicle": config.vehicle,
         "sensors": config.sensors,
-        "seeds": f"{options.judged_seeds(config)}, {config.trials} trials a cell, the same for all",
+        "seeds": f"{seeds}, {config.trials} trials per cell, the same for all",
     }
     chart = level_chart([cell._replace(policy=name) for cell in cells])
     parts = {
-        "Compared with the paper": [against_the_paper(cells)],
+        "Compared with the paper": [paper_grid(cells)],
         f"Goals by cell: {OURS}": [goal_grid(cells)],
         "All ten levels": [
             Picture(chart, "Success and v_max at every level"),
@@ -76,15 +80,15 @@ def document(config: Config, place: Place, console: Console) -> Made:
     numbers = {
         "cells": cells,
         "goals": {OURS: goals(cells)},
-        "policies": [{"name": OURS, "policy": policy, "about": about[OURS]}],
+        "policies": [{"name": OURS, "policy": policy, "about": policies[OURS]}],
     }
-    return Made(facts, parts, numbers)
+    return PageContents(facts, parts, numbers)
 
 
-def against_the_paper(cells: Sequence[Tally]) -> Grid:
-    """Return our rows and the printed ones, a method and level each, tracks as columns."""
+def paper_grid(cells: Sequence[Tally]) -> Grid:
+    """Return our rows and the printed ones, a row per method and level, tracks as columns."""
     printed = sim_to_sim()
-    lines = [[OURS, str(level), *_ours(cells, level)] for level in printed.levels]
+    lines = [[OURS, str(level), *_our_numbers(cells, level)] for level in printed.levels]
     for method, name in printed.methods.items():
         for level in printed.levels:
             line = [name, str(level)]
@@ -95,7 +99,7 @@ def against_the_paper(cells: Sequence[Tally]) -> Grid:
     return table(["method", "level", *COLUMNS], lines, note=f"Printed rows: {printed.source}.")
 
 
-def _ours(cells: Sequence[Tally], level: int) -> list[str]:
+def _our_numbers(cells: Sequence[Tally], level: int) -> list[str]:
     """Return our numbers at a level, track by track."""
     by_track, texts = {cell.track: cell for cell in cells if cell.difficulty == level}, []
     for cell in (by_track[track] for track in JUDGED):

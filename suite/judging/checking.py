@@ -1,4 +1,9 @@
-"""The checks of `suite check`: a policy's contract and actions, and the interface of flights."""
+"""Check a policy's interface and that of flight logs, and name probable faults (`suite check`).
+
+A policy's contract lists names, units, frames and rate of its inputs and outputs. A fault is an
+error of interface or log, such as a wrong unit, sign, scale, order, delay or rate; a finding is a
+record of one.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +23,16 @@ TIME_LIMIT_S = 5.0
 def check_policy(
     name: str, trust: bool, trials: int, console: Console
 ) -> tuple[Policy, dict[str, Any]]:
-    """Return the policy, and the command's answer about its interface.
+    """Return the policy, and the command's answer: its contract and the findings about it.
+
+    Args:
+        name: a shipped name, a checkpoint's folder or a policy file.
+        trust: as in `load_policy`.
+        trials: number of short flights that show its actions; may be 0.
+        console: shows every finding.
 
     Raises:
-        ValueError: if it is refused.
+        ValueError: if the policy is refused.
     """
     policy = load_policy(name, trust)
     findings = policy_findings(policy, trials, console)
@@ -34,12 +45,12 @@ def check_policy(
 def check_flight_files(
     flights: Sequence[Path], vehicle: str, policy: Policy | None, out: Path | None, console: Console
 ) -> dict[str, Any]:
-    """Return the command's answer about flights and a vehicle file.
+    """Return the command's answer about flights and a vehicle file: the findings about them.
 
     Args:
         flights: logs, or folders of them.
         vehicle: a file or a shipped name; "" for none.
-        policy: the flights should have its rate and camera.
+        policy: its rate and camera are compared with those of the flights; None compares nothing.
         out: folder for the corrected flights; None writes nothing.
         console: shows every finding.
 
@@ -62,20 +73,20 @@ def check_flight_files(
     from suite.delta.run import flight_files
 
     spec = None if policy is None else policy.spec
-    against = CheckContext(
+    context = CheckContext(
         load_vehicle(vehicle) if vehicle else None,
         None if spec is None else spec.rate_hz,
         None if spec is None else spec.camera.fov_deg,
     )
-    found: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(against)]
+    all_findings: list[tuple[Finding, str | None]] = [(f, None) for f in check_files(context)]
     files = flight_files(flights) if flights else []
     logs, warnings = read_flights(files, partial=True, limits=False) if files else ([], [])
     for warning in warnings:
         console.note(f"warning: {warning}")
     written = []
     for log in logs:
-        findings, readings = check_log(log, against, out is not None)
-        found += [(finding, log.name) for finding in findings]
+        findings, readings = check_log(log, context, out is not None)
+        all_findings += [(finding, log.name) for finding in findings]
         if out is not None:
             path = out / Path(log.name).name
             check_no_input(path, flights, "--out")
@@ -87,16 +98,18 @@ def check_flight_files(
             except FlightLogError as error:
                 console.note(f"warning: not written: {error}")
     for name in (None, *(log.name for log in logs)):
-        named = [finding for finding, flight in found if flight == name and finding.status != "ok"]
-        for text in finding_lines(named):
+        problems = [
+            finding for finding, flight in all_findings if flight == name and finding.status != "ok"
+        ]
+        for text in finding_lines(problems):
             console.say((f"{Path(name).name}: " if len(logs) > 1 and name else "") + text)
     if written:
         console.say(f"written: {', '.join(written)}")
     return {
         "flights": [log.name for log in logs],
         "vehicle": vehicle or None,
-        "findings": [{**finding._asdict(), "flight": flight} for finding, flight in found],
-        "not_identifiable": not_identifiable([finding for finding, _ in found]),
+        "findings": [{**finding._asdict(), "flight": flight} for finding, flight in all_findings],
+        "not_identifiable": not_identifiable([finding for finding, _ in all_findings]),
         "written": written,
     }
 
@@ -112,14 +125,18 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
     from eval.judging.outputs import probable_faults
 
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
-    found = [_record("contract", *note) for note in getattr(policy, "notes", ())]
-    found += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
-    known = {record["fault"] for record in found}
-    seen = [each for each in _in_flight(policy, trials, console) if each[0] not in known]
-    return found + [_record("action", *warning) for warning in seen]
+    findings = [_record("contract", *note) for note in getattr(policy, "notes", ())]
+    findings += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
+    known = {record["fault"] for record in findings}
+    warnings = _warnings_in_flight(policy, trials, console)
+    new = [warning for warning in warnings if warning[0] not in known]
+    return findings + [_record("action", *warning) for warning in new]
 
 
-def _in_flight(policy: Policy, trials: int, console: Console) -> list[tuple[str, str, str]]:
+def _warnings_in_flight(
+    policy: Policy, trials: int, console: Console
+) -> list[tuple[str, str, str]]:
+    """Return (fault, evidence, fix) of suspicious actions in a few short flights."""
     from eval.judging.judge import JudgeOptions, fly
     from eval.judging.outputs import action_report
     from eval.quadrotor.vehicle_file import load_vehicle

@@ -1,4 +1,7 @@
-"""Record flights as logs: one Parquet file per flight, and a list of them."""
+"""Record simulated flights as logs (`suite collect`): a Parquet file per flight, and a list.
+
+An interrupted call continues: a journal has a line for each finished flight.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +13,23 @@ from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.flying import (
-    Course,
-    about_policy,
-    by_content,
+    Manner,
     default_policy,
-    flying_needs,
+    flying_estimate,
     load_in_manner,
-    log_name,
-    read_course,
-    refuse_one_name,
-    say_notes,
-    who_flies,
+    policy_for_workers,
+    policy_record,
+    without_paths,
     workers_for,
 )
-from suite.judging.requests import Collection, Manner
+from suite.judging.requests import Collection
+from suite.judging.trials import (
+    TrialSet,
+    log_name,
+    read_trial_set,
+    refuse_equal_names,
+    show_notes,
+)
 from tracks.common.files import write_json
 from tracks.common.provenance import git_commit, stamp
 from tracks.common.work import Workers
@@ -48,8 +54,8 @@ def collect(
 
     Returns:
         The contents of flights.json: the stamp, the settings, and the flights as rows of results
-        with their `file` (null for a flight without a log: it is shorter than one second, or its
-        values break a rule of flight logs, with a warning).
+        with their `file`. The file is null for a flight without a log, which is shorter than one
+        second or breaks a rule of flight logs; the latter gives a warning.
 
     Raises:
         ValueError: if a setting of `collection` cannot be used, or `out` holds the flights of
@@ -58,26 +64,28 @@ def collect(
     from eval.judging.judge import check_records
     from eval.judging.results import Journal
 
-    course, manner = read_course(collection), Manner(speed=collection.speed)
+    trial_set, manner = read_trial_set(collection), Manner(speed=collection.speed)
     check_records(collection.simulator)
-    refuse_one_name({trial.track for trial in course.trials})
-    given = collection.policy or default_policy()
-    policy = load_in_manner(given, collection.trust, manner)
+    refuse_equal_names({trial.track for trial in trial_set.trials})
+    source = collection.policy or default_policy()
+    policy = load_in_manner(source, collection.trust, manner)
     out = Path(out)
     refuse_other_run(out, collection)
-    about = {
+    settings = {
         "collection": collection,
-        "policy": about_policy(given, policy),
-        "vehicle": course.vehicle,
-        "tracks": course.tracks,
+        "policy": policy_record(source, policy),
+        "vehicle": trial_set.vehicle,
+        "tracks": trial_set.tracks,
         "git_commit": git_commit(),
     }
-    identity = by_content(about)
-    rows = _rows_there(out, identity)
+    identity = without_paths(settings)
+    rows = _existing_rows(out, identity)
     with Journal(out / JOURNAL, identity) as journal:
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
-        _fly_missing(collection, course, policy, out, rows, journal, console, workers)
-        found = _write_list(out, about, course, rows)
+        _fly_missing(collection, trial_set, policy, out, rows, journal, console, workers)
+        flights = [rows[trial] for trial in trial_set.trials]
+        listing = {**stamp(1, collection.seed), **settings, "flights": flights}
+        write_json(out / LIST, listing)
     (out / JOURNAL).unlink()
     write_run_record(out, collection, collection.seed)
     logs = [row for row in rows.values() if row["file"]]
@@ -88,7 +96,7 @@ def collect(
         console.say(
             f"{len(rows) - len(logs)} without a log, {short} of them under {DURATION_MIN:g} s"
         )
-    return {**found, "out": str(out)}
+    return {**listing, "out": str(out)}
 
 
 Row = dict[str, Any]
@@ -97,7 +105,7 @@ Row = dict[str, Any]
 
 def _fly_missing(
     collection: Collection,
-    course: Course,
+    trial_set: TrialSet,
     policy: Policy,
     out: Path,
     rows: dict[TrialSpec, Row],
@@ -109,15 +117,15 @@ def _fly_missing(
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.worlds.trial import Rules
 
-    missing = [trial for trial in course.trials if trial not in rows]
+    missing = [trial for trial in trial_set.trials if trial not in rows]
     workers = workers_for(len(missing), workers, collection.simulator)
-    what = f"{len(missing)} flights in {collection.simulator}"
-    announce(console, what, flying_needs(len(missing), workers, collection.simulator))
-    say_notes(console, collection.simulator, course)
-    given, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
+    title = f"{len(missing)} flights in {collection.simulator}"
+    announce(console, title, flying_estimate(len(missing), workers, collection.simulator))
+    show_notes(console, collection.simulator, trial_set)
+    source, manner = collection.policy or default_policy(), Manner(speed=collection.speed)
     rules = Rules(time_limit_s=collection.time_limit_s)
-    options = JudgeOptions(workers=workers, rules=rules, sensors=course.sensors)
-    with console.progress("flights", len(course.trials)) as update:
+    options = JudgeOptions(workers=workers, rules=rules, sensors=trial_set.sensors)
+    with console.progress("flights", len(trial_set.trials)) as update:
 
         def keep(result: TrialResult, flight: Flight | None) -> None:
             name = None
@@ -129,25 +137,15 @@ def _fly_missing(
 
         if missing:
             fly(
-                who_flies(policy, given, collection.trust, workers, manner),
+                policy_for_workers(policy, source, collection.trust, workers, manner),
                 missing,
-                course.vehicle,
+                trial_set.vehicle,
                 collection.simulator,
                 options,
                 keep,
                 Record(depth=False),
-                course.tracks,
+                trial_set.tracks,
             )
-
-
-def _write_list(
-    out: Path, about: dict[str, Any], course: Course, rows: dict[TrialSpec, Row]
-) -> dict[str, Any]:
-    """Write the list of flights, in the order of the trials, and return it."""
-    flights = [rows[trial] for trial in course.trials]
-    found = {**stamp(1, about["collection"].seed), **about, "flights": flights}
-    write_json(out / LIST, found)
-    return found
 
 
 def _row(out: Path, result: TrialResult) -> Row | None:
@@ -174,26 +172,32 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
     return name
 
 
-def _rows_there(out: Path, about: dict[str, Any]) -> dict[TrialSpec, Row]:
-    """Return the rows of an earlier call; refuse those of another collection (`by_content`)."""
+def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
+    """Return the rows of an earlier call whose logs exist; refuse those of another collection.
+
+    `identity` are the settings of this call, without paths.
+    """
     from eval.worlds.trial import TrialSpec
 
     path = out / LIST
     if not path.is_file():
         return {}
     try:
-        found = read_json(path)
-        same = by_content({key: found[key] for key in about}) == about
+        listing = read_json(path)
+        is_same = without_paths({key: listing[key] for key in identity}) == identity
         rows = {
-            TrialSpec(row["track"], row["difficulty"], row["seed"]): row for row in found["flights"]
+            TrialSpec(row["track"], row["difficulty"], row["seed"]): row
+            for row in listing["flights"]
         }
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of flights ({error}); move it away") from error
-    if not same:
+    if not is_same:
         raise ValueError(
-            f"{path}: is of another collection or another version of the code; give another --out "
-            "or move it away"
+            f"{path}: was written by another collection or another version of the code; give "
+            "another --out or move it away"
         )
     return {
-        t: row for t, row in rows.items() if row["file"] is None or (out / row["file"]).is_file()
+        trial: row
+        for trial, row in rows.items()
+        if row["file"] is None or (out / row["file"]).is_file()
     }

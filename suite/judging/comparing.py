@@ -1,7 +1,8 @@
-"""Comparison of evaluations on the same trials; evaluations on different trials are refused.
+"""Compare the success rates of separate evaluations on the same trials (`suite compare`).
 
-`suite eval` with several policies flies all of them on the same trials. This module compares
-evaluations that were run separately, and several training seeds of one method.
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. Evaluations on
+different trials or under different conditions are refused. Several training seeds of one method
+are compared as a group.
 """
 
 from __future__ import annotations
@@ -64,25 +65,26 @@ def refuse_other_conditions(first: Run, other: Run) -> None:
         ValueError: naming what differs and what to do.
     """
     for key, value in first.conditions.items():
-        theirs = other.conditions.get(key)
-        if theirs != value:
-            what = "vehicle or tracks" if key == "files" else key
-            said = "" if key == "files" else f" ({value} and {theirs})"
+        other_value = other.conditions.get(key)
+        if other_value != value:
+            condition = f"{key} ({value} and {other_value})"
+            if key == "files":
+                condition = "vehicle or tracks"
             raise ValueError(
-                f"{first.name} and {other.name}: judged under another {what}{said}; run suite eval "
+                f"{first.name} and {other.name}: judged under another {condition}; run suite eval "
                 "again with the same options"
             )
-    only = first.rows.keys() ^ other.rows.keys()
-    if only:
-        trial = min(only)
+    unshared = first.rows.keys() ^ other.rows.keys()
+    if unshared:
+        trial = min(unshared)
         raise ValueError(
-            f"{first.name} and {other.name}: {len(only)} trials are in only one of them, such as "
-            f"{trial.track}, level {trial.difficulty}, seed {trial.seed}; run suite eval for both "
-            "with the same --track, --difficulty, --trials and --seed"
+            f"{first.name} and {other.name}: {len(unshared)} trials are in only one of them, such "
+            f"as {trial.track}, level {trial.difficulty}, seed {trial.seed}; run suite eval for "
+            "both with the same --track, --difficulty, --trials and --seed"
         )
 
 
-def paired(first: Run, other: Run) -> dict[str, Any]:
+def compare_runs(first: Run, other: Run) -> dict[str, Any]:
     """Return the difference of two runs on the same trials, as numbers and as a sentence.
 
     Raises:
@@ -90,36 +92,35 @@ def paired(first: Run, other: Run) -> dict[str, Any]:
     """
     refuse_other_conditions(first, other)
     trials = list(first.rows)
-    one, two = (np.array([run.rows[t].success for t in trials]) for run in (first, other))
-    found = paired_success(one, two)
+    a, b = (np.array([run.rows[t].success for t in trials]) for run in (first, other))
     return {
         "first": first.name,
         "second": other.name,
         "trials": len(trials),
-        "success": [float(one.mean()), float(two.mean())],
-        "difference": found,
-        "sentence": paired_sentence(first.name, other.name, one, two),
+        "success": [float(a.mean()), float(b.mean())],
+        "difference": paired_success(a, b),
+        "sentence": paired_sentence(first.name, other.name, a, b),
     }
 
 
-def paired_sentence(first: str, second: str, one: np.ndarray, two: np.ndarray) -> str:
-    """Return a sentence on the successes (n,) of two policies on the same trials."""
-    found = paired_success(one, two)
-    value, low, high = (100 * number for number in (found.value, found.low, found.high))
+def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> str:
+    """Return a sentence on the successes a and b, (n,) bool, of two policies on the same trials."""
+    difference = paired_success(a, b)
+    value, low, high = (100 * number for number in difference[:3])
     return (
-        f"{first} succeeded in {100 * one.mean():.1f} % and {second} in {100 * two.mean():.1f} % "
-        f"of the same {len(one)} trials: {first} minus {second} is {value:+.1f} percentage points "
+        f"{name_a} succeeded in {100 * a.mean():.1f} % and {name_b} in {100 * b.mean():.1f} % "
+        f"of the same {len(a)} trials: {name_a} minus {name_b} is {value:+.1f} percentage points "
         f"(paired, 95 % interval {low:+.1f} to {high:+.1f}, Newcombe 1998; exact McNemar test, "
-        f"p = {found.p_value:.2g})."
+        f"p = {difference.p_value:.2g})."
     )
 
 
-def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
+def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
     """Return mean, spread and interval of the success rate over training seeds and trials.
 
     Args:
         runs: the training seeds of a method, all judged on the same trials.
-        others: those of a second method; its rate is subtracted.
+        others: the training seeds of a second method, whose rate is subtracted; may be empty.
 
     Raises:
         ValueError: if conditions or trials differ, or a method has only one seed.
@@ -132,35 +133,39 @@ def seeds_of(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
         for group in (runs, others)
         if group
     ]
-    found, how = over_seeds(groups[0], groups[1] if others else None), "hierarchical bootstrap"
-    if found.low == found.high:  # Equal results give a bootstrap interval of no width.
-        one, *two = (group[0] > 0.5 for group in groups)
-        found, how = wilson(int(one.sum()), len(one)), "over trials only: Wilson"
-        if two:
-            found, how = Interval(*paired_success(one, two[0])[:3]), "over trials only: Newcombe"
+    interval = over_seeds(groups[0], groups[1] if others else None)
+    method = "hierarchical bootstrap"
+    if interval.low == interval.high:  # Equal results give a bootstrap interval of no width.
+        a, *b = (group[0] > 0.5 for group in groups)
+        interval, method = wilson(int(a.sum()), len(a)), "over trials only: Wilson"
+        if b:
+            interval = Interval(*paired_success(a, b[0])[:3])
+            method = "over trials only: Newcombe"
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
         "trials": len(trials),
         "success_by_seed": rates,
         "spread": [float(np.std(group, ddof=1)) for group in rates],
-        "mean": found,
-        "sentence": _seeds_sentence(found, rates, len(trials), how),
+        "mean": interval,
+        "sentence": _seeds_sentence(interval, rates, len(trials), method),
     }
 
 
 def _seeds_sentence(
-    found: Interval, rates: Sequence[Sequence[float]], trials: int, how: str
+    interval: Interval, rates: Sequence[Sequence[float]], trials: int, method: str
 ) -> str:
-    value, low, high = (100 * number for number in found)
+    """Return a sentence on the rates by training seed of one method, or of two."""
+    value, low, high = (100 * number for number in interval)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(
         f"{np.mean(group):.1%} (standard deviation over seeds {100 * np.std(group, ddof=1):.1f})"
         for group in rates
     )
-    what, sign = ("a difference of ", "+") if len(rates) > 1 else ("", "")
-    unit = "percentage points" if sign else "%"
+    prefix, sign, unit = "", "", "%"
+    if len(rates) > 1:
+        prefix, sign, unit = "a difference of ", "+", "percentage points"
     return (
         f"Over {count} training seeds and {trials} trials the success rate was {means}: "
-        f"{what}{value:{sign}.1f} {unit} (95 % interval over seeds and trials {low:{sign}.1f} to "
-        f"{high:{sign}.1f}, {how})."
+        f"{prefix}{value:{sign}.1f} {unit} (95 % interval over seeds and trials {low:{sign}.1f} to "
+        f"{high:{sign}.1f}, {method})."
     )

@@ -1,4 +1,4 @@
-"""A policy as the content of its files, for machines without these files."""
+"""The files that make up a policy: their SHA-256, and their content for other machines."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from policies import shipped
 from policies.policy import Policy, load_policy
 
 
-def flown_files(name_or_path: str | Path) -> dict[str, Path]:
+def policy_files(name_or_path: str | Path) -> dict[str, Path]:
     """Return the files that make up a policy, by their path within its folder.
 
-    Other files of the folder, such as its card, are no part of the policy.
+    Other files of the folder, such as its card, do not belong to the policy.
     """
     from policies.formats.checkpoint import CONFIG, WEIGHTS
 
@@ -31,23 +31,23 @@ def flown_files(name_or_path: str | Path) -> dict[str, Path]:
         from policies.formats.onnx_file import files_of
 
         # Links are resolved: external data are next to the file and not next to a link.
-        whole, *data = files_of(path)
-        home = whole.resolve().parent
-        return {path.name: whole, **{str(file.relative_to(home)): file for file in data}}
+        model, *data = files_of(path)
+        folder = model.resolve().parent
+        return {path.name: model, **{str(file.relative_to(folder)): file for file in data}}
     return {path.name: path}
 
 
 def policy_digest(name_or_path: str | Path) -> str:
     """Return the SHA-256 of the files that make up a policy, as hex."""
     digest = hashlib.sha256()
-    for file in flown_files(name_or_path).values():
+    for file in policy_files(name_or_path).values():
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class PolicyContent:
-    """A policy by content; a call returns the policy, which each process loads once."""
+    """The content of a policy's files; a call returns the policy, loaded once in each process."""
 
     name: str
     """Name of its folder, a possible label."""
@@ -63,8 +63,8 @@ class PolicyContent:
         """Return the content of a policy that can be loaded here."""
         path = shipped.locate(name_or_path).absolute()
         folder, file = (path, "") if path.is_dir() else (path.parent, path.name)
-        flown = flown_files(name_or_path).items()
-        files = tuple((name, entry.read_bytes()) for name, entry in flown)
+        contents = policy_files(name_or_path).items()
+        files = tuple((name, entry.read_bytes()) for name, entry in contents)
         return cls(folder.resolve().name, file, files, trust)
 
     def __call__(self) -> Policy:
@@ -79,10 +79,10 @@ class PolicyContent:
 @functools.lru_cache(maxsize=4)
 def _loaded(content: PolicyContent) -> Policy:
     """Return the policy; its files stay until the process ends, as some kinds read them again."""
-    kept = tempfile.mkdtemp(prefix="suite-policy-")
-    atexit.register(shutil.rmtree, kept, ignore_errors=True)
+    folder = tempfile.mkdtemp(prefix="suite-policy-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, data in content.files:
-        path = Path(kept, content.name, name)
+        path = Path(folder, content.name, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    return load_policy(Path(kept, content.name, content.file), content.trust)
+    return load_policy(Path(folder, content.name, content.file), content.trust)

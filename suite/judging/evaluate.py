@@ -1,4 +1,8 @@
-"""Judge policies: fly the trials, save each as it ends, write the tables."""
+"""Judge policies (`suite eval`): fly the trials in a simulator and write tables of the results.
+
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. Each result is
+saved in a journal as it ends, so an interrupted evaluation continues.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +14,19 @@ from suite.common.console import Console
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.stages import announce
 from suite.judging.flying import (
-    Course,
-    about_policy,
-    by_content,
+    Manner,
     default_policy,
-    flying_needs,
-    labels,
+    flying_estimate,
     load_in_manner,
-    read_course,
-    say_notes,
-    who_flies,
+    manners,
+    policy_for_workers,
+    policy_labels,
+    policy_record,
+    without_paths,
     workers_for,
 )
-from suite.judging.requests import Evaluation, Manner, manners
+from suite.judging.requests import Evaluation
+from suite.judging.trials import TrialSet, read_trial_set, show_notes
 from tracks.common.files import digest_of
 from tracks.common.grid import rich_table
 from tracks.common.provenance import stamp
@@ -39,15 +43,16 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """A policy that flies all trials in one manner."""
+    """A policy that flies all trials in one manner, a row of the tables."""
 
     source: str
-    """The given name or path."""
+    """Its name or path, as the user gave it."""
     policy: Policy
     """The loaded policy, in its manner."""
     label: str
     """Its label in tables."""
     manner: Manner
+    """Its commanded speed, and whether the safety monitor checks its actions."""
 
 
 def evaluate(
@@ -55,8 +60,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fly all trials and write trials.parquet, table.md, summary.json and run.json into `out`.
 
-    Each trial is saved in a journal as it ends: the same call after an interruption flies the
-    remaining ones, with any `workers`. The journals are removed when the tables are written.
+    The same call after an interruption flies the remaining trials, with any `workers`. The journals
+    are removed when the tables are written.
 
     Returns:
         The summary: `cells` and `paired` of `eval.judging.tables.summarise`, `over_plan` of
@@ -69,42 +74,42 @@ def evaluate(
     from eval.judging.results import write_results
     from eval.judging.tables import grids, markdown_table, summarise, with_interval
 
-    course, out = read_course(evaluation), Path(out)
+    trial_set, out = read_trial_set(evaluation), Path(out)
     refuse_other_run(out, evaluation)
-    given = tuple(evaluation.policies or (default_policy(),))
-    policies = [load_in_manner(name, evaluation.trust) for name in given]
-    plain = list(zip(given, policies, labels(given, [p.name for p in policies]), strict=True))
+    sources = tuple(evaluation.policies or (default_policy(),))
+    policies = [load_in_manner(source, evaluation.trust) for source in sources]
+    labels = policy_labels(sources, [policy.name for policy in policies])
     entries = [
-        Entry(name, manner(policy), manner.label(label), manner)
+        Entry(source, manner(policy), manner.label(label), manner)
         for manner in manners(evaluation.speed, evaluation.monitor)
-        for name, policy, label in plain
+        for source, policy, label in zip(sources, policies, labels, strict=True)
     ]
-    _refuse_twice([entry.label for entry in entries])
-    count = len(course.trials)
+    _refuse_equal_labels([entry.label for entry in entries])
+    count = len(trial_set.trials)
     workers = workers_for(count, workers, evaluation.simulator)
     if (out / "trials.parquet").is_file():
         console.note(f"{out} holds an evaluation; its results will be overwritten")
-    flown = count * len(entries)
-    needs = flying_needs(flown, workers, evaluation.simulator)
-    journals = _open_journals(evaluation, course, entries, out)
-    announce(console, f"{flown} trials in {evaluation.simulator}", needs)
-    say_notes(console, evaluation.simulator, course)
+    total = count * len(entries)
+    needs = flying_estimate(total, workers, evaluation.simulator)
+    journals = _open_journals(evaluation, trial_set, entries, out)
+    announce(console, f"{total} trials in {evaluation.simulator}", needs)
+    show_notes(console, evaluation.simulator, trial_set)
     for warning in dict.fromkeys(each for policy in policies for each in notes_of(policy)):
         console.note(str(warning))
     results: list[TrialResult] = []
     for entry, journal in zip(entries, journals, strict=True):
-        results += _fly_one(evaluation, course, entry, workers, journal, console)
-    over = _over_plan(results, course)
+        results += _fly_entry(evaluation, trial_set, entry, workers, journal, console)
+    laps = _laps_over_plan(results, trial_set)
     actions = {entry.label: _actions(entry, results, console) for entry in entries}
     summary = {
         **summarise(results),
-        "over_plan": over,
+        "over_plan": laps,
         "actions": actions,
         "sentences": _sentences(results),
         "judged": evaluation,
-        "policies": [about_policy(entry.source, entry.policy) for entry in entries],
-        "sha256": file_digests(course.vehicle, course.tracks, course.sensors),
-        "flown_otherwise": course.differences,
+        "policies": [policy_record(entry.source, entry.policy) for entry in entries],
+        "sha256": file_digests(trial_set.vehicle, trial_set.tracks, trial_set.sensors),
+        "flown_otherwise": trial_set.differences,
     }
     write_results(
         out,
@@ -114,20 +119,20 @@ def evaluate(
         seed=evaluation.seed,
     )
     write_run_record(out, evaluation, evaluation.seed)
-    kept = {journal.path for journal in journals if journal.others(course.trials)}
+    unfinished = {journal.path for journal in journals if journal.others(trial_set.trials)}
     for path in out.glob("journal-*.jsonl"):  # also journals of an earlier command
-        if path not in kept:
+        if path not in unfinished:
             path.unlink()
     for grid in grids(summary):
         console.show(rich_table(grid))
     for sentence in summary["sentences"]:
         console.say(sentence)
-    for one in (one for one in over if one.finished):
-        whose = f"{one.policy}: " if len(over) > 1 else ""
-        tracks = f"{one.finished} track{'s' * (one.finished != 1)}"
+    for lap in (lap for lap in laps if lap.finished):
+        prefix = f"{lap.policy}: " if len(laps) > 1 else ""
+        tracks = f"{lap.finished} track{'s' * (lap.finished != 1)}"
         console.say(
-            f"{whose}laps take {with_interval(one.ratio)} times a planned lap (median of {tracks}; "
-            "a plan knows the whole track)"
+            f"{prefix}laps take {with_interval(lap.ratio)} times a planned lap (median of "
+            f"{tracks}; a plan knows the whole track)"
         )
     console.say(f"written: {out / 'trials.parquet'}, table.md, summary.json")
     if not all(row.success for row in results if row.policy == results[0].policy):
@@ -135,14 +140,14 @@ def evaluate(
     return {**stamp(1, evaluation.seed), **summary, "out": str(out)}
 
 
-def _over_plan(results: Sequence[TrialResult], course: Course) -> list[OverPlan]:
-    """Return lap times over planned lap times, if the vehicle is the one of the plans."""
+def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list[OverPlan]:
+    """Return lap times over planned lap times; none if the plans are of another vehicle."""
     from eval.judging.plans import VEHICLE, over_plan
     from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 
-    if vehicle_table(course.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
+    if vehicle_table(trial_set.vehicle) != vehicle_table(load_vehicle(VEHICLE)):
         return []
-    return over_plan([row for row in results if row.track not in course.tracks])
+    return over_plan([row for row in results if row.track not in trial_set.tracks])
 
 
 def _sentences(results: Sequence[TrialResult]) -> list[str]:
@@ -151,13 +156,14 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
     from suite.judging.comparing import paired_sentence
 
-    flown: dict[str, dict[Any, bool]] = {}
+    successes: dict[str, dict[Any, bool]] = {}
     for row in results:
-        flown.setdefault(row.policy, {})[row.trial] = row.success
-    (first, one), *others = flown.items()
+        successes.setdefault(row.policy, {})[row.trial] = row.success
+    (first, reference), *others = successes.items()
+    expected = np.array(list(reference.values()))
     return [
-        paired_sentence(name, first, *(np.array([each[t] for t in one]) for each in (other, one)))
-        for name, other in others
+        paired_sentence(name, first, np.array([success[trial] for trial in reference]), expected)
+        for name, success in others
     ]
 
 
@@ -166,15 +172,15 @@ def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> 
     from eval.judging.outputs import action_report
 
     rows = [result for result in results if result.policy == entry.label]
-    found = action_report(rows, entry.policy.spec.action)
-    if found["decisions"]:
+    actions = action_report(rows, entry.policy.spec.action)
+    if actions["decisions"]:
         console.say(
-            f"{entry.label}: {found['limited']:.1%} of {found['decisions']} actions exceeded the "
-            "limits and were reduced"
+            f"{entry.label}: {actions['limited']:.1%} of {actions['decisions']} actions exceeded "
+            "the limits and were reduced"
         )
-    for warning in found["warnings"]:
+    for warning in actions["warnings"]:
         console.note(f"warning: {entry.label}: {warning}")
-    return found
+    return actions
 
 
 def file_digests(
@@ -182,22 +188,22 @@ def file_digests(
 ) -> dict[str, str]:
     """Return the SHA-256 of vehicle, sensors and tracks, by name.
 
-    It is that of the parsed content: comments in a file do not matter.
+    It is computed from the parsed content: comments in a file do not change it.
     """
     from eval.quadrotor.vehicle_file import vehicle_table
     from eval.sensors.sensors_file import sensors_table
 
-    parts: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
+    contents: dict[str, object] = {"vehicle": vehicle_table(vehicle)}
     if sensors.models:
-        parts["sensors"] = sensors_table(sensors)
-    parts |= {f"track {name}": track for name, track in tracks.items()}
-    return {what: digest_of(part) for what, part in parts.items()}
+        contents["sensors"] = sensors_table(sensors)
+    contents |= {f"track {name}": track for name, track in tracks.items()}
+    return {name: digest_of(content) for name, content in contents.items()}
 
 
-def _refuse_twice(called: list[str]) -> None:
+def _refuse_equal_labels(labels: list[str]) -> None:
     """Refuse two entries with one label, which tables would merge."""
-    for label in called:
-        if called.count(label) > 1:
+    for label in labels:
+        if labels.count(label) > 1:
             raise ValueError(
                 f"{label} would be judged twice; give each --policy and each --speed once "
                 "(speeds are compared to 6 digits)"
@@ -205,43 +211,44 @@ def _refuse_twice(called: list[str]) -> None:
 
 
 def _open_journals(
-    evaluation: Evaluation, course: Course, entries: Sequence[Entry], out: Path
+    evaluation: Evaluation, trial_set: TrialSet, entries: Sequence[Entry], out: Path
 ) -> list[Journal]:
     """Return the journal in `out` of each of `entries`.
 
     Raises:
-        ValueError: if an existing one is of other settings; none is made then.
+        ValueError: if an existing journal has other settings; then no file is made.
     """
     from eval.judging.results import Journal
 
     paths = [out / f"journal-{number}.jsonl" for number in range(len(entries))]
-    opened = {}
+    journals = {}
     pairs = zip(paths, entries, strict=True)
+    # Existing journals first: one of them may be refused.
     for path, entry in sorted(pairs, key=lambda pair: not pair[0].exists()):
-        about = {
+        settings = {
             **stamp(1, None),
-            "policy": about_policy(entry.source, entry.policy),
+            "policy": policy_record(entry.source, entry.policy),
             "speed": entry.manner.speed,
-            "vehicle": course.vehicle,
-            "sensors": course.sensors,
+            "vehicle": trial_set.vehicle,
+            "sensors": trial_set.sensors,
             "world": evaluation.simulator,
             "deadline_s": evaluation.deadline_s,
             "time_limit_s": evaluation.time_limit_s,
-            "tracks": course.tracks,
+            "tracks": trial_set.tracks,
         }
-        opened[path] = Journal(path, by_content(about))
-    return [opened[path] for path in paths]
+        journals[path] = Journal(path, without_paths(settings))
+    return [journals[path] for path in paths]
 
 
-def _fly_one(
+def _fly_entry(
     evaluation: Evaluation,
-    course: Course,
+    trial_set: TrialSet,
     entry: Entry,
     workers: Workers,
     journal: Journal,
     console: Console,
 ) -> list[TrialResult]:
-    """Return the results of one policy in the trials' order."""
+    """Fly the trials that the journal lacks; return all results in the trials' order."""
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, fly
     from eval.worlds.trial import Rules
@@ -251,18 +258,19 @@ def _fly_one(
         workers=workers,
         rules=Rules(time_limit_s=evaluation.time_limit_s),
         limits=ActionLimits(deadline_s=evaluation.deadline_s),
-        sensors=course.sensors,
+        sensors=trial_set.sensors,
     )
+    trials = trial_set.trials
     with journal:
-        missing = journal.missing(course.trials)
-        if len(missing) < len(course.trials):
-            console.note(f"{label}: {len(course.trials) - len(missing)} trials were flown before")
-        if others := journal.others(course.trials):
+        missing = journal.missing(trials)
+        if len(missing) < len(trials):
+            console.note(f"{label}: {len(trials) - len(missing)} trials were flown before")
+        if others := journal.others(trials):
             console.note(
-                f"{label}: {others} further trials were flown before and are not asked for now: "
-                f"the table is without them, {journal.path.name} keeps them"
+                f"{label}: {others} further trials were flown before, which this command does not "
+                f"request: the table is without them, {journal.path.name} keeps them"
             )
-        with console.progress(label, len(course.trials)) as update:
+        with console.progress(label, len(trials)) as update:
 
             def keep(result: TrialResult, flight: object) -> None:
                 journal.append(result._replace(policy=label))
@@ -271,13 +279,15 @@ def _fly_one(
                 update(done, f"{share:.0%} success")
 
             fly(
-                who_flies(entry.policy, entry.source, evaluation.trust, workers, entry.manner),
+                policy_for_workers(
+                    entry.policy, entry.source, evaluation.trust, workers, entry.manner
+                ),
                 missing,
-                course.vehicle,
+                trial_set.vehicle,
                 evaluation.simulator,
                 options,
                 keep,
-                tracks=course.tracks,
+                tracks=trial_set.tracks,
             )
         # An earlier run may have had other policies and another label.
-        return [journal.done[trial]._replace(policy=label) for trial in course.trials]
+        return [journal.done[trial]._replace(policy=label) for trial in trials]

@@ -1,4 +1,8 @@
-"""Fly judged trials again to show them: trials repeat to the bit, so no flight is stored."""
+"""Fly trials of an earlier evaluation again, to show them as a recording or video (`suite view`).
+
+A trial is one judged flight. It repeats to the bit, so an evaluation stores no flights: it is flown
+again with the same policy, vehicle and track, whose SHA-256 must be the same.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from suite.common.console import Console
 from suite.judging.content import policy_digest
 from suite.judging.evaluate import file_digests
-from suite.judging.flying import custom_tracks, default_policy, load_in_manner, trial_list
-from suite.judging.requests import Evaluation, manners, parse_levels, parse_tracks
+from suite.judging.flying import default_policy, load_in_manner, manners
+from suite.judging.requests import Evaluation
+from suite.judging.trials import custom_tracks, parse_levels, parse_tracks, trial_list
 from tracks.input.ranges import check_ranges, shown
 from tracks.input.reading import read_json
 
@@ -81,8 +86,8 @@ def read_digests(folder: Path) -> dict[str, str]:
         return {"policy": str(first), **dict(summary.get("sha256", {}))}
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{path}: does not say which policy was judged ({error}); give the command of suite "
-            "eval again with another --out, then view that"
+            f"{path}: does not say which policy was judged ({error}); run suite eval again with "
+            "another --out, then view that folder"
         ) from error
 
 
@@ -98,13 +103,13 @@ def fly_again(
     policy: str | None = None,
     judged: Mapping[str, str] | None = None,
 ) -> Replay:
-    """Fly `trials` as they were judged.
+    """Fly `trials` as they were judged, and return their flights.
 
     Args:
         evaluation: settings of the trials.
-        trials: to fly.
-        policy: one of the evaluation's; None: its first.
-        judged: expected digests, from `read_digests`; None compares nothing.
+        trials: the trials to fly.
+        policy: one of the evaluation's policies; None: the first.
+        judged: expected SHA-256 by input, from `read_digests`; None compares nothing.
 
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
@@ -124,7 +129,8 @@ def fly_again(
         sensors=sensors,
     )
     name = policy or (evaluation.policies or (default_policy(),))[0]
-    flown = load_in_manner(name, evaluation.trust, manners(evaluation.speed, monitor=False)[0])
+    manner = manners(evaluation.speed, monitor=False)[0]
+    loaded = load_in_manner(name, evaluation.trust, manner)
     vehicle = load_vehicle(evaluation.vehicle)
     tracks = custom_tracks(parse_tracks(evaluation.track))
     if judged is not None:
@@ -138,7 +144,7 @@ def fly_again(
             flights[result.trial] = flight
 
     results = fly(
-        flown,
+        loaded,
         trials,
         vehicle,
         evaluation.simulator,
@@ -152,7 +158,7 @@ def fly_again(
         for trial, result in zip(trials, results, strict=True)
     ]
     # Flights use the policy's camera, not that of the vehicle file.
-    camera = flown.spec.camera
+    camera = loaded.spec.camera
     return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
 
 
@@ -160,13 +166,13 @@ def _refuse_changed(
     sources: Mapping[str, str], digests: Mapping[str, str], judged: Mapping[str, str]
 ) -> None:
     """Refuse changed inputs, whose flights would differ."""
-    for what, digest in digests.items():
-        if judged.get(what, digest) != digest:
-            called = f"{what} {sources[what]}" if what in sources else what
+    for item, digest in digests.items():
+        if judged.get(item, digest) != digest:
+            label = f"{item} {sources[item]}" if item in sources else item
             raise ValueError(
-                f"{called}: has changed since these trials were judged, so they would be flown "
-                "otherwise; put back what was judged, or give the command of suite eval again with "
-                "another --out, then view that"
+                f"{label}: has changed since these trials were judged, so the flights would "
+                "differ; restore the judged version, or run suite eval again with another --out, "
+                "then view that folder"
             )
 
 

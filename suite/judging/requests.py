@@ -1,30 +1,21 @@
-"""The options of flights of `suite eval` and `suite collect`, and how they name tracks and levels.
+"""The options of the commands that fly a policy: `suite eval`, `suite collect` and `suite fly`.
 
-run.json records them. A `Manner` is a commanded speed, with the safety monitor or without.
+Each class is a command's request: which policy flies on which tracks, how often and in which
+simulator. run.json records it, and `trials.py` reads the tracks, levels and files that it names.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from policies.spec import PolicyError
 from suite.common.options import Advanced
 from tracks.input.ranges import Range, Seed, Trials
 
-if TYPE_CHECKING:
-    from policies.policy import Policy
-
 TimeLimit = Annotated[float, Range(0.0, 3600.0, above=True)]
 """Time limit of a trial [s], as in `eval.worlds.trial.Rules`."""
-
-LEVELS = tuple(range(10))
-"""The difficulty levels."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +33,14 @@ class Flights:
     vehicle: str = "reference"
     """A shipped vehicle's name or a vehicle file (.toml)."""
     time_limit_s: Advanced[TimeLimit] = 20.0
-    """A trial ends at this time [s]; a long course of your own needs more than the tables' 20."""
+    """A trial ends at this time [s]; a long track from a file may need more than the tables' 20."""
     trust: Advanced[bool] = False
     """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
 
 @dataclass(frozen=True)
 class SimulatedFlights(Flights):
-    """Flights in a simulator that can be chosen."""
+    """Flights with a choice of simulator and sensors."""
 
     simulator: str = "mujoco"
     """mujoco (fast on CPUs), mjx (for GPUs), reference (slow and simple), rotorpy (needs
@@ -92,101 +83,3 @@ class Collection(SimulatedFlights):
     """For a policy with a speed input: 0 (careful) to 1 (a race). Without it the policy's own."""
     seed: Seed = 100_000
     """Seed of the first trial; the default is far from the seeds of suite eval."""
-
-
-@dataclass(frozen=True)
-class Manner:
-    """Commanded speed and monitor; a call returns a policy that flies in this manner."""
-
-    monitored: bool = False
-    """Whether the safety monitor checks its actions."""
-    speed: float | None = None
-    """Commanded speed, 0 to 1 [1]; None: that of the policy's spec."""
-
-    def __call__(self, policy: Policy) -> Policy:
-        """Return `policy` flown in this manner.
-
-        Raises:
-            PolicyError: for a speed if the policy has no speed input.
-        """
-        if self.speed is not None:
-            policy = _at_speed(policy, self.speed)
-        if self.monitored:
-            from eval.judging.monitor import Monitored
-
-            policy = Monitored(policy)
-        return policy
-
-    def label(self, name: str) -> str:
-        """Return the label of the policy `name` in this manner."""
-        name += "" if self.speed is None else f"@{self.speed:g}"
-        return f"{name}+monitor" if self.monitored else name
-
-
-PLAIN = Manner()
-"""The policy's own speed, without monitor."""
-
-
-def manners(speeds: Sequence[float], monitor: bool) -> list[Manner]:
-    """Return all manners: each speed, then each speed with the monitor."""
-    plain = [Manner(speed=speed) for speed in speeds] or [Manner()]
-    return plain + [dataclasses.replace(manner, monitored=True) for manner in plain if monitor]
-
-
-def _at_speed(policy: Any, speed: float) -> Any:
-    if not policy.spec.speed_input:
-        raise PolicyError(
-            f"--speed {speed:g}: {policy.name} takes no speed as an input; leave --speed out, or "
-            "train a policy with --set spec.speed_input=True"
-        )
-    return dataclasses.replace(policy, spec=dataclasses.replace(policy.spec, speed=speed))
-
-
-def parse_levels(text: str) -> list[int]:
-    """Return the levels of "3", "0,3,9", "0-3", "0,5-9" or "all", in the order given.
-
-    Raises:
-        ValueError: for any other text, and for a level that is not 0 to 9.
-    """
-    if text.strip() == "all":
-        return list(LEVELS)
-    levels: list[int] = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", part)
-        if not match:
-            raise ValueError(
-                f"--difficulty {text!r}: {part!r} is no level; give 0 to 9, a list (0,3,9), "
-                "a range (0-3), or all"
-            )
-        first, last = int(match[1]), int(match[2] or match[1])
-        for level in (first, last):
-            if level not in LEVELS:
-                raise ValueError(f"--difficulty {text!r}: level {level} is not 0 to 9")
-        if last < first:
-            raise ValueError(f"--difficulty {text!r}: the range {part!r} runs backwards")
-        levels += range(first, last + 1)
-    return list(dict.fromkeys(levels))
-
-
-def parse_tracks(text: str) -> list[str]:
-    """Return the tracks of "all" (the judged families), a name, a file, or a list of them.
-
-    A name that ends in ``.toml`` is a track file; others are families.
-
-    Raises:
-        ValueError: for an unknown family, with the most similar one.
-    """
-    from tracks.families import JUDGED, check_family
-
-    if text.strip() == "all":
-        return list(JUDGED)
-    names = [part.strip() for part in text.split(",")]
-    for name in names:
-        if not is_track_file(name):
-            check_family(name)
-    return list(dict.fromkeys(names))
-
-
-def is_track_file(name: str) -> bool:
-    """Return whether `name` is a track file and not a family."""
-    return name.endswith(".toml")

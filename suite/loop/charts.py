@@ -1,4 +1,7 @@
-"""Charts of a loop as PNG: success and speed by cell, training curves, the Delta Action Model."""
+"""Draw the charts of a loop as PNG: success and speed, training curves, the Delta Action Model.
+
+A cell is the trials of one track at one level of difficulty.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,7 @@ from matplotlib.figure import Figure
 from eval.judging.statistics import Interval
 from suite.common.charts import curves_chart, dots, legend, png, titled
 from suite.delta.run import errors_by_name
-from suite.loop.compare import BEFORE, WITH, WITHOUT, Line
-from suite.loop.standings import Standing
+from suite.loop.compare import BEFORE, WITH, WITHOUT, CellComparison, PolicyResult
 
 COLOURS = {BEFORE: "#8b93a1", WITHOUT: "#e0892b", WITH: "#2463c9"}
 LABELS = {BEFORE: "before", WITHOUT: "tuned without delta", WITH: "tuned with delta"}
@@ -23,56 +25,57 @@ ONE_ROW_MOST = 8
 """Cells that have room for their names in two charts side by side."""
 
 
-def comparison_chart(lines: Sequence[Line]) -> bytes:
+def comparison_chart(rows: Sequence[CellComparison]) -> bytes:
     """Return success rates and mean speeds of the three policies by track and level."""
-    one_row = len(lines) <= ONE_ROW_MOST
-    figure = Figure(figsize=(10.4, 3.9 if one_row else 6.6), layout="constrained")
-    panels = figure.subplots(1, 2) if one_row else figure.subplots(2, 1)
-    cells = [line.track if line.difficulty is None else f"{line.track}\nlevel {line.difficulty}"
-             for line in lines]  # fmt: skip
+    side_by_side = len(rows) <= ONE_ROW_MOST
+    figure = Figure(figsize=(10.4, 3.9 if side_by_side else 6.6), layout="constrained")
+    panels = figure.subplots(1, 2) if side_by_side else figure.subplots(2, 1)
+    cells = [row.track if row.difficulty is None else f"{row.track}\nlevel {row.difficulty}"
+             for row in rows]  # fmt: skip
     titles = {"success": "Success [%]", "v_mean": "Mean speed, median over trials [m/s]"}
     for axes, (field, title) in zip(panels, titles.items(), strict=True):
         policies = [
-            (LABELS[variant], colour, [getattr(line, field)[number] for line in lines])
+            (LABELS[variant], colour, [getattr(row, field)[number] for row in rows])
             for number, (variant, colour) in enumerate(COLOURS.items())
         ]
-        _panel(axes, title, cells, policies, apart=0.2, ms=5.5, lw=1.8)
+        _draw_panel(axes, title, cells, policies, spacing=0.2, ms=5.5, lw=1.8)
     legend(figure, panels[0])
     return png(figure)
 
 
-def success_chart(stand: Sequence[Standing], labels: Mapping[str, str]) -> bytes:
+def success_chart(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> bytes:
     """Return the success rates of any policies by track and level, and over all."""
     figure = Figure(figsize=(10.4, 4.2), layout="constrained")
-    cells = [cell.replace(" ", "\nlevel ") for cell in (*stand[0].by_cell, "all")]
+    cells = [cell.replace(" ", "\nlevel ") for cell in (*results[0].by_cell, "all")]
     policies = [
-        (labels[one.name], colour, [*one.by_cell.values(), one.success])
-        for one, colour in zip(stand, SEVERAL, strict=False)
+        (labels[result.name], colour, [*result.by_cell.values(), result.success])
+        for result, colour in zip(results, SEVERAL, strict=False)
     ]
     axes = figure.subplots()
-    _panel(axes, "Success [%]", cells, policies, apart=0.13, ms=5, lw=1.6)
+    _draw_panel(axes, "Success [%]", cells, policies, spacing=0.13, ms=5, lw=1.6)
     legend(figure, axes)
     return png(figure)
 
 
-def _panel(
+def _draw_panel(
     axes: Axes,
     title: str,
     cells: Sequence[str],
     policies: Sequence[tuple[str, str, Sequence[Interval]]],
     *,
-    apart: float,
+    spacing: float,
     ms: float,
     lw: float,
 ) -> None:
     """Draw each policy (label, colour, intervals by cell); the last cell is that of all trials.
 
-    Dots of neighbouring policies are `apart` of a cell's width from each other.
+    `spacing` is the distance between the dots of neighbouring policies, in widths of a cell; `ms`
+    and `lw` are matplotlib's sizes of dots and lines.
     """
     percent = title.endswith("[%]")
     for number, (label, colour, intervals) in enumerate(policies):
-        at = np.arange(len(cells)) + apart * (number - 0.5 * (len(policies) - 1))
-        dots(axes, at, intervals, 100 if percent else 1, color=colour, label=label, ms=ms, lw=lw)
+        x = np.arange(len(cells)) + spacing * (number - 0.5 * (len(policies) - 1))
+        dots(axes, x, intervals, 100 if percent else 1, color=colour, label=label, ms=ms, lw=lw)
     titled(axes, title)
     axes.set_xticks(range(len(cells)), cells, fontsize=8)
     if len(cells) > 1:
@@ -81,27 +84,30 @@ def _panel(
 
 
 def training_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
-    """Return a training's curve and those of the fine-tunings after it, rows by variant."""
+    """Return the curves of a training and of the fine-tunings after it; `curves` are by variant."""
     labels = {**LABELS, BEFORE: "training"}
     named = {labels[name]: rows for name, rows in curves.items()}
     return curves_chart(named, tuple(COLOURS.values()), follow=True)
 
 
 def delta_chart(fitted: Mapping[str, Any]) -> bytes:
-    """Return the Delta Action Model's error over its fit next to its rivals' (from delta.json)."""
+    """Return the error of the Delta Action Model over its fit, and of simpler models, as lines.
+
+    `fitted` are the contents of delta.json.
+    """
     figure = Figure(figsize=(7.2, 3.4), layout="constrained")
     axes = figure.subplots()
-    at = [row["iteration"] for row in fitted["curve"]]
+    iterations = [row["iteration"] for row in fitted["curve"]]
     for key, label, style in (
         ("held_out_m", "with Delta Action Model, held-out flights", "-"),
         ("fit_m", "with Delta Action Model, fitted flights", ":"),
     ):
         errors = [row[key] for row in fitted["curve"]]
-        axes.plot(at, errors, style, color=COLOURS[WITH], lw=1.8, label=label)
-    *rivals, _ = errors_by_name(fitted).items()
-    for (name, error), role in zip(rivals, (BEFORE, WITHOUT), strict=False):
+        axes.plot(iterations, errors, style, color=COLOURS[WITH], lw=1.8, label=label)
+    *simpler, _ = errors_by_name(fitted).items()
+    for (name, error), variant in zip(simpler, (BEFORE, WITHOUT), strict=False):
         label = f"{name}, held-out flights"
-        axes.axhline(error["position_m"], color=COLOURS[role], lw=1.8, label=label)
+        axes.axhline(error["position_m"], color=COLOURS[variant], lw=1.8, label=label)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("iteration of the fit", fontsize=9)
     titled(axes, f"Position error after {fitted['horizon_s']:g} s [m]")

@@ -1,7 +1,10 @@
-"""Three policies on the same trials: before, fine-tuned without and with Delta Action Model.
+"""Compare policies that a loop judged on the same trials: rates, speeds and their differences.
 
-Fine-tuning without the model has the same number of gradient steps and is the control: the effect
-of the model is `with` minus `without`.
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed; the trials of one
+track and level are a cell. `compare` has a row per cell, for the three policies of the loop with a
+Delta Action Model: before, fine-tuned without the model, and fine-tuned with it. Fine-tuning
+without the model has the same number of gradient steps and is the control. `policy_results` has a
+row per policy, for any number of them.
 """
 
 from __future__ import annotations
@@ -15,7 +18,6 @@ import numpy as np
 
 from eval.judging.statistics import (
     Interval,
-    PairedDifference,
     bootstrap_mean,
     bootstrap_median,
     paired_bootstrap,
@@ -23,18 +25,12 @@ from eval.judging.statistics import (
     wilson,
 )
 from eval.worlds.trial import TrialResult, TrialSpec
-from tracks.common.grid import Cell, Grid, table
 
 BEFORE, WITHOUT, WITH = "before", "without", "with"
 VARIANTS = (BEFORE, WITHOUT, WITH)
-"""The compared policies, in the order of the tables."""
+"""The policies that `compare` compares, in the order of the tables."""
 OVERALL = "all"
-"""Name of the line over all cells, in place of a track."""
-CAVEAT = (
-    "Intervals are 95 % over trials, for these three policies: another training seed gives other "
-    "policies. The cells' intervals are not corrected for there being several."
-)
-"""Note below the tables on the intervals."""
+"""Name of the row over all cells, in place of a track."""
 
 
 class Measure(NamedTuple):
@@ -44,19 +40,21 @@ class Measure(NamedTuple):
     without: Interval
     """Fine-tuned without the Delta Action Model, with the same number of gradient steps."""
     with_delta: Interval
+    """Fine-tuned with the Delta Action Model."""
     with_minus_without: Interval
-    """On the same trials, trial by trial."""
+    """Paired by trial."""
     with_minus_before: Interval
+    """Paired by trial."""
 
 
-class Line(NamedTuple):
+class CellComparison(NamedTuple):
     """Results of the trials on one track at one level, or of all trials."""
 
     track: str
     difficulty: int | None
     """None over all cells."""
     trials: int
-    """Of each policy."""
+    """Number of trials of each policy."""
     success: Measure
     """Rates, Wilson; differences by Newcombe's paired interval."""
     p_value: float
@@ -69,8 +67,35 @@ class Line(NamedTuple):
     """As v_mean [m/s]."""
 
 
-def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[Line]:
-    """Return a line for every track and level, and one for all trials at the end.
+class Difference(NamedTuple):
+    """One policy's success minus another's on the same trials."""
+
+    against: str
+    """The other's name."""
+    success: Interval
+    """Newcombe's paired interval."""
+    p_value: float
+    """Exact McNemar test, two-sided."""
+
+
+class PolicyResult(NamedTuple):
+    """The results of one policy."""
+
+    name: str
+    success: Interval
+    """Rate, Wilson."""
+    by_cell: dict[str, Interval]
+    """The same on every track and level, as "zigzag 3"."""
+    gates: Interval
+    """Mean number of gates passed, bootstrap."""
+    v_mean: Interval
+    """Median over trials [m/s], bootstrap."""
+    differences: list[Difference]
+    """Against each other reference."""
+
+
+def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[CellComparison]:
+    """Return a row for every track and level, and one for all trials at the end.
 
     Args:
         results: of each of `VARIANTS`, on the same trials in the same order.
@@ -79,12 +104,52 @@ def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[Line]:
         ValueError: if the trials differ.
     """
     trials = same_trials({name: results[name] for name in VARIANTS})
-    lines = []
-    for track, level in dict.fromkeys(trial[:2] for trial in trials):
-        chosen = [k for k, trial in enumerate(trials) if trial[:2] == (track, level)]
-        rows = {name: [results[name][k] for k in chosen] for name in VARIANTS}
-        lines.append(_line(track, level, rows))
-    return [*lines, _line(OVERALL, None, results)]
+    rows = []
+    for (track, level), indices in _cells(trials).items():
+        in_cell = {name: [results[name][k] for k in indices] for name in VARIANTS}
+        rows.append(_compare_cell(track, level, in_cell))
+    return [*rows, _compare_cell(OVERALL, None, results)]
+
+
+def policy_results(
+    results: Mapping[str, Sequence[TrialResult]], references: Sequence[str]
+) -> list[PolicyResult]:
+    """Return the results of every policy, in the order of `results`.
+
+    Args:
+        results: by policy, of the same trials in the same order.
+        references: policies that the others are compared with.
+
+    Raises:
+        ValueError: if the trials differ.
+    """
+    cells = _cells(same_trials(results))
+    successes = {name: np.array([row.success for row in rows]) for name, rows in results.items()}
+    summaries = []
+    for name, rows in results.items():
+        seed, success = zlib.crc32(name.encode()), successes[name]
+        pairs = {
+            reference: paired_success(success, successes[reference])
+            for reference in references
+            if reference != name
+        }
+        summaries.append(
+            PolicyResult(
+                name=name,
+                success=success_rate(success),
+                by_cell={
+                    f"{track} {level}": success_rate(success[indices])
+                    for (track, level), indices in cells.items()
+                },
+                gates=bootstrap_mean(np.array([row.gates_passed for row in rows]), seed),
+                v_mean=bootstrap_median(np.array([row.v_mean for row in rows]), seed),
+                differences=[
+                    Difference(reference, Interval(*pair[:3]), pair.p_value)
+                    for reference, pair in pairs.items()
+                ],
+            )
+        )
+    return summaries
 
 
 def same_trials(results: Mapping[str, Sequence[TrialResult]]) -> list[TrialSpec]:
@@ -101,110 +166,54 @@ def same_trials(results: Mapping[str, Sequence[TrialResult]]) -> list[TrialSpec]
     return trials
 
 
-def rate(won: np.ndarray) -> Interval:
+def success_rate(success: np.ndarray) -> Interval:
     """Return the share of true values with Wilson's interval."""
-    return wilson(int(won.sum()), len(won))
+    return wilson(int(success.sum()), len(success))
 
 
-def _line(track: str, level: int | None, rows: Mapping[str, Sequence[TrialResult]]) -> Line:
+def _cells(trials: Sequence[TrialSpec]) -> dict[tuple[str, int], list[int]]:
+    """Return the indices of the trials on each track and level."""
+    cells: dict[tuple[str, int], list[int]] = {}
+    for index, trial in enumerate(trials):
+        cells.setdefault((trial.track, trial.difficulty), []).append(index)
+    return cells
+
+
+def _compare_cell(
+    track: str, level: int | None, rows: Mapping[str, Sequence[TrialResult]]
+) -> CellComparison:
+    """Return the comparison of the three policies on the trials of `rows`."""
     seed = zlib.crc32(repr((track, level)).encode())
     mean, median = partial(bootstrap_mean, seed=seed), partial(bootstrap_median, seed=seed)
+    median_difference = partial(paired_bootstrap, seed=seed)
 
     def columns(field: str) -> list[np.ndarray]:
         return [np.array([getattr(row, field) for row in rows[name]]) for name in VARIANTS]
 
     def measure(
         field: str,
-        alone: Callable[[np.ndarray], Interval],
-        apart: Callable[[np.ndarray, np.ndarray], Interval],
+        interval: Callable[[np.ndarray], Interval],
+        difference: Callable[[np.ndarray, np.ndarray], Interval],
     ) -> Measure:
         before, without, with_delta = columns(field)
         return Measure(
-            before=alone(before),
-            without=alone(without),
-            with_delta=alone(with_delta),
-            with_minus_without=apart(with_delta, without),
-            with_minus_before=apart(with_delta, before),
+            before=interval(before),
+            without=interval(without),
+            with_delta=interval(with_delta),
+            with_minus_without=difference(with_delta, without),
+            with_minus_before=difference(with_delta, before),
         )
 
-    medians_apart = partial(paired_bootstrap, seed=seed)
     _, without, with_delta = columns("success")
-    return Line(
+    return CellComparison(
         track,
         level,
         trials=len(rows[BEFORE]),
-        success=measure("success", rate, lambda *pair: Interval(*paired_success(*pair)[:3])),
+        success=measure(
+            "success", success_rate, lambda *pair: Interval(*paired_success(*pair)[:3])
+        ),
         p_value=paired_success(with_delta, without).p_value,
-        gates=measure("gates_passed", mean, lambda one, two: mean(one - two)),
-        v_mean=measure("v_mean", median, medians_apart),
-        v_max=measure("v_max", median, medians_apart),
-    )
-
-
-def grids(lines: Sequence[Line]) -> list[Grid]:
-    """Return the comparison as tables: success, gates, mean speed, largest speed."""
-    return [
-        _grid("Success, all gates without a collision [%]", lines, "success", 100, 0),
-        _grid("Gates passed, mean", lines, "gates", 1, 2),
-        _grid("Mean speed of a trial, median [m/s]", lines, "v_mean", 1, 2),
-        _grid("Largest speed of a trial, median [m/s]", lines, "v_max", 1, 2),
-    ]
-
-
-def _grid(title: str, lines: Sequence[Line], field: str, scale: float, digits: int) -> Grid:
-    test = field == "success"
-    headers = ["track", "level", "trials", "before", "tuned without delta", "tuned with delta"]
-    headers += ["with - without", *(["p (McNemar)"] if test else []), "with - before"]
-    rows = []
-    for line in lines:
-        measure: Measure = getattr(line, field)
-        level = "all" if line.difficulty is None else str(line.difficulty)
-        to_control, to_before = (difference_cell(d, scale, digits) for d in measure[3:])
-        alone = [value_text(interval, scale, digits) for interval in measure[:3]]
-        p_value = [f"{line.p_value:.2g}"] if test else []
-        rows.append([line.track, level, str(line.trials), *alone, to_control, *p_value, to_before])
-    return table(headers, rows, title, strong_last=True)
-
-
-def value_text(interval: Interval, scale: float, digits: int) -> str:
-    """Return a number with its interval for a table."""
-    value, low, high = (f"{scale * x:.{digits}f}" for x in interval)
-    return f"{value} [{low}, {high}]"
-
-
-def difference_cell(
-    interval: Interval | PairedDifference, scale: float = 100, digits: int = 0
-) -> Cell:
-    """Return a difference with its interval and sign, coloured if it excludes zero.
-
-    By default it is one of rates, in percentage points.
-    """
-    # Adding zero turns a rounded -0 into +0.
-    value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
-    tone = "good" if interval.low > 0 else "bad" if interval.high < 0 else ""
-    return Cell(f"{value} [{low}, {high}]", tone)
-
-
-def significance(difference: Interval) -> str:
-    """Return a text on whether one policy succeeds significantly more often than another."""
-    if difference.low > 0:
-        return "more than"
-    return "fewer than" if difference.high < 0 else "not significantly different from"
-
-
-def points(difference: Interval) -> str:
-    """Return a difference of success rates with its interval, in percentage points."""
-    value, interval = difference_cell(difference).text.split(" ", 1)
-    return f"{value} points {interval}"
-
-
-def verdict(overall: Line) -> str:
-    """Return a sentence on the effect of fine-tuning under the Delta Action Model."""
-    success = overall.success
-    return (
-        f"Fine-tuned with the Delta Action Model, {100 * success.with_delta.value:.0f} % of "
-        f"{overall.trials} trials succeed: {significance(success.with_minus_without)} the same "
-        f"fine-tuning without it ({100 * success.without.value:.0f} %; "
-        f"difference {points(success.with_minus_without)}); before, "
-        f"{100 * success.before.value:.0f} %."
+        gates=measure("gates_passed", mean, lambda a, b: mean(a - b)),
+        v_mean=measure("v_mean", median, median_difference),
+        v_max=measure("v_max", median, median_difference),
     )

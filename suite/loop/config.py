@@ -1,4 +1,9 @@
-"""The configuration of a loop, resolved from a recipe and options."""
+"""The settings of a loop, resolved from a recipe (a named training) and the command's options.
+
+A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
+judges both. The true vehicle is the one that flies; with a hidden vehicle it differs from the
+simulation's vehicle file.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +14,25 @@ from typing import Annotated
 
 from policies import shipped
 from suite.delta.fit import FitConfig
-from suite.judging.requests import is_track_file, parse_levels, parse_tracks
+from suite.judging.trials import is_track_file, parse_levels, parse_tracks
 from suite.train.config import TrainConfig, check
-from suite.train.overrides import changed, check_owned, check_phases, override, phase_configs
+from suite.train.overrides import check_owned, check_phases, override, phase_configs, with_changes
 from suite.train.recipes import (
     RECIPES,
     at_rate,
     finetune,
     named_recipe,
-    widened,
     with_iterations,
     with_quadrotor,
+    with_usual_spreads,
 )
 from tracks.common.files import digest_of
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
 RECORDED_FROM = 100_000
 """Difference of the seeds of recorded flights and judged trials, which keeps them separate."""
-OWN = ("mujoco", "mjx")
-"""Simulators that fly a vehicle exactly as its file describes."""
+EXACT_SIMULATORS = ("mujoco", "mjx")
+"""Simulators that fly a vehicle exactly as its file describes; the first is the default."""
 LOOP_SEEDS = Range(0, SEED_MOST - 10 * RECORDED_FROM)
 """Range of a loop's seed; those of fine-tunings and recorded flights are larger."""
 
@@ -63,9 +68,9 @@ class LoopConfig:
     policy: str | None
     """The policy to start from: a shipped name or a checkpoint's folder; None trains one."""
     track: str
-    """As in `suite.judging.requests.parse_tracks`, families only."""
+    """As in `suite.judging.trials.parse_tracks`, families only."""
     difficulty: str
-    """As in `suite.judging.requests.parse_levels`."""
+    """As in `suite.judging.trials.parse_levels`."""
     trials: Trials
     """Judged trials of each policy on every track at every level."""
     flights: Trials
@@ -97,7 +102,7 @@ class LoopConfig:
     @property
     def true_simulator(self) -> str:
         """The simulator of the true vehicle."""
-        return OWN[0]
+        return EXACT_SIMULATORS[0]
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,7 @@ class HiddenLoopConfig(LoopConfig):
 
     hidden_vehicle: str
     """The true vehicle's file; the loop uses only its flights."""
-    simulator: str = OWN[0]
+    simulator: str = EXACT_SIMULATORS[0]
     """The simulator in which it flies."""
     delta: bool = True
     """Whether Delta Action Models are fitted as well, and policies fine-tuned under them."""
@@ -137,20 +142,20 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
     policy's name has priority over a folder of that name, and a file over a shipped vehicle's name.
     """
 
-    def vehicle(given: str) -> str:
-        return "a file" if Path(given).is_file() else given
+    def without_path(name_or_path: str) -> str:
+        return "a file" if Path(name_or_path).is_file() else name_or_path
 
     policy = config.policy
     if policy is not None and policy not in shipped.names():
         policy = "a file"
-    vehicle_file, sensors = vehicle(config.vehicle), vehicle(config.sensors)
-    config = replace(config, policy=policy, vehicle=vehicle_file, sensors=sensors)
+    vehicle, sensors = without_path(config.vehicle), without_path(config.sensors)
+    config = replace(config, policy=policy, vehicle=vehicle, sensors=sensors)
     if isinstance(config, HiddenLoopConfig):
-        return replace(config, hidden_vehicle=vehicle(config.hidden_vehicle))
+        return replace(config, hidden_vehicle=without_path(config.hidden_vehicle))
     return config
 
 
-def recipe_of(policy: str | None) -> str:
+def default_recipe(policy: str | None) -> str:
     """Return the recipe for fine-tuning a policy: that of a shipped policy, else `race`."""
     return policy if policy in RECIPES else "race"
 
@@ -159,7 +164,7 @@ def resolve(
     *,
     recipe: str | None = None,
     hidden_vehicle: str | None = None,
-    simulator: str = OWN[0],
+    simulator: str = EXACT_SIMULATORS[0],
     sensors: str = "perfect",
     policy: str | None = None,
     track: str = "all",
@@ -190,10 +195,10 @@ def resolve(
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
-    hidden = hidden_vehicle is not None or simulator != OWN[0]
+    hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
     if hidden and policy is None:
         policy = default_policy()
-    recipe = recipe_of(policy) if recipe is None else recipe
+    recipe = default_recipe(policy) if recipe is None else recipe
     training = replace(named_recipe(recipe), seed=seed)
     sizes = HIDDEN_SIZES if hidden else SIZES
     size = sizes.get(recipe, sizes[""])
@@ -207,7 +212,7 @@ def resolve(
     _check_changes(changes, policy, iterations)
     if not delta and not hidden:
         raise ValueError(
-            "--no-delta: without --hidden-vehicle the loop is about the Delta Action Model; leave "
+            "--no-delta: without --hidden-vehicle the loop needs the Delta Action Model; leave "
             "--no-delta out, or give a hidden vehicle"
         )
     if not delta and fit_iterations is not None:
@@ -216,38 +221,38 @@ def resolve(
             "fitted; leave one of the two out"
         )
     if not hidden and policy is None:
-        training = changed(training, changes)
+        training = with_changes(training, changes)
         check_phases(training)
     true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
         check_simulator(simulator)
         true = load_vehicle(true_vehicle)
-        if simulated == replace(true, name=simulated.name) and simulator in OWN:
+        if simulated == replace(true, name=simulated.name) and simulator in EXACT_SIMULATORS:
             raise ValueError(
                 f"--hidden-vehicle {true_vehicle} is the simulation's vehicle {vehicle}: nothing "
-                "is hidden; give a vehicle file with an effect more, such as examples/hidden.toml, "
-                "or another simulator, such as --simulator rotorpy"
+                "is hidden; give a vehicle file with one more effect, such as "
+                "examples/hidden.toml, or another simulator, such as --simulator rotorpy"
             )
         digests["hidden_vehicle"] = digest_of(true)
     if policy is not None:
-        given = load_policy_checkpoint(checkpoint_folder(policy))
+        spec = load_policy_checkpoint(checkpoint_folder(policy)).spec
         last = phase_configs(training)[-1]
-        training = replace(at_rate(last, given.spec.rate_hz), spec=given.spec)
+        training = replace(at_rate(last, spec.rate_hz), spec=spec)
         digests["policy"] = policy_digest(policy)
     tuning = finetune(training)
-    longer = size.finetune_iterations if finetune_iterations is None else finetune_iterations
-    if longer is not None:
-        tuning = with_iterations(tuning, longer)
+    steps = size.finetune_iterations if finetune_iterations is None else finetune_iterations
+    if steps is not None:
+        tuning = with_iterations(tuning, steps)
     if hidden:
-        tuning = widened(with_quadrotor(tuning, simulated))
+        tuning = with_usual_spreads(with_quadrotor(tuning, simulated))
     if policy is not None:
         tuning = override(tuning, changes)
-    fitted = size.fit_iterations if fit_iterations is None else fit_iterations
+    fit_steps = size.fit_iterations if fit_iterations is None else fit_iterations
     check(tuning)
     config = LoopConfig(
         tuning=tuning,
-        fit=FitConfig(iterations=fitted, seed=seed),
+        fit=FitConfig(iterations=fit_steps, seed=seed),
         policy=policy,
         track=track,
         difficulty=difficulty,
@@ -278,12 +283,12 @@ def _check_changes(changes: Sequence[str], policy: str | None, iterations: int |
         owned["optimizer.iterations"] = "give --iterations"
     else:
         owned["optimizer.iterations"] = "give --finetune-iterations"
-        owned["spec"] = "a policy keeps the one that it was trained with"
+        owned["spec"] = "a policy keeps the spec that it was trained with"
         if iterations is not None:
             raise ValueError(
                 f"--iterations is {iterations}, but with --policy, --hidden-vehicle or "
-                "--simulator nothing is trained from scratch; say how long to fine-tune with "
-                "--finetune-iterations"
+                "--simulator nothing is trained from scratch; give --finetune-iterations, the "
+                "number of fine-tuning steps"
             )
     check_owned(changes, owned)
 
@@ -302,7 +307,7 @@ def check_simulator(name: str) -> None:
 
 
 def _check_seeds(config: LoopConfig) -> None:
-    """Check that recorded flights and judged trials differ.
+    """Refuse options with which recorded flights and judged trials would be the same, or too few.
 
     Raises:
         ValueError: with the option and what is allowed.
@@ -310,8 +315,8 @@ def _check_seeds(config: LoopConfig) -> None:
     files = [name for name in parse_tracks(config.track) if is_track_file(name)]
     if files:
         raise ValueError(
-            f"--track {files[0]}: a track from a file is the same at every seed, so flights on it "
-            "cannot be held apart from trials; give families (zigzag, circular, ellipse)"
+            f"--track {files[0]}: a track from a file is the same at every seed, so recorded "
+            "flights and judged trials would be the same; give families (zigzag, circular, ellipse)"
         )
     if config.flights * config.cells < 2:
         raise ValueError(

@@ -1,6 +1,8 @@
-"""The loop that shows the effect of the Delta Action Model: fine-tuning with it and without.
+"""The loop that shows the effect of a Delta Action Model: a policy is fine-tuned with and without.
 
-The control is fine-tuned for as many steps, so that the effect of more training alone is visible.
+The model is a network that corrects actions so that simulated flights match measured ones. The
+control is fine-tuned without it for the same number of steps, which shows the effect of more
+training.
 """
 
 from __future__ import annotations
@@ -13,28 +15,32 @@ from eval.worlds.trial import TrialResult
 from suite.common import curve
 from suite.common.report import Picture, Section
 from suite.delta.run import errors_by_name
-from suite.judging.requests import parse_tracks
+from suite.judging.trials import parse_tracks
 from suite.loop.charts import comparison_chart, delta_chart, training_chart
-from suite.loop.compare import BEFORE, CAVEAT, WITH, WITHOUT, compare, grids, verdict
+from suite.loop.compare import BEFORE, WITH, WITHOUT, compare
 from suite.loop.config import DeltaLoopConfig, LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
+from suite.loop.tables import CAVEAT, comparison_grids, verdict
+from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from tracks.common.grid import table
 
 JUDGED = "judging the one fine-tuned {} the Delta Action Model, on the same seeds"
+"""Description of the judging of a fine-tuned policy."""
 
 
-def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]) -> Findings:
+def summarise(
+    config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
+) -> Findings:
     """Return the results of the finished loop in `out`."""
     assert isinstance(config, DeltaLoopConfig)
-    lines = compare(results)
+    comparison = compare(results)
     fitted = json.loads((out / "delta" / "delta.json").read_text(encoding="utf-8"))
     return Findings(
-        verdict=verdict(lines[-1]),
-        tables=grids(lines),
+        verdict=verdict(comparison[-1]),
+        tables=comparison_grids(comparison),
         errors=[(out / "delta" / "table.md").read_text(encoding="utf-8")],
         numbers={
-            "comparison": lines,
+            "comparison": comparison,
             "delta": {key: value for key, value in fitted.items() if key != "curve"},
         },
         facts={
@@ -42,12 +48,13 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
             "levels": config.difficulty,
             "vehicle": config.vehicle,
         },
-        chart=Picture(comparison_chart(lines), "Bars: 95 % intervals over trials."),
-        sections=[_delta(fitted), _training(out, config)],
+        chart=Picture(comparison_chart(comparison), "Bars: 95 % intervals over trials."),
+        sections=[_delta_section(fitted), _training_section(out, config)],
     )
 
 
-def _delta(fitted: Mapping) -> Section:
+def _delta_section(fitted: Mapping) -> Section:
+    """Return the section with the model's errors on held-out flights, from delta.json."""
     errors = errors_by_name(fitted)
     base_m = next(iter(errors.values()))["position_m"]
     rows = [errors_row(name, error, base_m) for name, error in errors.items()]
@@ -57,26 +64,27 @@ def _delta(fitted: Mapping) -> Section:
         "Delta Action Model on held-out flights",
         [
             f"Recorded actions are flown again in the {corrected} for {horizon:g} s. "
-            f"{held} flights ({windows['held_out']} windows) took no part in any fit; "
-            f"{windows['fit']} windows of the others did.",
+            f"{held} flights ({windows['held_out']} windows) are held out: no fit used them. "
+            f"The fit used {windows['fit']} windows of the other flights.",
             table(["", "position error [m]", "velocity error [m/s]", "of the first"], rows),
             Picture(delta_chart(fitted), f"Mean distance from the record after {horizon:g} s."),
         ],
     )
 
 
-def _training(out: Path, config: DeltaLoopConfig) -> Section:
+def _training_section(out: Path, config: DeltaLoopConfig) -> Section:
+    """Return the section with the curves of the training and the fine-tunings."""
     folders = {BEFORE: "train", WITHOUT: "tuned-without", WITH: "tuned-with"}
     chart = training_chart({name: curve.read(out / folder) for name, folder in folders.items()})
     first = f"{config.training.optimizer.iterations} iterations of training, then "
     if config.policy:
         first = f"From {config.policy}: "
-    words = (
+    text = (
         f"{first}{config.tuning.optimizer.iterations} of fine-tuning, without and with the frozen "
-        "Delta Action Model. The curves are of the dynamics each was trained in, on random tracks, "
-        "so the two fine-tunings' levels are not comparable: with the model it is another vehicle."
+        "Delta Action Model. Each policy was trained in other dynamics, on random tracks, so the "
+        "levels of the two fine-tunings are not comparable."
     )
-    return Section("Training", [words, Picture(chart, "Thin: each iteration. Thick: means.")])
+    return Section("Training", [text, Picture(chart, "Thin: each iteration. Thick: means.")])
 
 
 LOOP = Loop(
@@ -89,21 +97,22 @@ LOOP = Loop(
     ),
     models=(DeltaModel("delta", "fitting the Delta Action Model to the flights"),),
     shown=(
-        Shown(BEFORE, "before", "Flights before fine-tuning"),
-        Shown(WITH, "tuned with delta", "Flights, fine-tuned with delta"),
+        ShownPolicy(BEFORE, "before", "Flights before fine-tuning"),
+        ShownPolicy(WITH, "tuned with delta", "Flights, fine-tuned with delta"),
     ),
-    find=find,
+    summarise=summarise,
     reading="All three policies fly the same trials in the MuJoCo quadrotor, without the Delta "
-    "Action Model. Tuned without delta is the control: as many iterations on the same tracks, in "
-    "the uncorrected dynamics. Coloured differences are those whose interval does not hold zero.",
+    "Action Model (delta). The policy tuned without delta is the control: it has the same number "
+    "of iterations on the same tracks, in the uncorrected dynamics. A difference is coloured if "
+    "its interval excludes zero.",
     caveat=CAVEAT,
-    advice="where the policy crashes within a second or two, train it for longer (--iterations), "
+    advice="if the policy crashes within a second or two, train it for longer (--iterations), "
     "or record more flights (--flights), with another --out",
     files=(
         ("table.md", "the tables on this page"),
         ("loop.json", "the same as numbers, with the configuration"),
         ("recording.rrd", "trials before and after, for rerun"),
-        ("eval-before/trials.parquet", "a row a trial, before"),
+        ("eval-before/trials.parquet", "a row per trial, before"),
         ("eval-without/trials.parquet", "tuned without delta"),
         ("eval-with/trials.parquet", "tuned with delta"),
         ("flights/flights.json", "the recorded flights"),

@@ -1,7 +1,8 @@
-"""The loop with an effect that the simulation lacks: it is diagnosed, and trained for.
+"""The loop with a hidden vehicle: its effect is diagnosed, and policies are fine-tuned for it.
 
-Only the judge reads the hidden vehicle's file. The simulation is corrected from measured flights
-alone.
+The hidden vehicle has a physical effect (such as drag) that the simulation's vehicle file lacks.
+Only the judge, the simulator that scores policies, reads the hidden vehicle's file. The simulation
+is corrected from measured flights only.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from suite.common.charts import curves_chart
 from suite.common.report import Links, Picture, Section
 from suite.diagnose.report.summary import components, grid
 from suite.loop.charts import SEVERAL, success_chart
-from suite.loop.compare import BEFORE, points, significance
-from suite.loop.config import OWN, HiddenLoopConfig, LoopConfig
+from suite.loop.compare import BEFORE, PolicyResult, policy_results
+from suite.loop.config import EXACT_SIMULATORS, HiddenLoopConfig, LoopConfig
 from suite.loop.report import errors_row
-from suite.loop.standings import Standing, cell_grid, overall_grid, standings
-from suite.loop.variants import DeltaModel, Findings, Loop, Shown, Variant
+from suite.loop.tables import cell_grid, overall_grid, points, significance
+from suite.loop.variants import DeltaModel, Findings, Loop, ShownPolicy, Variant
 from suite.loop.work import named_effects, read_diagnosis
 from tracks.common.files import to_json
 from tracks.common.grid import table
@@ -46,24 +47,27 @@ REFERENCES = (BEFORE, CONTROL, NOMINAL)
 MODELS = {CONTROL: "simulation's", NAMED: "corrected"}
 """Variants with a Delta Action Model in delta-NAME/, and the quadrotor that it corrects."""
 JUDGED = "judging the one fine-tuned {}, on the same seeds"
+"""Description of the judging of a fine-tuned policy."""
 
 
-def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]) -> Findings:
+def summarise(
+    config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResult]]
+) -> Findings:
     """Return the results of the finished loop in `out`."""
     assert isinstance(config, HiddenLoopConfig)
     diagnosis, trials = read_diagnosis(out), config.trials * config.cells
-    stand = standings(results, REFERENCES)
-    kept = ("verdict", "effects", "gap", "unexplained")
+    policies = policy_results(results, REFERENCES)
+    keys = ("verdict", "effects", "gap", "unexplained")
     return Findings(
-        verdict=verdict(stand, diagnosis, trials, place(config)),
-        tables=[overall_grid(stand, REFERENCES, LABELS, trials), cell_grid(stand, LABELS)],
+        verdict=verdict(policies, diagnosis, trials, vehicle_phrase(config)),
+        tables=[overall_grid(policies, REFERENCES, LABELS, trials), cell_grid(policies, LABELS)],
         errors=[
-            f"Delta Action Model of the {whose} quadrotor\n\n"
+            f"Delta Action Model of the {quadrotor} quadrotor\n\n"
             + (out / f"delta-{name}" / "table.md").read_text(encoding="utf-8")
-            for name, whose in MODELS.items()
+            for name, quadrotor in MODELS.items()
             if config.delta
         ],
-        numbers={"standings": stand, "diagnosis": {key: diagnosis[key] for key in kept}},
+        numbers={"standings": policies, "diagnosis": {key: diagnosis[key] for key in keys}},
         facts={
             "tracks": config.track,
             "levels": config.difficulty,
@@ -71,47 +75,43 @@ def find(config: LoopConfig, out: Path, results: Mapping[str, Sequence[TrialResu
             "hidden vehicle": config.hidden_vehicle,
             "flown in": config.simulator,
         },
-        chart=Picture(success_chart(stand, LABELS), "Bars: 95 % intervals over trials."),
+        chart=Picture(success_chart(policies, LABELS), "Bars: 95 % intervals over trials."),
         sections=[
-            _diagnosis(config, diagnosis),
-            *([_delta(out)] if config.delta else []),
-            _training(out, config),
+            _diagnosis_section(config, diagnosis),
+            *([_delta_section(out)] if config.delta else []),
+            _training_section(out, config),
         ],
     )
 
 
-def place(config: HiddenLoopConfig) -> str:
+def vehicle_phrase(config: HiddenLoopConfig) -> str:
     """Return the name of the hidden vehicle in sentences."""
-    return "the hidden vehicle" if config.simulator in OWN else f"the simulator {config.simulator}"
+    if config.simulator in EXACT_SIMULATORS:
+        return "the hidden vehicle"
+    return f"the simulator {config.simulator}"
 
 
 def verdict(
-    stand: Sequence[Standing],
+    policies: Sequence[PolicyResult],
     diagnosis: Mapping[str, Any],
     trials: int,
-    where: str = "the hidden vehicle",
+    vehicle: str = "the hidden vehicle",
 ) -> str:
-    """Return the loop's result in a few sentences; `where` names the judged vehicle."""
-    by_name = {one.name: one for one in stand}
-    apart = {other.against: other.success for other in by_name[NAMED].differences}
+    """Return the loop's result in a few sentences; `vehicle` names the judged vehicle."""
+    by_name = {policy.name: policy for policy in policies}
+    differences = {other.against: other.success for other in by_name[NAMED].differences}
 
     def percent(name: str) -> str:
         return f"{100 * by_name[name].success.value:.0f} %"
 
-    lost = apart[NOMINAL]
-    back = (
-        "above"
-        if lost.low > 0
-        else "below"
-        if lost.high < 0
-        else "not significantly different from"
-    )
+    to_control, to_nominal = differences[CONTROL], differences[NOMINAL]
     text = (
-        f"With {where} {percent(BEFORE)} of {trials} trials succeed, with the simulation's "
+        f"With {vehicle} {percent(BEFORE)} of {trials} trials succeed, with the simulation's "
         f"vehicle {percent(NOMINAL)}. The diagnosis names {named_effects(diagnosis)}. Fine-tuned "
-        f"with it, {percent(NAMED)} succeed there: {significance(apart[CONTROL])} the "
-        f"same fine-tuning without it ({percent(CONTROL)}; difference {points(apart[CONTROL])}), "
-        f"and {back} the policy where nothing is hidden (difference {points(lost)})."
+        f"with it, {percent(NAMED)} succeed there: {significance(to_control)} the "
+        f"same fine-tuning without it ({percent(CONTROL)}; difference {points(to_control)}), "
+        f"and {significance(to_nominal, 'above', 'below')} the policy where nothing is hidden "
+        f"(difference {points(to_nominal)})."
     )
     if DELTA not in by_name:
         return text
@@ -121,82 +121,93 @@ def verdict(
     )
 
 
-def _diagnosis(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
+def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
+    """Return the section with the verdict, the named effects and the true differences."""
     gap = diagnosis["gap"]
     rows = [
-        (effect["name"], ", ".join(effect["alternatives"]), one.label, *one.texts())
+        (effect["name"], ", ".join(effect["alternatives"]), component.label, *component.texts())
         for effect in diagnosis["effects"]
-        for one in components(effect)
+        for component in components(effect)
     ]
     headers = ["effect", "or", "parameter", "value", "95 %"]
     return Section(
         "What the diagnosis found in the flights",
         [
-            f"Verdict: {diagnosis['verdict']}. Held-out gap {gap['before']:.2f} before, "
-            f"{gap['after']:.2f} after; {gap['noise_floor']:.2g} is the noise floor.",
+            f"Verdict: {diagnosis['verdict']}. The gap (rollout error over the error of noise "
+            f"alone) on held-out flights is {gap['before']:.2f} before, {gap['after']:.2f} after; "
+            f"{gap['noise_floor']:.2g} is the noise floor.",
             grid("", headers, rows),
-            *what_is_hidden(config),
+            *describe_hidden(config),
             Links([("diagnosis/report.html", "the diagnosis's own report")]),
         ],
     )
 
 
-def what_is_hidden(config: HiddenLoopConfig) -> list[str]:
+def describe_hidden(config: HiddenLoopConfig) -> list[str]:
     """Return sentences on the differences of the hidden vehicle to the simulation's."""
     simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
-    more = hidden_effects(simulated, true)
-    hidden = [f"What the hidden vehicle's file holds and the simulation's does not: {more}."]
+    effects = hidden_effects(simulated, true)
+    sentences = [f"Differences of the hidden vehicle's file to the simulation's: {effects}."]
     if simulated == true:
-        hidden = ["The hidden vehicle's file is the simulation's."]
-    if config.simulator not in OWN:
-        otherwise = "; ".join(differences(config.simulator, true)) or "nothing"
-        hidden.append(f"What {config.simulator} flies otherwise than the file says: {otherwise}.")
-    return hidden
+        sentences = ["The hidden vehicle's file is that of the simulation."]
+    if config.simulator not in EXACT_SIMULATORS:
+        listed = "; ".join(differences(config.simulator, true)) or "none"
+        sentences.append(f"Differences of {config.simulator} to the vehicle file: {listed}.")
+    return sentences
 
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
     """Return the effects of `true` that `simulated` lacks or has with other values, as text."""
-    parts = []
+    texts = []
     for name, value in true.effects.items():
         if simulated.effects.get(name) != value:
-            held = (
+            values = (
                 f"{parameter.name} {to_json(getattr(value, parameter.name))} {parameter.unit}"
                 for parameter in EFFECTS[name].parameters
             )
-            parts.append(f"{name} ({', '.join(held)})")
-    parts += [f"no {name}" for name in simulated.effects if name not in true.effects]
+            texts.append(f"{name} ({', '.join(values)})")
+    texts += [f"no {name}" for name in simulated.effects if name not in true.effects]
     if replace(true, name=simulated.name, effects=simulated.effects) != simulated:
-        parts.append("other nominal values")
-    return "; ".join(parts)
+        texts.append("other nominal values")
+    return "; ".join(texts)
 
 
-def _delta(out: Path) -> Section:
+def _delta_section(out: Path) -> Section:
+    """Return the section with the errors of the Delta Action Models."""
     rows = []
-    for variant, whose in MODELS.items():
+    for variant, vehicle in MODELS.items():
         text = (out / f"delta-{variant}" / "delta.json").read_text(encoding="utf-8")
         fitted = json.loads(text)
-        rows.append(errors_row(f"{whose} vehicle", fitted["without"]))
-        rows.append(errors_row(f"{whose} vehicle with delta", fitted["delta_action"]))
+        rows.append(errors_row(f"{vehicle} vehicle", fitted["without"]))
+        rows.append(errors_row(f"{vehicle} vehicle with delta", fitted["delta_action"]))
     headers = ["held-out flights, after 1 s", "position error [m]", "velocity error [m/s]"]
-    words = (
-        "Recorded actions are flown again through the differentiable quadrotor; the flights are "
-        "as measured, so the noise of the start is in every row. The diagnosis, which corrected "
-        "the vehicle, has seen some of these flights; no Delta Action Model has."
+    text = (
+        "Recorded actions are flown again through the differentiable quadrotor. The flights have "
+        "measurement noise, so the noise of the start is in every row. The diagnosis, which "
+        "corrected the vehicle, used some of these flights; no fit of a Delta Action Model did."
     )
-    return Section("Delta Action Models on held-out flights", [words, table(headers, rows)])
+    return Section("Delta Action Models on held-out flights", [text, table(headers, rows)])
 
 
-def _training(out: Path, config: LoopConfig) -> Section:
+def _training_section(out: Path, config: LoopConfig) -> Section:
+    """Return the section with the curves of the fine-tunings."""
     assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}
     chart = curves_chart(curves, SEVERAL[2:])
-    words = (
-        f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each curve "
-        "is of the vehicle that it was trained in, so their levels are not comparable."
+    text = (
+        f"{config.tuning.optimizer.iterations} iterations each, from {config.policy}. Each policy "
+        "was trained with another vehicle, so the levels of the curves are not comparable."
     )
-    return Section("Fine-tuning", [words, Picture(chart, "Thin: each step. Thick: means.")])
+    return Section("Fine-tuning", [text, Picture(chart, "Thin: each step. Thick: means.")])
 
+
+READING = (
+    "The first policy flies the simulation's vehicle and the hidden vehicle. The others are "
+    "fine-tuned from it, for the same number of iterations on the same random tracks, and fly the "
+    "hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
+)
+"""Beginning of the explanation of the tables."""
 
 LOOP = Loop(
     title="A hidden effect, named and trained for",
@@ -232,26 +243,23 @@ LOOP = Loop(
     models=tuple(
         DeltaModel(
             f"delta-{name}",
-            f"fitting the Delta Action Model of the {whose} quadrotor",
+            f"fitting the Delta Action Model of the {quadrotor} quadrotor",
             diagnosed=name == NAMED,
         )
-        for name, whose in MODELS.items()
+        for name, quadrotor in MODELS.items()
     ),
     shown=(
-        Shown(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
-        Shown(
+        ShownPolicy(BEFORE, "before fine-tuning", "Flights before fine-tuning"),
+        ShownPolicy(
             NAMED, "fine-tuned with the named effect", "Flights fine-tuned with the named effect"
         ),
     ),
-    find=find,
-    reading="The first policy flies in the simulation's vehicle and with the hidden vehicle; the "
-    "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
-    "the hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
-    "quadrotor as it is, the others through it with its Delta Action Model, through the quadrotor "
-    "corrected by the named effect, and through that with a Delta Action Model of what it still "
-    "lacks. The judge flies the policies alone.",
+    summarise=summarise,
+    reading=f"{READING}quadrotor; the others through it with its Delta Action Model, through the "
+    "quadrotor corrected by the named effect, and through the latter with a Delta Action Model of "
+    "its remaining error. The judge flies the policies without a Delta Action Model.",
     caveat="Intervals are 95 % over trials, for these policies: another seed of the fine-tuning "
-    "gives other policies. Differences are taken trial by trial.",
+    "gives other policies. Differences are paired by trial.",
     advice="record more (--flights), with another --out",
     files=(
         ("table.md", "the tables on this page"),
@@ -260,7 +268,7 @@ LOOP = Loop(
         ("diagnosis/vehicle.toml", "the corrected vehicle file"),
         ("recording.rrd", "trials before and after, for rerun"),
         ("flights/flights.json", "the recorded flights"),
-        ("measured/measured.json", "the same as measured"),
+        ("measured/measured.json", "the same flights with measurement noise"),
         ("tuned-named/policy/config.json", "the policy tuned with the named effect"),
     ),
 )
@@ -269,9 +277,7 @@ WITHOUT_DELTA = replace(
     LOOP,
     variants=[variant for variant in LOOP.variants if variant.delta is None],
     models=(),
-    reading="The first policy flies in the simulation's vehicle and with the hidden vehicle; the "
-    "others are fine-tuned from it, for as many iterations on the same random tracks, and fly in "
-    "the hidden vehicle on the same trials. The control is fine-tuned through the simulation's "
-    "quadrotor as it is, the other through the quadrotor corrected by the named effect.",
+    reading=f"{READING}quadrotor, the other policy through the quadrotor corrected by the named "
+    "effect.",
 )
 """The loop without Delta Action Models, which takes half the time."""

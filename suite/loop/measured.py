@@ -1,7 +1,7 @@
-"""Recorded flights with the noise of a state estimator, cut before the first contact.
+"""Add measurement noise to a loop's recorded flights, and cut each before its first contact.
 
-The simulation's record is exact. With noise the diagnosis cannot use a precision that real logs do
-not have.
+The simulation's record is exact. The noise of a state estimator prevents the diagnosis from using a
+precision that real logs do not have.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ CONTACT_MARGIN_S = 0.1
 """Time that is cut off the end of an unfinished flight [s]."""
 SHORTEST_S = 1.5
 """Shorter flights are left out [s]."""
+LEAST_FILES = 5
+"""Smallest number of flights for a diagnosis, which are its independent units."""
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,18 @@ class Noise:
     """Standard deviations of white noise."""
 
     pos: float = 0.005
-    """Each axis [m]."""
+    """Of the position, each axis [m]."""
     attitude: float = 0.004
-    """About each body axis [rad]."""
+    """Of the rotation about each body axis [rad]."""
     vel: float = 0.03
-    """Each axis [m/s]."""
+    """Of the velocity, each axis [m/s]."""
     gyro: float = 0.02
-    """Each axis [rad/s]."""
+    """Of the body rates, each axis [rad/s]."""
     rotor: float = 5.0
-    """Each rotor [rad/s]."""
+    """Of the speed of each rotor [rad/s]."""
 
 
-def measure(flights: Path, out: Path, seed: int) -> list[Path]:
+def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
     """Write the flights of `suite collect` in `flights` with measurement noise into `out`.
 
     Returns:
@@ -57,8 +59,8 @@ def measure(flights: Path, out: Path, seed: int) -> list[Path]:
         if row["file"] is None:
             continue
         log = read_flights([flights / row["file"]])[0][0]
-        finished = row["ended_by"] in ("finished", "timeout")
-        log = noisy(cut_end(log, 0.0 if finished else CONTACT_MARGIN_S), Noise(), rng)
+        has_contact = row["ended_by"] not in ("finished", "timeout")
+        log = noisy(cut_end(log, CONTACT_MARGIN_S if has_contact else 0.0), Noise(), rng)
         if log.duration_s < SHORTEST_S:
             continue
         write_flight(out / row["file"], log)
@@ -73,17 +75,13 @@ def measure(flights: Path, out: Path, seed: int) -> list[Path]:
 
 def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
     """Return a log without its last `margin_s` [s]."""
-    return _rows(log, log.time_s <= log.time_s[-1] - margin_s)
-
-
-def _rows(log: FlightLog, kept: np.ndarray) -> FlightLog:
-    count = len(log.time_s)
+    selected, count = log.time_s <= log.time_s[-1] - margin_s, len(log.time_s)
     arrays = {
-        name: value[kept]
+        name: value[selected]
         for name, value in vars(log).items()
         if isinstance(value, np.ndarray) and len(value) == count
     }
-    extra = {name: value[kept] for name, value in log.extra.items()}
+    extra = {name: value[selected] for name, value in log.extra.items()}
     return replace(log, **arrays, extra=extra)
 
 
@@ -105,14 +103,14 @@ def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
     )
 
 
-def enough(files: Sequence[Path], duration_s: float) -> list[Path]:
-    """Return the first of `files` with `duration_s` of flight in total, at least five."""
+def first_files(files: Sequence[Path], duration_s: float) -> list[Path]:
+    """Return the first of `files` with `duration_s` of flight in total, at least `LEAST_FILES`."""
     logs, _ = read_flights(list(files))
-    length = {Path(log.name).name: log.duration_s for log in logs}
-    chosen, total = [], 0.0
+    durations_s = {Path(log.name).name: log.duration_s for log in logs}
+    selected, total_s = [], 0.0
     for file in files:
-        if total >= duration_s and len(chosen) >= 5:
+        if total_s >= duration_s and len(selected) >= LEAST_FILES:
             break
-        chosen.append(file)
-        total += length.get(file.name, 0.0)
-    return chosen
+        selected.append(file)
+        total_s += durations_s.get(file.name, 0.0)
+    return selected

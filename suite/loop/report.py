@@ -1,4 +1,4 @@
-"""The report of a loop: its findings, its flights, its files and its configuration."""
+"""Write the HTML report of a loop: its findings, pictures of flights, files and configuration."""
 
 from __future__ import annotations
 
@@ -15,67 +15,73 @@ from tracks.common.provenance import VERSION, git_commit
 
 
 def write_loop_report(
-    out: Path, loop: Loop, config: LoopConfig, found: Findings, seconds: Mapping[str, float]
+    out: Path, loop: Loop, config: LoopConfig, findings: Findings, seconds: Mapping[str, float]
 ) -> None:
-    """Write report.html of the finished loop in `out`; `seconds` are the times of the stages."""
+    """Write report.html of the finished loop in `out`; `seconds` are the stages' times."""
     report = Report(
         title=loop.title,
-        lead=found.verdict,
+        lead=findings.verdict,
         facts={
             "trials": f"{config.trials * config.cells} of each policy",
-            **found.facts,
+            **findings.facts,
             "started from": config.policy or "training",
             "seed": str(config.seed),
             "version": f"{VERSION}, {(git_commit() or 'no commit')[:10]}",
         },
         sections=[
-            Section("On the same seeds", [loop.reading, found.chart, *found.tables, loop.caveat]),
-            *found.sections,
-            *_flights(out, loop),
-            _run(out, loop, config, seconds),
+            Section(
+                "On the same seeds", [loop.reading, findings.chart, *findings.tables, loop.caveat]
+            ),
+            *findings.sections,
+            *_flight_sections(out, loop),
+            _files_section(out, loop, config, seconds),
         ],
     )
     write_report(out / "report.html", report)
 
 
-def _flights(out: Path, loop: Loop) -> list[Section]:
-    where = ", with the hidden vehicle" if loop.hidden else ""
-    words = (
+def _flight_sections(out: Path, loop: Loop) -> list[Section]:
+    """Return a section with the picture of each shown policy's flights."""
+    vehicle = ", with the hidden vehicle" if loop.hidden else ""
+    texts = (
         "The first seed of every track at the easiest and the hardest level, from above"
-        f"{where}. Gates that were passed are green; a star is a finished trial, a cross where it "
-        "ended.",
+        f"{vehicle}. Passed gates are green; a star is the end of a finished trial, a cross that "
+        "of any other.",
         "The same trials.",
     )
     return [
         Section(
-            one.heading,
-            [text, Picture((out / "replays" / f"{one.variant}.png").read_bytes(), "")],
+            shown.heading,
+            [text, Picture((out / "replays" / f"{shown.variant}.png").read_bytes(), "")],
         )
-        for one, text in zip(loop.shown, words, strict=True)
+        for shown, text in zip(loop.shown, texts, strict=True)
     ]
 
 
-def _run(out: Path, loop: Loop, config: LoopConfig, seconds: Mapping[str, float]) -> Section:
-    links = [(path, words) for path, words in loop.files if (out / path).is_file()]
-    took = {**seconds, "all": sum(seconds.values())}
-    times = [(name, duration(value)) for name, value in took.items()]
+def _files_section(
+    out: Path, loop: Loop, config: LoopConfig, seconds: Mapping[str, float]
+) -> Section:
+    """Return the section with links to existing files, times of the stages and the settings."""
+    links = [(path, text) for path, text in loop.files if (out / path).is_file()]
+    times_s = {**seconds, "all": sum(seconds.values())}
+    rows = [(name, duration(value)) for name, value in times_s.items()]
     return Section(
         "Files and configuration",
         [
             Links(links),
-            table(["stage", "took"], times, "Time", strong_last=True),
+            table(["stage", "took"], rows, "Time", strong_last=True),
             Details("Configuration", to_json(config, indent=2)),
         ],
     )
 
 
 def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = None) -> list[str]:
-    """Return a row of a Delta Action Model's errors on held-out flights.
+    """Return a table's row with a Delta Action Model's errors on held-out flights.
 
     Args:
         name: of the model.
-        errors: `position_m` and `velocity_m_s`.
-        base_m: position error to which a share is printed, if any.
+        errors: `position_m` [m] and `velocity_m_s` [m/s].
+        base_m: position error of which a share is printed [m]; None prints no share.
     """
     texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
     if base_m is not None:

@@ -1,6 +1,8 @@
-"""Run a loop stage by stage, each in its own folder, and report the result.
+"""Run a loop stage by stage, each in its own folder, and report the result (`suite loop`).
 
-An interrupted stage continues where it stopped; a finished one is not repeated.
+A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
+compares the policies. An interrupted stage continues where it stopped; a finished one is not
+repeated.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import Any
 
 from eval.judging.results import read_trials
 from suite.common.console import Console
-from suite.common.stages import claim, do_stages
+from suite.common.stages import claim, run_stages
 from suite.loop import delta_action, hidden_effect
 from suite.loop.config import HiddenLoopConfig, LoopConfig, loop_by_content
 from suite.loop.report import write_loop_report
@@ -22,6 +24,7 @@ from tracks.common.provenance import stamp
 from tracks.common.work import Workers
 
 FILES = ("table.md", "report.html", "recording.rrd")
+"""Files with the loop's results, which loop.json lists."""
 
 
 def run_loop(
@@ -33,7 +36,7 @@ def run_loop(
         config: the whole loop.
         out: its folder; an unfinished loop of the same configuration there continues.
         console: shows progress and results.
-        workers: of flights and fine-tunings; may change between calls.
+        workers: processes of flights and fine-tunings; may change between calls.
 
     Returns:
         The contents of loop.json, and `out`.
@@ -48,36 +51,36 @@ def run_loop(
         loop = hidden_effect.LOOP if config.delta else hidden_effect.WITHOUT_DELTA
     run = LoopRun(loop, config, Path(out), console, workers)
     claim(run.out, loop_by_content(config), config.seed)
-    seconds = do_stages(run.out, plan(run), console, f"the loop, to {run.out}")
-    return _conclude(run, seconds)
+    seconds = run_stages(run.out, plan(run), console, f"the loop, to {run.out}")
+    return _report_results(run, seconds)
 
 
-def _conclude(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Write and print the tables and the report."""
+def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """Write and print the tables and the report; return the contents of loop.json, and `out`."""
     loop, config, out, console = run.loop, run.config, run.out, run.console
     folders = {variant.name: out / f"eval-{variant.name}" for variant in loop.variants}
     results = {name: read_trials(folder / "trials.parquet") for name, folder in folders.items()}
-    found = loop.find(config, out, results)
+    findings = loop.summarise(config, out, results)
     header = stamp(1, config.seed)
-    marks = "; ".join(f"{key}: {value}" for key, value in header.items())
-    tables = map(markdown, found.tables)
-    parts = [found.verdict, *tables, loop.caveat, *found.errors, f"<!-- {marks} -->\n"]
-    write_text(out / "table.md", "\n\n".join(part.strip("\n") for part in parts) + "\n")
+    comment = "; ".join(f"{key}: {value}" for key, value in header.items())
+    tables = map(markdown, findings.tables)
+    texts = [findings.verdict, *tables, loop.caveat, *findings.errors, f"<!-- {comment} -->\n"]
+    write_text(out / "table.md", "\n\n".join(text.strip("\n") for text in texts) + "\n")
     answer = {
         **header,
-        "verdict": found.verdict,
-        **found.numbers,
+        "verdict": findings.verdict,
+        **findings.numbers,
         "seeds": seeds(run),
-        "stage_seconds": {name: round(took, 1) for name, took in seconds.items()},
+        "stage_seconds": {name: round(value, 1) for name, value in seconds.items()},
         "config": config,
         "files": {name: name for name in FILES},
     }
     write_json(out / "loop.json", answer)
-    write_loop_report(out, loop, config, found, seconds)
-    for table in found.tables:
+    write_loop_report(out, loop, config, findings, seconds)
+    for table in findings.tables:
         console.show(rich_table(table))
-    errors = [] if loop.hidden else [text.strip("\n") for text in found.errors]
-    console.say("\n\n".join([loop.caveat, *errors, found.verdict]) + "\n")
+    errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]
+    console.say("\n\n".join([loop.caveat, *errors, findings.verdict]) + "\n")
     console.say(f"table:     {out / 'table.md'}")
     console.say(f"report:    {out / 'report.html'}")
     if loop.hidden:
@@ -90,10 +93,9 @@ def _conclude(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
 def seeds(run: LoopRun) -> dict[str, Any]:
     """Return the first and the last seed of the trials and of the recorded flights."""
     config = run.config
+    trained = "fine-tuning" if run.loop.hidden else "training"
     return {
-        "fine-tuning"
-        if run.loop.hidden
-        else "training": "the random family, which is never judged",
+        trained: "the random family, which is never judged",
         "judged": [config.seed, config.seed + config.trials - 1],
         "recorded": [config.recorded_from, config.recorded_from + config.flights - 1],
     }

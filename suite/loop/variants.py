@@ -1,4 +1,7 @@
-"""A loop as data: the compared policies, with the dynamics of their fine-tuning and judging.
+"""Describe a loop as data: its policies, with the dynamics of their fine-tuning and judging.
+
+A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
+judges both. The judge is the simulator that scores policies.
 
 A loop's folder has train/ (or given/), eval-X/ of the first policy, flights/, with a hidden vehicle
 measured/ and diagnosis/, a folder for each Delta Action Model, tuned-X/ and eval-X/ of each
@@ -23,7 +26,7 @@ class Variant:
     """A policy of the loop, judged in eval-NAME/."""
 
     name: str
-    """Of its folders."""
+    """Name of the policy, a part of its folders' names."""
     judged: str
     """Description of the judging."""
     tuned: str | None = None
@@ -31,32 +34,32 @@ class Variant:
     delta: str | None = None
     """Folder of the Delta Action Model in the fine-tuning."""
     diagnosed: bool = False
-    """Whether the fine-tuning is through the vehicle that the diagnosis corrected."""
+    """Whether the fine-tuning flies the vehicle that the diagnosis corrected."""
     simulated: bool = False
-    """Whether it is judged with the simulation's vehicle instead of the true one."""
+    """Whether the policy is judged with the simulation's vehicle instead of the true one."""
 
 
 @dataclass(frozen=True)
 class DeltaModel:
-    """A fit of a Delta Action Model."""
+    """A fit of a Delta Action Model, a network that corrects actions to match measured flights."""
 
     folder: str
-    """Its folder."""
-    words: str
+    """Name of the model's folder."""
+    title: str
     """Description of the fit."""
     diagnosed: bool = False
     """Whether it corrects the vehicle that the diagnosis corrected."""
 
 
-class Shown(NamedTuple):
+class ShownPolicy(NamedTuple):
     """A policy in the recording and the pictures."""
 
     variant: str
-    """Its name."""
+    """Name of the policy."""
     label: str
-    """Its label in the recording."""
+    """Label of its flights in the recording."""
     heading: str
-    """Heading of its picture."""
+    """Heading of the picture of its flights."""
 
 
 @dataclass(frozen=True)
@@ -84,21 +87,21 @@ class Loop:
     """A kind of loop."""
 
     title: str
-    """Of the report."""
+    """Title of the report."""
     hidden: bool
     """Whether the flights get measurement noise and are diagnosed before a fit."""
     variants: Sequence[Variant]
-    """In the order of tables and stages."""
+    """The policies, in the order of tables and stages."""
     models: Sequence[DeltaModel]
-    """Fits, in the order of stages."""
-    shown: Sequence[Shown]
-    """First the policy before, then the one after."""
-    find: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
-    """Makes the findings from the configuration, the folder and the results by variant."""
+    """The fits, in the order of stages."""
+    shown: Sequence[ShownPolicy]
+    """The policy before the fine-tuning, and the one after."""
+    summarise: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
+    """Returns the findings, from the configuration, the folder and the results by variant."""
     reading: str
-    """How to read the tables."""
+    """Explanation of the tables."""
     caveat: str
-    """What the intervals do not include."""
+    """Note on what the intervals do not include."""
     advice: str
     """Advice if the flights are too short for a fit."""
     files: Sequence[tuple[str, str]]

@@ -1,4 +1,8 @@
-"""The stages of a loop, and their list for a kind of loop."""
+"""The stages of a loop: train, judge, record, diagnose, fit, fine-tune, judge again, replay.
+
+`plan` lists the stages of a kind of loop; each function below returns one `Stage`, whose work runs
+in its own folder.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +22,19 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console, Quiet
 from suite.common.errors import WorkFailed
-from suite.common.running.apart import Job
+from suite.common.running.remote import Job
 from suite.common.stages import Estimate, Stage, is_done
-from suite.common.work import all_done
+from suite.common.work import do_jobs
 from suite.delta.run import fit_delta, fitting_estimate
 from suite.judging.collect import collect
 from suite.judging.evaluate import evaluate
-from suite.judging.flying import checkpoint_folder, flying_needs, workers_for
+from suite.judging.flying import checkpoint_folder, flying_estimate, workers_for
 from suite.judging.replay import first_trials, fly_again
-from suite.judging.requests import Collection, Evaluation, parse_levels
+from suite.judging.requests import Collection, Evaluation
+from suite.judging.trials import parse_levels
 from suite.loop.compare import BEFORE
-from suite.loop.config import OWN, DeltaLoopConfig, LoopConfig
-from suite.loop.measured import enough, measure
+from suite.loop.config import EXACT_SIMULATORS, DeltaLoopConfig, LoopConfig
+from suite.loop.measured import add_measurement_noise, first_files
 from suite.loop.variants import DeltaModel, Loop, Variant
 from suite.train import run as training
 from suite.train.config import TrainConfig
@@ -54,14 +59,14 @@ class LoopRun:
     loop: Loop
     """The kind of loop."""
     config: LoopConfig
-    """Its settings."""
+    """The settings."""
     out: Path
     """The folder."""
     console: Console
     """Shows progress."""
     workers: Workers | None = None
-    """Of flights and fine-tunings; None flies in as many processes as shorten the work and
-    fine-tunes one policy after the other."""
+    """Processes of flights and fine-tunings; None flies in as many processes as shorten the work
+    and fine-tunes one policy after the other."""
 
     @property
     def logs(self) -> Path:
@@ -74,7 +79,7 @@ class LoopRun:
         return self.out / (f"tuned-{variant.name}" if variant.tuned else first) / "policy"
 
     def tuning(self, diagnosed: bool) -> TrainConfig:
-        """Return the fine-tuning, through the vehicle that the diagnosis corrected if asked."""
+        """Return the settings of the fine-tuning, with the corrected vehicle if `diagnosed`."""
         tuning = self.config.tuning
         if not diagnosed or tuning.quadrotor is None:
             return tuning
@@ -87,42 +92,43 @@ def plan(run: LoopRun) -> list[Stage]:
     first = [variant for variant in run.loop.variants if variant.tuned is None]
     later = [variant for variant in run.loop.variants if variant.tuned is not None]
     return [
-        _begin(run),
-        *(_judge(run, variant) for variant in first),
-        _record(run),
-        *([_measure(run), _diagnose(run)] if run.loop.hidden else []),
-        *(_fit(run, model) for model in run.loop.models),
-        *(_tune(run, variant) for variant in later),
-        *(_judge(run, variant) for variant in later),
-        _replay(run),
+        _first_policy_stage(run),
+        *(_judging_stage(run, variant) for variant in first),
+        _recording_stage(run),
+        *([_measuring_stage(run), _diagnosis_stage(run)] if run.loop.hidden else []),
+        *(_fit_stage(run, model) for model in run.loop.models),
+        *(_tuning_stage(run, variant) for variant in later),
+        *(_judging_stage(run, variant) for variant in later),
+        _replay_stage(run),
     ]
 
 
-def _begin(run: LoopRun) -> Stage:
-    """Train the first policy, or copy a shipped one or a checkpoint."""
-    config, given = run.config, run.config.policy
-    if given is None:
+def _first_policy_stage(run: LoopRun) -> Stage:
+    """Return the stage that trains the first policy, or copies a shipped one or a checkpoint."""
+    config, policy = run.config, run.config.policy
+    if policy is None:
         assert isinstance(config, DeltaLoopConfig)
 
         def train(folder: Path) -> None:
             training.train(config.training, folder, run.console)
 
-        needs = training.estimate(config.training)
-        return Stage("train", "training the first policy", needs, train)
+        estimate = training.estimate(config.training)
+        return Stage("train", "training the first policy", estimate, train)
 
     def copy(folder: Path) -> None:
         with replacing_folder(folder / "policy") as new:
-            shutil.copytree(checkpoint_folder(given), new, dirs_exist_ok=True)
+            shutil.copytree(checkpoint_folder(policy), new, dirs_exist_ok=True)
 
-    return Stage("given", f"taking {given} instead of training", Estimate(0, 0), copy)
+    return Stage("given", f"copying {policy} instead of training", Estimate(0, 0), copy)
 
 
-def _flying(run: LoopRun, trials: int, simulator: str) -> Estimate:
-    """Return the approximate time and memory of `trials` in `simulator`."""
-    return flying_needs(trials, workers_for(trials, run.workers, simulator), simulator)
+def _estimate_flights(run: LoopRun, trials: int, simulator: str) -> Estimate:
+    """Return the approximate time and memory of `trials` flights in `simulator`."""
+    return flying_estimate(trials, workers_for(trials, run.workers, simulator), simulator)
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
+    """Return the request to judge a variant's policy."""
     config = run.config
     return Evaluation(
         policies=(str(run.policy(variant)),),
@@ -131,28 +137,32 @@ def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
         trials=config.trials,
         seed=config.seed,
         vehicle=config.vehicle if variant.simulated else config.true_vehicle,
-        simulator=OWN[0] if variant.simulated else config.true_simulator,
+        simulator=EXACT_SIMULATORS[0] if variant.simulated else config.true_simulator,
         sensors=config.sensors,
     )
 
 
-def _judge(run: LoopRun, variant: Variant) -> Stage:
+def _judging_stage(run: LoopRun, variant: Variant) -> Stage:
+    """Return the stage that flies a variant's trials."""
+
     def work(folder: Path) -> None:
         evaluate(_evaluation(run, variant), folder, Quiet(), run.workers)
 
-    def tell(folder: Path) -> None:
+    def show_result(folder: Path) -> None:
         rows = read_trials(folder / "trials.parquet")
-        won = sum(row.success for row in rows) / len(rows)
+        success = sum(row.success for row in rows) / len(rows)
         gates = sum(row.gates_passed for row in rows) / len(rows)
-        words = f"{won:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
-        run.console.note(f"    {words}")
+        run.console.note(
+            f"    {success:.0%} of {len(rows)} trials succeed, {gates:.1f} gates on average"
+        )
 
-    judged = run.config.trials * run.config.cells
-    needs = _flying(run, judged, _evaluation(run, variant).simulator)
-    return Stage(f"eval-{variant.name}", variant.judged, needs, work, tell)
+    count = run.config.trials * run.config.cells
+    estimate = _estimate_flights(run, count, _evaluation(run, variant).simulator)
+    return Stage(f"eval-{variant.name}", variant.judged, estimate, work, show_result)
 
 
-def _record(run: LoopRun) -> Stage:
+def _recording_stage(run: LoopRun) -> Stage:
+    """Return the stage that records flights of the first policy with the true vehicle."""
     config = run.config
     first = next(variant for variant in run.loop.variants if variant.name == BEFORE)
     collection = Collection(
@@ -168,33 +178,37 @@ def _record(run: LoopRun) -> Stage:
     return Stage(
         "flights",
         "recording flights on other seeds",
-        _flying(run, config.flights * config.cells, config.true_simulator),
+        _estimate_flights(run, config.flights * config.cells, config.true_simulator),
         lambda folder: collect(collection, folder, Quiet(), run.workers),
     )
 
 
-def _measure(run: LoopRun) -> Stage:
+def _measuring_stage(run: LoopRun) -> Stage:
+    """Return the stage that adds measurement noise and selects the flights of the diagnosis."""
+
     def work(folder: Path) -> None:
         try:
-            files = measure(run.out / "flights", folder, run.config.seed)
+            files = add_measurement_noise(run.out / "flights", folder, run.config.seed)
         except ValueError as error:
             raise WorkFailed(
                 f"{error}; record more flights (--flights) with another --out"
             ) from error
-        chosen = [file.name for file in enough(files, DIAGNOSED_S)]
-        write_json(folder / "diagnosed.json", {"files": chosen})
+        names = [file.name for file in first_files(files, DIAGNOSED_S)]
+        write_json(folder / "diagnosed.json", {"files": names})
 
-    words = "cutting the flights before contact, with a log's noise"
-    needs = Estimate(1 + 0.05 * run.config.flights * run.config.cells, 0)
-    return Stage("measured", words, needs, work)
+    title = "adding measurement noise, and cutting the flights before contact"
+    estimate = Estimate(1 + 0.05 * run.config.flights * run.config.cells, 0)
+    return Stage("measured", title, estimate, work)
 
 
-def _diagnose(run: LoopRun) -> Stage:
+def _diagnosis_stage(run: LoopRun) -> Stage:
+    """Return the stage that names the effects that the simulation's vehicle file lacks."""
+
     def work(folder: Path) -> None:
         from suite.diagnose.run import diagnose_files
 
-        listed = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
-        paths = [run.logs / name for name in listed["files"]]
+        selected = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
+        paths = [run.logs / name for name in selected["files"]]
         try:
             diagnose_files(
                 paths,
@@ -207,34 +221,37 @@ def _diagnose(run: LoopRun) -> Stage:
         except ValueError as error:
             raise WorkFailed(f"the flights in {run.logs} cannot be diagnosed: {error}") from error
 
-    def tell(folder: Path) -> None:
-        found = read_diagnosis(run.out)
-        run.console.note(f"    {found['verdict']}: {named_effects(found) or 'nothing named'}")
-        if not found["effects"]:
+    def show_result(folder: Path) -> None:
+        diagnosis = read_diagnosis(run.out)
+        effects = named_effects(diagnosis) or "nothing named"
+        run.console.note(f"    {diagnosis['verdict']}: {effects}")
+        if not diagnosis["effects"]:
             raise WorkFailed(
-                f"the diagnosis says {found['verdict']} and names nothing to correct, see "
-                f"{folder / 'report.html'}; record more flights (--flights) with another --out"
+                f"the diagnosis has the verdict {diagnosis['verdict']} and names nothing to "
+                f"correct, see {folder / 'report.html'}; record more flights (--flights) with "
+                "another --out"
             )
 
-    words = "diagnosing what the vehicle file lacks"
-    return Stage("diagnosis", words, DIAGNOSIS, work, tell)
+    title = "diagnosing what the vehicle file lacks"
+    return Stage("diagnosis", title, DIAGNOSIS, work, show_result)
 
 
 def read_diagnosis(out: Path) -> dict[str, Any]:
-    """Return what the diagnosis.json of the loop in `out` holds."""
+    """Return the contents of diagnosis.json of the loop in `out`."""
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
 
 
-def named_effects(found: Mapping[str, Any]) -> str:
-    """Return the effects that diagnosis.json names, with their rivals, in words."""
-    parts = []
-    for effect in found["effects"]:
-        rivals = ", ".join(effect["alternatives"])
-        parts.append(effect["name"] + (f" (or {rivals})" if rivals else ""))
-    return ", ".join(parts)
+def named_effects(diagnosis: Mapping[str, Any]) -> str:
+    """Return the effects that diagnosis.json names, with their alternatives, as text."""
+    texts = []
+    for effect in diagnosis["effects"]:
+        alternatives = ", ".join(effect["alternatives"])
+        texts.append(effect["name"] + (f" (or {alternatives})" if alternatives else ""))
+    return ", ".join(texts)
 
 
-def _fit(run: LoopRun, model: DeltaModel) -> Stage:
+def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
+    """Return the stage that fits a Delta Action Model to the flights."""
     fit = run.config.fit
 
     def work(folder: Path) -> None:
@@ -247,81 +264,89 @@ def _fit(run: LoopRun, model: DeltaModel) -> Stage:
                 + run.loop.advice
             ) from error
 
-    def tell(folder: Path) -> None:
+    def show_result(folder: Path) -> None:
         for line in (folder / "table.md").read_text(encoding="utf-8").splitlines():
             run.console.note(f"    {line}")
 
     tuning = run.config.tuning
     through_quadrotor = tuning.quadrotor is not None
     steps = fit.horizon_s * (PHYSICS_HZ if through_quadrotor else tuning.spec.rate_hz)
-    needs = fitting_estimate(fit, steps, through_quadrotor)
-    return Stage(model.folder, model.words, needs, work, tell)
+    estimate = fitting_estimate(fit, steps, through_quadrotor)
+    return Stage(model.folder, model.title, estimate, work, show_result)
 
 
 class Tuning(NamedTuple):
-    """A fine-tuning, by content."""
+    """A fine-tuning, with the content of its inputs."""
 
     config: TrainConfig
+    """Its settings."""
     start: Mapping[str, np.ndarray]
-    """Where it starts."""
+    """The policy's parameters at its start."""
     delta: Mapping[str, np.ndarray] | None
-    """The Delta Action network that corrects what it goes through."""
+    """Parameters of the Delta Action network that corrects the actions; None without one."""
 
 
-def _tune(run: LoopRun, variant: Variant) -> Stage:
-    """Fine-tune a policy; the first of such stages fine-tunes those of all where several work."""
+def _tuning_stage(run: LoopRun, variant: Variant) -> Stage:
+    """Return the stage that fine-tunes a policy.
+
+    With several workers the first of these stages fine-tunes all policies, in parallel.
+    """
 
     def work(folder: Path) -> None:
-        several = run.workers is not None and run.workers != 1
-        later = [v for v in run.loop.variants if v.tuned is not None] if several else [variant]
-        jobs = [Job(_tuning(run, each), run.out / f"tuned-{each.name}") for each in later]
+        parallel = run.workers is not None and run.workers != 1
+        tuned = [v for v in run.loop.variants if v.tuned is not None] if parallel else [variant]
+        jobs = [Job(_tuning(run, each), run.out / f"tuned-{each.name}") for each in tuned]
         jobs = [job for job in jobs if not is_done(job.folder)]
-        all_done(_tune_one, jobs, run.workers, run.console, "fine-tuning")
+        do_jobs(_tune_policy, jobs, run.workers, run.console, "fine-tuning")
 
-    needs = training.estimate(run.config.tuning)
-    return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", needs, work)
+    estimate = training.estimate(run.config.tuning)
+    return Stage(f"tuned-{variant.name}", f"fine-tuning {variant.tuned}", estimate, work)
 
 
 def _tuning(run: LoopRun, variant: Variant) -> Tuning:
-    """Return what a variant is fine-tuned from and through."""
+    """Return the fine-tuning of a variant, with its inputs loaded."""
     tuning, first = run.tuning(variant.diagnosed), replace(variant, tuned=None)
-    start = training.started_from(str(run.policy(first)), tuning.spec)
+    start = training.load_start_params(str(run.policy(first)), tuning.spec)
     delta = None
     if variant.delta is not None:
         delta = load_delta(run.out / variant.delta / "delta").params
     return Tuning(tuning, jax.tree.map(np.asarray, start), delta)
 
 
-def _tune_one(job: Job, console: Console) -> None:
+def _tune_policy(job: Job, console: Console) -> None:
     tuning: Tuning = job.task
     start, delta = jax.tree.map(jnp.asarray, (tuning.start, tuning.delta))
     training.train(tuning.config, job.folder, console, start, delta)
 
 
-def _replay(run: LoopRun) -> Stage:
-    """Fly the first seed on every track, at the easiest and the hardest level, again.
+def _replay_stage(run: LoopRun) -> Stage:
+    """Return the stage that flies the first seed on every track again, for recording and pictures.
 
-    Trials are chosen by their seed, not by how they went; in the recording each is followed by the
-    same one flown by the other policy.
+    It does so at the easiest and the hardest level. Trials are selected by their seed, not by their
+    result; in the recording each is followed by the same trial of the other policy.
     """
     by_name = {variant.name: variant for variant in run.loop.variants}
     evaluation = _evaluation(run, by_name[BEFORE])
     levels = parse_levels(run.config.difficulty)
-    ends = replace(evaluation, difficulty=f"{min(levels)},{max(levels)}")
+    extremes = replace(evaluation, difficulty=f"{min(levels)},{max(levels)}")
 
     def work(folder: Path) -> None:
         from eval.view.picture import write_grid
         from eval.view.recording import write_recording
 
-        trials, flown, drone = first_trials(ends), [], None
+        trials, drone = first_trials(extremes), None
+        by_policy: list[list[Any]] = []
         columns = len(set(trial.difficulty for trial in trials))
         for variant, label, _ in run.loop.shown:
             policy = str(run.policy(by_name[variant]))
             rollouts, drone = fly_again(evaluation, trials, policy)
-            flown.append([(*pair, result._replace(policy=label)) for *pair, result in rollouts])
-            write_grid(folder / f"{variant}.png", flown[-1], columns)
-        pairs = [rollout for pair in zip(*flown, strict=True) for rollout in pair]
+            labelled: list[Any] = [
+                (*pair, result._replace(policy=label)) for *pair, result in rollouts
+            ]
+            by_policy.append(labelled)
+            write_grid(folder / f"{variant}.png", labelled, columns)
+        pairs = [rollout for pair in zip(*by_policy, strict=True) for rollout in pair]
         write_recording(folder.parent / "recording.rrd", pairs, drone)
 
-    words = "flying a few trials again for the recording and the pictures"
-    return Stage("replays", words, _flying(run, 12, evaluation.simulator), work)
+    title = "flying a few trials again for the recording and the pictures"
+    return Stage("replays", title, _estimate_flights(run, 12, evaluation.simulator), work)

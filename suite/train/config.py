@@ -1,4 +1,9 @@
-"""All settings of a training run, as frozen dataclasses with their limits."""
+"""All settings of a training run, as frozen dataclasses with the allowed range of each.
+
+`TrainConfig` is the whole run; `check` refuses settings that do not fit together. A named set of
+them is a recipe (`recipes.py`). A world is one simulated scene and drone of a batch; the judge is
+the independent simulator that scores trained policies.
+"""
 
 from __future__ import annotations
 
@@ -149,8 +154,8 @@ class LossConfig:
     gradient_decay: Annotated[float, Range(0.0, 1000.0)] = 0.916
     """alpha, the decay rate of the gradients of position and velocity, back in time [1/s]."""
     crash_depth_m: Annotated[float, Range(0.0, math.inf)] = 0.0
-    """A world deeper than this in a solid no longer counts in the loss of this rollout, because its
-    gradients have no more meaning for flying [m]."""
+    """A world deeper than this in a solid no longer counts in the loss of this rollout: gradients
+    inside a solid do not help to fly [m]."""
     tilt: Annotated[float, Range(0.0, 1e6)] = 0.0
     """Weight of L_tilt, which grows from 0 at a tilt of 65 degrees to 1 at 90 degrees, where the
     judge ends a trial. Above 0 a world beyond 90 degrees no longer counts. It has a gradient for
@@ -159,7 +164,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """The worlds of one iteration."""
+    """How the worlds of one iteration are drawn, and how long they fly."""
 
     batch: Annotated[int, Range(1, 10**6)] = 64
     """Worlds per iteration, over all devices; a multiple of `shards`."""
@@ -187,8 +192,8 @@ class EpisodeConfig:
     """Largest speed towards the gate of a world that starts between two gates; a sideways speed is
     added [m/s]."""
     missed_share: Share = 0.0
-    """Share of the worlds that start between two gates which start next to or above a gate's frame,
-    as after missing it."""
+    """Share of the worlds without a start at rest that start next to or above a gate's frame, as
+    after missing the gate, instead of between two gates."""
     sharp_share: Share = 0.55
     """Share of tracks with one or two sharp turns."""
     density: Annotated[tuple[float, float], Range(0.0, 100.0, ordered=True)] = (0.0, 1.3)
@@ -248,7 +253,7 @@ class TrainConfig:
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
     sensors: SensorsConfig | None = None
-    """Sensor models between the truth and the policy; None: perfect sensors."""
+    """Sensor models between the true state and the policy; None: perfect sensors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the loss and of the field."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
@@ -292,8 +297,8 @@ def check(config: TrainConfig) -> None:
     batch, shards = config.episode.batch, config.episode.shards
     if batch % shards:
         raise ValueError(
-            f"episode.batch is {batch}, allowed are multiples of episode.shards ({shards}); set "
-            "that as well"
+            f"episode.batch is {batch}, allowed are multiples of episode.shards ({shards}); change "
+            "one of the two"
         )
     stride, steps = config.episode.image_stride, config.episode.steps
     if steps % stride:

@@ -1,8 +1,8 @@
-"""The gradient of a rollout in two passes, because the encoder is the most expensive part.
+"""Compute the gradient of a rollout in two passes, because the image encoder costs the most time.
 
-First the rollout is differentiated with a frozen image encoder. A zero shift added to each
-embedding gives the gradient of the loss with respect to the embeddings. Then these gradients are
-back-propagated through the encoder, for all images at once.
+First the rollout (a flight of all simulated drones of a batch) is differentiated with a frozen
+encoder. A zero shift added to each embedding gives the gradient of the loss with respect to the
+embeddings. Then these gradients are back-propagated through the encoder, for all images at once.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ def sampled_encoder_gradient(
     """
     first = jax.random.randint(key, (), 0, stride)
 
-    def taken(array: jax.Array) -> jax.Array:
+    def sampled(array: jax.Array) -> jax.Array:
         split = array.reshape(-1, stride, *array.shape[1:])
         chosen = jax.lax.dynamic_index_in_dim(split, first, axis=1, keepdims=False)
         return chosen.reshape(-1, *array.shape[2:])
 
-    return encoder_gradient(params, taken(images), taken(stride * cotangents))
+    return encoder_gradient(params, sampled(images), sampled(stride * cotangents))
 
 
 def make_gradient(

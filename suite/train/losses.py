@@ -1,6 +1,8 @@
-"""The loss of one step, per world (Su et al. 2026, Sec. III-C): a table of terms.
+"""The training loss of one step, as a table of terms (Su et al. 2026, Sec. III-C).
 
-A new term is a function of a `Step`, a line in `LOSSES` and its weight in `LossConfig`.
+Each term is a function that returns a loss (B,), one per world (a simulated scene and drone) of the
+batch. A new term needs that function, a line in `LOSSES` and its weight in `LossConfig`. The gap of
+a step is the distance to the nearest solid, minus the safety radius.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ FIELD_DECAY = 0.3
 TILT_FREE_DEG = 65.0
 """Tilt up to which L_tilt is 0: fast turns need about this much [deg]."""
 UNIT_FIELD = 11.313708498984761
-"""|B| / C_I at the centre of a square gate of 1 m: 8 sqrt(2) [1/m]."""
+"""Size of the magnetic field over the current, |B| / C_I, at the centre of a square gate of 1 m:
+8 sqrt(2) [1/m]."""
 MAX_PULL = 5.0
 """Limit of the field's pull, relative to that at the centre of a 1 m gate [1]."""
 
@@ -44,9 +47,9 @@ def clearance(_: LossConfig, step: Step) -> jax.Array:
 
 def collide(_: LossConfig, step: Step) -> jax.Array:
     """Return L_collide, the mean over the path [m^3/s]."""
-    held_vel = jax.lax.stop_gradient(step.vel_w)
-    closing = jnp.maximum(-(step.away_w * held_vel[:, None]).sum(-1), 0.0)
-    return (closing * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(1)
+    fixed_vel = jax.lax.stop_gradient(step.vel_w)
+    closing_speed = jnp.maximum(-(step.away_w * fixed_vel[:, None]).sum(-1), 0.0)
+    return (closing_speed * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(1)
 
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:
@@ -61,8 +64,8 @@ def jerk(_: LossConfig, step: Step) -> jax.Array:
 
 def tilt(_: LossConfig, step: Step) -> jax.Array:
     """Return L_tilt: 0 up to a tilt of `TILT_FREE_DEG`, growing to 1 at 90 degrees [1]."""
-    least = math.cos(math.radians(TILT_FREE_DEG))
-    return (jnp.maximum(least - step.up, 0.0) / least) ** 2
+    free_up = math.cos(math.radians(TILT_FREE_DEG))
+    return (jnp.maximum(free_up - step.up, 0.0) / free_up) ** 2
 
 
 def speed_to_goal(step: Step) -> jax.Array:
@@ -76,10 +79,11 @@ def progress(config: LossConfig, step: Step) -> jax.Array:
 
     Progress above the commanded speed does not count, and any speed above it costs.
     """
-    if step.wanted is None:
+    command = step.speed_command
+    if command is None:
         return -speed_to_goal(step)
     slow, fast = config.speed_range
-    limit = jnp.where(step.wanted < 1.0, slow + (fast - slow) * step.wanted, jnp.inf)
+    limit = jnp.where(command < 1.0, slow + (fast - slow) * command, jnp.inf)
     return jnp.maximum(norm(step.vel_w) - limit, 0.0) - jnp.minimum(speed_to_goal(step), limit)
 
 
@@ -97,15 +101,17 @@ def projection(config: LossConfig, step: Step) -> jax.Array:
 def guidance(_: LossConfig, step: Step) -> jax.Array:
     """Return the term whose position gradient is -u_A / u_A(centre of a 1 m gate); 0 in value.
 
-    The field is unbounded at the gate's edges, so its pull is limited to MAX_PULL.
+    u_A is the paper's attractive field: it points along the magnetic field of a current around the
+    gate's opening, and is 0 for a velocity in that direction. It is unbounded at the gate's edges,
+    so it is limited to MAX_PULL.
     """
-    held_pos, held_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
+    fixed_pos, fixed_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
     gate = step.gate
-    field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, held_pos)
-    pull = attractive_field(field, held_vel, FIELD_DECAY)
+    field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, fixed_pos)
+    pull = attractive_field(field, fixed_vel, FIELD_DECAY)
     pull = pull / (CURRENT * UNIT_FIELD) ** (1 - FIELD_DECAY)
     pull = pull * jnp.minimum(1.0, MAX_PULL / norm(pull))[:, None]
-    return -(jax.lax.stop_gradient(pull) * (step.pos_w - held_pos)).sum(1)
+    return -(jax.lax.stop_gradient(pull) * (step.pos_w - fixed_pos)).sum(1)
 
 
 LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
@@ -128,7 +134,7 @@ def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:
     """Return the weighted terms (B,) by name; their sum is the loss of the step."""
 
     def total(terms: tuple[tuple[Term, str], ...]) -> jax.Array:
-        parts = (getattr(config, weight) * term(config, step) for term, weight in terms)
-        return functools.reduce(jnp.add, parts)
+        products = (getattr(config, weight) * term(config, step) for term, weight in terms)
+        return functools.reduce(jnp.add, products)
 
     return {name: total(terms) for name, terms in LOSSES.items()}

@@ -1,7 +1,7 @@
-"""Change settings of a run by name, `loss.progress=1.2`: for a user, and for the run's phases.
+"""Change settings of a run by name, as in `--set loss.progress=1.2`, also from one phase on.
 
-A phase has the settings of the phase before, with its own changes. A user's change holds in every
-phase; `phases.2.loss.progress=2` holds from the second phase on.
+A phase is a part of a run; it has the settings of the phase before, with its own changes. A user's
+change holds in every phase; `phases.2.loss.progress=2` holds from the second phase on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from tracks.input.ranges import check_ranges, is_finite, shown
 
 T = TypeVar("T")
 
-UNREAD = ("lag_mean", "lag_std", "drag", "drag_up", "wind_std", "time_step_std", "action_delay")
+POINT_MASS_ONLY = (
+    "lag_mean",
+    "lag_std",
+    "drag",
+    "drag_up",
+    "wind_std",
+    "time_step_std",
+    "action_delay",
+)
 """Settings of `physics` that only the point mass uses."""
 NEEDS = {
     "loss.projection_decay": "loss.projection",
@@ -44,21 +52,21 @@ def override(config: T, changes: Iterable[str]) -> T:
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
-    made = list(changes)
-    for change in made:
+    changes = list(changes)
+    for change in changes:
         path, separator, text = change.partition("=")
         if not separator:
             raise ValueError(f"--set {shown(change)}: write FIELD=VALUE, such as loss.progress=0.4")
         keys = path.strip().split(".")
-        _check_read(config, keys, shown(change))
-        config = _changed(config, keys, text.strip(), shown(change))
+        _check_model(config, keys, shown(change))
+        config = _with_value(config, keys, text.strip(), shown(change))
         check_ranges(config, f"--set {shown(change)}: ")
-    for change in made:
-        _check_heard(config, change.partition("=")[0].strip(), shown(change))
+    for change in changes:
+        _check_effective(config, change.partition("=")[0].strip(), shown(change))
     return config
 
 
-def _check_heard(config: object, path: str, change: str) -> None:
+def _check_effective(config: object, path: str, change: str) -> None:
     """Refuse a setting that has no effect because of another one."""
     for name, need in NEEDS.items():
         part, _, field = need.partition(".")
@@ -66,7 +74,7 @@ def _check_heard(config: object, path: str, change: str) -> None:
             value = getattr(getattr(config, part, None), field, None)
             if value is not None and not value:
                 raise ValueError(
-                    f"--set {change}: {path} does nothing where {need} is {value!r}; set that as "
+                    f"--set {change}: {path} has no effect while {need} is {value!r}; set that as "
                     "well, or leave this out"
                 )
 
@@ -76,10 +84,10 @@ def is_within(path: str, part: str) -> bool:
     return path == part or path.startswith(f"{part}.")
 
 
-def _check_read(config: object, keys: list[str], change: str) -> None:
+def _check_model(config: object, keys: list[str], change: str) -> None:
     """Refuse a setting of the point mass in a run through quadrotors."""
     quadrotor = getattr(config, "quadrotor", None)
-    if quadrotor is not None and keys[0] == "physics" and set(keys) & set(UNREAD):
+    if quadrotor is not None and keys[0] == "physics" and set(keys) & set(POINT_MASS_ONLY):
         raise ValueError(
             f"--set {change}: {'.'.join(keys)} is of the point mass, and this run goes through "
             "quadrotors; set one of quadrotor.* (suite train: or add --model point)"
@@ -99,12 +107,13 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
     """
     for change in changes:
         path = change.partition("=")[0].strip()
-        for mine, words in owned.items():
-            if is_within(path, mine):
-                raise ValueError(f"{option} {shown(change)}: this command sets {path}; {words}")
+        for owned_path, advice in owned.items():
+            if is_within(path, owned_path):
+                raise ValueError(f"{option} {shown(change)}: this command sets {path}; {advice}")
 
 
-def _changed(config: T, path: list[str], text: str, change: str) -> T:
+def _with_value(config: T, path: list[str], text: str, change: str) -> T:
+    """Return `config` with the setting at `path` read from `text`; `change` is for messages."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise ValueError(f"--set {change}: {shown(path[0])} is below a setting that has no parts")
     name, *rest = path
@@ -115,7 +124,7 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
     if rest and old is None and name in ABSENT:
         raise ValueError(f"--set {change}: this run has no {ABSENT[name]}")
     if rest:
-        return dataclasses.replace(config, **{name: _changed(old, rest, text, change)})
+        return dataclasses.replace(config, **{name: _with_value(old, rest, text, change)})
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
@@ -128,6 +137,7 @@ def _changed(config: T, path: list[str], text: str, change: str) -> T:
 
 
 def _value(old: object, text: str, change: str) -> object:
+    """Return the value that `text` gives for a setting, of the type of its `old` value."""
     try:
         value = ast.literal_eval(text)
     # The parser fails in different ways on text that is nested a thousand times.
@@ -149,11 +159,11 @@ def _value(old: object, text: str, change: str) -> object:
 
 def phase_ends(config: TrainConfig) -> tuple[int, ...]:
     """Return the number of gradient steps at the end of each phase."""
-    total, done = config.optimizer.iterations, 0.0
+    total, share = config.optimizer.iterations, 0.0
     ends = []
     for phase in config.phases or (Phase(),):
-        done += phase.share
-        ends.append(min(total, round(done * total)))
+        share += phase.share
+        ends.append(min(total, round(share * total)))
     return tuple(ends)
 
 
@@ -163,16 +173,16 @@ def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
     Raises:
         ValueError: for a change that cannot be made, naming the phase.
     """
-    now, configs, begun = replace(config, phases=()), [], 0
+    settings, configs, beginning = replace(config, phases=()), [], 0
     phases = config.phases or (Phase(),)
     for number, (phase, end) in enumerate(zip(phases, phase_ends(config), strict=True), 1):
         try:
-            now = override(now, phase.set)
+            settings = override(settings, phase.set)
         except ValueError as error:
             raise ValueError(f"phase {number}: {error}") from error
-        optimizer = replace(now.optimizer, iterations=max(1, end - begun))
-        configs.append(replace(now, optimizer=optimizer))
-        begun = end
+        optimizer = replace(settings.optimizer, iterations=max(1, end - beginning))
+        configs.append(replace(settings, optimizer=optimizer))
+        beginning = end
     return tuple(configs)
 
 
@@ -186,18 +196,18 @@ def check_phases(config: TrainConfig) -> None:
     total = math.fsum(phase.share for phase in config.phases)
     if config.phases and not math.isclose(total, 1.0, abs_tol=1e-6):
         raise ValueError(f"the shares of phases add up to {total:g}, allowed is 1")
-    common = _in_common(config, config)
-    for number, one in enumerate(phase_configs(config), 1):
-        check(one)
-        for key, value in _in_common(one, config).items():
+    common = _common_settings(config, config)
+    for number, phase in enumerate(phase_configs(config), 1):
+        check(phase)
+        for key, value in _common_settings(phase, config).items():
             if value != common[key]:
                 raise ValueError(
-                    f"phase {number} changes {key}, which a whole run has in common (of spec, "
-                    "rate_hz and speed may change); set it without a phase"
+                    f"phase {number} changes {key}, which all phases of a run must share (of spec, "
+                    "only rate_hz and speed may change); set it without a phase"
                 )
 
 
-def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
+def _common_settings(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
     """Return the settings that all phases must share."""
     spec = replace(config.spec, rate_hz=run.spec.rate_hz, speed=run.spec.speed)
     episode = config.episode
@@ -205,7 +215,7 @@ def _in_common(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
             "seed": config.seed}  # fmt: skip
 
 
-def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
+def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     """Return a run with a user's changes: SETTING=VALUE in every phase, or from one phase on.
 
     Args:
@@ -216,10 +226,10 @@ def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
     """
-    everywhere, phases = [], list(config.phases)
+    in_all_phases, phases = [], list(config.phases)
     for change in changes:
         if not change.startswith(PREFIX):
-            everywhere.append(change)
+            in_all_phases.append(change)
             continue
         number, _, rest = change.removeprefix(PREFIX).partition(".")
         if not (number.isdecimal() and 1 <= int(number) <= len(phases)):
@@ -229,27 +239,28 @@ def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
             )
         phase = phases[int(number) - 1]
         phases[int(number) - 1] = replace(phase, set=(*phase.set, rest))
-    paths = {change.partition("=")[0].strip() for change in everywhere}
-    return override(_dropping(replace(config, phases=tuple(phases)), paths), everywhere)
+    paths = {change.partition("=")[0].strip() for change in in_all_phases}
+    without = _without_phase_changes(replace(config, phases=tuple(phases)), paths)
+    return override(without, in_all_phases)
 
 
 def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
     """Return a run in which settings of a part, such as "loss", have these values in all phases."""
-    config = _dropping(config, {f"{part}.{name}" for name in values})
+    config = _without_phase_changes(config, {f"{part}.{name}" for name in values})
     return replace(config, **{part: replace(getattr(config, part), **values)})
 
 
 def without_quadrotor(config: TrainConfig) -> TrainConfig:
     """Return a run through the point mass instead of quadrotors."""
-    return replace(_dropping(config, {"quadrotor"}), quadrotor=None)
+    return replace(_without_phase_changes(config, {"quadrotor"}), quadrotor=None)
 
 
-def _dropping(config: TrainConfig, paths: Iterable[str]) -> TrainConfig:
+def _without_phase_changes(config: TrainConfig, paths: Iterable[str]) -> TrainConfig:
     """Return a run whose phases do not change the settings at or below `paths`."""
-    gone = tuple(paths)
+    removed = tuple(paths)
 
-    def stays(change: str) -> bool:
-        return not any(is_within(change.partition("=")[0], path) for path in gone)
+    def is_kept(change: str) -> bool:
+        return not any(is_within(change.partition("=")[0], path) for path in removed)
 
-    kept = (replace(p, set=tuple(filter(stays, p.set))) for p in config.phases)
-    return replace(config, phases=tuple(kept))
+    phases = (replace(phase, set=tuple(filter(is_kept, phase.set))) for phase in config.phases)
+    return replace(config, phases=tuple(phases))

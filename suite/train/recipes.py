@@ -1,4 +1,8 @@
-"""Settings of trainings by name; `suite train --recipe NAME`."""
+"""Recipes: the settings of a training under a name, for `suite train --recipe NAME`.
+
+Below the recipes are functions that return a recipe with another vehicle, rate or sensors. The
+judge, which the docstrings mention, is the independent simulator that scores the policies.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +72,7 @@ def race() -> TrainConfig:
             speed_input=True,
         ),
         physics=PointMassConfig(drag_up=(0.2, 2.0)),
-        quadrotor=replace(_varied(), attitude_hz=60.0, physics_hz=120.0),
+        quadrotor=replace(_racer5_with_spreads(), attitude_hz=60.0, physics_hz=120.0),
         loss=LossConfig(
             clearance=4.2,
             collide=0.28,
@@ -104,8 +108,8 @@ def race_small() -> TrainConfig:
 def paper() -> TrainConfig:
     """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
 
-    The paper does not give the scale of u_A with batch and horizon. Here it is added as written to
-    the gradient of a loss averaged over 64 worlds of 150 steps.
+    The paper does not say how its attractive field u_A scales with batch and horizon. Here u_A is
+    added as written to the gradient of a loss averaged over 64 worlds of 150 steps.
     """
     return TrainConfig(
         spec=PolicySpec(rate_hz=15.0),
@@ -221,7 +225,7 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
 
 
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
-    """Return `config` through the quadrotor of `vehicle`, with the recipe's randomisation.
+    """Return `config`, trained through the quadrotor of `vehicle` with the recipe's randomisation.
 
     Spreads of the centre of mass and of the trim scale with the vehicle's size: a small torque for
     a racer is more than a palm-sized quadrotor can produce.
@@ -230,40 +234,41 @@ def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
         ValueError: where the policy decides faster than the vehicle's controller runs.
     """
     check_decides_in_time(config.spec, vehicle)
-    own = config.quadrotor or QuadrotorConfig(vehicle)
-    arm, inertia = (of(vehicle) / of(own.vehicle) for of in (_arm_m, _inertia))
-    own = replace(
-        own,
+    quadrotor = config.quadrotor or QuadrotorConfig(vehicle)
+    arm_ratio = _arm_m(vehicle) / _arm_m(quadrotor.vehicle)
+    inertia_ratio = _inertia(vehicle) / _inertia(quadrotor.vehicle)
+    quadrotor = replace(
+        quadrotor,
         vehicle=vehicle,
-        com_std_m=min(arm * own.com_std_m, COM_STD_MOST),
-        trim_std=min(inertia * own.trim_std, TRIM_STD_MOST),
+        com_std_m=min(arm_ratio * quadrotor.com_std_m, COM_STD_MOST),
+        trim_std=min(inertia_ratio * quadrotor.trim_std, TRIM_STD_MOST),
     )
-    return replace(config, quadrotor=own)
+    return replace(config, quadrotor=quadrotor)
 
 
 SPREADS = (
     *("mass_std", "lag_spread_s", "drag_spread", "delay_spread_s"),
     *("gain_spread", "thrust_spread", "com_std_m", "trim_std"),
 )
-"""Spreads that `widened` increases."""
+"""Spreads that `with_usual_spreads` increases."""
 
 
-def widened(config: TrainConfig) -> TrainConfig:
+def with_usual_spreads(config: TrainConfig) -> TrainConfig:
     """Return `config` with quadrotors that vary by at least the usual errors of a vehicle file.
 
     A policy that is fine-tuned through one exact vehicle loses its robustness: with a hidden offset
     of the centre of mass its success fell far below that before the fine-tuning.
     """
-    own = config.quadrotor
-    if own is None:
+    quadrotor = config.quadrotor
+    if quadrotor is None:
         return config
-    base = replace(_varied(), com_std_m=0.008, trim_std=0.03)
-    wide = with_quadrotor(replace(config, quadrotor=base), own.vehicle).quadrotor
-    most = {name: max(getattr(own, name), getattr(wide, name)) for name in SPREADS}
-    return replace(config, quadrotor=replace(own, **most))
+    base = replace(_racer5_with_spreads(), com_std_m=0.008, trim_std=0.03)
+    usual = with_quadrotor(replace(config, quadrotor=base), quadrotor.vehicle).quadrotor
+    spreads = {name: max(getattr(quadrotor, name), getattr(usual, name)) for name in SPREADS}
+    return replace(config, quadrotor=replace(quadrotor, **spreads))
 
 
-def _varied() -> QuadrotorConfig:
+def _racer5_with_spreads() -> QuadrotorConfig:
     """Return quadrotors that vary widely around `racer5`."""
     from eval.quadrotor.vehicle_file import load_vehicle
 
@@ -290,7 +295,7 @@ def _inertia(vehicle: Vehicle) -> float:
     return (vehicle.inertia[0] + vehicle.inertia[1]) / 2
 
 
-def chosen_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
+def with_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
     """Return `config` with the dynamics of --model and --vehicle.
 
     Args:

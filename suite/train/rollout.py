@@ -1,9 +1,10 @@
-"""One rollout of the policy in its dynamics, with the loss of every step.
+"""Roll out the policy through differentiable dynamics, and compute the loss of every step.
 
-The image has no gradient with respect to the state (Zhang et al. 2025), so the encoder is outside
-the differentiated loop: the embeddings enter as constants plus `embedding_shift`, a zero whose
-gradient is the embeddings' cotangent. Obstacles, field and gates are evaluated without gradient as
-well.
+A rollout is a flight of B worlds (a world is one simulated scene and drone) over T policy periods.
+Images have no gradient with respect to the state (Zhang et al. 2025), so the image encoder is
+outside the differentiated loop: its embeddings enter as constants plus `embedding_shift`, a zero
+whose gradient is the embeddings' cotangent (see `gradient.py`). Obstacles, gates and their
+attractive field are evaluated without gradient as well.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from tracks.geometry.rotation import exp_rot, to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
-"""Solids of each kind in a training image, the nearest ones; the judge's images have all."""
+"""Solids of each kind in a training image, the nearest ones. Images of the judge, which scores
+policies in MuJoCo, have all solids."""
 
 
 class RolloutCarry(NamedTuple):
@@ -81,20 +83,20 @@ class StepRecord(NamedTuple):
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
     noted: Any = None
-    """Result of `note`, if there is one."""
+    """Result of `note`, the function for additional records, if there is one."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
-"""note(worlds, before, after, target) -> arrays (B, ...) that are recorded of a step; `target` is
-that at its beginning."""
+"""note(worlds, before, after, target) -> arrays (B, ...) to record of a step; `target` is the
+number of gates passed before it."""
 
 
 def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
     """Return the observation, without image, of drones that have passed `target` (B,) gates."""
     gates = worlds.scene.gates
     gate, target_w = target_gate(gates, target)
-    after, second_w = target_gate(gates, target, ahead=1)
-    axes_w = gate.rot_w[:, :, 0], after.rot_w[:, :, 0]
+    second_gate, second_w = target_gate(gates, target, ahead=1)
+    axes_w = gate.rot_w[:, :, 0], second_gate.rot_w[:, :, 0]
     return View(
         state.pos_w, state.rot_w, state.vel_w, target_w, second_w, *axes_w, gate_number=target
     )
@@ -102,8 +104,8 @@ def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return (the oldest entry, the queue without it and with `new` at its end)."""
-    line = jnp.concatenate([waiting, new[:, None]], axis=1)
-    return line[:, 0], line[:, 1:]
+    entries = jnp.concatenate([waiting, new[:, None]], axis=1)
+    return entries[:, 0], entries[:, 1:]
 
 
 def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
@@ -111,61 +113,69 @@ def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
     return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
 
 
-class Senses(NamedTuple):
-    """The sensor models of a training, as pure functions over B worlds."""
+class SensorModels(NamedTuple):
+    """The sensor models of a training, as pure functions over B worlds.
+
+    A view has all that the policy's observation is computed from: pose, velocity, gates, depth.
+    """
 
     start: Callable[[Worlds, View], Any]
     """(worlds, view at the start) -> memory of the models."""
-    see: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
-    """(worlds, truth, keys (B,), memory) -> (view with errors, memory)."""
+    measure: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
+    """(worlds, true view, keys (B,), memory) -> (view with errors, memory)."""
 
 
-def make_senses(config: TrainConfig) -> Senses:
+def make_sensor_models(config: TrainConfig) -> SensorModels:
     """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
 
     The functions are the judge's. The trainer has states only at decisions: a state in between is
     interpolated, and an image in between is one of the two neighbours, at random.
     """
     assert config.sensors is not None
-    held, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
-    parts, longest = view_models(held), config.sensors.magnitude[1]
-    ages = (scale_model(name, held[name], longest) for name in held if name == "delay")
+    models, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
+    seen_models, largest = view_models(models), config.sensors.magnitude[1]
+    delays = (scale_model(name, models[name], largest) for name in models if name == "delay")
     # Number of stored views: the largest possible age in policy periods.
-    periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in ages), default=0)
+    periods = max((ceil((1 + d.jitter) * max(d.state, d.image) / dt_s) for d in delays), default=0)
 
     def current_models(worlds: Worlds) -> dict[str, Any]:
         assert worlds.sensed is not None
-        return sensors.scale_models(parts, worlds.sensed.magnitude)
+        return sensors.scale_models(seen_models, worlds.sensed.magnitude)
 
     def start(worlds: Worlds, truth: View) -> Any:
         assert worlds.sensed is not None
-        about = worlds.sensed.trial, dt_s, spec.camera
-        return (truth,) * periods, sensors.start(current_models(worlds), truth, *about)
+        arguments = worlds.sensed.trial, dt_s, spec.camera
+        return (truth,) * periods, sensors.start(current_models(worlds), truth, *arguments)
 
-    def see(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
-        past, kept = memory
-        draws, views = {}, (truth, *past)
-        for number, name in enumerate(parts):
-            own = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
+    def measure(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
+        past_views, states = memory
+        draws, views = {}, (truth, *past_views)
+        for number, name in enumerate(seen_models):
+            model_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
             needs = SENSORS[name].observation
-            draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(own)
-        old = truth
-        if past:
+            draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(
+                model_keys
+            )
+        delayed = truth
+        if past_views:
             assert worlds.sensed is not None
-            delay = scale_model("delay", held["delay"], worlds.sensed.magnitude["delay"])
-            own = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
-            chance = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(own)
-            shake = 1.0 + delay.jitter * (2.0 * chance[:, :2] - 1.0)
-            ages = jnp.stack([delay.state, delay.image], -1) * shake / dt_s
-            old = older(views, ages[:, 0], jnp.floor(ages[:, 1] + chance[:, 2]))
-        seen, kept = sensors.sense(current_models(worlds), kept, old, draws, dt_s, spec.camera)
-        image = jax.lax.stop_gradient(seen.depth_m)
-        return seen._replace(depth_m=image), (views[:periods], jax.lax.stop_gradient(kept))
+            delay = scale_model("delay", models["delay"], worlds.sensed.magnitude["delay"])
+            delay_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, 0)
+            uniform = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(delay_keys)
+            jitter = 1.0 + delay.jitter * (2.0 * uniform[:, :2] - 1.0)
+            ages = jnp.stack([delay.state, delay.image], -1) * jitter / dt_s
+            # A random rounding: up as often as the fraction says.
+            delayed = delayed_view(views, ages[:, 0], jnp.floor(ages[:, 1] + uniform[:, 2]))
+        view, states = sensors.sense(
+            current_models(worlds), states, delayed, draws, dt_s, spec.camera
+        )
+        image = jax.lax.stop_gradient(view.depth_m)
+        return view._replace(depth_m=image), (views[:periods], jax.lax.stop_gradient(states))
 
-    return Senses(start, see)
+    return SensorModels(start, measure)
 
 
-def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
+def delayed_view(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
     """Return the view of an age between decisions; the next gate is that of the nearer decision.
 
     Args:
@@ -173,54 +183,54 @@ def older(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View
         age: (B,) of the state [policy periods].
         image_age: (B,) of the image, whole numbers [policy periods].
     """
-    seen = views[0]
-    for number, (late, before) in enumerate(pairwise(views)):
-        share = age - number
-        part, turn_b = share[:, None], rotation_since(before.rot_w, late.rot_w)
-        old = select(share > 0.5, before, late)._replace(
-            pos_w=late.pos_w + part * (before.pos_w - late.pos_w),
-            vel_w=late.vel_w + part * (before.vel_w - late.vel_w),
-            rot_w=product(late.rot_w, exp_rot(part * turn_b)),
-            depth_m=seen.depth_m,
+    view = views[0]
+    for number, (later, earlier) in enumerate(pairwise(views)):
+        fraction = age - number
+        weight, turn_b = fraction[:, None], rotation_since(earlier.rot_w, later.rot_w)
+        between = select(fraction > 0.5, earlier, later)._replace(
+            pos_w=later.pos_w + weight * (earlier.pos_w - later.pos_w),
+            vel_w=later.vel_w + weight * (earlier.vel_w - later.vel_w),
+            rot_w=product(later.rot_w, exp_rot(weight * turn_b)),
+            depth_m=view.depth_m,
         )
-        seen = select(share > 0.0, old, seen)
-        seen = seen._replace(depth_m=select(image_age > number, before.depth_m, seen.depth_m))
-    return seen
+        view = select(fraction > 0.0, between, view)
+        view = view._replace(depth_m=select(image_age > number, earlier.depth_m, view.depth_m))
+    return view
 
 
-class Sight(NamedTuple):
+class Observer(NamedTuple):
     """The observation of policies, as pure functions over B worlds; images have no gradient."""
 
     start: Callable[[Worlds, DynamicsState], Any]
     """(worlds, state at the start) -> memory of the sensor models; () without models."""
-    see: Callable[..., tuple[Observation, Any]]
+    observe: Callable[..., tuple[Observation, Any]]
     """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, memory); without
     sensor models `memory` may be left out."""
 
 
-def make_sight(config: TrainConfig) -> Sight:
+def make_observer(config: TrainConfig) -> Observer:
     """Return the observation in training, with image noise and sensor errors."""
     spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
     # One ray a pixel, also for a supersampling camera: more rays took time without a gain.
     rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
-    senses = None if config.sensors is None else make_senses(config)
+    models = None if config.sensors is None else make_sensor_models(config)
 
     def true_view(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
         # Scaling the rays across the optical axis changes the field of view. All worlds of an
         # iteration share the scale, so that the rays are one array.
         axis = rays.mean(0)
-        wide = axis + (rays - axis) * worlds.fov_scale[0]
+        scaled_rays = axis + (rays - axis) * worlds.fov_scale[0]
         pos_w, rot_w = jax.lax.stop_gradient((state.pos_w, state.rot_w))
-        depth_m = depth_image(worlds.scene, pos_w, rot_w, wide, camera.range_m, SEEN)
+        depth_m = depth_image(worlds.scene, pos_w, rot_w, scaled_rays, camera.range_m, SEEN)
         image_m = depth_m.reshape(-1, camera.height, camera.width)
         return view_in(worlds, state, target)._replace(depth_m=image_m)
 
     def start(worlds: Worlds, state: DynamicsState) -> Any:
-        if senses is None:
+        if models is None:
             return ()
-        return senses.start(worlds, true_view(worlds, state, jnp.asarray(worlds.target)))
+        return models.start(worlds, true_view(worlds, state, jnp.asarray(worlds.target)))
 
-    def see(
+    def observe_worlds(
         worlds: Worlds,
         state: DynamicsState,
         target: jax.Array,
@@ -229,20 +239,21 @@ def make_sight(config: TrainConfig) -> Sight:
         memory: Any = (),
     ) -> tuple[Observation, Any]:
         view = true_view(worlds, state, target)
-        if senses is not None:
-            view, memory = senses.see(worlds, view, keys, memory)
-        seen = observe(spec, view, last_action_b, worlds.wanted)
+        if models is not None:
+            view, memory = models.measure(worlds, view, keys, memory)
+        observation = observe(spec, view, last_action_b, worlds.speed_command)
         grain = jax.vmap(lambda key: jax.random.normal(key, view.depth_m.shape[1:]))(keys)
-        return seen._replace(image=seen.image + noise * grain), memory
+        return observation._replace(image=observation.image + noise * grain), memory
 
-    return Sight(start, see)
+    return Observer(start, observe_worlds)
 
 
 def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
     """Return the delayed states at the start, (B, state_delay, state_size): copies of the first."""
-    view, still = view_in(worlds, state, jnp.asarray(worlds.target)), jnp.zeros_like(state.pos_w)
-    seen = observe(config.spec, view, still, worlds.wanted).state
-    return jnp.repeat(seen[:, None], config.physics.state_delay, axis=1)
+    view = view_in(worlds, state, jnp.asarray(worlds.target))
+    no_action = jnp.zeros_like(state.pos_w)
+    observed = observe(config.spec, view, no_action, worlds.speed_command).state
+    return jnp.repeat(observed[:, None], config.physics.state_delay, axis=1)
 
 
 def make_rollout(
@@ -251,11 +262,12 @@ def make_rollout(
     """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
 
     `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
-    the frozen Delta Action network's parameters or None. The loss is the mean over steps and
-    worlds; records are (T, B, ...), without gradient.
+    the parameters of a Delta Action network, which corrects the actions so that simulated flights
+    match measured ones, or None. The loss is the mean over steps and worlds; records are
+    (T, B, ...), without gradient.
     """
     weights, physics, width = config.loss, config.physics, config.spec.hidden_size
-    sight, dynamics = make_sight(config), make_dynamics(config)
+    observer, dynamics = make_observer(config), make_dynamics(config)
 
     def start(worlds: Worlds) -> RolloutCarry:
         batch = len(worlds.target)
@@ -269,7 +281,7 @@ def make_rollout(
             observed=observed_at_start(worlds, state, config),
             delta_hidden=delta_network.start(batch),
             alive=jnp.ones(batch),
-            sensed=sight.start(worlds, state),
+            sensed=observer.start(worlds, state),
         )
 
     def rollout(
@@ -288,35 +300,37 @@ def make_rollout(
             shift_now, key_now, number = inputs
             before, target = carry.state, carry.target
             keys = world_keys(key_now, worlds)
-            seen, sensed = sight.see(worlds, before, target, carry.action_b, keys, carry.sensed)
-            embedding = encode(params, seen.image) + shift_now
+            observation, sensed = observer.observe(
+                worlds, before, target, carry.action_b, keys, carry.sensed
+            )
+            embedding = encode(params, observation.image) + shift_now
             embedding, embeddings = queue(carry.embeddings, embedding)
-            state, observed = queue(carry.observed, seen.state)
+            state, observed = queue(carry.observed, observation.state)
             action, hidden = network.recur(params, carry.hidden, embedding, state)
-            flown, delta_hidden = action, carry.delta_hidden
+            corrected, delta_hidden = action, carry.delta_hidden
             if delta is not None:
                 vel_b = to_local(before.rot_w, before.vel_w)
                 correction, delta_hidden = delta_network.step(
                     delta, delta_hidden, vel_b, before.rot_w[:, 2], action
                 )
-                flown = action + correction
+                corrected = action + correction
             _, target_w = target_gate(worlds.scene.gates, target)
-            after = dynamics.step(before, worlds.constants, flown, target_w, keys)
-            made = make_step(weights, worlds, before, after, target)
-            terms = losses.weighted(weights, made)
-            target_after = target + made.passed
+            after = dynamics.step(before, worlds.constants, corrected, target_w, keys)
+            motion = make_step(weights, worlds, before, after, target)
+            terms = losses.weighted(weights, motion)
+            target_after = target + motion.passed
             goes_on = number + 1 < worlds.stop
             if config.episode.finish:
                 goes_on = goes_on & (target_after < worlds.scene.gates.center_w.shape[1])
-            intact = made.clearance > -weights.crash_depth_m
+            intact = motion.clearance > -weights.crash_depth_m
             if weights.tilt > 0.0:
-                intact = intact & (made.up > 0.0)
+                intact = intact & (motion.up > 0.0)
             record = StepRecord(
-                image=seen.image,
+                image=observation.image,
                 terms={name: term * carry.alive for name, term in terms.items()},
                 speed=jnp.linalg.norm(after.vel_w, axis=-1),
-                clearance=made.clearance,
-                passed=made.passed,
+                clearance=motion.clearance,
+                passed=motion.passed,
                 pos_w=after.pos_w,
                 hidden=hidden,
                 alive=carry.alive,

@@ -1,7 +1,7 @@
-"""A training run in a folder, by backpropagation through its dynamics.
+"""Train a policy by backpropagation through differentiable dynamics: `train`, and its estimate.
 
-Worlds and noise depend only on the seed and the iteration; `training_loop.py` describes the
-folder's files.
+`train` describes the run's phases to the loop of `training_loop.py`, which iterates, saves and
+resumes in a folder. Simulated scenes and noise depend only on the seed and the iteration.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from suite.common.stages import Estimate
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_phases, phase_configs, phase_ends
 from suite.train.shards import check_processes
-from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
+from suite.train.training_loop import Outcome, Run, RunPhase, Watch, flight_note, train_in_folder
 from suite.train.update import TrainState, make_update, start_state
 from suite.train.worlds import sample_worlds
 from tracks.common.files import plain
@@ -36,6 +36,9 @@ STEPS_PER_CORE_S = 5000.0
 """Environment steps a second of a processor core, gradient included; for the estimate."""
 COMPILE_S = 15.0
 """Time to compile, for the estimate [s]."""
+PROGRAM_BYTES, FLOATS_PER_UNIT = 8e8, 24
+"""Memory of the process without a batch [B], and stored numbers per unit of the recurrent state
+and environment step; for the estimate."""
 
 
 def estimate(
@@ -56,22 +59,22 @@ def estimate(
     """
     pixels = config.spec.camera.height * config.spec.camera.width
     cores = usable_cores() if jax.default_backend() == "cpu" else 50
-    seconds, most = 0.0, 0
+    seconds, most_frames = 0.0, 0
     for phase in phase_configs(config):
         frames = phase.episode.batch * phase.episode.steps
         steps = phase.optimizer.iterations * frames * passes
         seconds += compile_s + steps / (steps_per_core_s * cores)
-        most = max(most, frames)
-    floats = most * (images * pixels + 24 * config.spec.hidden_size)
-    return Estimate(seconds, 8e8 + floats * 4.0)
+        most_frames = max(most_frames, frames)
+    floats = most_frames * (images * pixels + FLOATS_PER_UNIT * config.spec.hidden_size)
+    return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)
 
 
-def started_from(policy: str, spec: PolicySpec) -> network.Params:
+def load_start_params(policy: str, spec: PolicySpec) -> network.Params:
     """Return the parameters of `policy`, converted for a policy with `spec`.
 
     Args:
         policy: a shipped policy's name or a checkpoint's folder.
-        spec: of the policy to train.
+        spec: inputs and network of the policy to train.
 
     Raises:
         ValueError: if it does not exist, or has an input that `spec` lacks.
@@ -96,10 +99,11 @@ def train(
 
     Args:
         config: the whole run.
-        folder: of the run; a run of the same configuration in it is resumed.
-        console: for progress.
+        folder: where the run's files go; a run of the same configuration in it is resumed.
+        console: shows progress.
         params: initial parameters instead of random ones.
-        delta: a frozen Delta Action network to train under.
+        delta: parameters of a Delta Action network, which corrects every action so that simulated
+            flights match measured ones; they are not trained.
         watch: measures the policy during the training; only in a single process.
         mirror: receives the rows of the curve as well.
 
@@ -111,32 +115,32 @@ def train(
     check_phases(config)
     check_processes(config)
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
-    hosts.agree({"the configuration": origin["config"], "--init-from": origin["from"],
+    hosts.check_same({"the configuration": origin["config"], "--init-from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
     configs, ends = phase_configs(config), phase_ends(config)
     begins = (0, *ends[:-1])
-    specs = (configs[0].spec, *(one.spec for one in configs[:-1]))
-    methods = [
-        Method(
+    specs_before = (configs[0].spec, *(phase.spec for phase in configs[:-1]))
+    phases = [
+        RunPhase(
             end=end,
-            spec=one.spec,
-            frames=one.episode.batch * one.episode.steps,
-            worlds=functools.partial(sample_worlds, one),
-            make_update=functools.partial(make_update, one, delta, begin),
+            spec=phase.spec,
+            frames=phase.episode.batch * phase.episode.steps,
+            worlds=functools.partial(sample_worlds, phase),
+            make_update=functools.partial(make_update, phase, delta, begin),
             note=functools.partial(flight_note, "loss"),
-            begin=functools.partial(_refitted, seen=seen, spec=one.spec),
+            begin=functools.partial(_convert_policy, before=before, spec=phase.spec),
         )
-        for one, begin, end, seen in zip(configs, begins, ends, specs, strict=True)
+        for phase, begin, end, before in zip(configs, begins, ends, specs_before, strict=True)
     ]
     run = Run(config, config.seed, origin, folder, estimate(config), mirror)
-    return train_in_folder(methods, run, start_state(configs[0], params), console, watch)
+    return train_in_folder(phases, run, start_state(configs[0], params), console, watch)
 
 
-def _refitted(state: TrainState, seen: PolicySpec, spec: PolicySpec) -> TrainState:
-    """Return the state of a policy with spec `seen`, converted for a policy with `spec`."""
-    if seen == spec:
+def _convert_policy(state: TrainState, before: PolicySpec, spec: PolicySpec) -> TrainState:
+    """Return the state of a policy with spec `before`, converted for a policy with `spec`."""
+    if before == spec:
         return state
-    return state._replace(params=network.adapt_params(state.params, seen, spec))
+    return state._replace(params=network.adapt_params(state.params, before, spec))
 
 
 def _digest(params: Mapping[str, Any] | None) -> str | None:

@@ -1,8 +1,9 @@
-"""A batch in shards: computed separately, in parallel where possible, and summed in a fixed order.
+"""Compute the gradient of a batch in shards, in parallel, and sum them in a fixed order.
 
-The number of shards is a setting of the run and does not depend on the number of cores, devices and
-processes. All shards are computed by the same compiled program, and their gradients are summed in
-the order of the shards, so that the sums have the same bits on every machine.
+A shard is a part of a batch of worlds (simulated scenes with a drone). The number of shards is a
+setting of the run and does not depend on the number of cores, devices and processes. All shards are
+computed by the same compiled program, and their gradients are summed in the order of the shards, so
+that the sums have the same bits with any number of cores.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class Shard(NamedTuple):
     """Results of the worlds of a shard, or of a batch."""
 
     gradient: network.Params
-    """Mean over worlds."""
+    """Gradient of the loss, the mean over worlds."""
     numbers: dict[str, jax.Array]
-    """Of the curve, means over worlds, scalars each."""
+    """Numbers of the curve, means over worlds, scalars each."""
     hidden: jax.Array
     """(B, hidden) recurrent state of a random step of each world."""
 
@@ -46,11 +47,11 @@ def flight_numbers(loss: jax.Array, records: StepRecord) -> dict[str, jax.Array]
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
-    hit = counts & (records.clearance < BODY_RADIUS_M)
+    collided = counts & (records.clearance < BODY_RADIUS_M)
     numbers = {
         "loss": loss,
         "gates": (records.passed & counts).sum(0).mean(),
-        "collided": hit.any(0).mean(),
+        "collided": collided.any(0).mean(),
         "speed": speed.mean(),
         "counted": counts.mean(),
         "speed_max": speed.max(0).mean(),
@@ -80,8 +81,8 @@ def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> ja
     steps, batch = records.alive.shape
     step = jax.vmap(lambda key: jax.random.randint(key, (), 0, steps))(keys)
     world = jnp.arange(batch)
-    taken = records.alive[step, world] > 0
-    return jnp.where(taken[:, None], records.hidden[step, world], before)
+    counts = records.alive[step, world] > 0
+    return jnp.where(counts[:, None], records.hidden[step, world], before)
 
 
 def check_processes(config: TrainConfig) -> None:
@@ -107,18 +108,19 @@ def make_shards(
 
     Args:
         config: the run.
-        delta: a frozen Delta Action network whose correction is added to every action.
+        delta: parameters of a Delta Action network, which corrects every action so that simulated
+            flights match measured ones; they are not trained.
     """
     gradient_of, seed = make_gradient(config), jax.random.key(np.uint32(config.seed))
     shards, size = config.episode.shards, config.episode.batch // config.episode.shards
-    each, devices = shards // jax.process_count(), jax.local_devices()
-    mine = range(each * jax.process_index(), each * (jax.process_index() + 1))
+    per_process, devices = shards // jax.process_count(), jax.local_devices()
+    own_shards = range(per_process * jax.process_index(), per_process * (jax.process_index() + 1))
     # On a CPU each thread keeps a core busy; an accelerator needs one thread.
-    at_once = usable_cores() if jax.default_backend() == "cpu" else len(devices)
-    pool, compiled = ThreadPoolExecutor(min(len(mine), at_once)), False
+    most_threads = usable_cores() if jax.default_backend() == "cpu" else len(devices)
+    pool, compiled = ThreadPoolExecutor(min(len(own_shards), most_threads)), False
 
     @jax.jit
-    def computed(
+    def compute(
         params: network.Params, hidden: jax.Array, iteration: jax.Array, worlds: Worlds
     ) -> Shard:
         key = jax.random.fold_in(seed, iteration)
@@ -133,23 +135,24 @@ def make_shards(
     ) -> list[Shard]:
         nonlocal compiled
 
-        def one(shard: int) -> Shard:
+        def compute_on_device(shard: int) -> Shard:
             part = jax.tree.map(lambda leaf: leaf[shard * size : (shard + 1) * size], worlds)
-            given = (params, hidden, iteration, part)
+            arguments = (params, hidden, iteration, part)
             # Accelerators round products by default, too coarsely for rotations.
             with jax.default_matmul_precision("highest"):
-                found = computed(*jax.device_put(given, devices[shard % len(devices)]))
-            return jax.block_until_ready(jax.device_put(found, devices[0]))
+                result = compute(*jax.device_put(arguments, devices[shard % len(devices)]))
+            return jax.block_until_ready(jax.device_put(result, devices[0]))
 
         # Several threads would all compile the same program at the first call.
-        found = list(pool.map(one, mine) if compiled else map(one, mine))
+        run = pool.map if compiled else map
+        results = list(run(compute_on_device, own_shards))
         compiled = True
-        return hosts.gathered(found)
+        return hosts.gather(results)
 
     return sharded
 
 
-def added_up(shards: list[Shard]) -> Shard:
+def batch_mean(shards: list[Shard]) -> Shard:
     """Return the results of the whole batch: means of the shards, summed in their order."""
     gradient, numbers = jax.tree.map(
         lambda *leaves: functools.reduce(jnp.add, leaves) / len(leaves),

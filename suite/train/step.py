@@ -1,4 +1,8 @@
-"""One step of worlds, as losses and reward use it: the goal, the gate and the nearest solids."""
+"""One step of training, with all that the losses and the reward need: motion, gate, obstacles.
+
+A step is one period of the policy. A world is one simulated scene and drone; B of them step at
+once. `make_step` computes a `Step` from the states before and after it.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +24,8 @@ BODY_RADIUS_M = 0.08
 NEAR = Counts(boxes=8, cylinders=4, capsules=3, spheres=3)
 """Solids of each kind among which the nearest obstacle is searched."""
 BEYOND_M = 10.0
-"""Distance of the goal behind the last gate after passing it, so that braking gains nothing; with
-`episode.finish` it holds only for the step that passes the gate [m]."""
+"""Distance of the goal behind the last gate once that is passed, so that braking gains nothing [m].
+With `episode.finish` a world ends there, and only the step that passes the gate uses it."""
 PATH_SAMPLES = 4
 """Points of a step's path at which the nearest obstacle is searched: at 7 m/s and 30 Hz they are 6
 cm apart, less than the body's radius."""
@@ -43,7 +47,8 @@ class Step(NamedTuple):
     up: jax.Array
     """(B,) z component of body z at the step's end, with gradient if the attitude has one [1]."""
     gap: jax.Array
-    """(B, S) distance to the nearest solid beyond r_q at points of the path, with gradient [m]."""
+    """(B, S) distance to the nearest solid, minus the safety radius r_q, at S points of the step's
+    path, with gradient [m]."""
     away_w: jax.Array
     """(B, S, 3) unit vectors along which `gap` grows."""
     goal_w: jax.Array
@@ -51,12 +56,12 @@ class Step(NamedTuple):
     place_g: jax.Array
     """(B, 3) position in the frame of the next gate [m]."""
     gate: Gates
-    """(B, ...) next gate at the step's beginning, whose field is used."""
+    """(B, ...) next gate at the step's beginning; its attractive field u_A guides the drone."""
     passed: jax.Array
     """(B,) bool: that gate was crossed."""
     clearance: jax.Array
     """(B,) smallest signed distance to a solid on the step's path [m]."""
-    wanted: jax.Array | None = None
+    speed_command: jax.Array | None = None
     """(B,) the commanded speed, 0 to 1, if the policy has that input [1]."""
 
 
@@ -85,26 +90,27 @@ def approach_shift(config: LossConfig, place_g: jax.Array) -> jax.Array:
         place_g: (B, 3) positions in the gates' frames [m].
     """
     place_g = jax.lax.stop_gradient(place_g)
-    off = norm(place_g[:, 1:]) + jnp.maximum(place_g[:, 0], 0.0)
-    return jnp.clip(off - APPROACH_FREE_M, 0.0, config.approach_m)
+    distance_off = norm(place_g[:, 1:]) + jnp.maximum(place_g[:, 0], 0.0)
+    return jnp.clip(distance_off - APPROACH_FREE_M, 0.0, config.approach_m)
 
 
 def gap_beyond(
     config: LossConfig, distance: jax.Array, away_w: jax.Array, path_w: jax.Array
 ) -> jax.Array:
-    """Return the distance to the nearest solid beyond the safety radius, (B, S) [m].
+    """Return the distance to the nearest solid, minus the safety radius, (B, S) [m].
 
     The nearest solid is found outside the differentiated graph; the gradient of the distance with
     respect to the path is the direction away from the solid, which is exact.
 
     Args:
-        config: r_q.
+        config: has the safety radius r_q.
         distance: (B, S) signed distance at `path_w`, no gradient [m].
         away_w: (B, S, 3) unit vectors along which it grows.
         path_w: (B, S, 3) points with gradient [m].
     """
-    moved = ((path_w - jax.lax.stop_gradient(path_w)) * away_w).sum(-1)
-    return distance + moved - config.safety_radius_m
+    # Zero in value; its gradient with respect to the path is `away_w`.
+    shift = ((path_w - jax.lax.stop_gradient(path_w)) * away_w).sum(-1)
+    return distance + shift - config.safety_radius_m
 
 
 def make_step(
@@ -119,8 +125,8 @@ def make_step(
     Gates and obstacles are evaluated without gradient.
 
     Args:
-        config: the progress term's goal and r_q are used.
-        worlds: gates and obstacles.
+        config: settings of the progress term's goal, and the safety radius.
+        worlds: have the gates and obstacles.
         before: state at the step's beginning.
         after: state at its end.
         target: (B,) number of passed gates.
@@ -128,14 +134,14 @@ def make_step(
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
     count = gates.center_w.shape[1]
-    held = jax.lax.stop_gradient((before.pos_w, after.pos_w))
-    passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *held)
+    ends_w = jax.lax.stop_gradient((before.pos_w, after.pos_w))
+    passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, *ends_w)
     passed = passed & (target < count)
-    goal = target + (passed & config.pass_first)
-    aim, aim_w = target_gate(gates, goal)
-    place_g = to_local(aim.rot_w, after.pos_w - aim.center_w)
-    shift = (goal < count) * approach_shift(config, place_g)
-    goal_w = aim_w - shift[:, None] * aim.rot_w[:, :, 0]
+    goal_index = target + (passed & config.pass_first)
+    goal_gate, goal_w = target_gate(gates, goal_index)
+    place_g = to_local(goal_gate.rot_w, after.pos_w - goal_gate.center_w)
+    shift = (goal_index < count) * approach_shift(config, place_g)
+    goal_w = goal_w - shift[:, None] * goal_gate.rot_w[:, :, 0]
     share = (jnp.arange(PATH_SAMPLES) + 1.0) / PATH_SAMPLES
     path_w = before.pos_w[:, None] + share[:, None] * (after.pos_w - before.pos_w)[:, None]
     distance, away_w = nearest_obstacle(worlds.scene, jax.lax.stop_gradient(path_w), NEAR)
@@ -153,5 +159,5 @@ def make_step(
         gate=gate,
         passed=passed,
         clearance=distance.min(-1),
-        wanted=worlds.wanted,
+        speed_command=worlds.speed_command,
     )

@@ -1,9 +1,9 @@
-"""A training in a folder: iterations, checkpoints that survive a kill, exact resumption, curves.
+"""Run a training in a folder: iterate, save checkpoints that survive a kill, resume exactly.
 
 The folder has run.json (settings and versions), metrics.jsonl (the curve), validation.jsonl
 (measurements during the training), policy/ (the checkpoint to fly) and state/ (for resuming). An
 iteration depends only on the state and its number, so a resumed run has the same curve as one
-without a stop.
+without a stop. Both trainers, differentiable and PPO, use it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
 from suite.common.running import hosts
-from suite.common.stages import Estimate, announce, differences, first_of
+from suite.common.stages import Estimate, announce, differences, first_changes
 from suite.train.worlds import Worlds, WorldsAhead
 from tracks.common.files import recover_folder
 from tracks.common.work.threads import threads
@@ -60,8 +60,8 @@ class Watch(NamedTuple):
     """(the policy's parameters) -> a row of validation.jsonl."""
 
 
-class Method(NamedTuple):
-    """The functions of one phase of a run.
+class RunPhase(NamedTuple):
+    """The functions of one phase of a run, a part of it with its own settings.
 
     A state has the policy's `params` and the number of the next `iteration`.
     """
@@ -69,13 +69,13 @@ class Method(NamedTuple):
     end: int
     """Iteration of the run at which the phase ends; it begins at the end of the phase before."""
     spec: PolicySpec
-    """Of the policy during the phase."""
+    """Spec of the policy during the phase."""
     frames: int
     """Environment steps in one iteration."""
     worlds: Callable[[int], Worlds]
     """The fresh worlds of an iteration."""
     make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
-    """Called once: update(state, worlds) -> (state', numbers of the curve)."""
+    """Returns update(state, worlds) -> (state', numbers of the curve); called once."""
     note: Callable[[Mapping[str, float]], str]
     """Returns a short text about a row of the curve."""
     begin: Callable[[Any], Any] = lambda state: state
@@ -96,11 +96,11 @@ class Run(NamedTuple):
     config: Any
     """The resolved configuration, a dataclass."""
     seed: int
-    """Of the run."""
+    """Seed of the run, for its record."""
     origin: dict[str, Any]
     """The inputs, such as "config", that must be the same to resume a folder's run."""
     folder: Path
-    """Of the run."""
+    """Where the run's files go."""
     estimate: Estimate
     """Time and memory of the whole run."""
     mirror: curve.Mirror | None = None
@@ -108,7 +108,7 @@ class Run(NamedTuple):
 
 
 def train_in_folder(
-    phases: Sequence[Method], run: Run, fresh: Any, console: Console, watch: Watch | None = None
+    phases: Sequence[RunPhase], run: Run, fresh: Any, console: Console, watch: Watch | None = None
 ) -> Outcome:
     """Run the phases' updates from the folder's state, or from the `fresh` one, to the end.
 
@@ -119,18 +119,18 @@ def train_in_folder(
         WorkFailed: if a number of the curve is not finite, or another process has ended.
     """
     folder = run.folder
-    if hosts.writes():
+    if hosts.is_writer():
         refuse_other_run(folder, run.config)
         fresh = _resume(run, fresh)
-    # On the update's device: from another place, the second step would compile it again.
-    state = jax.device_put(hosts.from_the_first(fresh), jax.local_devices()[0])
+    # On the update's device: a state elsewhere would make the second step compile again.
+    state = jax.device_put(hosts.broadcast_from_first(fresh), jax.local_devices()[0])
     done, total = int(state.iteration), phases[-1].end
-    if not hosts.writes():
+    if not hosts.is_writer():
         return Outcome(folder / "policy", int(_iterate(phases, run, state, console).iteration), {})
     if done < total or _is_missing(watch, folder, done, total):
         announce(console, f"training to {folder}", run.estimate)
         if done < total:
-            write_run_record(folder, run.config, run.seed, goes_on=done > 0)
+            write_run_record(folder, run.config, run.seed, resumed=done > 0)
         state = _iterate(phases, run, state, console, watch)
     rows = curve.read(folder)
     if not rows:
@@ -144,48 +144,50 @@ def train_in_folder(
 
 
 def _iterate(
-    phases: Sequence[Method], run: Run, state: Any, console: Console, watch: Watch | None = None
+    phases: Sequence[RunPhase], run: Run, state: Any, console: Console, watch: Watch | None = None
 ) -> Any:
+    """Return the state after the last phase; phases that are already finished are skipped."""
     total, first, beginning = phases[-1].end, int(state.iteration), 0
     with (
         console.progress("training", total, begun=first) as show,
         _Recorder(run, watch, total) as recorder,
         WorldsAhead() as ahead,
     ):
-        recorder.last = (next(method for method in phases if first <= method.end), state)
+        recorder.last = (next(phase for phase in phases if first <= phase.end), state)
         if _is_missing(watch, run.folder, first, total):
             recorder.measure_if_due(state)
-        for method in phases:
-            if int(state.iteration) < method.end:
+        for phase in phases:
+            if int(state.iteration) < phase.end:
                 if int(state.iteration) == beginning:
-                    state = method.begin(state)
-                state = _iterate_phase(method, state, recorder, show, ahead)
-            beginning = method.end
+                    state = phase.begin(state)
+                state = _iterate_phase(phase, state, recorder, show, ahead)
+            beginning = phase.end
     return state
 
 
 def _iterate_phase(
-    method: Method,
+    phase: RunPhase,
     state: Any,
     recorder: _Recorder,
     show: Callable[[int, str], None],
     ahead: WorldsAhead,
 ) -> Any:
+    """Return the state after the phase; every iteration is recorded and shown."""
     first = int(state.iteration)
-    update = method.make_update()
+    update = phase.make_update()
     started = time.monotonic()
-    for iteration, worlds in ahead.worlds(method.worlds, first, method.end):
-        with _explained_if_another_ended(iteration, recorder.run.folder):
+    for iteration, worlds in ahead.worlds(phase.worlds, first, phase.end):
+        with _lost_process_explained(iteration, recorder.run.folder):
             state, numbers = update(state, worlds)
             row = {key: float(value) for key, value in numbers.items()}
         _check_finite(iteration, row, recorder.run.folder)
         seconds = time.monotonic() - started
-        speed = method.frames / seconds
+        speed = phase.frames / seconds
         # A cold iteration includes compiling.
         clock = {"seconds": round(seconds, 4), "cold": iteration == first}
         row = {"iteration": iteration, **row, "steps_per_s": round(speed), **clock}
-        recorder.add(method, state, row)
-        show(iteration + 1, f"{method.note(row)}, {speed:.0f} steps/s")
+        recorder.add(phase, state, row)
+        show(iteration + 1, f"{phase.note(row)}, {speed:.0f} steps/s")
         started = time.monotonic()
     return state
 
@@ -196,8 +198,8 @@ class _Recorder:
     def __init__(self, run: Run, watch: Watch | None, total: int) -> None:
         self.run, self.watch, self.total = run, watch, total
         self.rows: list[dict[str, Any]] = []
-        self.watched: list[dict[str, Any]] = []
-        self.last: tuple[Method, Any] | None = None
+        self.measurements: list[dict[str, Any]] = []
+        self.last: tuple[RunPhase, Any] | None = None
         self.saved_at = time.monotonic()
 
     def __enter__(self) -> _Recorder:
@@ -206,51 +208,54 @@ class _Recorder:
     def __exit__(self, *_: object) -> None:
         self.save()
 
-    def add(self, method: Method, state: Any, row: dict[str, Any]) -> None:
+    def add(self, phase: RunPhase, state: Any, row: dict[str, Any]) -> None:
         """Add the row of an iteration and the state after it."""
         # The row is added first: after an interrupt between the two, resuming removes the extra
         # row; a missing row could not be restored.
         self.rows.append(row)
-        self.last = (method, state)
+        self.last = (phase, state)
         self.measure_if_due(state)
         if time.monotonic() - self.saved_at > SAVE_PERIOD_S:
             self.save()
             self.saved_at = time.monotonic()
 
     def measure_if_due(self, state: Any) -> None:
+        """Measure the policy after this number of steps, if `watch` measures then."""
         done = int(state.iteration)
         if self.watch and _is_due(self.watch, done, self.total):
-            self.watched.append({"iteration": done, **self.watch.measure(state.params)})
+            self.measurements.append({"iteration": done, **self.watch.measure(state.params)})
 
     def save(self) -> None:
-        if not hosts.writes():
+        """Write the new rows, the policy and the state; only the first process writes."""
+        if not hosts.is_writer():
             return
         curve.append(self.run.folder, self.rows)
         if self.run.mirror:
             self.run.mirror(self.rows)
-        if self.watched:
-            curve.append(self.run.folder, self.watched, curve.WATCHED)
-        self.rows, self.watched = [], []
+        if self.measurements:
+            curve.append(self.run.folder, self.measurements, curve.WATCHED)
+        self.rows, self.measurements = [], []
         if self.last:
             _save(self.run, *self.last)
 
 
 @contextmanager
-def _explained_if_another_ended(iteration: int, folder: Path) -> Iterator[None]:
+def _lost_process_explained(iteration: int, folder: Path) -> Iterator[None]:
     """Raise `WorkFailed` with advice if another process of the training has ended."""
     try:
         yield
     except Exception as error:
-        if not hosts.is_gone(error):
+        if not hosts.is_process_lost(error):
             raise
         raise WorkFailed(
             f"another process of this training is gone, at iteration {iteration} "
-            f"({str(error).splitlines()[0][:120]}). Give the same command on every host again: it "
-            f"goes on from what the first one saved in {folder}"
+            f"({str(error).splitlines()[0][:120]}). Repeat the command on every host: it resumes "
+            f"from the state that the first host saved in {folder}"
         ) from error
 
 
 def _is_due(watch: Watch, done: int, total: int) -> bool:
+    """Return whether the policy is measured after `done` of `total` steps."""
     return done % watch.every == 0 or done == total
 
 
@@ -267,56 +272,58 @@ def _check_finite(iteration: int, row: dict[str, float], folder: Path) -> None:
     if bad:
         raise WorkFailed(
             f"training diverged at iteration {iteration}: {', '.join(bad)} not finite. The last "
-            f"finite state is in {folder / 'state'}; lower optimizer.rate or set optimizer.clip, "
-            "or where that was at once narrow what varies: a vehicle may tumble without end"
+            f"finite state is in {folder / 'state'}. Lower optimizer.rate or set optimizer.clip. "
+            "If it diverged in the first iterations, narrow the randomisation: a vehicle may tumble"
         )
 
 
-def _save(run: Run, method: Method, state: Any) -> None:
-    described = {
-        **run.origin,
-        "iteration": int(state.iteration),
-        "threads": threads(),
-    }
+def _save(run: Run, phase: RunPhase, state: Any) -> None:
+    """Write the policy and the state to the run's folder."""
+    training = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
     policy = run.folder / "policy"
-    save_policy(policy, state.params, method.spec, seed=run.seed, training=described)
+    save_policy(policy, state.params, phase.spec, seed=run.seed, training=training)
     # The state is written last: then the policy and the curve of its steps are on the disk.
     save_arrays(
         run.folder / "state",
         tree_to_arrays(state),
         kind="training",
         seed=run.seed,
-        extra={"training": described},
+        extra={"training": training},
     )
 
 
 def _resume(run: Run, fresh: Any) -> Any:
+    """Return the folder's saved state, or `fresh` if it has none; cut the curve to that state.
+
+    Raises:
+        ValueError: if the folder has another run, or sums would round differently from here on.
+    """
     origin, folder = run.origin, run.folder
-    place = folder / "state"
-    recover_folder(place)
-    if not place.exists():
+    saved = folder / "state"
+    recover_folder(saved)
+    if not saved.exists():
         folder.mkdir(parents=True, exist_ok=True)
         curve.cut(folder, 0)
         curve.cut(folder, 0, curve.WATCHED)
         return fresh
-    theirs = read_config(place)["training"]
-    options = [f"another --{key}" for key in ("from", "delta") if theirs.get(key) != origin[key]]
-    changes = options + differences(theirs["config"], origin["config"])
+    stored = read_config(saved)["training"]
+    options = [f"another --{key}" for key in ("from", "delta") if stored.get(key) != origin[key]]
+    changes = options + differences(stored["config"], origin["config"])
     if changes:
         raise ValueError(
-            f"{folder} holds another run ({first_of(changes)}); repeat its options to resume it, "
-            f"give another --out (with --init-from {folder / 'policy'} to train its policy on), or "
-            "remove the folder to start over"
+            f"{folder} holds another run ({first_changes(changes)}); repeat its options to resume "
+            f"it, give another --out (with --init-from {folder / 'policy'} to train its policy "
+            "further), or remove the folder to start over"
         )
-    before, now = theirs.get("threads", threads()), threads()
+    before, now = stored.get("threads", threads()), threads()
     if (before == 1) != (now == 1):
         raise ValueError(
-            f"{folder} was trained with {before} threads of XLA, and here are {now}: sums would "
-            f"round otherwise from here on. Set NPROC={before} in the environment to go on with "
-            "the same bits, or give another --out"
+            f"{folder} was trained with {before} threads of XLA, and now there are {now}: sums "
+            f"would round differently from here on. Set NPROC={before} in the environment to "
+            "resume with the same bits, or give another --out"
         )
-    stored = load_arrays(place, kind="training")
-    state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, stored.arrays, str(place)))
+    arrays = load_arrays(saved, kind="training").arrays
+    state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, arrays, str(saved)))
     curve.cut(folder, int(state.iteration))
     curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)
     return state

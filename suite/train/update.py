@@ -1,4 +1,8 @@
-"""One gradient step: the gradient of all shards, AdamW, and the numbers of the curve."""
+"""One gradient step of a training: sum the shards' gradients, apply AdamW, report the curve.
+
+A shard is a part of the batch whose gradient is computed separately (`shards.py`). The curve is the
+table of numbers, such as loss and speed, with a row per step.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import optax
 
 from policies.networks import delta_network, network
 from suite.train.config import OptimizerConfig, TrainConfig
-from suite.train.shards import Shard, added_up, curve_numbers, make_shards
+from suite.train.shards import Shard, batch_mean, curve_numbers, make_shards
 from suite.train.worlds import Worlds
 
 RATE_END, WEIGHT_DECAY = 1e-5, 1e-2
@@ -22,9 +26,9 @@ class TrainState(NamedTuple):
     """State of a run between iterations."""
 
     params: network.Params
-    """The policy's."""
+    """The policy's parameters."""
     optimizer: optax.OptState
-    """Of AdamW."""
+    """AdamW's state."""
     iteration: jax.Array
     """Number of finished gradient steps, a scalar."""
     hidden: jax.Array
@@ -35,7 +39,7 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
     """Return AdamW with warm-up, cosine decay and optional clipping by global norm.
 
     Args:
-        config: of the run, or of one of its phases.
+        config: the optimiser's settings in the run, or in one of its phases.
         begin: gradient steps of the run before that phase; AdamW's moments are kept.
     """
     rate = optax.warmup_cosine_decay_schedule(
@@ -50,7 +54,7 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
 
 def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:
-    """Return the state before the first iteration, from random or given parameters."""
+    """Return the state before the first iteration, from `params` or, without, random parameters."""
     if params is None:
         params = network.init(jax.random.key(config.seed), config.spec)
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
@@ -68,15 +72,16 @@ def make_update(
     """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
 
     Args:
-        config: of the run, or of one of its phases.
-        delta: a frozen Delta Action network whose correction is added to every action.
+        config: settings of the run, or of one of its phases.
+        delta: parameters of a Delta Action network, which corrects every action so that simulated
+            flights match measured ones; they are not trained.
         begin: gradient steps of the run before that phase.
     """
     optimizer, shards_of = make_optimizer(config.optimizer, begin), make_shards(config, delta)
 
     @jax.jit
     def step(state: TrainState, shards: list[Shard]) -> tuple[TrainState, dict[str, jax.Array]]:
-        batch = added_up(shards)
+        batch = batch_mean(shards)
         change, optimizer_state = optimizer.update(batch.gradient, state.optimizer, state.params)
         after = TrainState(
             # optax has a general type for trees; it returns the type of its argument.

@@ -1,7 +1,8 @@
-"""The worlds of one iteration: new tracks, start states and randomised parameters (numpy).
+"""Draw the worlds of one training iteration with numpy: tracks, start states, parameters.
 
-They are a pure function of (config, iteration): a resumed run has the same worlds, and the worlds
-of later iterations are sampled while the devices compute.
+A world is one simulated scene and drone; a batch has B of them. Worlds are a pure function of
+(config, iteration): a resumed run has the same ones, and `WorldsAhead` samples those of later
+iterations while the devices compute.
 """
 
 from __future__ import annotations
@@ -29,14 +30,18 @@ from tracks.geometry.cull import Bounds, bounds
 from tracks.geometry.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
 
+START_DRAWS, START_CLEARANCE_M, START_HEIGHT_M = 6, 0.5, 0.4
+"""Tries to draw a start point between gates, the clearance at which the search ends [m], and the
+lowest height of such a point [m]."""
+
 
 class Sensed(NamedTuple):
     """Random numbers of the sensor models in a batch of worlds, by the models' names."""
 
     magnitude: dict[str, Array]
-    """(B,) [1]."""
+    """(B,) factor on the model's errors: 0 is a perfect sensor, 1 the sensors file's values [1]."""
     trial: dict[str, Draws]
-    """(B, ...) numbers that a model draws once per trial."""
+    """(B, ...) numbers that a model draws once per flight."""
 
 
 class Worlds(NamedTuple):
@@ -64,7 +69,7 @@ class Worlds(NamedTuple):
     """(B,) number in the batch, which determines a world's noise on any device."""
     fov_scale: Array
     """(B,) this iteration's scale of the rays across the optical axis."""
-    wanted: Array | None = None
+    speed_command: Array | None = None
     """(B,) the commanded speed, 0 to 1, if the policy has that input [1]."""
     sensed: Sensed | None = None
     """Random numbers of the sensor models, if there are any."""
@@ -72,76 +77,83 @@ class Worlds(NamedTuple):
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
     """Return a lower bound of the distance to the obstacles other than gate frames [m]."""
+    # The boxes of a scene begin with the bars of the gates' frames.
     bars = track.scene.gates.opening_g.shape[0] * track.scene.gates.opening_g.shape[1]
     spheres = dict(bounds(track.scene))
     spheres["boxes"] = Bounds(*(field[bars:] for field in spheres["boxes"]))
-    away = np.concatenate([ball.center_w for ball in spheres.values()]) - point_w
+    offset_w = np.concatenate([ball.center_w for ball in spheres.values()]) - point_w
     radius = np.concatenate([ball.radius for ball in spheres.values()])
-    return float((np.linalg.norm(away, axis=-1) - radius).min(initial=np.inf))
+    return float((np.linalg.norm(offset_w, axis=-1) - radius).min(initial=np.inf))
 
 
-def _roomiest(
-    track: Track, rng: np.random.Generator, place: Callable[[int], np.ndarray]
+def _draw_free_point(
+    track: Track, rng: np.random.Generator, draw_point: Callable[[int], np.ndarray]
 ) -> tuple[np.ndarray, int]:
-    """Return one of up to six points that `place` draws for random next gates, and that gate.
+    """Return a start point (3,) away from obstacles [m], and the index of its next gate.
 
-    It is the first with a clearance of 0.5 m, or the one with the largest.
+    Up to `START_DRAWS` gates and points are drawn. The first point with a clearance of
+    `START_CLEARANCE_M` is taken, or the one with the largest clearance.
+
+    Args:
+        track: the scene.
+        rng: draws the gate.
+        draw_point: (index of the next gate) -> a point (3,) [m].
     """
     best = (-np.inf, track.start_pos_w, 0)
-    for _ in range(6):
+    for _ in range(START_DRAWS):
         target = int(rng.integers(0, len(track.scene.gates.center_w)))
-        point = place(target)
-        point[2] = max(point[2], 0.4)
-        room = _clearance(track, point)
-        if room > best[0]:
-            best = (room, point, target)
-        if room > 0.5:
+        point_w = draw_point(target)
+        point_w[2] = max(point_w[2], START_HEIGHT_M)
+        clearance = _clearance(track, point_w)
+        if clearance > best[0]:
+            best = (clearance, point_w, target)
+        if clearance > START_CLEARANCE_M:
             break
     return best[1], best[2]
 
 
-def _on_the_way(
+def _start_between_gates(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position, velocity and next gate between two gates, away from obstacles."""
+    """Return position [m], velocity [m/s] and next gate of a drone between two gates."""
     center_w = track.scene.gates.center_w
 
-    def place(target: int) -> np.ndarray:
-        behind = track.start_pos_w if target == 0 else center_w[target - 1]
+    def draw_point(target: int) -> np.ndarray:
+        previous_w = track.start_pos_w if target == 0 else center_w[target - 1]
         share = rng.uniform(0.1, 0.7)
-        return behind + share * (center_w[target] - behind) + rng.normal(0, 0.25, 3)
+        return previous_w + share * (center_w[target] - previous_w) + rng.normal(0, 0.25, 3)
 
-    point, target = _roomiest(track, rng, place)
-    towards = center_w[target] - point
-    towards = towards / max(np.linalg.norm(towards), 1e-6)
+    point_w, target = _draw_free_point(track, rng, draw_point)
+    to_gate = center_w[target] - point_w
+    to_gate = to_gate / max(np.linalg.norm(to_gate), 1e-6)
     sideways = rng.normal(0, 0.25, 3)
-    return point, rng.uniform(0, speed_limit) * (towards + sideways), target
+    return point_w, rng.uniform(0, speed_limit) * (to_gate + sideways), target
 
 
-def _after_a_miss(
+def _start_after_a_miss(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position, velocity and next gate of a drone that has missed that gate."""
+    """Return position [m], velocity [m/s] and next gate of a drone that has missed that gate."""
     gates = track.scene.gates
 
-    def place(target: int) -> np.ndarray:
+    def draw_point(target: int) -> np.ndarray:
         angle, radius_g = rng.uniform(-np.pi, np.pi), rng.uniform(0.9, 1.8)
         point_g = np.array(
             [rng.uniform(-0.7, 1.2), radius_g * np.cos(angle), radius_g * np.sin(angle)]
         )
         return gates.center_w[target] + gates.rot_w[target] @ point_g
 
-    point, target = _roomiest(track, rng, place)
+    point_w, target = _draw_free_point(track, rng, draw_point)
     onward = rng.uniform(0, 0.4) * gates.rot_w[target, :, 0] + rng.normal(0, 0.08, 3)
-    return point, speed_limit * onward, target
+    return point_w, speed_limit * onward, target
 
 
-def _constants(
+def _draw_constants(
     config: TrainConfig, iteration: int, rng: np.random.Generator
 ) -> dynamics.WorldParams:
-    """Return the parameters of the dynamics in an iteration.
+    """Return the parameters of the dynamics, (B, ...), of an iteration.
 
-    Quadrotors have a random generator of their own. Point masses are drawn in any case, so that
+    Quadrotors have a separate random generator. Point masses are drawn in any case, so that
     later numbers of `rng` do not depend on the model.
     """
     physics, batch, period = config.physics, config.episode.batch, 1.0 / config.spec.rate_hz
@@ -160,13 +172,13 @@ def _constants(
     # Training through the point mass does not load the judge's physics.
     from suite.train.dynamics.quadrotor import QuadrotorParams, draw_effects
 
-    own = np.random.default_rng([config.seed, iteration, 1])
-    effects = draw_effects(config.quadrotor, batch, own)
+    quadrotor_rng = np.random.default_rng([config.seed, iteration, 1])
+    effects = draw_effects(config.quadrotor, batch, quadrotor_rng)
     return QuadrotorParams(np.full(batch, period, np.float32), effects)
 
 
-def _wanted(config: TrainConfig, iteration: int) -> Array | None:
-    """Return the commanded speed of each world, from a random generator of its own."""
+def _draw_speed_commands(config: TrainConfig, iteration: int) -> Array | None:
+    """Return the commanded speed (B,), 0 to 1, from a separate random generator; None without."""
     if not config.spec.speed_input:
         return None
     rng = np.random.default_rng([config.seed, iteration, 3])
@@ -175,8 +187,8 @@ def _wanted(config: TrainConfig, iteration: int) -> Array | None:
     return np.where(races, 1.0, rng.random(batch)).astype(np.float32)
 
 
-def _sensed(config: TrainConfig, iteration: int) -> Sensed | None:
-    """Return the random numbers of the sensor models, from a random generator of their own."""
+def _draw_sensors(config: TrainConfig, iteration: int) -> Sensed | None:
+    """Return the sensor models' random numbers, from a separate generator; None without models."""
     if config.sensors is None:
         return None
     rng, batch = np.random.default_rng([config.seed, iteration, 4]), config.episode.batch
@@ -194,7 +206,7 @@ def _sensed(config: TrainConfig, iteration: int) -> Sensed | None:
 
 
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
-    """Return the worlds of an iteration."""
+    """Return the B worlds of an iteration."""
     rng = np.random.default_rng([config.seed, iteration])
     episode, batch = config.episode, config.episode.batch
     tracks, starts = [], []
@@ -213,14 +225,14 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         if rest:
             starts.append((track.start_pos_w, np.zeros(3), 0))
         elif episode.missed_share > 0 and rng.random() < episode.missed_share:
-            starts.append(_after_a_miss(track, episode.start_speed, rng))
+            starts.append(_start_after_a_miss(track, episode.start_speed, rng))
         else:
-            starts.append(_on_the_way(track, episode.start_speed, rng))
+            starts.append(_start_between_gates(track, episode.start_speed, rng))
     pos, vel, target = (np.stack(column) for column in zip(*starts, strict=True))
     gate = np.stack([t.scene.gates.center_w[i] for t, i in zip(tracks, target, strict=True)])
     yaw = np.arctan2(gate[:, 1] - pos[:, 1], gate[:, 0] - pos[:, 0]) + rng.normal(0, 0.2, batch)
-    constants = _constants(config, iteration, rng)
-    earliest = max(1, round(episode.stop_from * episode.steps))
+    constants = _draw_constants(config, iteration, rng)
+    first_stop = max(1, round(episode.stop_from * episode.steps))
     return Worlds(
         scene=stack([track.scene for track in tracks], MAX_COUNTS),
         pos_w=pos.astype(np.float32),
@@ -230,11 +242,11 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
         constants=constants,
         hidden=np.zeros((batch, config.spec.hidden_size), np.float32),
         remembers=np.where(rests, 0.0, 1.0).astype(np.float32),
-        stop=np.where(rests, rng.integers(earliest, episode.steps + 1, batch), episode.steps),
+        stop=np.where(rests, rng.integers(first_stop, episode.steps + 1, batch), episode.steps),
         number=np.arange(batch, dtype=np.int32),
         fov_scale=np.full(batch, rng.uniform(*config.physics.fov_scale), np.float32),
-        wanted=_wanted(config, iteration),
-        sensed=_sensed(config, iteration),
+        speed_command=_draw_speed_commands(config, iteration),
+        sensed=_draw_sensors(config, iteration),
     )
 
 
@@ -249,8 +261,8 @@ class WorldsAhead:
         self._depth = 1 if jax.default_backend() == "cpu" else max(2, usable_cores() - 1)
 
     def __enter__(self) -> WorldsAhead:
-        alone = self._depth == 1
-        self._pool: Executor = ThreadPoolExecutor(1) if alone else worker_pool(self._depth)
+        in_thread = self._depth == 1
+        self._pool: Executor = ThreadPoolExecutor(1) if in_thread else worker_pool(self._depth)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -267,8 +279,8 @@ class WorldsAhead:
             end: the iteration after the last.
         """
         numbers = iter(range(first, end))
-        begun = deque(self._pool.submit(sample, k) for k in islice(numbers, self._depth))
+        pending = deque(self._pool.submit(sample, k) for k in islice(numbers, self._depth))
         for iteration in range(first, end):
-            worlds = begun.popleft().result()
-            begun.extend(self._pool.submit(sample, k) for k in islice(numbers, 1))
+            worlds = pending.popleft().result()
+            pending.extend(self._pool.submit(sample, k) for k in islice(numbers, 1))
             yield iteration, worlds

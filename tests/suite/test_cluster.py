@@ -16,8 +16,8 @@ import eval.judging.results
 from policies import shipped
 from suite import cli
 from suite.common.console import Console
-from suite.common.running.apart import Job
-from suite.common.work import all_done
+from suite.common.running.remote import Job
+from suite.common.work import do_jobs
 from tests.support.cluster import cluster
 from tests.support.tools import program
 
@@ -126,9 +126,9 @@ def test_trainings_come_back_as_this_machine_would_have_made_them(tmp_path, monk
     configs = [replace(recipe, seed=seed) for seed in (0, 1)]
     here = [Job(config, tmp_path / "here" / str(config.seed)) for config in configs]
     there = [Job(config, tmp_path / "there" / str(config.seed)) for config in configs]
-    assert all_done(train_there, here, 1, Console(), "training") == [2, 2]
+    assert do_jobs(train_there, here, 1, Console(), "training") == [2, 2]
     with cluster(tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache")) as nodes:
-        assert all_done(train_there, there, nodes.address, Console(), "training") == [2, 2]
+        assert do_jobs(train_there, there, nodes.address, Console(), "training") == [2, 2]
     for one, other in zip(here, there, strict=True):
         weights = "policy/weights.safetensors"
         assert (one.folder / weights).read_bytes() == (other.folder / weights).read_bytes()

@@ -174,12 +174,16 @@ def test_variables_that_change_results_are_set_aside(monkeypatch, capsys):
     aside = {"JAX_ENABLE_X64": "1", "JAX_DEBUG_INFS": "perhaps", "JAX_TRANSFER_GUARD": "disallow"}
     own = kept | aside
     full = {"JAX_DEFAULT_MATMUL_PRECISION": "highest"}
-    assert startup.pin(own) == sorted(aside) and own == kept | full
-    assert startup.pin(own) == [] and own == kept | full, "a process of a command finds its own"
-    assert startup.pin(own | {"JAX_DEFAULT_MATMUL_PRECISION": "bfloat16"}) == list(full)
+    assert startup.clean_jax_environment(own) == sorted(aside) and own == kept | full
+    assert startup.clean_jax_environment(own) == [] and own == kept | full, (
+        "a process of a command finds its own"
+    )
+    assert startup.clean_jax_environment(
+        own | {"JAX_DEFAULT_MATMUL_PRECISION": "bfloat16"}
+    ) == list(full)
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     assert cli.main(["effects"]) == 0
-    assert "JAX_ENABLE_X64 of the environment is set aside" in capsys.readouterr().err
+    assert "JAX_ENABLE_X64 of the environment is ignored" in capsys.readouterr().err
 
 
 def test_a_compiled_program_that_a_kill_cut_is_compiled_again(tmp_path):
@@ -244,7 +248,8 @@ def test_a_cache_that_is_full_or_cut_costs_time_and_no_words(root):
     words = ["Error writing persistent compilation cache entry for 'f'", "Error reading persistent "
              "compilation cache entry for 'f'"]  # fmt: skip
     warn = f"import warnings\nfor words in {words!r}: warnings.warn(words)"
-    code = f"import os, sys\nfrom suite.common.startup import hush\nhush()\n{warn}\n"
+    code = "import os, sys\nfrom suite.common import startup\nstartup.suppress_warnings()\n"
+    code += f"{warn}\n"
     code += f"os.execl(sys.executable, 'python', '-c', {warn!r})"  # as in a process of ours
     env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, timeout=60)

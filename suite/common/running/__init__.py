@@ -1,1 +1,1 @@
-"""How a command runs: folder locks, signals, several processes and hosts."""
+"""The running of a command: folder locks, signals, several processes and hosts."""

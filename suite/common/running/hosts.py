@@ -1,4 +1,4 @@
-"""One command in several JAX processes, on one machine or many.
+"""Run one command in several connected JAX processes, on one host or many.
 
 All processes run the same command. JAX connects them through the first one, the coordinator, which
 writes the files; the others need no access to its folders.
@@ -17,28 +17,29 @@ from suite.common.errors import WorkFailed
 from tracks.common.files import to_json
 from tracks.input.ranges import Range
 
-COME_S = 300
+CONNECT_S = 300
 """Time for all processes to connect [s]."""
-SILENT_S = 60
+HEARTBEAT_S = 60
 """A process without a heartbeat for this time counts as ended [s]."""
 ENVIRONMENTS = (
     ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_STEP_NODELIST"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE", "OMPI_MCA_orte_hnp_uri"),
 )
-"""By scheduler: variables with this process, the number of processes, and the coordinator."""
-MOST = 100_000
+"""Environment variables of each scheduler, SLURM and Open MPI: the number of this process, the
+number of processes, and the coordinator."""
+MOST_PROCESSES = 100_000
 
 
 @dataclass(frozen=True)
-class Joined:
-    """This process among several; srun of SLURM and mpirun of Open MPI set it."""
+class ProcessOptions:
+    """Options that connect this process to others; srun and mpirun make them unnecessary."""
 
     coordinator: str | None = None
     """For a training on several hosts: HOST:PORT at which the others reach the first process."""
-    processes: Annotated[int, Range(1, MOST)] | None = None
-    """For a training on several hosts: how many processes. Without it the scheduler (SLURM, Open
-    MPI) decides; 1 is this one alone."""
-    process: Annotated[int, Range(0, MOST)] | None = None
+    processes: Annotated[int, Range(1, MOST_PROCESSES)] | None = None
+    """For a training on several hosts: the number of processes. Without it the scheduler (SLURM,
+    Open MPI) decides; 1 is this process alone."""
+    process: Annotated[int, Range(0, MOST_PROCESSES)] | None = None
     """For a training on several hosts: the number of this process, from 0."""
 
 
@@ -46,27 +47,29 @@ class Member(NamedTuple):
     """A process among several."""
 
     number: int
-    of: int
+    """From 0."""
+    processes: int
+    """How many there are."""
     coordinator: str | None
-    """None: JAX finds it in the scheduler's environment."""
+    """HOST:PORT of the first process; None: JAX finds it in the scheduler's environment."""
 
 
-def member(asked: Joined, environment: Mapping[str, str] | None = None) -> Member:
+def read_member(options: ProcessOptions, environment: Mapping[str, str] | None = None) -> Member:
     """Return this process's number from the options or the environment; (0, 1) if it is alone.
 
     Raises:
         ValueError: for incomplete options, or numbers out of range.
     """
-    given = (asked.coordinator, asked.processes, asked.process)
-    if asked.processes == 1 and asked.coordinator is None and not asked.process:
+    values = (options.coordinator, options.processes, options.process)
+    if options.processes == 1 and options.coordinator is None and not options.process:
         return Member(0, 1, None)
-    if any(value is not None for value in given):
-        if None in given:
+    if any(value is not None for value in values):
+        if None in values:
             raise ValueError(
                 "--coordinator, --processes and --process go together: HOST:PORT of the first "
-                "process, how many there are, and which one this is"
+                "process, the number of processes, and the number of this one"
             )
-        coordinator, count, number = given
+        coordinator, count, number = values
         host, _, port = str(coordinator).rpartition(":")
         if not (host and port.isascii() and port.isdigit() and int(port[:6]) < 65536):
             raise ValueError(f"--coordinator is {coordinator!r}; allowed is HOST:PORT")
@@ -74,108 +77,108 @@ def member(asked: Joined, environment: Mapping[str, str] | None = None) -> Membe
         if number >= count:
             raise ValueError(f"--process is {number}; allowed is 0 to {count - 1}")
         return Member(number, count, coordinator)
-    values = os.environ if environment is None else environment
-    for number, count, how in ENVIRONMENTS:
-        if {number, count, how} <= set(values) and int(values[count]) > 1:
-            return Member(int(values[number]), int(values[count]), None)
+    variables = os.environ if environment is None else environment
+    for number, count, coordinator in ENVIRONMENTS:
+        if {number, count, coordinator} <= set(variables) and int(variables[count]) > 1:
+            return Member(int(variables[number]), int(variables[count]), None)
     return Member(0, 1, None)
 
 
-def join(one: Member) -> None:
+def connect(member: Member) -> None:
     """Connect to the other JAX processes; must be called before JAX searches for devices.
 
     Raises:
         WorkFailed: if the others do not connect in time.
     """
-    if one.of == 1:
+    if member.processes == 1:
         return
     import jax
 
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    given = one.coordinator is not None
+    by_options = member.coordinator is not None
     try:
         jax.distributed.initialize(
-            one.coordinator,
-            one.of if given else None,
-            one.number if given else None,
-            cluster_detection_method="deactivate" if given else None,
-            initialization_timeout=COME_S,
-            heartbeat_timeout_seconds=SILENT_S,
+            member.coordinator,
+            member.processes if by_options else None,
+            member.number if by_options else None,
+            cluster_detection_method="deactivate" if by_options else None,
+            initialization_timeout=CONNECT_S,
+            heartbeat_timeout_seconds=HEARTBEAT_S,
         )
     except RuntimeError as error:
+        coordinator = member.coordinator or "the coordinator that the scheduler names"
         raise WorkFailed(
-            f"process {one.number} of {one.of} did not meet the others at "
-            f"{one.coordinator or 'the coordinator that the scheduler names'} within {COME_S} s; "
-            "start the same command on every host, with one --coordinator that all of them reach"
+            f"process {member.number} of {member.processes} did not connect to the others at "
+            f"{coordinator} within {CONNECT_S} s; start the same command on every host, with one "
+            "--coordinator that all of them reach"
         ) from error
 
 
-def several() -> bool:
+def is_distributed() -> bool:
     """Return whether this process is one of several."""
     return "jax" in sys.modules and sys.modules["jax"].distributed.is_initialized()
 
 
-def writes() -> bool:
-    """Return whether this process writes the files."""
-    return not several() or sys.modules["jax"].process_index() == 0
+def is_writer() -> bool:
+    """Return whether this process writes the files: the first one does."""
+    return not is_distributed() or sys.modules["jax"].process_index() == 0
 
 
-def agree(what: Mapping[str, Any]) -> None:
-    """Check that all processes have the same settings and software.
+def check_same(settings: Mapping[str, Any]) -> None:
+    """Check that all processes have the same settings (by name) and software.
 
     Raises:
-        ValueError: if they differ.
+        ValueError: naming the settings that differ.
     """
-    if not several():
+    if not is_distributed():
         return
     import numpy as np
     from jax.experimental import multihost_utils
 
     from tracks.common.work.pickling import software
 
-    asked = [to_json(what[key]) for key in what] + [to_json(software())]
-    sums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in asked]
-    found = np.asarray(multihost_utils.process_allgather(np.asarray(sums, np.int32)))
-    differs = [name for name, column in zip([*what, "software"], found.T, strict=True)
-               if len(set(column.tolist())) > 1]  # fmt: skip
-    if differs:
+    texts = [*map(to_json, settings.values()), to_json(software())]
+    sums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in texts]
+    all_sums = np.asarray(multihost_utils.process_allgather(np.asarray(sums, np.int32)))
+    differing = [name for name, column in zip([*settings, "software"], all_sums.T, strict=True)
+                 if len(set(column.tolist())) > 1]  # fmt: skip
+    if differing:
         raise ValueError(
-            f"the {len(found)} processes were started apart: they differ in {', '.join(differs)}. "
-            "Give all of them the same command and the same version, or --processes 1 to each to "
-            "work alone"
+            f"the {len(all_sums)} processes differ in {', '.join(differing)}. Give all of them the "
+            "same command and the same version, or --processes 1 to each for separate runs"
         )
 
 
-def from_the_first(tree: Any) -> Any:
+def broadcast_from_first(tree: Any) -> Any:
     """Return the first process's arrays in all processes."""
-    if not several():
+    if not is_distributed():
         return tree
     from jax.experimental import multihost_utils
 
     return multihost_utils.broadcast_one_to_all(tree)
 
 
-def gathered(trees: list[Any]) -> list[Any]:
-    """Return the trees of arrays of all processes in order; each gives the same number."""
-    if not several():
+def gather(trees: list[Any]) -> list[Any]:
+    """Return the trees of arrays of all processes in order; each passes the same number."""
+    if not is_distributed():
         return trees
     import jax
     from jax.experimental import multihost_utils
 
-    found = multihost_utils.process_allgather(trees)
+    stacked = multihost_utils.process_allgather(trees)
     count = jax.process_count()
     return [
         jax.tree.map(lambda leaf, process=process: leaf[process], tree)
         for process in range(count)
-        for tree in found
+        for tree in stacked
     ]
 
 
-def is_gone(error: Exception) -> bool:
+def is_process_lost(error: Exception) -> bool:
     """Return whether an error of JAX means that another process has ended."""
     import jax
 
-    words = str(error)
-    return several() and (
-        isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in words or "NCCL" in words
+    text = str(error)
+    return is_distributed() and (
+        isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in text or "NCCL" in text
     )

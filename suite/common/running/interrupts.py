@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a command ends within seconds with code 130, at any point of its work.
+"""Handle Ctrl-C and SIGTERM: a command ends within seconds with code 130, whatever it computes.
 
 Python handles a signal between two of its own instructions, but XLA may compile for half a minute
 within one. An interpreter that exits while XLA's threads work crashes, since it frees their memory.
@@ -24,15 +24,16 @@ from typing import NoReturn
 
 from suite.common.errors import INTERRUPTED
 
-AGAIN_S = 0.05
+RESEND_S = 0.05
 """Time before a lost interrupt is sent again [s]."""
 PATIENCE_S = 3.0
 """Time for the main thread to handle a signal [s]."""
-WORDS = (
+MESSAGE = (
     "suite: interrupted in a step that cannot be stopped (mostly the compiler), so ended at once; "
     "what was saved is kept\n"
 )
 _SHOW_CURSOR = "\x1b[?25h"
+"""Terminal code that shows the cursor, which a progress bar hides."""
 
 
 @contextmanager
@@ -44,40 +45,40 @@ def ends_in_seconds() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handled, left = threading.Event(), threading.Event()
-    report = sys.unraisablehook
+    handled, finished = threading.Event(), threading.Event()
+    old_hook = sys.unraisablehook
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         handled.set()
         raise KeyboardInterrupt
 
-    def again() -> None:
-        if not left.is_set():
-            os.kill(os.getpid(), mine[-1])
+    def resend() -> None:
+        if not finished.is_set():
+            os.kill(os.getpid(), signals[-1])
 
-    def lost(what: sys.UnraisableHookArgs) -> None:
-        if not issubclass(what.exc_type, KeyboardInterrupt):
-            report(what)
+    def resend_lost_interrupt(args: sys.UnraisableHookArgs) -> None:
+        if not issubclass(args.exc_type, KeyboardInterrupt):
+            old_hook(args)
             return
-        timer = threading.Timer(AGAIN_S, again)
+        timer = threading.Timer(RESEND_S, resend)
         timer.daemon = True
         timer.start()
 
-    mine = [s for s in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(s) != signal.SIG_IGN]
+    signals = [s for s in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(s) != signal.SIG_IGN]
     source, sink = os.pipe()
     os.set_blocking(sink, False)
-    listener = threading.Thread(target=_listen, args=(source, mine, handled), daemon=True)
-    before = {number: signal.signal(number, interrupt) for number in mine}
-    fd_before = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
-    sys.unraisablehook = lost
+    listener = threading.Thread(target=_listen, args=(source, signals, handled), daemon=True)
+    old_handlers = {number: signal.signal(number, interrupt) for number in signals}
+    old_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
+    sys.unraisablehook = resend_lost_interrupt
     listener.start()
     try:
         yield
     finally:
-        left.set()
-        sys.unraisablehook = report
-        signal.set_wakeup_fd(fd_before)
-        for number, handler in before.items():
+        finished.set()
+        sys.unraisablehook = old_hook
+        signal.set_wakeup_fd(old_fd)
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)
         os.close(sink)
         handled.set()
@@ -93,10 +94,10 @@ def end_at_once(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _listen(source: int, mine: list[signal.Signals], handled: threading.Event) -> None:
+def _listen(source: int, signals: list[signal.Signals], handled: threading.Event) -> None:
     """Read the numbers of signals until the pipe closes; end the process at an unhandled one."""
     while numbers := os.read(source, 1):
-        if numbers[0] in mine and not handled.wait(PATIENCE_S):
-            words = (_SHOW_CURSOR if os.isatty(2) else "") + WORDS
-            os.write(2, words.encode())
+        if numbers[0] in signals and not handled.wait(PATIENCE_S):
+            message = (_SHOW_CURSOR if os.isatty(2) else "") + MESSAGE
+            os.write(2, message.encode())
             os._exit(INTERRUPTED)

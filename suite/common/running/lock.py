@@ -1,4 +1,4 @@
-"""One writer per folder: a lock of the operating system, with a description of its holder.
+"""Lock an output folder, so that only one command writes into it at a time.
 
 The lock is `flock` on an empty file in the folder, so it ends with the process that holds it. The
 holder is described in a second file, which is written under another name and renamed. Both files
@@ -23,18 +23,19 @@ from tracks.input.reading import InputError, read_json
 
 LOCK, HOLDER = ".suite-lock", ".suite-lock.json"
 """Names of the two files in the folder; removed when the command ends."""
-_UNKNOWN = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+"""Errors of a file system without locks."""
 
 
 @contextmanager
 def one_writer(folder: Path) -> Iterator[None]:
-    """Be the only command that writes into `folder`; partial files of killed commands are removed.
+    """Lock `folder`, and remove partial files of killed commands from it.
 
     The folder is made, and removed again if it stays empty. On a file system without locks nothing
     is locked.
 
     Raises:
-        ValueError: if another command writes there: which one, since when, and what to do.
+        ValueError: if another command writes there, with its name, its start and what to do.
         OSError: if the folder cannot be made or written.
     """
     from filelock import FileLock, Timeout
@@ -44,22 +45,22 @@ def one_writer(folder: Path) -> Iterator[None]:
         lock = FileLock(path, timeout=0, mode=0o644, fallback_to_soft=False)
         if _is_foreign(path):
             raise ValueError(
-                f"{path} is not the suite's, whose own is an empty file; move it away, or give "
+                f"{path} is not a lock of the suite, which is an empty file; move it away, or give "
                 "another --out"
             )
         try:
             lock.acquire()
         except Timeout:
             raise ValueError(
-                f"{folder} is being written by {_holder(folder)}; wait until it is through, end "
-                "it, or give another --out"
+                f"{folder} is being written by {_holder(folder)}; wait until it ends, stop it, or "
+                "give another --out"
             ) from None
         except OSError as error:
-            if error.errno not in _UNKNOWN:
+            if error.errno not in _NO_LOCKS:
                 raise
         try:
             sweep_parts(folder)
-            write_json(folder / HOLDER, _about())
+            write_json(folder / HOLDER, _this_command())
             yield
         finally:
             # Removed before the release: a waiting command then makes a new file. In the other
@@ -72,15 +73,15 @@ def one_writer(folder: Path) -> Iterator[None]:
 def _is_foreign(path: Path) -> bool:
     """Return whether the file at `path` is no lock of the suite; it may vanish at any moment."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return False
-    return not stat.S_ISREG(found.st_mode) or found.st_size > 0
+    return not stat.S_ISREG(status.st_mode) or status.st_size > 0
 
 
 @contextmanager
 def one_writer_each(folders: list[Path]) -> Iterator[None]:
-    """Be the only command that writes into any of `folders`; see `one_writer`."""
+    """Lock all of `folders`; see `one_writer`."""
     with contextlib.ExitStack() as stack:
         # Path.resolve raises no OSError for a link to itself.
         for folder in dict.fromkeys(Path(os.path.realpath(path)) for path in folders):
@@ -88,7 +89,8 @@ def one_writer_each(folders: list[Path]) -> Iterator[None]:
         yield
 
 
-def _about() -> dict[str, object]:
+def _this_command() -> dict[str, object]:
+    """Return the command line, process, host and time, to describe the holder of a lock."""
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     since = datetime.now(UTC).isoformat(timespec="seconds")
     return {"command": command[:500], "pid": os.getpid(), "host": os.uname().nodename,
@@ -96,10 +98,10 @@ def _about() -> dict[str, object]:
 
 
 def _holder(folder: Path) -> str:
+    """Return a description of the command that holds the lock."""
     try:
-        about = read_json(folder / HOLDER)
-        return (
-            f"`{about['command']}` (pid {about['pid']} on {about['host']}, since {about['since']})"
-        )
+        holder = read_json(folder / HOLDER)
+        process = f"pid {holder['pid']} on {holder['host']}, since {holder['since']}"
+        return f"`{holder['command']}` ({process})"
     except (OSError, InputError, KeyError, TypeError):
         return "another command"

@@ -1,12 +1,12 @@
-"""Benchmarks: our hot paths against plain implementations of the same, in turn in one run."""
+"""Benchmarks: the speed of core parts of the suite against plain implementations, in one run."""
 
 from __future__ import annotations
 
 BENCHES: dict[str, str] = {
-    "train": "gradient steps a second against a plain torch-eager loop of the same method",
+    "train": "gradient steps per second against a plain torch-eager loop of the same method",
     "policy": "a step of the shipped policy exported as C against ONNX Runtime, on one thread",
-    "judge": "trials a second of processor time against the same with MuJoCo's own rays",
-    "env": "decisions a second of 64 races in one vector environment against 64 in a loop",
-    "diagnose": "refits a minute of six numbers against mujoco.sysid on the same flights",
+    "judge": "trials per second of processor time against MuJoCo's own depth rays",
+    "env": "decisions per second of 64 races in one vector environment against 64 in a loop",
+    "diagnose": "refits per minute of six numbers against mujoco.sysid on the same flights",
 }
-"""Name -> one-line summary; NAME.py has `run() -> Comparison`."""
+"""Name -> one-line summary; the module NAME.py has `run() -> Comparison`."""

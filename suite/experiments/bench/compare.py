@@ -1,4 +1,4 @@
-"""Times implementations in turn, and warns where the machine is too busy for a fair comparison."""
+"""Time several implementations in turn, and warn if the machine is too busy for a comparison."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Figure:
     unit: str
     """Such as "gradient steps/s"."""
     less_is_better: bool = False
-    """Whether it is a time."""
+    """Whether it is a time, not a rate."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The outcome of a benchmark."""
+    """The result of a benchmark."""
 
     name: str
     """The benchmark's name."""
@@ -38,7 +38,7 @@ class Comparison:
     baseline: Figure
     """The plain implementation of the same, on the same inputs."""
     warnings: tuple[str, ...] = ()
-    """Why the figures may not be trusted; empty on a free machine."""
+    """Reasons not to trust the figures; empty on a machine without other load."""
     details: dict[str, Any] = field(default_factory=dict)
     """Further results of the benchmark."""
     grid: Grid | None = None
@@ -46,7 +46,7 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """How many times as fast ours is (above 1: faster)."""
+        """Our speed over the baseline's (above 1: ours is faster)."""
         ratio = self.ours.value / self.baseline.value
         return 1 / ratio if self.ours.less_is_better else ratio
 
@@ -61,27 +61,27 @@ def in_turn(
 
     Args:
         calls: by name; each must finish its work before it returns (`jax.block_until_ready`).
-        rounds: in each of them every call is made once.
-        clock: seconds, increasing.
-        most_s: no round begins after this time; the first one always does [s].
+        rounds: number of rounds; in each of them every call is made once.
+        clock: returns the time [s].
+        most_s: no round begins after this time, except the first [s].
     """
     for call in calls.values():
         call()
-    taken: dict[str, list[float]] = {name: [] for name in calls}
-    until = time.perf_counter() + most_s
-    for done in range(rounds):
-        if done and time.perf_counter() > until:
+    times_s: dict[str, list[float]] = {name: [] for name in calls}
+    end_s = time.perf_counter() + most_s
+    for number in range(rounds):
+        if number and time.perf_counter() > end_s:
             break
         for name, call in calls.items():
             started = clock()
             call()
-            taken[name].append(clock() - started)
-    return taken
+            times_s[name].append(clock() - started)
+    return times_s
 
 
-def compared(
+def compare_times(
     name: str,
-    taken: Mapping[str, list[float]],
+    times_s: Mapping[str, list[float]],
     work: float,
     unit: str,
     details: Mapping[str, Any],
@@ -90,12 +90,14 @@ def compared(
 
     Args:
         name: of the benchmark.
-        taken: times from `in_turn`, ours first [s].
-        work: done in one call, in units of the figure times seconds.
+        times_s: times from `in_turn`, ours first [s].
+        work: work of one call, in units of the figure times seconds.
         unit: of the figures.
         details: further results.
     """
-    ours, baseline = (Figure(work / statistics.median(seconds), unit) for seconds in taken.values())
+    ours, baseline = (
+        Figure(work / statistics.median(seconds), unit) for seconds in times_s.values()
+    )
     return Comparison(name, ours, baseline, details=dict(details))
 
 
@@ -108,5 +110,5 @@ def load_warnings(interval_s: float = 1.0) -> tuple[str, ...]:
         return ()
     return (
         f"other processes use {share:.0%} of the processor: the figures, above all the baseline's, "
-        "are not reliable; run again on a free machine",
+        "are not reliable; run again on a machine without other load",
     )

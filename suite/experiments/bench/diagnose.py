@@ -1,8 +1,8 @@
-"""`suite bench diagnose`: the diagnosis's refit against `mujoco.sysid` on the same data.
+"""The benchmark `diagnose`: the fit of the diagnosis against `mujoco.sysid` on the same data.
 
 Both fit six numbers (mass, centre of mass, inertia) to the same windows of five flights of 10 s,
-from the same initial values, in turn. Only the fit is timed: the logs have been read and the
-programs compiled before.
+from the same initial values, in turn. Only the fit is timed, after logs are read and programs are
+compiled.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from suite.diagnose.data.noise import noise_of
 from suite.diagnose.estimate.block import NormalEquations
 from suite.diagnose.estimate.gauss_newton import fit, intervals95
 from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, start_estimate
-from suite.experiments.bench.compare import Comparison, compared, in_turn
+from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
 SEED = 20_001
-"""Of the truth, the flights and their noise; no blind case and no tuning used it."""
+"""Seed of the truth, the flights and their noise; no blind case and no tuning used it."""
 ROUNDS = 3
+"""Number of timed fits of each side."""
 
 
 def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
@@ -31,8 +32,8 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
 
     Args:
         seed: of the truth, the flights and their noise.
-        duration_s: of each of the five flights.
-        rounds: how often each side is timed, after one call to warm up.
+        duration_s: length of each of the five flights [s].
+        rounds: number of timed fits of each side, after one call to warm up.
 
     Raises:
         WorkFailed: if a package of `mujoco.sysid` is missing.
@@ -56,33 +57,33 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     def theirs() -> None:
         answers["mujoco.sysid"] = sysid_baseline.refit(problem)
 
-    taken = in_turn({"ours": ours, "mujoco.sysid": theirs}, rounds)
+    times_s = in_turn({"ours": ours, "mujoco.sysid": theirs}, rounds)
     details = {
         **_agreement(task, answers),
         "stretches": len(task.windows.flight),
         "seed": seed,
-        "seconds": {side: median(seconds) for side, seconds in taken.items()},
+        "seconds": {side: median(seconds) for side, seconds in times_s.items()},
     }
-    return compared("diagnose", taken, 60.0, "refits/min", details)
+    return compare_times("diagnose", times_s, 60.0, "refits/min", details)
 
 
 def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]:
     """Return the fitted numbers (K,) and their normal equations, as the diagnosis fits them.
 
-    It estimates the noise, linearises along the free start of every window, and repeats
-    Gauss-Newton steps on windows as long as the model is accurate; these grow as the numbers
-    improve.
+    It estimates the noise, linearises with respect to the numbers and the start of every window,
+    and makes Gauss-Newton steps on the part of the windows in which the model is accurate. It
+    repeats this while that part grows.
     """
     indices, state = list(task.indices), start_estimate(model, task.windows)
-    seen = 0
+    used_values = 0
     while True:
         directions = [*indices, *model.starts]
         linear = model.linearise(state.theta, state.free, task.windows, directions)
         evidence, known = rollout_evidence(model, task.windows, linear, along=indices)
         state, block = fit(evidence, state, indices, known=known)
-        if evidence.trusted.valid.sum() <= seen:
+        if evidence.trusted.valid.sum() <= used_values:
             return state.theta[indices], block.equations
-        seen = evidence.trusted.valid.sum()
+        used_values = evidence.trusted.valid.sum()
 
 
 def _agreement(
@@ -95,7 +96,7 @@ def _agreement(
     """
     widths = {side: intervals95(equations).half_width for side, (_, equations) in answers.items()}
     first, second = (values for values, _ in answers.values())
-    apart = np.abs(first - second) / np.hypot(*widths.values())
+    difference = np.abs(first - second) / np.hypot(*widths.values())
     rows = {}
     for k, name in enumerate(task.names):
         rows[name] = {
@@ -104,6 +105,6 @@ def _agreement(
                 side: f"{values[k]:.4g} +- {widths[side][k]:.2g}"
                 for side, (values, _) in answers.items()
             },
-            "apart_over_joint": round(float(apart[k]), 2),
+            "apart_over_joint": round(float(difference[k]), 2),
         }
-    return {**rows, "inside_the_joint_interval": f"{(apart <= 1.0).sum()} of {len(rows)}"}
+    return {**rows, "inside_the_joint_interval": f"{(difference <= 1.0).sum()} of {len(rows)}"}

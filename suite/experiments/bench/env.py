@@ -1,38 +1,41 @@
-"""`suite bench env`: decisions a second of one vector environment against single ones in a loop."""
+"""The benchmark `env`: decisions per second of a vector environment against single ones in a loop.
+
+Both fly 64 races with images; a vector environment steps all of them at once.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from suite.experiments.bench.compare import Comparison, compared, in_turn
+from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 
 ENVS, DECISIONS = 64, 20
-"""Environments, and decisions of each that are timed at once."""
+"""Number of environments, and of decisions of each in a timed call."""
 
 
 def run(envs: int = ENVS, decisions: int = DECISIONS, repeats: int = 3) -> Comparison:
-    """Step both with images and the same actions; an environment whose episode ends is reset."""
+    """Time both with the same actions; an environment is reset when its episode ends."""
     from eval.envs.gymnasium_env import RaceEnv, RaceVectorEnv
 
-    many = RaceVectorEnv(envs, track="random")
+    vector_env = RaceVectorEnv(envs, track="random")
     singles = [RaceEnv(track="random") for _ in range(envs)]
-    many.reset(seed=0)
+    vector_env.reset(seed=0)
     for number, env in enumerate(singles):
         env.reset(seed=number)
     rng = np.random.default_rng(0)
     actions = (0.1 * rng.standard_normal((decisions, envs, 3))).astype(np.float32)
 
     def ours() -> None:
-        for action in actions:
-            many.step(action)
+        for step_actions in actions:
+            vector_env.step(step_actions)
 
     def baseline() -> None:
-        for action in actions:
-            for env, own in zip(singles, action, strict=True):
-                _, _, terminated, truncated, _ = env.step(own)
+        for step_actions in actions:
+            for env, action in zip(singles, step_actions, strict=True):
+                _, _, terminated, truncated, _ = env.step(action)
                 if terminated or truncated:
                     env.reset()
 
-    taken = in_turn({"ours": ours, "baseline": baseline}, repeats)
+    times_s = in_turn({"ours": ours, "baseline": baseline}, repeats)
     details = {"environments": envs, "image": "24 x 32", "vehicle": "racer5"}
-    return compared("env", taken, envs * decisions, "decisions/s", details)
+    return compare_times("env", times_s, envs * decisions, "decisions/s", details)

@@ -1,9 +1,10 @@
-"""`suite bench judge`: the judge's speed, compared with the same trials using `mj_multiRay`.
+"""The benchmark `judge`: trials per second of the judge, against depth images by `mj_multiRay`.
 
-The shipped policy flies the same trials twice, level 9 of every family, in one process. The suite
-casts the rays of all images together (`tracks/geometry/tiles.py`). The baseline casts those of one
-camera after the other with `mj_multiRay`, and flies 64 trials at once. Both are timed by the
-process's own processor time, which other work on the machine hardly changes.
+The judge is the simulator that scores policies. The shipped policy flies the same trials twice,
+level 9 of every track family, in one process. The suite casts the rays of all images together
+(`tracks/geometry/tiles.py`). The baseline casts those of one camera after the other with
+`mj_multiRay`, and flies 64 trials at once. Both are timed by the processor time of the process,
+which depends little on other work on the machine.
 """
 
 from __future__ import annotations
@@ -21,30 +22,32 @@ from eval.worlds import WORLDS
 from eval.worlds.mujoco import MujocoWorld
 from eval.worlds.trial import Rules, TrialResult, TrialSpec
 from policies.policy import load_policy
-from suite.experiments.bench.compare import Comparison, compared, in_turn
+from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.judging.flying import default_policy
 from tracks.families import JUDGED
 
 TRIALS = 128
+"""Number of trials in a timed call."""
 BASELINE = "mujoco, its own rays"
+"""Name of the baseline's simulator."""
 
 
 class OwnRays(MujocoWorld):
-    """The world `mujoco` with images cast by MuJoCo's rays."""
+    """The simulator `mujoco` with images cast by MuJoCo's rays."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._seen: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        self._scenes: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
         images = []
         for row, slot in enumerate(slots.tolist()):
             model = self._models[slot]
-            if self._seen.get(slot, (None, None))[0] is not model:
-                self._seen[slot] = model, mujoco.MjData(model)
-                mujoco.mj_kinematics(*self._seen[slot])
+            if self._scenes.get(slot, (None, None))[0] is not model:
+                self._scenes[slot] = model, mujoco.MjData(model)
+                mujoco.mj_kinematics(*self._scenes[slot])
             # `_eye` is the policy's camera model; it casts the rays by `mj_multiRay`.
-            images.append(self._eye.image(*self._seen[slot], pos_w[row], rot_w[row]))
+            images.append(self._eye.image(*self._scenes[slot], pos_w[row], rot_w[row]))
         return np.array(images)
 
 
@@ -54,29 +57,29 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
     Args:
         policy: name or folder; the shipped one by default.
         trials: number of trials per call.
-        time_limit_s: of a trial [s].
+        time_limit_s: longest trial [s].
     """
     if BASELINE not in WORLDS:
         WORLDS.register(BASELINE, OwnRays)
-    flown, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
+    loaded, vehicle = load_policy(policy or default_policy()), load_vehicle("reference")
     # JUDGED: the three track families of the results tables.
     specs = [TrialSpec(JUDGED[k % 3], 9, k // 3) for k in range(trials)]
-    ended: dict[str, list[TrialResult]] = {}
+    results: dict[str, list[TrialResult]] = {}
 
-    def judged(world: str, slots: int) -> None:
+    def judge(simulator: str, slots: int) -> None:
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
-        ended[world] = fly(flown, specs, vehicle, world, options)
+        results[simulator] = fly(loaded, specs, vehicle, simulator, options)
 
-    ours = partial(judged, "mujoco", JudgeOptions().slots)
-    calls = {"ours": ours, "baseline": partial(judged, BASELINE, 64)}
-    taken = in_turn(calls, rounds=2, clock=time.process_time)
-    pairs = list(zip(*ended.values(), strict=True))
-    alike = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
+    ours = partial(judge, "mujoco", JudgeOptions().slots)
+    calls = {"ours": ours, "baseline": partial(judge, BASELINE, 64)}
+    times_s = in_turn(calls, rounds=2, clock=time.process_time)
+    pairs = list(zip(*results.values(), strict=True))
+    same = sum((a.ended_by, a.gates_passed) == (b.ended_by, b.gates_passed) for a, b in pairs)
     details = {
-        "policy": flown.name,
-        "rays_a_pixel": flown.spec.camera.rays**2,
+        "policy": loaded.name,
+        "rays_a_pixel": loaded.spec.camera.rays**2,
         "trials": trials,
-        "trials_that_end_alike": alike,
-        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * flown.spec.rate_hz,
+        "trials_that_end_alike": same,
+        "images_a_trial": float(np.mean([a.time_s for a, _ in pairs])) * loaded.spec.rate_hz,
     }
-    return compared("judge", taken, trials, "trials/s of processor time", details)
+    return compare_times("judge", times_s, trials, "trials/s of processor time", details)

@@ -1,4 +1,4 @@
-"""`suite bench policy`: a step of the C export against ONNX Runtime's, each on one thread.
+"""The benchmark `policy`: a step of the C export against one of ONNX Runtime, each on one thread.
 
 The shipped policy is exported as C (float32 and int8), compiled for this machine and stepped one
 observation at a time with its memory, in turn with ONNX Runtime and torch, each called from Python.
@@ -22,6 +22,7 @@ loads, the product, a share of the loop) [1]. Assumed, not measured."""
 A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
 """A Cortex-A76: a quarter of the peak of two units of four lanes [1]. Assumed, not measured."""
 ROUNDS = 20
+"""Number of timed blocks of each engine."""
 
 
 def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
@@ -32,7 +33,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
         rounds: blocks of 100 steps of each engine.
 
     Raises:
-        WorkFailed: where there is no C compiler.
+        WorkFailed: without a C compiler.
     """
     import torch
 
@@ -51,16 +52,14 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
     try:
         with tempfile.TemporaryDirectory() as folder:
             steps, layers = _c_steps(name, checkpoint, Path(folder))
-            usual, bound = onnx_steps(checkpoint)
-            steps |= {"ONNX Runtime": usual, "ONNX Runtime, memory bound": bound}
+            run_step, bound_step = onnx_steps(checkpoint)
+            steps |= {"ONNX Runtime": run_step, "ONNX Runtime, memory bound": bound_step}
             steps["torch"] = torch_step(checkpoint)
             times = time_in_turn(steps, rounds)
     finally:
         torch.set_num_threads(threads)
-    count, weights = (
-        multiply_adds(checkpoint.spec),
-        sum(x.nbytes for x in checkpoint.params.values()),
-    )
+    count = multiply_adds(checkpoint.spec)
+    weight_bytes = sum(x.nbytes for x in checkpoint.params.values())
     rows: dict[str, dict[str, Any]] = {}
     for engine, timing in times.items():
         row: dict[str, Any] = {
@@ -68,7 +67,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
             "p99_us": 1e6 * timing.p99_s,
             "max_us": 1e6 * timing.max_s,
             "multiply_adds": count,
-            "weight_bytes": weights,
+            "weight_bytes": weight_bytes,
             "working_bytes": None,
         }
         if engine in layers:
@@ -94,16 +93,17 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
     # The time of a step does not depend on the scales, so no flights are needed for them.
     observed, steps, layers = random_observations(checkpoint.spec, 50), {}, {}
     for dtype in ("float32", "int8"):
-        engine, place = f"C {dtype}", folder / dtype
+        engine, out = f"C {dtype}", folder / dtype
         project = c_project(checkpoint, name, dtype, observed)
-        place.mkdir()
+        out.mkdir()
         for file, text in project.files.items():
-            (place / file).write_text(text, encoding="utf-8")
-        steps[engine], layers[engine] = c_step(load_c(place, trust=True)), project.layers
+            (out / file).write_text(text, encoding="utf-8")
+        steps[engine], layers[engine] = c_step(load_c(out, trust=True)), project.layers
     return steps, layers
 
 
 def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
+    """Return the measured times and the estimates for two processors, a row per engine."""
     headers = (
         "engine", "median [us]", "p99 [us]", "longest [us]", "multiply-adds", "weights [B]",
         "working memory [B]", "Cortex-M7 480 MHz [ms], estimate", "A76 2.4 GHz [ms], estimate",
@@ -111,7 +111,8 @@ def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
     lines = []
     for engine, row in rows.items():
         texts = [f"{row[key]:.1f}" for key in ("median_us", "p99_us", "max_us")]
-        texts += [_shown(row[key]) for key in ("multiply_adds", "weight_bytes", "working_bytes")]
+        counts = (row[key] for key in ("multiply_adds", "weight_bytes", "working_bytes"))
+        texts += ["-" if count is None else str(count) for count in counts]
         estimates = ("estimate_cortex_m7_480mhz_ms", "estimate_a76_2400mhz_ms")
         texts += [f"{row[key]:.2f}" if key in row else "-" for key in estimates]
         lines.append([engine, *texts])
@@ -121,7 +122,3 @@ def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
         f"{m7['C float32']:g} (float32) and {m7['C int8']:g} (int8), A76 {a76['C float32']:g}."
     )
     return table(headers, lines, note=note)
-
-
-def _shown(count: int | None) -> str:
-    return "-" if count is None else str(count)

@@ -1,7 +1,8 @@
-"""The data of the diagnosis benchmark: the same windows of the same flights for both sides.
+"""The data of the benchmark `diagnose`: windows of simulated flights of a vehicle to identify.
 
-Measured rotor speeds drive both models, since a MuJoCo model has no rate loop. Mass, centre of mass
-and inertia are fitted: `mujoco.sysid` is made for these.
+A window is a short part of a flight. Measured rotor speeds are the input of both models, since a
+MuJoCo model has no rate loop. Mass, centre of mass and inertia are fitted, which `mujoco.sysid` is
+made for.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ REFITTED = ("mass_offset", "com_offset", "inertia_scale")
 
 @dataclass(frozen=True)
 class Task:
-    """Windows, and what is fitted to them."""
+    """Windows, and the parameters that are fitted to them."""
 
     nominal: Vehicle
-    """The initial values of both sides."""
+    """The vehicle with the initial values of both sides."""
     space: ParameterSpace
     """The catalogue's parameters for that vehicle."""
     indices: tuple[int, ...]
@@ -53,7 +54,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
 
     Args:
         seed: of the truth, the flights and the noise.
-        duration_s: of each flight.
+        duration_s: length of each flight [s].
     """
     from eval.flights.follow import FlightFailed
     from eval.flights.simulate import SENSORS, fly, log_of
@@ -62,7 +63,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
 
     def attempt(number: int) -> Task:
         rng = np.random.default_rng([seed, number])
-        truth = replace(nominal, effects=MappingProxyType(_drawn(nominal, rng)))
+        truth = replace(nominal, effects=MappingProxyType(_draw_effects(nominal, rng)))
         flights = fly(nominal, truth, ordinary_flights(rng, duration_s), sensors.rate_hz)
         logs = [
             log_of(flight, truth, sensors, rng, f"flight {i}") for i, flight in enumerate(flights)
@@ -78,12 +79,12 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     indices = tuple(i for i, entry in enumerate(space.entries) if entry.effect in REFITTED)
     number = 0
     while True:
-        with contextlib.suppress(FlightFailed):  # too heavy for its controller; few draws are
+        with contextlib.suppress(FlightFailed):  # a few drawn vehicles are too heavy to fly
             return attempt(number)
         number += 1
 
 
-def _drawn(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
+def _draw_effects(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
     """Return the effects' values: every number off by its usual size, up or down at random."""
     neutral, values = all_values(nominal), dict[str, Any]()
     for name in REFITTED:
@@ -92,7 +93,7 @@ def _drawn(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
             size = max(parameter.size, 1)
             shift = rng.uniform(*parameter.typical, size) * rng.choice((-1.0, 1.0), size)
             shift[list(parameter.unseen)] = 0.0
-            now = np.atleast_1d(np.asarray(getattr(neutral[name], parameter.name), float)) + shift
-            fields[parameter.name] = tuple(now.tolist()) if parameter.size else float(now[0])
+            value = np.atleast_1d(np.asarray(getattr(neutral[name], parameter.name), float)) + shift
+            fields[parameter.name] = tuple(value.tolist()) if parameter.size else float(value[0])
         values[name] = type(neutral[name])(**fields)
     return values

@@ -1,10 +1,10 @@
-"""The refit of `rigid_body.Task` by `mujoco.sysid`, which the diagnosis is compared with.
+"""The baseline of the benchmark `diagnose`: fit mass, centre of mass and inertia by `mujoco.sysid`.
 
-`mujoco.sysid` takes finite differences of rollouts in MuJoCo's C engine.
-
-The model is MuJoCo's, with the rotors' thrusts as controls. Bounds and typical sizes are those of
-the catalogue. Residuals are divided by the measurement noise, so both sides minimise the same
-error. A window starts in its measured state: `mujoco.sysid` does not estimate initial states.
+It takes finite differences of rollouts in MuJoCo's C engine. The controls of the model are the
+rotors' thrusts. Bounds and typical sizes of the parameters are those of the suite's catalogue of
+effects. Residuals are divided by the measurement noise, so both sides minimise the same error. A
+window (a short part of a flight) starts in its measured state: `mujoco.sysid` does not estimate
+initial states.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ FILL_S = 1e-3
 
 
 class Problem(NamedTuple):
-    """What is prepared once, outside the timing."""
+    """The data that are prepared once, outside the timing."""
 
     task: Task
+    """Windows and parameters."""
     params: Any
     """`mujoco.sysid.ParameterDict` at the nominal values."""
     residual: Any
@@ -54,7 +55,8 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
 
     Args:
         task: windows and parameters.
-        sigma: (19,) noise of the channels.
+        sigma: (19,) standard deviation of the noise of each channel (the first 12 are position,
+            attitude, velocity and body rates).
     """
     import mujoco.sysid as sysid
 
@@ -71,9 +73,9 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
         "quadrotor",
         spec,
         names,
-        [_start(base, windows, w) for w in range(len(names))],
+        [_start_state(base, windows, w) for w in range(len(names))],
         [_thrusts(task, w, dt) for w in range(len(names))],
-        [_measured(task, w) for w in range(len(names))],
+        [_measurements(task, w) for w in range(len(names))],
     )
     scale = 1.0 / np.where(np.isfinite(sigma[:12]), sigma[:12], np.inf)
 
@@ -86,14 +88,14 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
         state: np.ndarray,
         **_: Any,
     ) -> tuple[np.ndarray, Any, Any]:
-        # The state after step k stands in row k - 1, behind the time. The first row is the start.
+        # Row k - 1 of `state` has the time and the state after step k; measured row 0 is the start.
         rows = np.clip(np.rint(measured.times[1:] / dt).astype(int), 1, len(state)) - 1
         errors = _difference(state[rows, 1 : 1 + STATE_SIZE], measured.data[1:])
         return np.where(np.isfinite(errors), errors, 0.0) * scale, measured, measured
 
     residual = sysid.build_residual_fn(
         models_sequences=[sequences],
-        build_model=lambda params, _: _built(base, task, params.as_vector()),
+        build_model=lambda params, _: _with_parameters(base, task, params.as_vector()),
         modify_residual=modify_residual,
         n_threads=os.cpu_count() or 1,
         resample_true=False,
@@ -117,17 +119,17 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
             x_scale=problem.task.array("step"),
         )
     values = np.asarray(params.as_vector())
-    parts = problem.residual(values, params)[0]
+    residuals = problem.residual(values, params)[0]
     count = len(problem.task.windows.flight)
     jacobian = np.asarray(result.jac).reshape(count, -1, len(values))
-    residual = np.concatenate(parts).reshape(count, -1)
+    residual = np.concatenate(residuals).reshape(count, -1)
     jacobian_t = np.swapaxes(jacobian, 1, 2)
     gradient = -(jacobian_t @ residual[..., None])[..., 0]
     return values, NormalEquations(jacobian_t @ jacobian, gradient, (residual**2).sum(1))
 
 
-def _built(base: Any, task: Task, values: np.ndarray) -> Any:
-    """Return a copy of the compiled model with the fitted numbers."""
+def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
+    """Return a copy of the compiled model with the values (K,) of the fitted numbers."""
     theta = task.space.array("start")
     theta[list(task.indices)] = values
     effects = task.space.effects(theta)
@@ -142,7 +144,8 @@ def _built(base: Any, task: Task, values: np.ndarray) -> Any:
     return model
 
 
-def _start(model: Any, windows: Any, w: int) -> np.ndarray:
+def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
+    """Return the measured state at the start of window `w`, as `mujoco.sysid` reads it."""
     import mujoco.sysid as sysid
 
     quat = np.empty(4)
@@ -154,6 +157,7 @@ def _start(model: Any, windows: Any, w: int) -> np.ndarray:
 
 
 def _thrusts(task: Task, w: int, dt: float) -> Any:
+    """Return the rotors' thrusts in window `w` [N], from the measured speeds."""
     import mujoco.sysid as sysid
 
     constants = make_plant(task.nominal, dt).constants
@@ -163,7 +167,8 @@ def _thrusts(task: Task, w: int, dt: float) -> Any:
     return sysid.TimeSeries(dt * np.arange(len(thrust)), thrust)
 
 
-def _measured(task: Task, w: int) -> Any:
+def _measurements(task: Task, w: int) -> Any:
+    """Return the measured states of window `w`; missing values are NaN."""
     import mujoco.sysid as sysid
 
     windows = task.windows
@@ -176,19 +181,20 @@ def _measured(task: Task, w: int) -> Any:
     # Three angles are four numbers of a quaternion.
     values[~seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
     # A window with fewer rows is filled with empty rows, whose times must still increase.
-    times, filled = np.array(windows.row_s[w]), ~seen.any(axis=1)
-    times[filled] = times.max() + FILL_S * np.arange(1, filled.sum() + 1)
+    times, is_empty = np.array(windows.row_s[w]), ~seen.any(axis=1)
+    times[is_empty] = times.max() + FILL_S * np.arange(1, is_empty.sum() + 1)
     return sysid.TimeSeries(times, values)
 
 
 def _difference(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return simulated - measured (N, 12), the attitude as a small rotation in body axes."""
     rotation_b = np.full((len(measured), 3), np.nan)
-    seen = np.isfinite(measured[:, 3:7]).all(axis=1)
-    reference, found = (
-        Rotation.from_quat(rows[seen, 3:7], scalar_first=True) for rows in (measured, simulated)
+    is_measured = np.isfinite(measured[:, 3:7]).all(axis=1)
+    reference, attitude = (
+        Rotation.from_quat(rows[is_measured, 3:7], scalar_first=True)
+        for rows in (measured, simulated)
     )
-    rotation_b[seen] = 2.0 * (reference.inv() * found).as_quat(canonical=True)[:, :3]
+    rotation_b[is_measured] = 2.0 * (reference.inv() * attitude).as_quat(canonical=True)[:, :3]
     errors = np.zeros((len(measured), 12))
     errors[:, SLICES["position"]] = simulated[:, :3] - measured[:, :3]
     errors[:, SLICES["attitude"]] = rotation_b

@@ -1,8 +1,8 @@
-"""The trainer's method as a plain torch-eager loop: the baseline of `suite bench train`.
+"""The baseline of the benchmark `train`: the training method as a plain torch-eager loop.
 
-Same network, point mass, losses, field, delays and noise as `suite.train` with the recipe `paper`,
-one step after another with the encoder inside the loop, and backward through it. What the recipe
-does not use is not here.
+Network, point mass, losses, field, delays and noise are those of `suite.train` with the recipe
+`paper`. The encoder is inside the loop over steps, and the backward pass goes through the loop.
+Settings that the recipe does not use are not implemented.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
 
 SIZES = ("camera", "hidden_size", "channels")
-"""What may differ from the recipe: the network's and the image's size."""
+"""Settings that may differ from the recipe: sizes of the network and the image."""
 
 
 class TorchState(NamedTuple):
@@ -44,9 +44,9 @@ class TorchState(NamedTuple):
 
 
 def to_torch(tree: Any) -> Any:
-    """Return a tree of named tuples with its arrays as tensors, and None where there is none."""
+    """Return a tree of named tuples with its arrays as tensors; None stays None."""
     if isinstance(tree, tuple):
-        return type(tree)(*(to_torch(part) for part in tree))
+        return type(tree)(*(to_torch(leaf) for leaf in tree))
     return None if tree is None else torch.as_tensor(tree)
 
 
@@ -106,19 +106,22 @@ class Baseline:
         """Take over the parameters of `policies.networks.network`.
 
         Raises:
-            ValueError: for a setting of the loss or the observation that is not the recipe's, and
-                for quadrotors.
+            ValueError: for quadrotors, and for a setting of the loss or the observation that
+                differs from the recipe `paper`.
         """
         if config.quadrotor is not None:
-            raise ValueError("the torch baseline flies the point mass alone; leave quadrotor out")
+            raise ValueError(
+                "the torch baseline has no quadrotor, only the point mass; leave quadrotor out"
+            )
         for part in ("loss", "spec"):
-            mine, fixed = getattr(config, part), getattr(paper(), part)
-            for field in fields(fixed):
-                value, allowed = getattr(mine, field.name), getattr(fixed, field.name)
+            settings, allowed_settings = getattr(config, part), getattr(paper(), part)
+            for field in fields(allowed_settings):
+                value = getattr(settings, field.name)
+                allowed = getattr(allowed_settings, field.name)
                 if value != allowed and field.name not in SIZES:
                     raise ValueError(
                         f"{part}.{field.name} is {value!r}, allowed for the torch baseline is "
-                        f"{allowed!r}, that of the recipe paper"
+                        f"{allowed!r}, as in the recipe paper"
                     )
         self.config = config
         self.network = torch_twin(params, config.spec).requires_grad_(True)
@@ -151,13 +154,13 @@ class Baseline:
         for _ in range(config.episode.steps):
             gate, target_w = self.target_gate(worlds.scene.gates, target)
             images.append(self.render(worlds, body))
-            seen = [to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w)]
-            state = torch.cat([seen[0], body.rot_w[:, 2], seen[1], action], -1)
+            vel_b, gate_b = (to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w))
+            state = torch.cat([vel_b, body.rot_w[:, 2], gate_b, action], -1)
             states = [*(states or [state] * physics.state_delay), state]
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, step(body, constants, action, target_w, config)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
-            total = total + self.judge(worlds, before, body, gate, target_w).mean()
+            total = total + self.step_loss(worlds, before, body, gate, target_w).mean()
             target = target + (passed & (target < worlds.scene.gates.center_w.shape[1]))
         return total / config.episode.steps
 
@@ -188,7 +191,7 @@ class Baseline:
         image = image + self.config.physics.depth_noise * torch.randn_like(image)
         return image.reshape(-1, camera.height, camera.width)
 
-    def judge(
+    def step_loss(
         self,
         worlds: Worlds,
         before: TorchState,
@@ -220,7 +223,7 @@ class Baseline:
         return loss - config.field_gain * guidance
 
     def pull(self, gate: Gates, pos_w: Tensor, vel_w: Tensor) -> Tensor:
-        """Return u_A (B, 3), 1 across the centre of a gate of 1 m."""
+        """Return the field's pull u_A (B, 3), 1 across the centre of a gate of 1 m."""
         field = torch_scene.magnetic_field(gate, pos_w)
         size = field.norm(dim=-1)
         aligned = (vel_w * field).sum(-1) / (vel_w.norm(dim=-1) * size + 1e-5)

@@ -1,7 +1,8 @@
-"""Depth, distance, field and gate crossing in plain batched torch, for the eager baseline.
+"""Scene geometry in plain batched torch, for the baseline of the benchmark `train`.
 
-Every function evaluates all solids at once, (worlds, solids, rays or points), as one would write it
-first; nothing here carries gradients.
+It computes depth images, distances to obstacles, the magnetic field and gate crossings. Every
+function evaluates all solids at once, (worlds, solids, rays or points), without gradients and
+without optimisation.
 """
 
 from __future__ import annotations
@@ -14,25 +15,28 @@ from tracks.geometry.scene import Gates, Scene
 
 Tensor = torch.Tensor
 FAR, TINY = 1e9, 1e-12
+"""Depth of a ray that hits nothing [m], and a lower limit of divisors."""
 
 
 def to_world(rot_w: Tensor, vector: Tensor) -> Tensor:
-    """Turn local vectors (..., 3) into world axes."""
+    """Return local vectors (..., 3) in world axes."""
     return (rot_w @ vector[..., None])[..., 0]
 
 
 def to_local(rot_w: Tensor, vector_w: Tensor) -> Tensor:
-    """Turn world vectors (..., 3) into local axes."""
+    """Return world vectors (..., 3) in local axes."""
     return (rot_w.transpose(-1, -2) @ vector_w[..., None])[..., 0]
 
 
 def _slab(origin: Tensor, speed: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ray lengths at which |origin + speed t| enters and leaves `half`."""
     inverse = 1.0 / torch.where(speed.abs() < TINY, torch.full_like(speed, TINY), speed)
     middle, spread = -origin * inverse, half * inverse.abs()
     return middle - spread, middle + spread
 
 
-def _ball(square: Tensor, cross: Tensor, excess: Tensor) -> tuple[Tensor, Tensor]:
+def _quadratic(square: Tensor, cross: Tensor, excess: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the roots of square t^2 + 2 cross t + excess = 0; FAR and -FAR without roots."""
     discriminant = cross * cross - square * excess
     root, inverse = discriminant.clamp(min=0).sqrt(), 1.0 / square.clamp(min=TINY)
     missed = discriminant < 0
@@ -41,27 +45,30 @@ def _ball(square: Tensor, cross: Tensor, excess: Tensor) -> tuple[Tensor, Tensor
 
 
 def _entry(enter: Tensor, leave: Tensor) -> Tensor:
+    """Return the ray length at which the first solid is entered; FAR without one."""
     hit = (enter <= leave) & (leave > 0)
     return enter.clamp(min=0).masked_fill(~hit, FAR).amin(1)
 
 
-def _round(origin: Tensor, radius: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def _sphere(origin: Tensor, radius: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ray lengths at which spheres are entered and left."""
     excess = (origin * origin).sum(-1) - radius * radius
-    return _ball((rays * rays).sum(-1), origin @ rays.T, excess[..., None])
+    return _quadratic((rays * rays).sum(-1), origin @ rays.T, excess[..., None])
 
 
-def _tube(rods: Any, origin: Tensor, axis: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def _cylinder(rods: Any, origin: Tensor, axis: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ray lengths at which cylinders of finite length are entered and left."""
     along, speed = (origin * axis).sum(-1)[..., None], axis @ rays.T
     square = (rays * rays).sum(-1) - speed * speed
     excess = (origin * origin).sum(-1) - along[..., 0] ** 2 - rods.radius**2
-    enter, leave = _ball(square, origin @ rays.T - along * speed, excess[..., None])
+    enter, leave = _quadratic(square, origin @ rays.T - along * speed, excess[..., None])
     near, far = _slab(along, speed, rods.half_length[..., None])
     return torch.maximum(enter, near), torch.minimum(leave, far)
 
 
 @torch.no_grad()
 def depth_image(scene: Scene, pos_w: Tensor, rot_w: Tensor, rays: Tensor, reach: float) -> Tensor:
-    """Return planar depths (B, R) [m]; as `depth.depth_image`, without culling."""
+    """Return planar depths (B, R) [m]; see `tracks.geometry.depth.depth_image`, without culling."""
     down = rot_w[:, 2] @ rays.T
     hits = [torch.where(down < -TINY, -pos_w[:, 2:] / down.clamp(max=-TINY), FAR).clamp(min=0)]
 
@@ -72,13 +79,13 @@ def depth_image(scene: Scene, pos_w: Tensor, rot_w: Tensor, rays: Tensor, reach:
     hits.append(_entry(near.amax(2), far.amin(2)))
     for rods, flat in ((scene.cylinders, True), (scene.capsules, False)):
         origin, axis = (pos_w[:, None] - rods.center_w) @ rot_w, rods.axis_w @ rot_w
-        hits.append(_entry(*_tube(rods, origin, axis, rays)))
+        hits.append(_entry(*_cylinder(rods, origin, axis, rays)))
         if not flat:
             for sign in (-1.0, 1.0):
                 end = origin + sign * axis * rods.half_length[..., None]
-                hits.append(_entry(*_round(end, rods.radius, rays)))
+                hits.append(_entry(*_sphere(end, rods.radius, rays)))
     origin = (pos_w[:, None] - scene.spheres.center_w) @ rot_w
-    hits.append(_entry(*_round(origin, scene.spheres.radius, rays)))
+    hits.append(_entry(*_sphere(origin, scene.spheres.radius, rays)))
     return torch.stack(hits).amin(0).clamp(max=reach)
 
 
@@ -135,7 +142,7 @@ def nearest_obstacle(scene: Scene, point_w: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def magnetic_field(gate: Gates, point_w: Tensor, current: float = 2e-5) -> Tensor:
-    """Return the field (B, 3) of one gate a world; see `tracks.geometry.field.magnetic_field`."""
+    """Return the field (B, 3) of each world's gate; see `tracks.geometry.field.magnetic_field`."""
     point = to_local(gate.rot_w, point_w - gate.center_w)[:, None]
     corners = torch.cat([torch.zeros_like(gate.opening_g[..., :1]), gate.opening_g], -1)
     start, end = corners - point, corners.roll(-1, -2) - point
@@ -150,7 +157,7 @@ def magnetic_field(gate: Gates, point_w: Tensor, current: float = 2e-5) -> Tenso
 
 @torch.no_grad()
 def crossed(gate: Gates, before_w: Tensor, after_w: Tensor) -> Tensor:
-    """Return whether the step (B,) passed the gate; see `tracks.geometry.crossing.crossing`."""
+    """Return whether each step (B,) passes its gate; see `tracks.geometry.crossing.crossing`."""
     before = to_local(gate.rot_w, before_w - gate.center_w)
     after = to_local(gate.rot_w, after_w - gate.center_w)
     crosses = (before[:, 0] < 0) & (after[:, 0] >= 0)

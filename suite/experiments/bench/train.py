@@ -1,8 +1,9 @@
-"""`suite bench train`: gradient steps a second against a plain torch-eager loop.
+"""The benchmark `train`: gradient steps per second against a plain torch-eager loop.
 
-Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids at
-the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. Steps through the judge's
-quadrotor, varied as the recipe `race` does, are given as a multiple of the point mass's time.
+Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids with
+the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. A world is one simulated scene
+and drone. The time of a step through the quadrotor, randomised as in the recipe `race`, is reported
+as a multiple of the point mass's.
 """
 
 from __future__ import annotations
@@ -25,16 +26,20 @@ from tracks.geometry.scene import PARKED_Z, Counts, Gates
 SOLIDS = Counts(boxes=44, cylinders=8, capsules=6, spheres=6)
 """The 64 solids of every world: 32 bars of the gates' frames, 12 other boxes, 20 round ones."""
 BATCH, STEPS, THREADS = 64, 150, 2
+"""Worlds, policy periods of a rollout, and threads of both sides."""
 UNTRUSTED_BELOW = 2000.0
-"""A free machine of two cores makes at least this many steps a second with the baseline."""
+"""Two cores without other load make at least this many steps per second with the baseline [1/s]."""
 ROUNDS = 4
+"""Number of timed rounds."""
 OURS, BASELINE, QUADROTOR = "ours", "baseline", "quadrotor"
+"""Names of the timed programs."""
 ENOUGH_S = 100.0
-"""No further round begins after this time, enough for all rounds on a free machine [s]."""
+"""No further round begins after this time, in which two cores without other load make all rounds
+[s]."""
 
 
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
-    """Return the recipe `paper` at the bench's size, on one device."""
+    """Return the recipe `paper` with the benchmark's batch and horizon."""
     base = named_recipe("paper")
     return replace(base, episode=replace(base.episode, batch=batch, steps=steps))
 
@@ -48,33 +53,36 @@ def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
     rng = np.random.default_rng(seed)
     scene = worlds.scene
     kinds = {
-        name: type(part)(*(array[:, :limit].copy() for array in part))
-        for name, part, limit in (
+        name: type(solids)(*(array[:, :limit].copy() for array in solids))
+        for name, solids, limit in (
             (name, getattr(scene, name), getattr(SOLIDS, name))
             for name in ("boxes", "cylinders", "capsules", "spheres")
         )
     }
-    for part in kinds.values():
-        missing = part.center_w[..., 2] < PARKED_Z / 2
-        part.center_w[missing] = _near_gates(scene.gates, missing, rng)
+    for solids in kinds.values():
+        missing = solids.center_w[..., 2] < PARKED_Z / 2
+        solids.center_w[missing] = _near_gates(scene.gates, missing, rng)
         for name, low, high in (("half_size", 0.05, 0.25), ("radius", 0.1, 0.3)):
-            if hasattr(part, name):
-                array = getattr(part, name)
+            if hasattr(solids, name):
+                array = getattr(solids, name)
                 array[missing] = rng.uniform(low, high, array[missing].shape)
-        if hasattr(part, "half_length"):
-            part.half_length[missing] = rng.uniform(0.1, 0.8, missing.sum())
+        if hasattr(solids, "half_length"):
+            solids.half_length[missing] = rng.uniform(0.1, 0.8, missing.sum())
     return worlds._replace(scene=scene._replace(**kinds, triangles=scene.triangles[:, :0]))
 
 
 def _near_gates(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a point (N, 3) near a gate of its world for each missing solid [m]."""
     world, _ = np.nonzero(missing)
-    center = gates.center_w[world, rng.integers(0, gates.center_w.shape[1], len(world))]
-    angle, away = rng.uniform(0, 2 * np.pi, len(world)), rng.uniform(1.5, 4.0, len(world))
-    shift = np.stack([away * np.cos(angle), away * np.sin(angle), rng.uniform(-1, 1, len(world))])
+    count = len(world)
+    center = gates.center_w[world, rng.integers(0, gates.center_w.shape[1], count)]
+    angle, radius = rng.uniform(0, 2 * np.pi, count), rng.uniform(1.5, 4.0, count)
+    shift = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-1, 1, count)])
     return center + shift.T
 
 
 def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
+    """Return a call that makes one gradient step of the trainer."""
     import jax
 
     from suite.train.update import make_update, start_state
@@ -90,21 +98,22 @@ def _ours(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
 
 
 def _baseline(config: TrainConfig, worlds: Worlds) -> Callable[[], Any]:
+    """Return a call that makes one gradient step of the torch baseline."""
     from suite.experiments.bench.torch_baseline import Baseline, to_torch
     from suite.train.update import start_state
 
     params = {k: np.asarray(v) for k, v in start_state(config).params.items()}
-    side, tensors = Baseline(config, params), to_torch(worlds)
-    return lambda: side.update(tensors)
+    baseline, tensors = Baseline(config, params), to_torch(worlds)
+    return lambda: baseline.update(tensors)
 
 
 def run(batch: int = BATCH, steps: int = STEPS, rounds: int = ROUNDS) -> Comparison:
     """Time both sides in turn and return the best of all rounds for each.
 
     Args:
-        batch: worlds.
+        batch: number of worlds.
         steps: policy periods of a rollout.
-        rounds: how often each side is timed, after one call to warm up.
+        rounds: number of timed calls of each side, after one call to warm up.
     """
     with _two_cores():
         return _compare(batch, steps, rounds)
@@ -129,6 +138,7 @@ def _two_cores() -> Iterator[None]:
 
 
 def _compare(batch: int, steps: int, rounds: int) -> Comparison:
+    """Return the comparison; the best time of each side counts."""
     point = bench_config(batch, steps)
     quadrotor = replace(point, quadrotor=named_recipe("race").quadrotor)
     worlds = bench_worlds(point)
@@ -137,14 +147,14 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
         BASELINE: _baseline(point, worlds),
         QUADROTOR: _ours(quadrotor, bench_worlds(quadrotor)),
     }
-    taken = in_turn(sides, rounds, most_s=ENOUGH_S)
-    rates = {key: batch * steps / min(seconds) for key, seconds in taken.items()}
+    times_s = in_turn(sides, rounds, most_s=ENOUGH_S)
+    rates = {key: batch * steps / min(seconds) for key, seconds in times_s.items()}
     ours, baseline = rates[OURS], rates[BASELINE]
     warnings = ()
     if baseline < UNTRUSTED_BELOW:
         warnings = (
-            f"the baseline makes {baseline:.0f} steps/s, on a free machine of two cores at least "
-            f"{UNTRUSTED_BELOW:.0f}: the figures are not reliable, run again on a free machine",
+            f"the baseline makes {baseline:.0f} steps/s; two cores without other load make at "
+            f"least {UNTRUSTED_BELOW:.0f}. The figures are not reliable, run again without load",
         )
     unit = "gradient steps/s"
     details = {
@@ -156,6 +166,6 @@ def _compare(batch: int, steps: int, rounds: int) -> Comparison:
             "unit": unit,
             "time_over_point_mass": round(ours / rates[QUADROTOR], 2),
         },
-        "rounds_s": taken,
+        "rounds_s": times_s,
     }
     return Comparison("train", Figure(ours, unit), Figure(baseline, unit), warnings, details)

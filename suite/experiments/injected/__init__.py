@@ -1,1 +1,1 @@
-"""Faults that are put into correct flights, and flights in the formats of other programs."""
+"""Injection of faults into correct flights, and writers for the log formats of other programs."""

@@ -1,4 +1,4 @@
-"""Good flights: simulated ones with measurement noise, and real logs."""
+"""Flights without a fault, into which faults are injected: simulated ones with noise, real logs."""
 
 from __future__ import annotations
 
@@ -21,21 +21,31 @@ NOISE = {"pos": 0.002, "vel": 0.02, "quat": 0.001, "rate": 0.03, "acc": 0.3, "mo
          "voltage": 0.05, "baro": 0.05}  # fmt: skip
 """Standard deviation of the white noise of each signal [its unit]."""
 LOGS = ("nanobench/*.csv", "crazyswarm2/log*", "crazypad/*/*log*")
+"""Patterns of the real logs' files."""
 
 
-def flight_parts(
+def flight_signals(
     log: FlightLog, vehicle: Vehicle, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return a flight of the judge as noisy signals, with a battery voltage and a barometer."""
+    """Return a simulated flight as noisy signals, with a battery voltage and a barometer.
+
+    Args:
+        log: the flight.
+        vehicle: its vehicle, for the throttle.
+        rng: draws the noise.
+
+    Returns:
+        signal -> (T, C) in SI units and our frames; `time` is (T,) [s].
+    """
     assert log.thrust_cmd is not None and log.rate_cmd_b is not None and log.rotor_speed is not None
-    change = velocity_from_position(log.time_s, log.vel_w)
-    parts = {
+    acc_w = velocity_from_position(log.time_s, log.vel_w)  # the derivative of any signal
+    signals = {
         "time": log.time_s,
         "pos": log.pos_w,
         "quat": log.quat_wxyz,
         "vel": log.vel_w,
         "rate": log.rate_b,
-        "acc": rotate(conjugate(log.quat_wxyz), change + [0.0, 0.0, GRAVITY]),
+        "acc": rotate(conjugate(log.quat_wxyz), acc_w + [0.0, 0.0, GRAVITY]),
         "cmd_thrust": log.thrust_cmd[:, None],
         "cmd_rate": log.rate_cmd_b,
         "motor": log.rotor_speed,
@@ -43,25 +53,25 @@ def flight_parts(
         "voltage": (16.0 - 0.05 * log.time_s)[:, None],
         "baro": log.pos_w[:, 2:],
     }
-    for name, size in NOISE.items():
-        parts[name] = parts[name] + size * rng.normal(size=parts[name].shape)
-    parts["quat"] = parts["quat"] / np.linalg.norm(parts["quat"], axis=1, keepdims=True)
-    return parts
+    for name, sigma in NOISE.items():
+        signals[name] = signals[name] + sigma * rng.normal(size=signals[name].shape)
+    signals["quat"] = signals["quat"] / np.linalg.norm(signals["quat"], axis=1, keepdims=True)
+    return signals
 
 
-def as_log(parts: Mapping[str, np.ndarray], name: str) -> FlightLog:
+def as_log(signals: Mapping[str, np.ndarray], name: str) -> FlightLog:
     """Return signals as a flight log, with extra columns `throttle` and `baro`.
 
     Raises:
-        FlightLogError: where they break a rule of flight logs.
+        FlightLogError: if they break a rule of flight logs.
     """
-    columns = {"time": parts["time"]}
+    columns = {"time": signals["time"]}
     for group, names in GROUPS.items():
-        if group != "time" and group in parts:
-            columns |= dict(zip(names, np.asarray(parts[group]).T, strict=True))
-    columns |= {n: parts[n][:, 0] for n in ("throttle", "baro") if n in parts}
-    lacks = [group for group in ("pos", "quat", "rate") if group not in parts]
-    return log_from_columns(columns, {"partial": lacks} if lacks else {}, name, limits=False)
+        if group != "time" and group in signals:
+            columns |= dict(zip(names, np.asarray(signals[group]).T, strict=True))
+    columns |= {n: signals[n][:, 0] for n in ("throttle", "baro") if n in signals}
+    missing = [group for group in ("pos", "quat", "rate") if group not in signals]
+    return log_from_columns(columns, {"partial": missing} if missing else {}, name, limits=False)
 
 
 def real_logs(folder: Path) -> list[Path]:

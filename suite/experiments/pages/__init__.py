@@ -1,1 +1,1 @@
-"""Result pages: the page, tables, charts, and the paper's printed numbers."""
+"""Result pages of docs/results: writing a page, its tables and charts, and the paper's numbers."""

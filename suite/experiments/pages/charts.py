@@ -1,4 +1,4 @@
-"""The documents' charts, each as a PNG file's bytes."""
+"""Draw the charts of the result pages, each as a PNG file's bytes."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from suite.common.charts import LINES, dots, legend, plain_axes, png, titled
 from suite.common.curve import METRICS
 from suite.experiments.pages.paper import Ablated, sim_to_sim
 from suite.experiments.study.conditions import Sweep
-from suite.experiments.study.disturbed import Tested
+from suite.experiments.study.disturbed import ConditionResult
 from suite.experiments.study.summary import Spread, Summary
 from tracks.families import JUDGED
 
 
 def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
-    """Have an axis of percentages cover the data, whose lowest value or interval end is `low`."""
-    ends = (max(-2.0, 5.0 * math.floor(low / 5.0) - 2.0), 101.5)
-    (axes.set_ylim if vertical else axes.set_xlim)(*ends)
+    """Limit an axis of percentages to the data, whose lowest value or interval end is `low`."""
+    limits = (max(-2.0, 5.0 * math.floor(low / 5.0) - 2.0), 101.5)
+    (axes.set_ylim if vertical else axes.set_xlim)(*limits)
 
 
 def level_chart(cells: Sequence[Tally]) -> bytes:
-    """Return a policy's success and v_max below by level, a column a track, next to the paper's."""
+    """Return success (above) and v_max (below) by level, a column per track, with the paper's."""
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
     lowest, filled = 100.0, {"ms": 4, "lw": 1.2, "color": LINES[0]}
     hollow = {"ms": 5, "color": "#555b66", "mfc": "none"}
     for number, track in enumerate(JUDGED):
         upper, lower = rows[:, number]
-        theirs = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
-        at = np.array([c.level for c in theirs]) + 0.25
-        words = f"the paper, {theirs[0].trials} trials a level"
-        printed = [wilson(c.won, c.trials) for c in theirs]
-        dots(upper, at, printed, 100, label=words, fmt="D", lw=1.2, **hollow)
-        lower.plot(at, [c.v_max for c in theirs], "D", **hollow)
-        mine = [cell for cell in cells if cell.track == track]
-        levels = [c.difficulty for c in mine]
-        words = f"{mine[0].policy}, {mine[0].trials} trials a level"
-        dots(upper, levels, [c.success for c in mine], 100, label=words, **filled)
-        dots(lower, levels, [c.v_max for c in mine], **filled)
-        lowest = min([lowest, *(100 * c.success.low for c in mine)])
-        lowest = min([lowest, *(100 * c.value for c in printed)])
+        paper = [c for c in sim_to_sim().cells if (c.method, c.track) == ("with_delta", track)]
+        paper_levels = np.array([c.level for c in paper]) + 0.25
+        label = f"the paper, {paper[0].trials} trials per level"
+        paper_rates = [wilson(c.won, c.trials) for c in paper]
+        dots(upper, paper_levels, paper_rates, 100, label=label, fmt="D", lw=1.2, **hollow)
+        lower.plot(paper_levels, [c.v_max for c in paper], "D", **hollow)
+        ours = [cell for cell in cells if cell.track == track]
+        levels = [c.difficulty for c in ours]
+        label = f"{ours[0].policy}, {ours[0].trials} trials per level"
+        dots(upper, levels, [c.success for c in ours], 100, label=label, **filled)
+        dots(lower, levels, [c.v_max for c in ours], **filled)
+        lowest = min([lowest, *(100 * c.success.low for c in ours)])
+        lowest = min([lowest, *(100 * c.value for c in paper_rates)])
         titled(upper, track)
         plain_axes(lower)
         lower.set_xlabel("level", fontsize=9)
@@ -59,25 +59,25 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
     return png(figure)
 
 
-def effects_chart(entries: Sequence[Tested]) -> bytes:
-    """Return success under each effect, the worst on top; the first entry is undisturbed."""
+def effects_chart(entries: Sequence[ConditionResult]) -> bytes:
+    """Return success under each effect, the lowest on top; the first entry is undisturbed."""
     first, *others = entries
     names = list(first.results)
     others.sort(key=lambda entry: max(entry.success(name).value for name in names), reverse=True)
     shown = [*others, first]
     figure = Figure(figsize=(8.6, 1.4 + 0.24 * len(shown)), layout="constrained")
     axes = figure.subplots()
-    at = np.arange(len(shown))
+    y = np.arange(len(shown))
     for number, name in enumerate(names):
-        colour, place = LINES[number % len(LINES)], 0.22 * (number - (len(names) - 1) / 2)
-        found = [entry.success(name) for entry in shown]
-        value, low, high = 100 * np.array(found).T
-        reach = np.maximum([value - low, high - value], 0)
-        label = f"{name}, {len(first.results[name])} trials a row; dashed: undisturbed"
+        colour, offset = LINES[number % len(LINES)], 0.22 * (number - (len(names) - 1) / 2)
+        rates = [entry.success(name) for entry in shown]
+        value, low, high = 100 * np.array(rates).T
+        bars = np.maximum([value - low, high - value], 0)
+        label = f"{name}, {len(first.results[name])} trials per row; dashed: undisturbed"
         style = {"fmt": "o", "ms": 4, "lw": 1.4, "color": colour, "label": label}
-        axes.errorbar(value, at - place, xerr=reach, **style)
+        axes.errorbar(value, y - offset, xerr=bars, **style)
         axes.axvline(100 * first.success(name).value, color=colour, lw=1, ls="--", alpha=0.6)
-    axes.set_yticks(at, [f"{e.condition.name}  {e.condition.words}".strip() for e in shown])
+    axes.set_yticks(y, [f"{e.condition.name}  {e.condition.size_text}".strip() for e in shown])
     _percent_axis(axes, min(100 * e.success(n).low for e in shown for n in names), vertical=False)
     axes.set_xlabel("success [%]", fontsize=9)
     titled(axes, "Success under one effect at a time, with 95 % Wilson intervals")
@@ -86,10 +86,10 @@ def effects_chart(entries: Sequence[Tested]) -> bytes:
     return png(figure)
 
 
-def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
+def sweeps_chart(grown: Mapping[Sweep, Sequence[ConditionResult]]) -> bytes:
     """Return success against the size of each disturbance, a panel each.
 
-    Only measured sizes are drawn; dots of several policies stand next to each other.
+    Dots are at the measured sizes; those of several policies are next to each other.
     """
     results = next(iter(grown.values()))[0].results
     names = list(results)
@@ -101,13 +101,13 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
         axes.set_visible(False)
     for axes, (sweep, points) in zip(panels, grown.items(), strict=False):
         sizes = [point.condition.size for point in points]
-        apart = 0.03 * (max(sizes) - min(sizes))
+        spacing = 0.03 * (max(sizes) - min(sizes))
         for number, name in enumerate(names):
-            at = np.array(sizes) + apart * (number - (len(names) - 1) / 2)
-            label = f"{short_name(name)}, {len(results[name])} trials a point"
+            x = np.array(sizes) + spacing * (number - (len(names) - 1) / 2)
+            label = f"{short_name(name)}, {len(results[name])} trials per point"
             colour = LINES[number % len(LINES)]
-            found = [point.success(name) for point in points]
-            dots(axes, at, found, 100, ms=3.5, lw=1.2, color=colour, label=label)
+            rates = [point.success(name) for point in points]
+            dots(axes, x, rates, 100, ms=3.5, lw=1.2, color=colour, label=label)
         titled(axes, sweep.name)
         axes.set_xlabel(sweep.axis, fontsize=8)
         axes.set_ylabel("success [%]", fontsize=8)
@@ -117,7 +117,7 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[Tested]]) -> bytes:
 
 
 def short_name(policy: str) -> str:
-    """Return a policy's label for a legend: of a checkpoint RUN/policy the name of the run."""
+    """Return a policy's label for a legend; that of a checkpoint RUN/policy is the run's name."""
     path = PurePath(policy)
     return path.parent.name if path.name == "policy" and path.parent.name else policy
 
@@ -126,57 +126,60 @@ def bars_chart(
     rows: Mapping[str, Mapping[str, Spread]],
     printed: Mapping[str, Ablated],
     kinds: Mapping[str, str],
-    trained: str,
+    sample: str,
 ) -> bytes:
     """Return means over training seeds as bars, least and most as dots, the paper's as diamonds.
 
     Args:
         rows: numbers by key: a kind and its weight, such as "field 0.4".
-        printed: the paper's, of some keys.
-        kinds: label of each kind, in the colours' order.
-        trained: the seeds and trials, for the legend.
+        printed: the paper's numbers, of some keys.
+        kinds: label of each kind, in the order of the colours.
+        sample: the seeds and trials, for the legend.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
-    every = figure.subplots(1, 3, sharey=True)
-    for axes, name in zip(every, ("success_cross", "collision_free", "v_max"), strict=True):
+    panels = figure.subplots(1, 3, sharey=True)
+    for axes, name in zip(panels, ("success_cross", "collision_free", "v_max"), strict=True):
         scale = METRICS[name].scale
-        for at, (key, numbers) in enumerate(rows.items()):
+        for y, (key, numbers) in enumerate(rows.items()):
             colour = LINES[list(kinds).index(key.split()[0])]
             mean, least, most = (scale * value for value in numbers[name])
-            axes.barh(at, mean, height=0.55, color=colour, alpha=0.6)
-            label = f"mean, least and most of {trained}" if at == 0 else None
-            axes.plot([least, most], [at, at], "o-", ms=4, lw=1.2, color=colour, label=label)
+            axes.barh(y, mean, height=0.55, color=colour, alpha=0.6)
+            label = f"mean, least and most of {sample}" if y == 0 else None
+            axes.plot([least, most], [y, y], "o-", ms=4, lw=1.2, color=colour, label=label)
             if key in printed:
-                theirs = scale * getattr(printed[key], name)
-                label = "the paper" if at == 0 else None
-                axes.plot(theirs, at, "D", ms=7, mfc="none", mec="black", label=label)
+                paper_value = scale * getattr(printed[key], name)
+                label = "the paper" if y == 0 else None
+                axes.plot(paper_value, y, "D", ms=7, mfc="none", mec="black", label=label)
         titled(axes, METRICS[name].title)
         if scale == 100:
             axes.set_xlim(-3, 103)
     labels = [f"{kinds[kind]} {weight}" for kind, weight in map(str.split, rows)]
-    every[0].set_yticks(range(len(rows)), labels)
-    every[0].invert_yaxis()
-    legend(figure, every[0])
+    panels[0].set_yticks(range(len(rows)), labels)
+    panels[0].invert_yaxis()
+    legend(figure, panels[0])
     return png(figure)
 
 
 def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
-    """Return numbers over steps and over time, a column each; bands span the training seeds."""
+    """Return numbers over steps (above) and over time (below), a column per number.
+
+    Bands are the range over training seeds.
+    """
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, len(names), sharey="col")
     for column, name in enumerate(names):
         scale = METRICS[name].scale
-        for axes, x, words in ((upper[column], "steps", "environment steps [thousands]"),
-                               (lower[column], "time", "training [s]")):  # fmt: skip
-            unit = 1e3 if x == "steps" else 1.0
+        for axes, key, label in ((upper[column], "steps", "environment steps [thousands]"),
+                                 (lower[column], "time", "training [s]")):  # fmt: skip
+            unit = 1e3 if key == "steps" else 1.0
             for colour, row in zip(LINES, rows, strict=False):
-                at = [point[x].mean / unit for point in row.at]
+                x = [point[key].mean / unit for point in row.at]
                 mean, least, most = scale * np.array([point[name] for point in row.at]).T
-                axes.fill_between(at, least, most, color=colour, alpha=0.15, lw=0)
+                axes.fill_between(x, least, most, color=colour, alpha=0.15, lw=0)
                 axes.plot(
-                    at, mean, "o-", ms=3, color=colour, label=f"{row.words}, {row.seeds} seeds"
+                    x, mean, "o-", ms=3, color=colour, label=f"{row.label}, {row.seeds} seeds"
                 )
-            axes.set_xlabel(words, fontsize=9)
+            axes.set_xlabel(label, fontsize=9)
             titled(axes, METRICS[name].heading)
         if scale == 100:
             _percent_axis(upper[column], min(100 * p[name].least for row in rows for p in row.at))

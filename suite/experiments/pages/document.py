@@ -1,7 +1,7 @@
-"""A result page: the generated part stands between two comments, hand-written text around it.
+"""Write a result page: NAME.md with its tables, NAME.png with its charts, NAME.json with numbers.
 
-`suite reproduce` replaces only the part between the comments, so that a page can be made again
-without losing its text.
+In NAME.md the generated part is between two comments, with hand-written text around it.
+`suite reproduce` replaces only the generated part, so a page can be made again without losing text.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from suite.common.console import Console
 from suite.common.provenance import machine, package_versions
 from suite.common.report import Picture
 from suite.experiments import EXPERIMENTS
-from suite.experiments.study.cache import FLIES, Place, code_digest
+from suite.experiments.study.cache import FLIES, Workspace, code_digest
 from tracks.common.files import plain, replacing_file, write_json, write_text
 from tracks.common.grid import Grid, markdown
 from tracks.common.provenance import stamp
@@ -27,7 +27,7 @@ BEGIN, END = "<!-- made by suite reproduce -->", "<!-- end of what suite reprodu
 """The lines around the generated part."""
 
 
-class Made(NamedTuple):
+class PageContents(NamedTuple):
     """The results of an experiment."""
 
     facts: Mapping[str, str]
@@ -35,50 +35,50 @@ class Made(NamedTuple):
     parts: Mapping[str, Sequence[Grid | Picture]]
     """Tables and charts, by heading."""
     numbers: Mapping[str, Any]
-    """Contents of NAME.json, besides configuration and provenance."""
+    """Contents of NAME.json, without configuration and provenance."""
 
 
 def check_page(out: Path, name: str) -> None:
     """Refuse a page that cannot be made again without losing text.
 
     Raises:
-        ValueError: where `out` has a NAME.md without the two comments.
+        ValueError: if `out` has a NAME.md without the two comments.
     """
     path = out / f"{name}.md"
     if path.is_file():
-        _around(path.read_text(encoding="utf-8"), path)
+        _split_page(path.read_text(encoding="utf-8"), path)
 
 
 def write_document(
-    place: Place, name: str, config: Any, made: Made, console: Console
+    workspace: Workspace, name: str, config: Any, contents: PageContents, console: Console
 ) -> dict[str, Any]:
-    """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `place.out`.
+    """Write the charts `name`.png, `name`-2.png, ..., `name`.json and `name`.md to `workspace.out`.
 
     The page is written last, after everything that it shows.
 
     Args:
-        place: folder of the files.
+        workspace: folder of the files.
         name: of the experiment.
         config: of the experiment; its `seed` goes into the stamp.
-        made: the results.
-        console: prints which files were written.
+        contents: the results.
+        console: prints the names of the written files.
 
     Returns:
         The contents of `name`.json, and `out`, the page's path.
 
     Raises:
         ValueError: if the existing page lacks the two comments.
-        OSError: where a file cannot be written.
+        OSError: if a file cannot be written.
     """
-    header, page = stamp(SCHEMA, config.seed), place.out / f"{name}.md"
-    facts = {**made.facts, **_provenance(header)}
+    header, page = stamp(SCHEMA, config.seed), workspace.out / f"{name}.md"
+    facts = {**contents.facts, **_provenance(header)}
     old = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
-    before, after = _around(old, page)
+    before, after = _split_page(old, page)
     header["code_sha256"] = code_digest(*FLIES)
-    answer = {**header, "made_by": facts, "config": config, **made.numbers}
+    answer = {**header, "made_by": facts, "config": config, **contents.numbers}
     figures: list[str] = []
     blocks = ["\n".join(f"- {key}: {value}" for key, value in facts.items())]
-    for title, parts in made.parts.items():
+    for title, parts in contents.parts.items():
         blocks.append(f"## {title}")
         for part in parts:
             if isinstance(part, Grid):
@@ -86,10 +86,10 @@ def write_document(
                 continue
             file = f"{name}.png" if not figures else f"{name}-{len(figures) + 1}.png"
             figures.append(file)
-            with replacing_file(place.out / file) as new:
+            with replacing_file(workspace.out / file) as new:
                 new.write_bytes(part.png)
             blocks.append(f"![{part.caption}]({file})")
-    write_json(place.out / f"{name}.json", answer)
+    write_json(workspace.out / f"{name}.json", answer)
     write_text(page, "\n\n".join([before + BEGIN, *blocks, END]) + after)
     console.say(f"written: {page}, {name}.json" + "".join(f", {file}" for file in figures))
     return {**plain(answer), "out": str(page)}
@@ -100,23 +100,24 @@ def _new_page(name: str) -> str:
     return f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
 
 
-def _around(text: str, path: Path) -> tuple[str, str]:
+def _split_page(text: str, path: Path) -> tuple[str, str]:
     """Return the text before and after the generated part of a page."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    before, begin, remainder = text.partition(BEGIN)
+    _, end, after = remainder.partition(END)
     if not begin or not end:
         raise ValueError(
             f"{path}: has no {END if begin else BEGIN}, so its text would be lost; move it away, "
-            f"or add the lines {BEGIN} and {END} around what is to be replaced"
+            f"or add the lines {BEGIN} and {END} around the part to replace"
         )
     return before, after
 
 
 def _provenance(header: Mapping[str, Any]) -> dict[str, str]:
-    where = machine()
+    """Return command, commit, machine and engines, for the facts of a page."""
+    computer = machine()
     engines = (f"{key} {package_versions()[key]}" for key in ("mujoco", "jax", "numpy"))
     return {
         "command": f"`{shlex.join(['suite', *sys.argv[1:]])}`",
         "commit": f"{header['git_commit']}, version {header['suite_version']}",
-        "machine": f"{where['processor']}, {where['cores']} cores; {', '.join(engines)}",
+        "machine": f"{computer['processor']}, {computer['cores']} cores; {', '.join(engines)}",
     }

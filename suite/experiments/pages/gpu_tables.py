@@ -1,4 +1,7 @@
-"""The tables of the page `gpu`: speed of training and judging, and the CPU's outcomes."""
+"""The tables of the page `gpu`: speed of training and judging, and the comparison with the CPU.
+
+A world is one simulated scene and drone of a batch.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,18 @@ from eval.judging.tables import percent
 from tracks.common.grid import Grid, table_of
 
 MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
-"""Dynamics that are trained through, by key."""
+"""Dynamics of the training: key -> name in tables."""
 Numbers = Mapping[str, Any]
+"""Numbers of a row, by name."""
 
 
 def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
-    """Return the trainer's speed: a row a model and number of worlds.
+    """Return the trainer's speed, a row per model and number of worlds.
 
     Args:
         rows: model, worlds, seconds and operations of a gradient step.
         steps: decisions of a world in a gradient step.
-        best: operations a second of a matrix product.
+        best: operations per second of a matrix product, the device's best speed.
     """
     return table_of(
         rows,
@@ -36,7 +40,7 @@ def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
 
 
 def judge_grid(rows: Sequence[Numbers]) -> Grid:
-    """Return the judge's speed, a row a number of trials at once."""
+    """Return the judge's speed, a row per number of trials at once."""
     return table_of(
         rows,
         ("trials at once", lambda row: f"{row['worlds']}"),
@@ -47,13 +51,13 @@ def judge_grid(rows: Sequence[Numbers]) -> Grid:
 
 
 def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
-    """Return a row a simulator on the CPU: how many trials end as on the accelerator."""
+    """Return how many trials have the same result on CPU and accelerator, a row per simulator."""
 
     def difference(row: Numbers) -> str:
         return "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in row["difference"]))
 
     return table_of(
-        [{"name": name, **found} for name, found in pairs.items()],
+        [{"name": name, **numbers} for name, numbers in pairs.items()],
         ("compared with", lambda row: row["name"]),
         ("trials", lambda row: f"{row['trials']}"),
         ("the same success", lambda row: f"{row['same_success']}"),

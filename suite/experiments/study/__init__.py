@@ -1,1 +1,1 @@
-"""Studies: policies of several settings and training seeds are trained, judged and compared."""
+"""The parts of an experiment: training several settings from several seeds, judging, comparing."""

@@ -1,4 +1,4 @@
-"""The cache of experiments: results are named by a digest of their inputs and code."""
+"""The cache of experiments: names of results, made by a SHA-256 of their inputs and code."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from tracks.common.names import added_entries
 from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
+"""Folder of the four packages."""
 NO_RESULT = ("view", "importers", "faults", "envs")
 """Folders whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
-"""The rooms whose code affects a flight."""
+"""The packages whose code affects a flight."""
 
 
 @dataclass(frozen=True)
-class Place:
+class Workspace:
     """Folders and workers of an experiment."""
 
     out: Path
@@ -44,24 +45,24 @@ def digest(value: Any) -> str:
 
 
 @functools.cache
-def code_digest(*rooms: str) -> str:
-    """Return a digest (16 hex digits) of the code of `rooms`.
+def code_digest(*folders: str) -> str:
+    """Return a digest (16 hex digits) of the code in `folders`.
 
     Args:
-        rooms: folders of the project, such as "tracks" or "suite/train".
+        folders: folders of the project, such as "tracks" or "suite/train".
     """
-    sums = hashlib.sha256()
-    for room in rooms:
-        for path in sorted((ROOT / room).rglob("*.py")):
+    sha256 = hashlib.sha256()
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob("*.py")):
             name = path.relative_to(ROOT)
             if not set(name.parts) & set(NO_RESULT):
-                sums.update(f"{name.as_posix()}\0".encode() + path.read_bytes())
-    return sums.hexdigest()[:16]
+                sha256.update(f"{name.as_posix()}\0".encode() + path.read_bytes())
+    return sha256.hexdigest()[:16]
 
 
 @functools.cache
 def engines() -> dict[str, str | None]:
-    """Return what else can change a result: processor, versions and added packages."""
+    """Return further inputs of a result: processor, versions and plugins."""
     versions = package_versions()
     names = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco", "mujoco-mjx", "torch")
     return {
@@ -72,14 +73,14 @@ def engines() -> dict[str, str | None]:
 
 
 def added_digest() -> str | None:
-    """Return a digest (16 hex digits) of effects, tracks and worlds of other packages, if any."""
-    sums = hashlib.sha256()
+    """Return a digest (16 hex digits) of the plugins' effects, tracks and simulators, if any."""
+    sha256 = hashlib.sha256()
     entries = added_entries()
     for entry in entries:
-        sums.update(f"{entry.group}\0{entry.name}\0{entry.value}\0".encode())
+        sha256.update(f"{entry.group}\0{entry.name}\0{entry.value}\0".encode())
         for path in _sources(entry.module.partition(".")[0]):
-            sums.update(path.name.encode() + b"\0" + path.read_bytes())
-    return sums.hexdigest()[:16] if entries else None
+            sha256.update(path.name.encode() + b"\0" + path.read_bytes())
+    return sha256.hexdigest()[:16] if entries else None
 
 
 def _sources(module: str) -> list[Path]:

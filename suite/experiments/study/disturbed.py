@@ -1,4 +1,8 @@
-"""Policies flown under other conditions than those of the result tables."""
+"""Fly policies under conditions, such as a vehicle with an additional effect or with sensor errors.
+
+An effect is one physical cause of a mismatch, such as drag. A sweep is a series of conditions in
+which one disturbance grows.
+"""
 
 from __future__ import annotations
 
@@ -18,31 +22,31 @@ from suite.experiments.study.conditions import (
     sweep_conditions,
     sweeps,
 )
-from suite.experiments.study.judging import Order, Place, Setup, flown
-from suite.experiments.study.options import chosen
+from suite.experiments.study.judging import Setup, TrialRequest, Workspace, fly_trials
+from suite.experiments.study.options import select
 
 
-class Tested(NamedTuple):
+class ConditionResult(NamedTuple):
     """A condition and the results of every policy under it, on the same trials."""
 
     condition: Condition
     results: Mapping[str, Sequence[TrialResult]]
-    """By the policy's label."""
+    """Results of the trials, by the policy's label."""
 
     def success(self, policy: str) -> Interval:
         """Return the success rate over all tracks and levels."""
         return wilson(int(self.won(policy).sum()), len(self.results[policy]))
 
     def won(self, policy: str) -> np.ndarray:
-        """Return which trials succeeded, (n,) bool."""
+        """Return whether each trial succeeded, (n,) bool."""
         return np.array([row.success for row in self.results[policy]])
 
 
-Grown = dict[Sweep, list[Tested]]
-"""The tested conditions of each sweep, the undisturbed first."""
+SweepResults = dict[Sweep, list[ConditionResult]]
+"""The results under the conditions of each sweep, the undisturbed first."""
 
 
-def chosen_conditions(
+def select_conditions(
     vehicle: Vehicle, only: Sequence[str]
 ) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
     """Return the effects and the sweeps of `vehicle` that are in `only`, all if it is empty.
@@ -50,63 +54,65 @@ def chosen_conditions(
     Raises:
         ValueError: for an unknown name.
     """
-    grown, alone = sweeps(vehicle), effect_conditions(vehicle)
-    known = dict.fromkeys(entry.name for entry in (*grown, *alone))
-    names = chosen(known, only, "effect or sweep")
+    all_sweeps, singles = sweeps(vehicle), effect_conditions(vehicle)
+    known = dict.fromkeys(entry.name for entry in (*all_sweeps, *singles))
+    names = select(known, only, "effect or sweep")
     return (
-        [condition for condition in alone if condition.name in names],
-        {sweep: sweep_conditions(vehicle, sweep) for sweep in grown if sweep.name in names},
+        [condition for condition in singles if condition.name in names],
+        {sweep: sweep_conditions(vehicle, sweep) for sweep in all_sweeps if sweep.name in names},
     )
 
 
-def flown_under(
-    alone: Sequence[Condition],
-    grown: Mapping[Sweep, Sequence[Condition]],
+def fly_conditions(
+    singles: Sequence[Condition],
+    by_sweep: Mapping[Sweep, Sequence[Condition]],
     policies: Mapping[str, str],
     trials: Sequence[TrialSpec],
-    place: Place,
+    workspace: Workspace,
     console: Console,
-) -> tuple[list[Tested], Grown]:
+) -> tuple[list[ConditionResult], SweepResults]:
     """Return all conditions with the results of every policy under them.
 
     Args:
-        alone: single conditions.
-        grown: conditions by sweep.
-        policies: by label.
+        singles: conditions that belong to no sweep.
+        by_sweep: conditions by sweep.
+        policies: names or paths, by label.
         trials: each policy flies all of them under every condition.
-        place: cache of flights, and workers.
+        workspace: cache of flights, and workers.
         console: shows progress.
     """
-    conditions = [*alone, *(point for points in grown.values() for point in points)]
-    orders = {
-        (at, name): Order(
+    conditions = [*singles, *(point for points in by_sweep.values() for point in points)]
+    requests = {
+        (number, name): TrialRequest(
             Setup(policy, condition.vehicle, condition.sensors, condition.simulator), trials
         )
         for name, policy in policies.items()
-        for at, condition in enumerate(conditions)
+        for number, condition in enumerate(conditions)
     }
-    rows = flown(orders, place, console, "flying under every condition")
-    tested = [
-        Tested(condition, {name: rows[at, name] for name in policies})
-        for at, condition in enumerate(conditions)
+    rows = fly_trials(requests, workspace, console, "flying under every condition")
+    results = [
+        ConditionResult(condition, {name: rows[number, name] for name in policies})
+        for number, condition in enumerate(conditions)
     ]
-    rest = iter(tested[len(alone) :])
-    return tested[: len(alone)], {s: [next(rest) for _ in points] for s, points in grown.items()}
+    of_sweeps = iter(results[len(singles) :])
+    return results[: len(singles)], {
+        sweep: [next(of_sweeps) for _ in points] for sweep, points in by_sweep.items()
+    }
 
 
-def tested_numbers(entry: Tested, base: Tested) -> dict[str, Any]:
+def tested_numbers(entry: ConditionResult, base: ConditionResult) -> dict[str, Any]:
     """Return the results under one condition for JSON, over all trials and by track."""
-    found: dict[str, Any] = {
+    numbers: dict[str, Any] = {
         "name": entry.condition.name,
         "size": entry.condition.size,
-        "words": entry.condition.words,
+        "words": entry.condition.size_text,
         "sensors": entry.condition.sensors,
         "effects": dict(entry.condition.vehicle.effects),
         "policies": {},
     }
     for name, rows in entry.results.items():
         tracks = dict.fromkeys(row.track for row in rows)
-        found["policies"][name] = {
+        numbers["policies"][name] = {
             "success": entry.success(name),
             "change": paired_success(entry.won(name), base.won(name)),
             "tracks": {
@@ -116,4 +122,4 @@ def tested_numbers(entry: Tested, base: Tested) -> dict[str, Any]:
             "v_max": float(np.median([row.v_max for row in rows])),
             "v_mean": float(np.median([row.v_mean for row in rows])),
         }
-    return found
+    return numbers

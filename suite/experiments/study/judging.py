@@ -1,7 +1,8 @@
-"""Judged trials in a permanent cache: the same flight is flown only once.
+"""Judge trials with a permanent cache of results: each flight is flown only once.
 
-A journal in the cache is named by the digest of all that determines an outcome: policy, vehicle,
-the judge's code, the engines. Each trial is written there as it ends. All pages share the journals.
+A trial is one flight: a track, a level of difficulty and a seed. A journal in the cache is named by
+the SHA-256 of all that determines an outcome: policy, vehicle, the judge's code, the engines. Each
+result is written there as its trial ends. All pages share the journals.
 """
 
 from __future__ import annotations
@@ -23,17 +24,16 @@ from policies.policy import Policy, load_policy
 from policies.spec import NeedsTrust, PolicyError
 from suite.common.console import Console
 from suite.common.stages import announce
-from suite.experiments.study.cache import FLIES, Place, code_digest, digest, engines
+from suite.experiments.study.cache import FLIES, Workspace, code_digest, digest, engines
 from suite.judging.content import PolicyContent, policy_digest
 from suite.judging.flying import (
     TRIALS_A_PROCESS,
-    cost_of,
     default_policy,
-    flying_needs,
-    labels,
-    trial_list,
+    flying_estimate,
+    policy_labels,
+    relative_cost,
 )
-from suite.judging.requests import parse_levels
+from suite.judging.trials import parse_levels, trial_list
 from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import JUDGED
 
@@ -55,57 +55,59 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Order:
+class TrialRequest:
     """Trials of one setup."""
 
     setup: Setup
     trials: Sequence[TrialSpec]
 
 
-def flown(
-    orders: Mapping[Key, Order], place: Place, console: Console, what: str
+def fly_trials(
+    requests: Mapping[Key, TrialRequest], workspace: Workspace, console: Console, title: str
 ) -> dict[Key, list[TrialResult]]:
-    """Return the results of every order; those not in the cache are flown first.
+    """Return the results of every request; those not in the cache are flown first.
 
     After an interrupt, finished trials stay in the cache.
 
     Args:
-        orders: several may have the same setup.
-        place: folder of the journals, and the workers; without workers as many processes of this
-            machine as shorten the work.
+        requests: several may have the same setup.
+        workspace: folder of the journals, and the workers; without workers as many processes of
+            this machine as shorten the work.
         console: shows progress.
-        what: label of the progress.
+        title: label of the progress.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
-    policies = {order.setup.policy for order in orders.values()}
+    policies = {request.setup.policy for request in requests.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
-    about = {key: _about(order.setup, digests) for key, order in orders.items()}
-    names = {key: digest(entry) for key, entry in about.items()}
-    setups = {names[key]: order.setup for key, order in orders.items()}
-    wanted: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
-    for key, order in orders.items():
-        wanted[names[key]].update(dict.fromkeys(order.trials))
+    inputs = {key: _inputs(request.setup, digests) for key, request in requests.items()}
+    names = {key: digest(entry) for key, entry in inputs.items()}
+    setups = {names[key]: request.setup for key, request in requests.items()}
+    # Dictionaries as sets that keep their order.
+    requested: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
+    for key, request in requests.items():
+        requested[names[key]].update(dict.fromkeys(request.trials))
     with ExitStack() as stack:
         journals = {
-            name: stack.enter_context(Journal(place.cache / "trials" / f"{name}.jsonl", entry))
-            for name, entry in {names[key]: entry for key, entry in about.items()}.items()
+            name: stack.enter_context(Journal(workspace.cache / "trials" / f"{name}.jsonl", entry))
+            for name, entry in {names[key]: entry for key, entry in inputs.items()}.items()
         }
-        missing = [journals[name].missing(list(trials)) for name, trials in wanted.items()]
-        left, total = sum(map(len, missing)), sum(map(len, wanted.values()))
-        if left < total:
-            console.note(f"{what}: {total - left} of {total} trials were flown before")
-        if left:
-            workers = place.workers or min(usable_cores(), max(1, left // TRIALS_A_PROCESS))
-            costs = [cost_of(setup.simulator) for setup in setups.values()]
+        missing = [journals[name].missing(list(trials)) for name, trials in requested.items()]
+        remaining, total = sum(map(len, missing)), sum(map(len, requested.values()))
+        if remaining < total:
+            console.note(f"{title}: {total - remaining} of {total} trials were flown before")
+        if remaining:
+            worthwhile = max(1, remaining // TRIALS_A_PROCESS)
+            workers = workspace.workers or min(usable_cores(), worthwhile)
+            costs = [relative_cost(setup.simulator) for setup in setups.values()]
             cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
-            announce(console, f"{what}: {left} trials", flying_needs(cost, workers))
-            numbers, all_journals = count(total - left + 1), list(journals.values())
-            with console.progress(what, total) as update:
+            announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
+            numbers, all_journals = count(total - remaining + 1), list(journals.values())
+            with console.progress(title, total) as update:
 
-                def keep(piece: int, ended: tuple[int, TrialResult]) -> None:
-                    number, result = ended
+                def keep(piece: int, answer: tuple[int, TrialResult]) -> None:
+                    number, result = answer
                     all_journals[number].append(result)
                     # A sweep has more journals than a process may have open files.
                     all_journals[number].close()
@@ -115,12 +117,12 @@ def flown(
                 pieces = _pieces(list(setups.values()), missing, worker_count(workers))
                 run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
     return {
-        key: [journals[names[key]].done[trial] for trial in order.trials]
-        for key, order in orders.items()
+        key: [journals[names[key]].done[trial] for trial in request.trials]
+        for key, request in requests.items()
     }
 
 
-def name_of(policy: str) -> str:
+def policy_name(policy: str) -> str:
     """Return the name of a policy that a page may fly.
 
     Raises:
@@ -130,15 +132,16 @@ def name_of(policy: str) -> str:
         return load_policy(policy).name
     except NeedsTrust:
         raise PolicyError(
-            f"{policy}: loading it can run its maker's code, which suite reproduce does of no "
-            "policy; give a checkpoint's folder or an .onnx file, or fly it with suite eval"
+            f"{policy}: loading it can run its maker's code, which suite reproduce never does; "
+            "give a checkpoint's folder or an .onnx file, or fly it with suite eval"
         ) from None
 
 
-def named_policies(given: Sequence[str]) -> dict[str, str]:
-    """Return the given policies, or the shipped one, by label."""
-    given = given or (default_policy(),)
-    return dict(zip(labels(given, [name_of(path) for path in given]), given, strict=True))
+def named_policies(sources: Sequence[str]) -> dict[str, str]:
+    """Return label -> source of the policies, or of the shipped default without any."""
+    sources = sources or (default_policy(),)
+    labels = policy_labels(sources, [policy_name(source) for source in sources])
+    return dict(zip(labels, sources, strict=True))
 
 
 def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:
@@ -146,14 +149,14 @@ def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:
     return {name: f"{path}, SHA-256 {policy_digest(path)[:16]}" for name, path in policies.items()}
 
 
-def trials_of(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpec]:
+def judged_trials(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpec]:
     """Return an experiment's judged trials, at `levels` or those of its --difficulty."""
     levels = parse_levels(config.difficulty) if levels is None else levels
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
-def _about(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Return everything but the trial that determines an outcome."""
+def _inputs(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
+    """Return all inputs of an outcome except the trial."""
     return {
         "policy_sha256": digests[setup.policy],
         "vehicle": setup.vehicle,
@@ -169,7 +172,7 @@ Loaders = dict[str, Callable[[], Policy]]
 
 
 class Share(NamedTuple):
-    """Trials of one setup."""
+    """Trials of one setup in a piece of work."""
 
     number: int
     """Number of the setup."""
@@ -191,15 +194,15 @@ def _pieces(
     total = sum(map(len, missing))
     most = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
     pieces: list[list[Share]] = [[]]
-    held = 0
+    size = 0
     for number, (setup, trials) in enumerate(zip(setups, missing, strict=True)):
-        cut = math.ceil(len(trials) / most) if trials else 0
-        for part in (trials[k::cut] for k in range(cut)):
-            if held and held + len(part) > most:
+        count = math.ceil(len(trials) / most) if trials else 0
+        for share in (trials[k::count] for k in range(count)):
+            if size and size + len(share) > most:
                 pieces.append([])
-                held = 0
-            pieces[-1].append(Share(number, setup, part))
-            held += len(part)
+                size = 0
+            pieces[-1].append(Share(number, setup, share))
+            size += len(share)
     return pieces
 
 

@@ -1,4 +1,7 @@
-"""Options that experiments share: their ranges, and the recipe that they select."""
+"""Options that several experiments have, and the recipe that they select.
+
+A recipe is a named set of settings of a training (`suite/train/recipes.py`).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from suite.judging.requests import parse_levels
+from suite.judging.trials import parse_levels
 from suite.train.config import TrainConfig
 from suite.train.overrides import check_owned
 from tracks.common.names import unknown_name
@@ -21,8 +24,8 @@ GATES = 4
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Options of all experiments on judged policies."""
+class JudgingOptions:
+    """Options of the experiments that judge policies."""
 
     policy: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """A shipped policy's name, a checkpoint's folder or a policy file; may be given several times.
@@ -38,11 +41,11 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class FourGates:
-    """Options of all experiments on tracks of four gates."""
+class FourGateOptions:
+    """Options of the experiments that train on tracks of four gates."""
 
     recipe: str = "race-paper"
-    """The recipe of all trainings, except for its size, its gates and what is compared."""
+    """The recipe of all trainings, except for its size, its gates and the compared settings."""
     set: tuple[str, ...] = ("episode.image_stride=3",)
     """Change settings of the recipe by name."""
     iterations: Iterations = 200
@@ -59,15 +62,15 @@ class FourGates:
     """Seed of the unseen worlds; must not be a training seed."""
 
 
-def chosen(known: Mapping[str, T], only: Sequence[str], what: str) -> dict[str, T]:
+def select(known: Mapping[str, T], only: Sequence[str], kind: str) -> dict[str, T]:
     """Return the entries of `known` whose names are in `only`, all if it is empty.
 
     Raises:
-        ValueError: for an unknown name; `what` is what the message calls an entry.
+        ValueError: for an unknown name; the message calls an entry `kind`.
     """
     for name in only:
         if name not in known:
-            raise unknown_name(what, name, known)
+            raise unknown_name(kind, name, known)
     return {name: entry for name, entry in known.items() if name in (only or known)}
 
 
@@ -78,36 +81,42 @@ def check(config: Any) -> None:
         ValueError: naming the option and what is allowed.
     """
     check_ranges(config, options=True)
-    given = vars(config)
-    seeds = given.get("training_seeds", (0,))
+    values = vars(config)
+    seeds = values.get("training_seeds", (0,))
     if len(set(seeds)) < len(seeds) or not seeds:
-        said = " ".join(map(str, seeds)) or "empty"
-        raise ValueError(f"--training-seeds is {said}; give each once")
-    if isinstance(config, FourGates) and config.seed in seeds:
+        text = " ".join(map(str, seeds)) or "empty"
+        raise ValueError(f"--training-seeds is {text}; give each once")
+    if isinstance(config, FourGateOptions) and config.seed in seeds:
         raise ValueError(
-            f"--seed {config.seed} is one of --training-seeds, whose policies would have seen the "
-            "worlds they are measured on; give another"
+            f"--seed {config.seed} is one of --training-seeds, whose policies would be measured on "
+            "worlds of their training; give another"
         )
-    if "difficulty" in given:
-        parse_levels(given["difficulty"])
+    if "difficulty" in values:
+        parse_levels(values["difficulty"])
 
 
-def four_gate_recipe(config: FourGates) -> TrainConfig:
+def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     """Return the recipe that `config` selects, on tracks of four gates.
 
     Raises:
         ValueError: for an unknown recipe or change, or one without the field, which is compared.
     """
-    from suite.train.overrides import changed, check_phases
+    from suite.train.overrides import check_phases, with_changes
     from suite.train.recipes import named_recipe, with_iterations
 
     owned = {"episode.batch": "give --worlds", "optimizer.iterations": "give --iterations"}
     check_owned(config.set, {**owned, "episode.gates": f"all fly {GATES}, as in the paper"})
-    base = with_iterations(changed(named_recipe(config.recipe), config.set), config.iterations)
+    base = with_iterations(with_changes(named_recipe(config.recipe), config.set), config.iterations)
     check_phases(base)
     if base.loss.field_gain == 0.0:
         raise ValueError("loss.field_gain is 0, allowed is a number above: the field is compared")
     return replace(base, episode=replace(base.episode, gates=GATES, batch=config.worlds))
+
+
+def recipe_fact(config: FourGateOptions) -> str:
+    """Return the recipe and its changes, for the facts of a page."""
+    changes = " ".join([*config.set, f"episode.gates={GATES}"])
+    return f"`{config.recipe}` of suite train (a named set of settings), with {changes}"
 
 
 def judged_seeds(config: Any) -> str:

@@ -1,4 +1,4 @@
-"""Speed of a compiled program, compared with the device's speed of multiplying matrices."""
+"""Measure the speed of a compiled JAX program, and the best speed of the device for comparison."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ REPEATS = 4
 
 def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     """Return the shortest time of several calls of a compiled program, results awaited [s]."""
-    taken = []
+    times_s = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        started = time.perf_counter()
         jax.block_until_ready(call())
-        taken.append(time.perf_counter() - began)
-    return min(taken)
+        times_s.append(time.perf_counter() - started)
+    return min(times_s)
 
 
 def count_operations(function: Callable[..., Any], *args: Any) -> float:
@@ -36,22 +36,23 @@ def count_operations(function: Callable[..., Any], *args: Any) -> float:
 
 
 def _operations(jaxpr: Any) -> float:
-    return sum(_of_equation(equation) for equation in jaxpr.eqns)
+    return sum(_equation_operations(equation) for equation in jaxpr.eqns)
 
 
-def _of_equation(equation: Any) -> float:
+def _equation_operations(equation: Any) -> float:
+    """Return the operations of one primitive, with those of the functions that it calls."""
     name, params = equation.primitive.name, equation.params
     inner = [
-        getattr(part, "jaxpr", part)
+        getattr(item, "jaxpr", item)
         for value in params.values()
-        for part in (value if isinstance(value, (tuple, list)) else (value,))
-        if hasattr(part, "eqns") or hasattr(getattr(part, "jaxpr", None), "eqns")
+        for item in (value if isinstance(value, (tuple, list)) else (value,))
+        if hasattr(item, "eqns") or hasattr(getattr(item, "jaxpr", None), "eqns")
     ]
     if inner:
-        each = [_operations(part) for part in inner]
+        operations = [_operations(jaxpr) for jaxpr in inner]
         if name == "cond":
-            return max(each)
-        return params.get("length", 1) * sum(each)
+            return max(operations)
+        return params.get("length", 1) * sum(operations)
     size = sum(math.prod(out.aval.shape) for out in equation.outvars)
     if name == "dot_general":
         (contracted, _), _ = params["dimension_numbers"]
@@ -64,9 +65,9 @@ def _of_equation(equation: Any) -> float:
 
 
 def multiplying_rate(size: int) -> float:
-    """Return the operations a second of a product of float32 matrices in full precision [1/s].
+    """Return the operations per second of a product of float32 matrices in full precision [1/s].
 
-    It is about the best that the device reaches without rounding to fewer bits.
+    It is approximately the best speed of the device without rounding to fewer bits.
     """
     matrix = jax.random.normal(jax.random.key(0), (size, size))
     with jax.default_matmul_precision("highest"):
@@ -76,9 +77,9 @@ def multiplying_rate(size: int) -> float:
 
 
 def peak_memory() -> int | None:
-    """Return the most bytes that the default device, or on a CPU this process, has held."""
+    """Return the peak memory of the default device, or on a CPU of this process [bytes]."""
     if jax.default_backend() == "cpu":
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    found = jax.devices()[0].memory_stats() or {}
-    return found.get("peak_bytes_in_use")
+    statistics = jax.devices()[0].memory_stats() or {}
+    return statistics.get("peak_bytes_in_use")

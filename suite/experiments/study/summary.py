@@ -1,4 +1,4 @@
-"""Results of each setting over its training seeds, in worlds that no training has seen."""
+"""Summarise the trainings of each setting over its seeds: mean, least and most of every number."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from suite.common.curve import METRICS
-from suite.experiments.study.training import Row, Trained
+from suite.experiments.study.training import Setting, TrainingResult
 
 
 class Spread(NamedTuple):
@@ -23,26 +23,29 @@ class Summary(NamedTuple):
     """One setting over its training seeds; diverged trainings are left out of all numbers."""
 
     key: str
-    words: str
+    """Name of the setting."""
+    label: str
+    """Its label in tables."""
     recipe: Any
+    """Its settings, a `TrainConfig` or a `PpoConfig`."""
     seeds: int
     """Number of trainings, including diverged ones."""
-    whole: list[list[dict[str, float]]]
+    trainings: list[list[dict[str, float]]]
     """The measurements of every training that did not diverge."""
     at: list[dict[str, Spread]]
-    """Over seeds, at each measurement; empty if all diverged."""
+    """The spread over seeds at each measurement; empty if all diverged."""
 
     @property
     def diverged(self) -> int:
         """Number of trainings that diverged."""
-        return self.seeds - len(self.whole)
+        return self.seeds - len(self.trainings)
 
     def values(self, name: str) -> list[float]:
         """Return a number of each training at its end, without diverged ones."""
-        return [points[-1][name] for points in self.whole]
+        return [points[-1][name] for points in self.trainings]
 
     def text(self, name: str) -> str:
-        """Return a number at the end for a cell: mean over seeds [least, most]."""
+        """Return a number at the end as text for a table: mean over seeds [least, most]."""
         if not self.at:
             return "diverged"
         _, scale, digits = METRICS[name]
@@ -50,18 +53,18 @@ class Summary(NamedTuple):
         return f"{mean} [{least}, {most}]"
 
 
-def summaries(rows: Sequence[Row], runs: Sequence[Trained]) -> list[Summary]:
-    """Return every setting over its seeds, in order."""
-    found = []
-    for row in rows:
-        mine = [run for run in runs if run.row == row.key]
-        whole = [run.points for run in mine if not run.diverged]
+def summaries(settings: Sequence[Setting], runs: Sequence[TrainingResult]) -> list[Summary]:
+    """Return the summary of every setting, in order."""
+    result = []
+    for key, label, recipe in settings:
+        of_setting = [run for run in runs if run.setting == key]
+        trainings = [run.points for run in of_setting if not run.diverged]
         at = [
             {name: _spread([point[name] for point in seeds]) for name in seeds[0]}
-            for seeds in zip(*whole, strict=True)
+            for seeds in zip(*trainings, strict=True)
         ]
-        found.append(Summary(row.key, row.words, row.recipe, len(mine), whole, at))
-    return found
+        result.append(Summary(key, label, recipe, len(of_setting), trainings, at))
+    return result
 
 
 def _spread(values: Sequence[float]) -> Spread:

@@ -1,6 +1,6 @@
-"""Settings x training seeds, trained; a finished training is reused.
+"""Train several settings from several seeds, and measure the policies; finished ones are reused.
 
-A run's folder is named by the hash of its configuration. Newer code does not train it again, so
+A training's folder is named by the hash of its configuration. Newer code does not repeat it, so
 pages name the commit of each training.
 """
 
@@ -18,10 +18,10 @@ import numpy as np
 from suite.common import curve
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.running.apart import Job
+from suite.common.running.remote import Job
 from suite.common.stages import Estimate, announce
-from suite.common.work import all_done
-from suite.experiments.study.cache import Place, digest
+from suite.common.work import do_jobs
+from suite.experiments.study.cache import Workspace, digest
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 
@@ -29,33 +29,34 @@ if TYPE_CHECKING:
     from suite.train.rollout import Note
 
 
-class Row(NamedTuple):
+class Setting(NamedTuple):
     """A setting that is trained from every seed."""
 
     key: str
     """Its name."""
-    words: str
+    label: str
     """Its label in tables."""
     recipe: Any
     """A `TrainConfig` or a `PpoConfig`; its seed is replaced."""
 
 
-class Unseen(NamedTuple):
-    """Measurement of policies in worlds that no training has seen."""
+class UnseenWorlds(NamedTuple):
+    """Measurement of policies in worlds (scenes with a drone) that no training uses."""
 
     measurements: int
-    """About how many during a training; 0 measures only the finished policy."""
+    """Approximate number during a training; 0 measures only the finished policy."""
     trials: int
+    """Number of worlds."""
     seed: int
     """Seed of the worlds."""
     seconds: float
     """Length of a trial, from a standing start [s]."""
 
 
-class Trained(NamedTuple):
+class TrainingResult(NamedTuple):
     """One training of a setting."""
 
-    row: str
+    setting: str
     """The setting's key."""
     seed: int
     policy: str
@@ -77,29 +78,29 @@ class Trained(NamedTuple):
 class Study:
     """Settings, training seeds and measurement."""
 
-    rows: Sequence[Row]
+    settings: Sequence[Setting]
     seeds: Sequence[int]
-    unseen: Unseen
-    """Flights in the dynamics of the training."""
+    unseen: UnseenWorlds
+    """The measurement, in the dynamics of the training."""
     by_seed: bool = False
-    """Whether the settings alternate, so that all see the same load of the machine."""
+    """Whether the settings alternate, so that all have the same load of the machine."""
 
     def pieces(self) -> list[tuple[str, Any]]:
         """Return key and configuration of every training, in the order of the work."""
         if self.by_seed:
-            return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.rows]
-        return [(r.key, replace(r.recipe, seed=s)) for r in self.rows for s in self.seeds]
+            return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.settings]
+        return [(r.key, replace(r.recipe, seed=s)) for r in self.settings for s in self.seeds]
 
 
-def trained(study: Study, place: Place, console: Console) -> list[Trained]:
+def train_all(study: Study, workspace: Workspace, console: Console) -> list[TrainingResult]:
     """Return every training of `study`; missing ones are trained or resumed first.
 
     If one diverges, the others continue.
 
     Args:
         study: settings and seeds.
-        place: cache of trainings, and workers; with at most one worker the trainings follow each
-            other on all cores.
+        workspace: cache of trainings, and workers; with at most one worker the trainings run one
+            after the other on all cores.
         console: shows progress.
     """
     from suite.train.ppo.update import estimate as ppo_estimate
@@ -108,18 +109,18 @@ def trained(study: Study, place: Place, console: Console) -> list[Trained]:
     pieces = study.pieces()
     if not pieces:
         return []
-    needs = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
-    memory = max(need.memory_bytes for need in needs)
-    memory *= place.workers if isinstance(place.workers, int) else 1
-    whole = Estimate(sum(need.seconds for need in needs), memory)
-    announce(console, f"{len(pieces)} trainings, less those that are there", whole)
-    jobs = [Job(piece, place.cache / _folder_of(piece, study.unseen)) for piece in pieces]
-    do = functools.partial(train_one, unseen=study.unseen)
-    ended = all_done(do, jobs, place.workers, console, "training")
-    return [_read(job, *end) for job, end in zip(jobs, ended, strict=True)]
+    estimates = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
+    memory = max(each.memory_bytes for each in estimates)
+    memory *= workspace.workers if isinstance(workspace.workers, int) else 1
+    total = Estimate(sum(each.seconds for each in estimates), memory)
+    announce(console, f"{len(pieces)} trainings, of which finished ones are reused", total)
+    jobs = [Job(piece, workspace.cache / _training_folder(piece, study.unseen)) for piece in pieces]
+    do = functools.partial(train_setting, unseen=study.unseen)
+    results = do_jobs(do, jobs, workspace.workers, console, "training")
+    return [_read(job, *result) for job, result in zip(jobs, results, strict=True)]
 
 
-def _folder_of(piece: tuple[str, Any], unseen: Unseen) -> Path:
+def _training_folder(piece: tuple[str, Any], unseen: UnseenWorlds) -> Path:
     """Return the folder of a training within the cache."""
     key, config = piece
     if unseen.measurements:
@@ -127,16 +128,19 @@ def _folder_of(piece: tuple[str, Any], unseen: Unseen) -> Path:
     return Path("trainings", digest(config))
 
 
-def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dict[str, float]]]:
+def train_setting(
+    job: Job, console: Console, unseen: UnseenWorlds
+) -> tuple[str, list[dict[str, float]]]:
     """Train one of `Study.pieces` in the job's folder unless it is finished, and measure it.
 
     Returns:
-        `Trained.diverged`, and the measurement of the finished policy, if only that is measured.
+        `TrainingResult.diverged`, and the measurement of the finished policy if only that is
+        measured.
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
     from suite.train.ppo.update import train_ppo
-    from suite.train.run import started_from, train
+    from suite.train.run import load_start_params, train
     from suite.train.training_loop import Watch
 
     (key, config), folder, watch = job.task, job.folder, None
@@ -144,7 +148,7 @@ def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dic
     if unseen.measurements:
         shared = config.shared if is_ppo else phase_configs(config)[-1]
         iterations = config.iterations if is_ppo else config.optimizer.iterations
-        measure = make_validation(shared, *unseen[1:], rewarded(shared))
+        measure = make_validation(shared, *unseen[1:], reward_recorder(shared))
         watch = Watch(max(1, iterations // unseen.measurements), measure)
     try:
         (train_ppo if is_ppo else train)(config, folder, console, watch=watch)
@@ -154,26 +158,33 @@ def train_one(job: Job, console: Console, unseen: Unseen) -> tuple[str, list[dic
     if watch:
         return "", []
     last = phase_configs(config)[-1]
-    params = started_from(str(folder / "policy"), last.spec)
-    found = make_validation(last, *unseen[1:])(params)
+    params = load_start_params(str(folder / "policy"), last.spec)
+    scores = make_validation(last, *unseen[1:])(params)
     console.note(
-        f"{key}, seed {config.seed}: success cross {found['success_cross']:.0%}, "
-        f"collision-free {found['collision_free']:.0%}, v_max {found['v_max']:.1f} m/s"
+        f"{key}, seed {config.seed}: success cross {scores['success_cross']:.0%}, "
+        f"collision-free {scores['collision_free']:.0%}, v_max {scores['v_max']:.1f} m/s"
     )
-    return "", [found]
+    return "", [scores]
 
 
-def _read(job: Job, diverged: str, found: list[dict[str, float]]) -> Trained:
-    """Return a training from its folder."""
+def _read(job: Job, diverged: str, at_end: list[dict[str, float]]) -> TrainingResult:
+    """Return a training from its folder; `at_end` is the measurement of the finished policy."""
     (key, config), policy = job.task, job.folder / "policy"
-    points, compile_s = curve_of(job.folder, config.episode.batch * config.episode.steps)
+    points, compile_s = read_measurements(job.folder, config.episode.batch * config.episode.steps)
     rows = curve.read(job.folder)
-    seconds = sum(row["seconds"] for row in rows if not row["cold"])
-    about = (str(policy), seconds, compile_s, commit_of(policy))
-    return Trained(key, config.seed, *about, diverged, found or points)
+    return TrainingResult(
+        setting=key,
+        seed=config.seed,
+        policy=str(policy),
+        seconds=sum(row["seconds"] for row in rows if not row["cold"]),
+        compile_s=compile_s,
+        commit=training_commit(policy),
+        diverged=diverged,
+        points=at_end or points,
+    )
 
 
-def rewarded(config: TrainConfig) -> Note:
+def reward_recorder(config: TrainConfig) -> Note:
     """Return a function that records the paper's reward at every step of a rollout."""
     from suite.train.ppo.reward import make_reward
 
@@ -181,10 +192,10 @@ def rewarded(config: TrainConfig) -> Note:
     return lambda worlds, before, body, target: reward(worlds, before, body, target)[0].total()
 
 
-def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
+def read_measurements(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
     """Return a run's measurements with their steps and time, and the time of compilation [s].
 
-    Iterations that compile, the first and those after a stop, count as long as the median of the
+    Iterations that compile, the first and those after a stop, count with the median time of the
     others.
 
     Args:
@@ -193,17 +204,17 @@ def curve_of(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
     """
     rows = curve.read(folder)
     warm = [row["seconds"] for row in rows if not row["cold"]]
-    usual = float(np.median(warm)) if warm else 0.0
-    spent = np.cumsum([0.0, *(usual if row["cold"] else row["seconds"] for row in rows)])
-    compiling = sum(max(0.0, row["seconds"] - usual) for row in rows if row["cold"])
+    median_s = float(np.median(warm)) if warm else 0.0
+    time_s = np.cumsum([0.0, *(median_s if row["cold"] else row["seconds"] for row in rows)])
+    compile_s = sum(max(0.0, row["seconds"] - median_s) for row in rows if row["cold"])
     points = []
     for point in curve.read(folder, curve.WATCHED):
-        done = point.pop("iteration")
-        points.append({"steps": done * frames, "time": float(spent[done]), **point})
-    return points, compiling
+        iteration = point.pop("iteration")
+        points.append({"steps": iteration * frames, "time": float(time_s[iteration]), **point})
+    return points, compile_s
 
 
-def commit_of(policy: Path) -> str:
+def training_commit(policy: Path) -> str:
     """Return the commit that trained `policy` (RUN/policy), or "unknown".
 
     A training that was interrupted and resumed may have several commits; all are returned.
@@ -216,7 +227,7 @@ def commit_of(policy: Path) -> str:
         return "unknown"
 
 
-def facts(config: Any, runs: Sequence[Trained]) -> dict[str, str]:
+def facts(config: Any, runs: Sequence[TrainingResult]) -> dict[str, str]:
     """Return the facts of a page on trainings: seeds, commits, unseen worlds."""
     return {
         "training seeds": " ".join(map(str, config.training_seeds)),

@@ -1,4 +1,6 @@
-"""Success of a policy in the trainer's dynamics, on fixed worlds that no training has seen.
+"""Measure a policy's success in the trainer's dynamics, on worlds that no training uses.
+
+A world is one simulated scene and drone.
 
 Flight, collisions and passed gates are computed by the trainer's code (`suite/train/rollout.py`): a
 collision is a distance below `BODY_RADIUS_M` at one of `PATH_SAMPLES` points of a step's path.
@@ -39,7 +41,7 @@ class Scores(NamedTuple):
     """Sum over the trial; zero without a reward."""
 
 
-def scored(
+def score_trials(
     passed: jax.Array,
     clearance: jax.Array,
     speed: jax.Array,
@@ -57,17 +59,18 @@ def scored(
         gates: number of gates of a trial.
         reward: (T, B) of the step.
     """
-    hit = clearance < BODY_RADIUS_M
-    passed = passed & ~hit
-    over = jnp.cumsum(hit | (jnp.cumsum(passed, 0) >= gates), 0) > 0
-    ran = jnp.concatenate([jnp.ones_like(over[:1]), ~over[:-1]])
-    count = (passed & ran).sum(0)
+    collision = clearance < BODY_RADIUS_M
+    passed = passed & ~collision
+    ended = jnp.cumsum(collision | (jnp.cumsum(passed, 0) >= gates), 0) > 0
+    # The step that ends a trial is the last one that counts.
+    counts = jnp.concatenate([jnp.ones_like(ended[:1]), ~ended[:-1]])
+    total = (passed & counts).sum(0)
     return Scores(
-        gates=count,
-        collided=(hit & ran).any(0),
-        crossed=count >= gates,
-        v_max=jnp.where(ran, speed, 0.0).max(0),
-        reward=jnp.where(ran, reward, 0.0).sum(0),
+        gates=total,
+        collided=(collision & counts).any(0),
+        crossed=total >= gates,
+        v_max=jnp.where(counts, speed, 0.0).max(0),
+        reward=jnp.where(counts, reward, 0.0).sum(0),
     )
 
 
@@ -105,14 +108,14 @@ def make_flight(
         embedding_shift = jnp.zeros((episode.steps, episode.batch, config.spec.hidden_size))
         key = jax.random.key(np.uint32(config.seed))
         _, records = rollout(params, embedding_shift, worlds, key, network.encode)
-        noted = 0.0 if reward is None else records.noted
+        rewards = 0.0 if reward is None else records.noted
         gates = worlds.scene.gates.center_w.shape[1]
-        return scored(records.passed, records.clearance, records.speed, gates, noted)
+        return score_trials(records.passed, records.clearance, records.speed, gates, rewards)
 
     return fly
 
 
-def measured(scores: Scores) -> dict[str, float]:
+def mean_scores(scores: Scores) -> dict[str, float]:
     """Return the results over all trials.
 
     They are `success_cross` (all gates passed without a collision), `collision_free` (no collision,
@@ -133,7 +136,7 @@ def measured(scores: Scores) -> dict[str, float]:
 def make_validation(
     config: TrainConfig, trials: int, seed: int, seconds: float, reward: Note | None = None
 ) -> Measure:
-    """Return measure(params) -> numbers of `measured`, on the same worlds at every call.
+    """Return measure(params) -> numbers of `mean_scores`, on the same worlds at every call.
 
     Args:
         config: of the training, whose dynamics are flown.
@@ -144,5 +147,5 @@ def make_validation(
     """
     config = validation_worlds(config, trials, seed, seconds)
     fly, worlds = make_flight(config, reward), sample_worlds(config, 0)
-    placed: Worlds = jax.tree.map(jnp.asarray, worlds)
-    return lambda params: measured(fly(params, placed))
+    on_device: Worlds = jax.tree.map(jnp.asarray, worlds)
+    return lambda params: mean_scores(fly(params, on_device))

@@ -1,1 +1,1 @@
-"""Exports a policy, checks the exported files, and measures their speed."""
+"""Export of a policy for other programs: writing, checking against the original, timing."""

@@ -1,4 +1,8 @@
-"""`suite export`: write the files, and for C a card with parity and time per step measured here."""
+"""Export a policy to other formats (`suite export`).
+
+An export in C is compiled and compared with the original policy (parity); a card, a Markdown page
+next to it, has the largest difference and the time per step.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,16 @@ def export(
 ) -> dict[str, Any]:
     """Export a policy of the suite in `formats`; C with a card of parity and time per step.
 
+    Args:
+        policy: a shipped name or a checkpoint's folder.
+        out: folder of the exported files.
+        formats: such as "onnx" and "c".
+        dtype: type of the weights, float32 or int8.
+        console: shows progress and the parity.
+
+    Returns:
+        `written`, the files; for C also `parity`.
+
     Raises:
         ValueError: if the policy is not the suite's, a format or type is unknown, or an export of
             another policy would be overwritten.
@@ -44,7 +58,7 @@ def export(
     if "c" in formats:
         check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
-    _claim(policy, out, [main_file(name, wanted) for wanted in formats], checkpoint.seed)
+    _record_source(policy, out, [main_file(name, each) for each in formats], checkpoint.seed)
     observed = None
     if dtype == "int8":
         console.note("flying 10 random tracks to measure the activations")
@@ -52,13 +66,13 @@ def export(
     written = export_policy(policy, out, formats, dtype, observed)
     if "c" not in formats:
         return {"written": written}
-    found = parity(out, checkpoint, observed)
-    console.say(found.sentence)
-    write_text(out / CARD, card_text(policy, name, checkpoint, dtype, found))
-    return {"written": [*written, out / CARD], "parity": found}
+    result = parity(out, checkpoint, observed)
+    console.say(result.sentence)
+    write_text(out / CARD, card_text(policy, name, checkpoint, dtype, result))
+    return {"written": [*written, out / CARD], "parity": result}
 
 
-def _claim(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
+def _record_source(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
     """Record `policy` as the source of `files`, or refuse to overwrite those of another policy.
 
     File names do not show the policy: every training calls its checkpoint policy/, and the names of
@@ -68,20 +82,21 @@ def _claim(policy: str, out: Path, files: Sequence[str], seed: int | None) -> No
         ValueError: naming the file and what to do.
     """
     source, digest = str(shipped.locate(policy).resolve()), policy_digest(policy)
-    noted = _noted(out / NOTE)
+    records = _read_sources(out / NOTE)
     for file in files:
-        was = noted.get(file, {})
-        if (out / file).exists() and source != was.get("source") and digest != was.get("sha256"):
-            whose = was.get("source", "an unrecorded policy")
+        old = records.get(file, {})
+        if (out / file).exists() and source != old.get("source") and digest != old.get("sha256"):
+            old_source = old.get("source", "an unrecorded policy")
             raise ValueError(
-                f"--out {out}: {file} there was exported from {whose} and would be overwritten by "
-                f"that of {policy}; give another --out, or move the file away"
+                f"--out {out}: {file} was exported from {old_source} and would be overwritten by "
+                f"the export of {policy}; give another --out, or move the file away"
             )
-        noted[file] = {"source": source, "sha256": digest}
-    write_json(out / NOTE, {**stamp(1, seed), "files": noted})
+        records[file] = {"source": source, "sha256": digest}
+    write_json(out / NOTE, {**stamp(1, seed), "files": records})
 
 
-def _noted(path: Path) -> dict[str, dict[str, str]]:
+def _read_sources(path: Path) -> dict[str, dict[str, str]]:
+    """Return source and SHA-256 of each recorded export; none without the file."""
     if not path.is_file():
         return {}
     try:
@@ -95,22 +110,22 @@ _LICENCE = "Apache-2.0, as diffracing-suite; the weights may have another licenc
 
 
 def card_text(
-    given: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, found: Parity
+    source: str, name: str, checkpoint: PolicyCheckpoint, dtype: str, result: Parity
 ) -> str:
     """Return the card of an export as Markdown.
 
     Args:
-        given: the policy as the user named it.
+        source: the policy as the user named it.
         name: the name of the export.
-        checkpoint: the source of the export.
+        checkpoint: the exported policy.
         dtype: type of the weights.
-        found: parity with the checkpoint, and time per step.
+        result: parity with the checkpoint, and time per step.
     """
     spec = checkpoint.spec
     timing = "not measured"
-    if found.timing:
-        median, p99, most = (f"{1e6 * x:.0f}" for x in found.timing)
-        timing = f"median {median} us, 99th percentile {p99} us, longest {most} us (one thread)"
+    if result.timing:
+        median, p99, longest = (f"{1e6 * seconds:.0f}" for seconds in result.timing)
+        timing = f"median {median} us, 99th percentile {p99} us, longest {longest} us (one thread)"
     seed = "unknown" if checkpoint.seed is None else checkpoint.seed
     rows = (
         ("policy", name),
@@ -118,7 +133,7 @@ def card_text(
         ("checkpoint", f"weights.safetensors, SHA-256 `{checkpoint.config['weights']['sha256']}`"),
         ("made by", f"diffracing-suite {VERSION}, training seed {seed}"),
         ("rate", f"{spec.rate_hz:g} Hz"),
-        ("parity", found.sentence),
+        ("parity", result.sentence),
         ("time per step here", timing),
         ("multiply-adds per step", str(multiply_adds(spec))),
         ("memory that the caller provides", f"{memory_bytes(spec, dtype == 'int8')} bytes"),
@@ -126,20 +141,20 @@ def card_text(
     )
     table = "\n".join(f"| {key} | {markdown_cell(value)} |" for key, value in rows)
     title = f"# {markdown_cell(name)}, {dtype}, in C"
-    return f"{title}\n\n| | |\n| --- | --- |\n{table}\n\n{_success(given)}"
+    return f"{title}\n\n| | |\n| --- | --- |\n{table}\n\n{_success_rates(source)}"
 
 
-def _success(given: str) -> str:
+def _success_rates(source: str) -> str:
     """Return the success rates in the policy's own card, or a line that they are unknown."""
-    path = shipped.locate(given) / "card.md"
+    path = shipped.locate(source) / "card.md"
     text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
-    lines = [line for line in text.splitlines() if line.startswith("|") and "success" in line]
-    if not lines:
+    lines = text.splitlines()
+    headers = [k for k, line in enumerate(lines) if line.startswith("|") and "success" in line]
+    if not headers:
         return "Success rate: unknown; `suite eval --policy . --trust` measures it.\n"
-    whole = text.splitlines()
-    first = whole.index(lines[0])
-    last = next((k for k in range(first, len(whole)) if not whole[k].startswith("|")), len(whole))
-    table = "\n".join(whole[first:last])
+    first = headers[0]
+    last = next((k for k in range(first, len(lines)) if not lines[k].startswith("|")), len(lines))
+    table = "\n".join(lines[first:last])
     spans = " with 95 % intervals" if re.search(r"\[\d", table) else ""
     return (
         f"Success rate of the original policy, from its card{spans} "

@@ -1,4 +1,7 @@
-"""Times of a policy's single steps on one thread, with several engines in turn."""
+"""Measure the time of a policy's single steps on one thread, in C, ONNX Runtime and torch.
+
+The engines run in turn, in blocks of steps, so that all see the same load of the machine.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ class Timing(NamedTuple):
 
 def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timing]:
     """Return the times of every engine, block by block in turn."""
-    taken: dict[str, list[float]] = {name: [] for name in steps}
+    times: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(rounds):
         for name, step in steps.items():
             for _ in range(WARM):
@@ -42,8 +45,8 @@ def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timin
             for _ in range(BLOCK):
                 started = time.perf_counter()
                 step()
-                taken[name].append(time.perf_counter() - started)
-    return {name: _timing(np.array(seconds)) for name, seconds in taken.items()}
+                times[name].append(time.perf_counter() - started)
+    return {name: _timing(np.array(seconds)) for name, seconds in times.items()}
 
 
 def _timing(seconds: np.ndarray) -> Timing:
@@ -54,15 +57,15 @@ def c_step(policy: CPolicy) -> Step:
     """Return a step of a policy.c, called as on a flight controller."""
     state, image = _inputs(policy.spec)
     memory, action = policy.start(1), np.zeros((1, 3), np.float32)
-    held = (memory, state, image, action)
+    arrays = (memory, state, image, action)
     library = ctypes.CDLL(str(policy.library))
     library.policy_reset(ctypes.c_void_p(memory.ctypes.data))
-    pointers = [ctypes.c_void_p(x.ctypes.data) for x in held]
+    pointers = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
     function = library.policy_step
 
     def step() -> np.ndarray:
         function(*pointers)
-        return held[-1]
+        return arrays[-1]  # keeps all four alive as long as the pointers
 
     return step
 
@@ -86,11 +89,11 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     for name, value in (("action", np.zeros((1, 3), np.float32)), ("hidden_next", hidden)):
         binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
 
-    def usual() -> Any:
+    def run() -> Any:
         action, feed["hidden"] = session.run(None, feed)
         return action
 
-    return usual, lambda: session.run_with_iobinding(binding)
+    return run, lambda: session.run_with_iobinding(binding)
 
 
 def torch_step(checkpoint: PolicyCheckpoint) -> Step:
@@ -112,6 +115,7 @@ def torch_step(checkpoint: PolicyCheckpoint) -> Step:
 
 
 def _inputs(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
+    """Return a random state (1, state_size) and image (1, height, width)."""
     rng = np.random.default_rng(0)
     state = rng.normal(size=(1, spec.state_size)).astype(np.float32)
     size = (1, spec.camera.height, spec.camera.width)

@@ -1,6 +1,7 @@
-"""Differences between an export in C and its policy over many steps with memory.
+"""Measure the parity of a C export: the differences of its actions from the original policy's.
 
-Observations from flights of the judge set the scales of an int8 export, and are the inputs of both.
+Both get the same observations, and keep their recurrent memory over many steps. An int8 export
+needs observations from simulated flights, which also set the scales of its activations.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from policies.spec import PolicyError, PolicySpec
 from suite.judging.deploy.latency import Timing, c_step, time_in_turn
 
 STEPS = 1000
+"""Number of compared steps."""
 
 
 class Parity(NamedTuple):
@@ -65,32 +67,34 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
     given = "on flights" if observed else "inputs drawn at random"
     if find_compiler() is None:
         return Parity(0, given, np.nan, np.nan, None)
-    inputs = observed or random_observations(checkpoint.spec, STEPS, seed=1)
-    part = Observed(*(x[:STEPS] for x in inputs))
-    policy = load_c(folder, trust=True)
-    apart = np.abs(
-        actions_of(policy, part) - native_actions(checkpoint.params, checkpoint.spec, part)
+    inputs = Observed(
+        *(x[:STEPS] for x in observed or random_observations(checkpoint.spec, STEPS, seed=1))
     )
-    if not np.isfinite(apart).all():
+    policy = load_c(folder, trust=True)
+    expected = native_actions(checkpoint.params, checkpoint.spec, inputs)
+    errors = np.abs(actions_of(policy, inputs) - expected)
+    if not np.isfinite(errors).all():
         raise PolicyError(f"{folder}: the compiled policy gives numbers that are not finite")
     timing = time_in_turn({"c": c_step(policy)}, rounds=5)["c"]
-    return Parity(len(apart), given, float(apart.max()), float(np.median(apart)), timing)
+    return Parity(len(errors), given, float(errors.max()), float(np.median(errors)), timing)
 
 
 TRACK = "random"
-"""The training distribution: the tracks of the result tables do not set an export's scales."""
+"""Family of the observed flights: that of the training, so that the tracks of the result tables do
+not set an export's scales."""
 LEVELS = tuple(range(10))
+"""Their levels of difficulty, one flight each."""
 SEED = 900_000
 """Seed of the first flight; no result table uses it."""
 
 
 class Recorder:
-    """A policy that records its inputs, for each of the judge's slots."""
+    """A policy that records its inputs, for all flights that the judge runs at once."""
 
     def __init__(self, policy: Policy) -> None:
         """Record the inputs of `policy`."""
         self._policy = policy
-        self._given: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self._inputs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     @property
     def name(self) -> str:
@@ -110,15 +114,15 @@ class Recorder:
         self, hidden: Hidden, state: np.ndarray, image: np.ndarray, fresh: np.ndarray
     ) -> tuple[np.ndarray, Hidden]:
         """Return the policy's actions and memory."""
-        self._given.append((state.copy(), image.copy(), fresh.copy()))
+        self._inputs.append((state.copy(), image.copy(), fresh.copy()))
         return self._policy.act(hidden, state, image, fresh)
 
     def observed(self) -> Observed:
-        """Return all inputs, flight by flight, without rows of idle slots."""
-        state, image, fresh = (np.stack(each, 1) for each in zip(*self._given, strict=True))
-        flew = np.abs(state).max(-1) > 0
-        parts: list[Any] = [x[flew] for x in (state, image, fresh)]
-        return Observed(*parts)
+        """Return all inputs, flight by flight, without those after a flight's end (zeros)."""
+        state, image, fresh = (np.stack(each, 1) for each in zip(*self._inputs, strict=True))
+        is_flying = np.abs(state).max(-1) > 0
+        arrays: list[Any] = [x[is_flying] for x in (state, image, fresh)]
+        return Observed(*arrays)
 
 
 def observed_flights(

@@ -1,4 +1,8 @@
-"""Flights over the link in real time: many with a simulated vehicle, or one with a real link."""
+"""Fly over the link in real time: many trials with a simulated vehicle, or one with a real one.
+
+A trial is one flight on a track that a seed determines. The companion runs the policy and its
+checks; this module exchanges its datagrams, writes its logs and summarises its delays.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +23,14 @@ from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.observation import Observation
 from policies.policy import Policy
 from suite.common.console import Console
-from suite.judging.flying import Course, log_name
 from suite.judging.link.companion import FINISHED, Companion, Row
 from suite.judging.link.messages import Wire
-from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, Request, VehicleProcess
+from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S, FlightRequest, VehicleProcess
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
+from suite.judging.trials import TrialSet, log_name
 
-ALIVE_S = 1.0
+HEARTBEAT_S = 1.0
 """Period of the companion's heartbeat [s]."""
 POLL_S = 0.002
 """Period of the watchdog without messages [s]."""
@@ -38,7 +42,7 @@ class Flight(NamedTuple):
     """One flight over the link."""
 
     row: dict[str, Any]
-    """Its result."""
+    """Its result, a row of fly.json."""
     rows: list[Row]
     """Its states and set points."""
 
@@ -47,65 +51,72 @@ def warm_up(policy: Policy) -> None:
     """Run a policy a few times, so that nothing is compiled in flight."""
     spec = policy.spec
     size = (1, spec.camera.height, spec.camera.width)
-    seen = Observation(np.zeros((1, spec.state_size), np.float32), np.zeros(size, np.float32))
+    observation = Observation(
+        np.zeros((1, spec.state_size), np.float32), np.zeros(size, np.float32)
+    )
     hidden = policy.start(1)
     for _ in range(3):
-        _, hidden = policy.act(hidden, seen.state, seen.image, np.ones(1, bool))
+        _, hidden = policy.act(hidden, *observation, np.ones(1, bool))
 
 
 def fly_simulated(
-    policy: Policy, course: Course, rules: Rules, limits: Limits, out: Path, console: Console
+    policy: Policy, trial_set: TrialSet, rules: Rules, limits: Limits, out: Path, console: Console
 ) -> Iterator[Flight]:
-    """Fly every trial of `course` against a simulated vehicle on the loopback, in real time."""
+    """Fly every trial with a simulated vehicle on the loopback interface, in real time."""
     warm_up(policy)
-    vehicle, done = VehicleProcess(), 0
+    vehicle, successes = VehicleProcess(), 0
     try:
-        with console.progress("flights", len(course.trials)) as update:
-            for number, trial in enumerate(course.trials, 1):
-                flight = _one(policy, trial, course, rules, limits, out, vehicle)
+        with console.progress("flights", len(trial_set.trials)) as update:
+            for number, trial in enumerate(trial_set.trials, 1):
+                flight = _fly_trial(policy, trial, trial_set, rules, limits, out, vehicle)
                 yield flight
-                done += flight.row["success"]
-                update(number, f"{done} of {number} finished")
+                successes += flight.row["success"]
+                update(number, f"{successes} of {number} finished")
     finally:
         vehicle.close()
 
 
-def _one(
+def _fly_trial(
     policy: Policy,
     trial: TrialSpec,
-    course: Course,
+    trial_set: TrialSet,
     rules: Rules,
     limits: Limits,
     out: Path,
     vehicle: VehicleProcess,
 ) -> Flight:
-    wire, track = Wire(COMPANION, VEHICLE), track_of(course.tracks, trial)
-    link = UdpLink("udpin:127.0.0.1:0", wire.speaks)
+    """Fly one trial with the vehicle's process, and write the companion's log into `out`."""
+    wire, track = Wire(COMPANION, VEHICLE), track_of(trial_set.tracks, trial)
+    link = UdpLink("udpin:127.0.0.1:0", wire.is_from_peer)
     try:
-        companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
+        companion = Companion(policy, track, trial_set.vehicle, wire, time.monotonic, limits)
         address = f"udpout:127.0.0.1:{link.port}"
-        spec = policy.spec
-        flown_by = (spec.camera, spec.rate_hz, address, policy.name)
-        vehicle.start(Request(track, trial, course.vehicle, rules, *flown_by))
-        flown = None
-        with _no_collection():
-            while flown is None and companion.over is None:
+        camera, rate_hz = policy.spec.camera, policy.spec.rate_hz
+        vehicle.start(
+            FlightRequest(
+                track, trial, trial_set.vehicle, rules, camera, rate_hz, address, policy.name
+            )
+        )
+        result = None
+        with _no_garbage_collection():
+            while result is None and companion.over is None:
                 exchange(companion, link)
-                flown = vehicle.flown()
-        if flown is None:
-            flown = vehicle.flown(AFTER_S if companion.over == FINISHED else 0.0) or vehicle.stop()
+                result = vehicle.result()
+        if result is None:
+            wait_s = AFTER_S if companion.over == FINISHED else 0.0
+            result = vehicle.result(wait_s) or vehicle.stop()
     finally:
         link.close()
-    assert flown is not None
-    handed = companion.over if companion.over not in (None, FINISHED) else None
+    assert result is not None
+    trial_row = result.trial._asdict()
     row = {
-        **flown.result._asdict(),
-        "handed_over": handed,
-        "vehicle_slips": flown.slips,
+        **trial_row,
+        "handed_over": None if companion.over == FINISHED else companion.over,
+        "vehicle_slips": result.slips,
         "late_actions": companion.late_answers,
         "bad_actions": companion.bad_actions,
         "missed_decisions": companion.missed_decisions,
-        "file": write_log(companion, flown.result._asdict(), out),
+        "file": write_log(companion, trial_row, out),
     }
     return Flight(row, companion.rows)
 
@@ -125,14 +136,14 @@ def fly_link(
 
     It also ends if no vehicle answers within `wait_s`. After an interrupt no set point is sent.
     """
-    begin, called = clock(), -math.inf
-    with _no_collection():
+    begin_s, heartbeat_s = clock(), -math.inf
+    with _no_garbage_collection():
         while companion.over is None:
-            if clock() - called > ALIVE_S:
-                link.send([companion.alive()])
-                called = clock()
+            if clock() - heartbeat_s > HEARTBEAT_S:
+                link.send([companion.heartbeat()])
+                heartbeat_s = clock()
             exchange(companion, link)
-            if not companion.rows and clock() - begin > wait_s:
+            if not companion.rows and clock() - begin_s > wait_s:
                 return
 
 
@@ -164,7 +175,7 @@ def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
+def _no_garbage_collection() -> Iterator[None]:
     """Disable Python's garbage collector, which would stop a flight for milliseconds."""
     gc.collect()
     gc.disable()
@@ -178,13 +189,13 @@ def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
     """Return statistics of the delays of set points [ms].
 
     Args:
-        rows: of one flight or several.
-        deadline_s: a longer answer counts as missed.
+        rows: states and set points of one flight or several.
+        deadline_s: an answer that takes longer counts as missed [s].
     """
     if not rows:
         return {}
     decided = [row for row in rows if row.decided]
-    found: dict[str, Any] = {
+    statistics: dict[str, Any] = {
         "set_points": len(rows),
         "decisions": len(decided),
         "deadlines_missed": sum(row.answered_s > deadline_s for row in rows),
@@ -195,13 +206,13 @@ def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
         ("state_age_ms", [row.state_age_s for row in rows]),
         ("image_age_ms", [row.image_age_s for row in decided]),
     ):
-        each = 1e3 * np.array(values)
-        found[name] = {
-            "median": float(np.median(each)),
-            "p99": float(np.quantile(each, 0.99)),
-            "max": float(each.max()),
+        delay_ms = 1e3 * np.array(values)
+        statistics[name] = {
+            "median": float(np.median(delay_ms)),
+            "p99": float(np.quantile(delay_ms, 0.99)),
+            "max": float(delay_ms.max()),
         }
-    return found
+    return statistics
 
 
 def log_of(companion: Companion, about: dict[str, Any]) -> FlightLog | None:

@@ -1,4 +1,6 @@
-"""The link's messages: MAVLink 2 of the dialect `common`, converted to our values.
+"""Convert between the link's messages (MAVLink 2, dialect `common`) and values in our frames.
+
+The link connects the vehicle with the companion computer, which runs the policy.
 
 | content | message |
 |---|---|
@@ -9,11 +11,11 @@
 | heartbeat of the companion | HEARTBEAT (0) |
 
 MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
-transmission is made for small pictures: 24 x 32 pixels need seven packets. A lost packet loses only
+transmission is made for small images: 24 x 32 pixels need seven packets. A lost packet loses only
 its image.
 
-MAVLink's world frame is NED and its body frame FRD, ours are z up and FLU. Both conversions are the
-same half turn about x.
+MAVLink's world frame is NED (north, east, down) and its body frame FRD (forward, right, down); ours
+are z up and FLU (forward, left, up). Both conversions are the same half turn about x.
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ SIGNING_EPOCH_S = 1420070400
 LOCAL_NED, BODY_FRD = 1, 12
 """MAVLink's numbers of the frames."""
 _HEAD = b"P5\n%d %d\n65535\n"
+"""Header of a 16-bit PGM image: width and height."""
 
 
 class State(NamedTuple):
@@ -73,25 +76,28 @@ class SetPoint(NamedTuple):
     """Share of the largest collective thrust, 0 to 1."""
 
 
-class Note(NamedTuple):
+class OperatorText(NamedTuple):
     """A text for the operator."""
 
     text: str
 
 
-class Alive(NamedTuple):
+class Heartbeat(NamedTuple):
     """A heartbeat of the companion; a waiting vehicle learns its address from it."""
 
 
 class Packet(NamedTuple):
-    """A part of an image: its number among `parts`, or -1 for the announcement."""
+    """A packet of an image, or the announcement of the image."""
 
-    place: int
-    parts: int
+    number: int
+    """Number of the packet, from 0; -1 for the announcement."""
+    total: int
+    """Number of packets of the image, in an announcement; else 0."""
     data: bytes
+    """Bytes of the image, or its width, height and size as three uint32."""
 
 
-Message = State | SetPoint | Note | Alive | Packet
+Message = State | SetPoint | OperatorText | Heartbeat | Packet
 
 
 def dialect() -> Any:
@@ -151,51 +157,52 @@ class Wire:
         self.foreign = 0
         self.broken = 0
 
-    def encoded(self, message: Message) -> bytes:
+    def encode(self, message: Message) -> bytes:
         """Return a message as one datagram."""
         mav = self._out
         if isinstance(message, State):
-            q = turned_quat(message.quat_wxyz)
-            vel = turned(to_local(quat_to_rot(message.quat_wxyz), message.vel_w))
-            made = mav.odometry_encode(
-                int(message.time_s * 1e6), LOCAL_NED, BODY_FRD, *turned(message.pos_w), q.tolist(),
-                *vel, *turned(message.rate_b), [0.0] * 21, [0.0] * 21, message.resets,
+            quat = flip_quat(message.quat_wxyz)
+            vel = flip_axes(to_local(quat_to_rot(message.quat_wxyz), message.vel_w))
+            packed = mav.odometry_encode(
+                int(message.time_s * 1e6), LOCAL_NED, BODY_FRD, *flip_axes(message.pos_w),
+                quat.tolist(), *vel, *flip_axes(message.rate_b), [0.0] * 21, [0.0] * 21,
+                message.resets,
             )  # fmt: skip
         elif isinstance(message, SetPoint):
-            made = mav.set_attitude_target_encode(
+            packed = mav.set_attitude_target_encode(
                 0, self._other, 1, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0],
-                *turned(message.rate_b), message.thrust,
+                *flip_axes(message.rate_b), message.thrust,
             )  # fmt: skip
-        elif isinstance(message, Note):
-            made = mav.statustext_encode(4, message.text.encode("ascii", "replace")[:50])
-        elif isinstance(message, Alive):
+        elif isinstance(message, OperatorText):
+            packed = mav.statustext_encode(4, message.text.encode("ascii", "replace")[:50])
+        elif isinstance(message, Heartbeat):
             kind = self._dialect.MAV_TYPE_ONBOARD_CONTROLLER
             none, active = self._dialect.MAV_AUTOPILOT_INVALID, self._dialect.MAV_STATE_ACTIVE
-            made = mav.heartbeat_encode(kind, none, 0, 0, active)
-        elif message.place < 0:
+            packed = mav.heartbeat_encode(kind, none, 0, 0, active)
+        elif message.number < 0:
             width, height, size = np.frombuffer(message.data, np.uint32)
             kind = self._dialect.MAVLINK_DATA_STREAM_IMG_PGM
-            numbers = (int(size), int(width), int(height), message.parts)
-            made = mav.data_transmission_handshake_encode(kind, *numbers, PACKET, 0)
+            numbers = (int(size), int(width), int(height), message.total)
+            packed = mav.data_transmission_handshake_encode(kind, *numbers, PACKET, 0)
         else:
             data = message.data.ljust(PACKET, b"\0")
-            made = mav.encapsulated_data_encode(message.place, list(data))
-        return made.pack(mav)
+            packed = mav.encapsulated_data_encode(message.number, list(data))
+        return packed.pack(mav)
 
-    def speaks(self, datagram: bytes) -> bool:
+    def is_from_peer(self, datagram: bytes) -> bool:
         """Return whether a datagram comes from the other end."""
-        messages, _ = self._parsed(datagram, keep=False)
+        messages, _ = self._parse(datagram, keep=False)
         return any(
             message.get_type() != "BAD_DATA" and message.get_srcSystem() == self._other
             for message in messages
         )
 
-    def decoded(self, datagrams: Iterable[bytes]) -> list[Message]:
+    def decode(self, datagrams: Iterable[bytes]) -> list[Message]:
         """Return the received messages in order."""
-        found: list[Message] = []
+        decoded: list[Message] = []
         for datagram in datagrams:
-            messages, cut_off = self._parsed(datagram)
-            self.broken += cut_off
+            messages, is_truncated = self._parse(datagram)
+            self.broken += is_truncated
             for message in messages:
                 if message.get_type() == "BAD_DATA":
                     self.broken += 1
@@ -203,10 +210,10 @@ class Wire:
                     self.foreign += 1
                 else:
                     with np.errstate(invalid="ignore"):  # the watchdog checks for infinities
-                        found += self._ours(message)
-        return found
+                        decoded += self._convert(message)
+        return decoded
 
-    def _parsed(self, datagram: bytes, keep: bool = True) -> tuple[list[Any], bool]:
+    def _parse(self, datagram: bytes, keep: bool = True) -> tuple[list[Any], bool]:
         """Return a datagram's messages, and whether it is truncated."""
         # A new parser for each: a truncated message must not affect the next datagram.
         parser = self._dialect.MAVLink(None)
@@ -218,7 +225,8 @@ class Wire:
             self._signing = parser.signing
         return messages, parser.buf_len() > 0
 
-    def _ours(self, message: Any) -> list[Message]:
+    def _convert(self, message: Any) -> list[Message]:
+        """Return MAVLink's message as one of ours; none if its type is not used."""
         kind = message.get_type()
         if kind == "ODOMETRY":
             return [_state_of(message)]
@@ -227,9 +235,9 @@ class Wire:
                 self.foreign += 1
                 return []
             rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-            return [SetPoint(turned(rates), float(message.thrust))]
+            return [SetPoint(flip_axes(rates), float(message.thrust))]
         if kind == "STATUSTEXT":
-            return [Note(message.text)]
+            return [OperatorText(message.text)]
         if kind == "DATA_TRANSMISSION_HANDSHAKE":
             sizes = np.array([message.width, message.height, message.size], np.uint32)
             return [Packet(-1, message.packets, sizes.tobytes())]
@@ -244,10 +252,10 @@ def _state_of(message: Any) -> State:
     Autopilots differ in the frame of the velocity: PX4 sends LOCAL_NED since its version 1.14 and
     BODY_FRD before.
     """
-    quat = turned_quat(message.q)
+    quat = flip_quat(message.q)
     norm = float(np.linalg.norm(quat))
     quat = quat / norm if np.isfinite(norm) and norm > 0.5 else np.full(4, np.nan)
-    vel = turned([message.vx, message.vy, message.vz])
+    vel = flip_axes([message.vx, message.vy, message.vz])
     fault = ""
     if message.frame_id != LOCAL_NED or message.child_frame_id not in (LOCAL_NED, BODY_FRD):
         fault = (
@@ -258,17 +266,17 @@ def _state_of(message: Any) -> State:
         fault = "the vehicle's estimator has failed (ODOMETRY's quality is negative)"
     return State(
         time_s=message.time_usec * 1e-6,
-        pos_w=turned([message.x, message.y, message.z]),
+        pos_w=flip_axes([message.x, message.y, message.z]),
         quat_wxyz=quat,
         vel_w=to_world(quat_to_rot(quat), vel) if message.child_frame_id == BODY_FRD else vel,
-        rate_b=turned((message.rollspeed, message.pitchspeed, message.yawspeed)),
+        rate_b=flip_axes((message.rollspeed, message.pitchspeed, message.yawspeed)),
         resets=message.reset_counter,
         fault=fault,
     )
 
 
 def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
-    """Return a planar depth image (H, W) [m] as packets; depths from the range on are 0."""
+    """Return a planar depth image (H, W) [m] as packets; depths of `range_m` and more become 0."""
     height, width = depth_m.shape
     millimetres = np.where(depth_m < range_m, np.rint(depth_m * 1e3), 0).clip(0, 65535)
     data = _HEAD % (width, height) + millimetres.astype(">u2").tobytes()
@@ -278,8 +286,8 @@ def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
     return [first, *(Packet(k, 0, part) for k, part in enumerate(parts))]
 
 
-class Picture:
-    """Assembles packets to images."""
+class ImageAssembler:
+    """Assembles received packets to depth images."""
 
     def __init__(self, height: int, width: int, range_m: float) -> None:
         """Assemble images of this size; pixels without depth get `range_m`.
@@ -295,29 +303,29 @@ class Picture:
                 f"a camera of {height} x {width} pixels: the link carries images of at most "
                 f"{MOST_PACKETS * PACKET // 2} pixels; fly a policy with a smaller one"
             )
-        self._parts: dict[int, bytes] = {}
-        self._wanted = 0
+        self._received: dict[int, bytes] = {}
+        self._expected = 0
         self.other_size: tuple[int, int] | None = None
         """Width and height of the last announced image of another size."""
 
     def add(self, packet: Packet) -> np.ndarray | None:
         """Return the depth image (H, W) [m] that this packet completes, else None."""
-        if packet.place < 0:
+        if packet.number < 0:
             width, height, size = (int(x) for x in np.frombuffer(packet.data, np.uint32))
-            fits = size == self._size and packet.parts == -(-self._size // PACKET)
-            self._parts, self._wanted = {}, packet.parts if fits else 0
+            fits = size == self._size and packet.total == -(-self._size // PACKET)
+            self._received, self._expected = {}, packet.total if fits else 0
             if (height, width) != self._shape:
                 self.other_size = (width, height)
             return None
-        if packet.place in self._parts:  # from the next image, whose announcement was lost
-            self._parts, self._wanted = {}, 0
-        if packet.place >= self._wanted:
+        if packet.number in self._received:  # from the next image, whose announcement was lost
+            self._received, self._expected = {}, 0
+        if packet.number >= self._expected:
             return None
-        self._parts[packet.place] = packet.data
-        if len(self._parts) < self._wanted:
+        self._received[packet.number] = packet.data
+        if len(self._received) < self._expected:
             return None
-        data = b"".join(self._parts[k] for k in range(self._wanted))[: self._size]
-        self._parts, self._wanted = {}, 0
+        data = b"".join(self._received[k] for k in range(self._expected))[: self._size]
+        self._received, self._expected = {}, 0
         if not data.startswith(self._head):
             return None
         millimetres = np.frombuffer(data, ">u2", offset=len(self._head)).reshape(self._shape)
@@ -325,11 +333,11 @@ class Picture:
         return np.minimum(metres, self._range_m)
 
 
-def turned(vector: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return a vector (3,) of one world or body frame in the other convention."""
+def flip_axes(vector: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Convert a vector (3,) from NED or FRD to z up or FLU, or back."""
     return np.asarray(vector, float) * HALF_TURN
 
 
-def turned_quat(quat_wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return an attitude (4,), body to world, wxyz, in the other convention."""
+def flip_quat(quat_wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Convert an attitude (4,), body to world, from FRD to NED to FLU to z up, or back."""
     return np.asarray(quat_wxyz, float) * QUAT_HALF_TURN

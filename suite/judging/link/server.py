@@ -1,4 +1,4 @@
-"""A process with a simulated vehicle at its end of the link, which flies in real time."""
+"""Run a simulated vehicle in its own process, which flies in real time at its end of the link."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ SLIP_S = 0.02
 """A step with a longer delay shifts the later steps, instead of a burst to catch up [s]."""
 
 
-class Request(NamedTuple):
-    """A flight for the vehicle."""
+class FlightRequest(NamedTuple):
+    """A flight for the vehicle's process."""
 
     track: Track
     trial: TrialSpec
@@ -35,36 +35,39 @@ class Request(NamedTuple):
     rules: Rules
     camera: Camera
     image_hz: float
+    """Rate of the depth images [Hz]."""
     address: str
+    """UDP address of the other end."""
     policy: str
+    """Name of the policy, for the result."""
 
 
-class Flown(NamedTuple):
+class VehicleResult(NamedTuple):
     """The vehicle's result of a flight."""
 
-    result: TrialResult
+    trial: TrialResult
     slips: int
     """Number of steps with a delay above `SLIP_S`, on a busy machine."""
 
 
 class VehicleProcess:
-    """The process: `start` a flight, get its result by `flown`, `stop` a running one."""
+    """The process: `start` a flight, get its `result`, `stop` a running one."""
 
     def __init__(self) -> None:
         """Start the process."""
         register_dict_views()
         context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=serve, args=(other,), daemon=True)
+        self._pipe, remote = context.Pipe()
+        self._process = context.Process(target=serve, args=(remote,), daemon=True)
         self._process.start()
-        other.close()
+        remote.close()
 
-    def start(self, request: Request) -> None:
+    def start(self, request: FlightRequest) -> None:
         """Start a flight."""
         self._pipe.send(request)
 
-    def flown(self, wait_s: float = 0.0) -> Flown | None:
-        """Return the flight's result, or None while it runs.
+    def result(self, wait_s: float = 0.0) -> VehicleResult | None:
+        """Return the flight's result after waiting for at most `wait_s`, or None while it runs.
 
         Raises:
             WorkFailed: if the process has died.
@@ -74,10 +77,10 @@ class VehicleProcess:
         except EOFError:
             raise WorkFailed("the simulated vehicle's process died; run again") from None
 
-    def stop(self) -> Flown | None:
+    def stop(self) -> VehicleResult | None:
         """Stop the flight and return its result."""
         self._pipe.send("stop")
-        return self.flown(WAIT_S)
+        return self.result(WAIT_S)
 
     def close(self) -> None:
         """End the process."""
@@ -95,11 +98,11 @@ def serve(pipe: Connection) -> None:
             request = pipe.recv()
         except EOFError:
             return
-        if isinstance(request, Request):
+        if isinstance(request, FlightRequest):
             pipe.send(fly_in_real_time(request, pipe))
 
 
-def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
+def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
     """Fly one trial in real time, until it ends or the pipe has a message."""
     link = UdpLink(request.address)
     try:
@@ -123,4 +126,4 @@ def fly_in_real_time(request: Request, pipe: Connection) -> Flown:
         slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
     finally:
         link.close()
-    return Flown(vehicle.result(request.policy), slips)
+    return VehicleResult(vehicle.result(request.policy), slips)

@@ -1,7 +1,8 @@
-"""A vehicle in MuJoCo at the end of a link, like a flight controller with a depth camera.
+"""A simulated vehicle at one end of a link, which acts like a flight controller with a camera.
 
-It sends its state and images, and flies the received set points; without them it brakes and hovers.
-Before the first one it stays at the trial's start. Its physics are the judge's.
+It sends its state and depth images over MAVLink, and flies the received set points; without new
+ones it brakes and hovers. Before the first one it stays at the trial's start. The physics are those
+of the judge, which flies policies in MuJoCo and scores them.
 """
 
 from __future__ import annotations
@@ -60,13 +61,13 @@ class SimulatedVehicle:
         """Place the vehicle at the start of `track`.
 
         Args:
-            track: the trial's.
+            track: the track of the trial.
             trial: its seed determines gusts.
             vehicle: the flown vehicle.
-            camera: of the depth images.
-            image_hz: rate of the images.
+            camera: size and field of view of the depth images.
+            image_hz: rate of the images [Hz].
             wire: this end of the link.
-            rules: end of the trial.
+            rules: when the trial ends.
         """
         self._vehicle, self._wire, self._trial = vehicle, wire, trial
         self._rules = rules or Rules()
@@ -88,7 +89,7 @@ class SimulatedVehicle:
         self._progress = start_progress(motion.pos_w)
         self._eye, self._steps_an_image = DepthCamera(camera), 1 / (image_hz * self.dt)
         self._command: Command | None = None
-        self._heard_step = self._ticks = 0
+        self._command_step = self._ticks = 0
         self.images = 0
 
     @property
@@ -103,17 +104,17 @@ class SimulatedVehicle:
 
     @property
     def time_s(self) -> float:
-        """Time of its own clock since its start [s]."""
+        """Time of the vehicle's clock since its start [s]."""
         return self._ticks * self.dt
 
     def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
         """Fly one physics step and return the datagrams sent before it.
 
         Args:
-            datagrams: received ones.
-            clock_s: time for the stamps; None: its own clock [s].
+            datagrams: the received ones.
+            clock_s: time for the stamps; None: the vehicle's clock [s].
         """
-        for message in self._wire.decoded(datagrams):
+        for message in self._wire.decode(datagrams):
             if (
                 isinstance(message, SetPoint)
                 and np.isfinite([*message.rate_b, message.thrust]).all()
@@ -122,31 +123,33 @@ class SimulatedVehicle:
                 limit = np.array(self._vehicle.controller.rate_max)
                 rate_b = np.clip(message.rate_b, -limit, limit)
                 self._command = Command(np.array([thrust]), rate_b[None])
-                self._heard_step = int(self._progress.step[0])
+                self._command_step = int(self._progress.step[0])
         motion = motion_of(self._data)
-        sent = self._measured(motion, self.time_s if clock_s is None else clock_s)
+        sent = self._measurements(motion, self.time_s if clock_s is None else clock_s)
         self._ticks += 1
         if self._command is not None and not self.over:
             self._fly(motion, self._command)
         return sent
 
-    def _measured(self, motion: Motion, clock_s: float) -> list[bytes]:
+    def _measurements(self, motion: Motion, clock_s: float) -> list[bytes]:
+        """Return the datagrams of the image and the state that are due at this step."""
         sent = []
         if self._ticks >= round(self.images * self._steps_an_image):
             depth = self._eye.image(self._model, self._data, motion.pos_w[0], motion.rot_w[0])
             packets = image_packets(depth, self._eye.camera.range_m)
-            sent += [self._wire.encoded(packet) for packet in packets]
+            sent += [self._wire.encode(packet) for packet in packets]
             self.images += 1
         if self._ticks % self._autopilot.attitude_every == 0:
             quat = self._data.qpos[3:].copy()
             state = State(clock_s, motion.pos_w[0], quat, motion.vel_w[0], motion.rate_b[0])
-            sent.append(self._wire.encoded(state))
+            sent.append(self._wire.encode(state))
         return sent
 
     def _fly(self, motion: Motion, command: Command) -> None:
+        """Make one physics step under the command, or braking if it is too old."""
         step = int(self._progress.step[0])
-        if (step - self._heard_step) * self.dt > LOST_S:
-            command = self._braking(motion)
+        if (step - self._command_step) * self.dt > LOST_S:
+            command = self._brake_command(motion)
         noise = None if self._draws is None else self._draws[None, step + 1]
         plant, wrench = plant_step(
             self._autopilot.plant,
@@ -156,22 +159,23 @@ class SimulatedVehicle:
             np.array([step * self.dt]),
         )
         self._plant = plant
-        bad = ~is_wrench(self._rules, wrench)
-        if not bad[0]:
+        invalid = ~is_wrench(self._rules, wrench)
+        if not invalid[0]:
             self._data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
             self._data.qfrc_applied[3:] = wrench.torque_b[0]
             mujoco.mj_step2(self._model, self._data)
             mujoco.mj_step1(self._model, self._data)
         self._progress = self._progress._replace(step=self._progress.step + 1)
         after, contact = motion_of(self._data), np.array([self._data.ncon > 0])
-        diverged = bad | has_diverged(self._rules, after)
+        diverged = invalid | has_diverged(self._rules, after)
         self._progress = judge_state(
             self._rules, self._progress, self._course, self.dt, after, contact, diverged
         )
 
-    def _braking(self, motion: Motion) -> Command:
-        wanted_w = (-BRAKE * motion.vel_w).clip(-BRAKE_MOST, BRAKE_MOST)
-        force_w = action_to_force(to_local(motion.rot_w, wanted_w), motion.rot_w)
+    def _brake_command(self, motion: Motion) -> Command:
+        """Return the command that decelerates to hover, with the present heading."""
+        acc_w = (-BRAKE * motion.vel_w).clip(-BRAKE_MOST, BRAKE_MOST)
+        force_w = action_to_force(to_local(motion.rot_w, acc_w), motion.rot_w)
         heading_w = level_heading(motion.rot_w)
         return attitude_command(self._vehicle.controller, force_w, motion.rot_w, heading_w)
 
@@ -179,9 +183,10 @@ class SimulatedVehicle:
         """Return the trial's result so far; an unfinished one counts as a timeout."""
         progress = self._progress
         ended = int(progress.ended[0])
-        how = ENDINGS[ended - 1] if ended else "timeout"
+        ended_by = ENDINGS[ended - 1] if ended else "timeout"
+        is_collision = ended_by == "collision"
         step = int(progress.step[0])
-        place = progress.pos_w[0]
+        pos_w = progress.pos_w[0]
         return TrialResult(
             *self._trial,
             policy=policy,
@@ -189,11 +194,11 @@ class SimulatedVehicle:
             world="link",
             success=ended == FINISHED,
             gates_passed=int(progress.gates[0]),
-            ended_by=how,
-            collided_with=contact_name(self._model, self._data) if how == "collision" else None,
-            pos_x=float(place[0]),
-            pos_y=float(place[1]),
-            pos_z=float(place[2]),
+            ended_by=ended_by,
+            collided_with=contact_name(self._model, self._data) if is_collision else None,
+            pos_x=float(pos_w[0]),
+            pos_y=float(pos_w[1]),
+            pos_z=float(pos_w[2]),
             time_s=step * self.dt,
             v_max=float(progress.v_max[0]),
             v_mean=float(progress.v_sum[0]) / max(step + (ended != DIVERGED), 1),

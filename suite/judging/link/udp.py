@@ -1,4 +1,7 @@
-"""UDP datagrams: `udpin:HOST:PORT` waits for the other end, `udpout:HOST:PORT` sends first."""
+"""A UDP socket as one end of the link between the vehicle and the policy's computer.
+
+The address `udpin:HOST:PORT` waits for the other end, `udpout:HOST:PORT` sends first.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +16,18 @@ MOST_BYTES = 2048
 class UdpLink:
     """One end of a link; a waiting end answers only the first valid sender."""
 
-    def __init__(self, address: str, speaks: Callable[[bytes], bool] = lambda _: True) -> None:
+    def __init__(
+        self, address: str, is_from_peer: Callable[[bytes], bool] = lambda _: True
+    ) -> None:
         """Open an end.
 
         Args:
             address: udpin:HOST:PORT or udpout:HOST:PORT.
-            speaks: whether a datagram is valid; senders of others are ignored.
+            is_from_peer: returns whether a datagram comes from the other end; a waiting end ignores
+                all datagrams before the first one that does.
 
         Raises:
-            ValueError: for an address of another form, a port that is taken, an unknown host.
+            ValueError: for an address of another form, a port in use, or an unknown host.
         """
         kind, _, place = address.partition(":")
         host, _, port = place.rpartition(":")
@@ -35,7 +41,7 @@ class UdpLink:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._peer: tuple[str, int] | None = None
-        self._speaks = speaks
+        self._is_from_peer = is_from_peer
         self.strangers = 0
         """Number of ignored datagrams of other senders."""
         try:
@@ -45,8 +51,9 @@ class UdpLink:
         except OSError as error:
             self._socket.close()
             raise ValueError(
-                f"--link {address}: {error.strerror or error}; udpin takes an address of this "
-                "machine (0.0.0.0 for all) and a free port above 1023, udpout a host that is known"
+                f"--link {address}: {error.strerror or error}; udpin needs an address of this "
+                "machine (0.0.0.0 for all) and a free port above 1023, udpout a host that can be "
+                "found"
             ) from None
         if kind == "udpout":
             self._peer = resolved
@@ -60,18 +67,18 @@ class UdpLink:
         """Return the received datagrams, after waiting for at most `wait_s`; may be none."""
         if wait_s > 0:
             select.select([self._socket], [], [], wait_s)
-        found = []
+        received = []
         while True:
             try:
                 data, sender = self._socket.recvfrom(MOST_BYTES)
             except BlockingIOError:
-                return found
+                return received
             except OSError:  # the other end is closed
                 continue
-            if self._peer is None and self._speaks(data):
+            if self._peer is None and self._is_from_peer(data):
                 self._peer = sender
             if sender == self._peer:
-                found.append(data)
+                received.append(data)
             else:
                 self.strangers += 1
 

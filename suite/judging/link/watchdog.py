@@ -1,7 +1,8 @@
-"""The watchdog: limits of the vehicle's states and of the link, beyond which a policy hands over.
+"""The watchdog of a flight over a link: checks of the received states, with their limits.
 
-Only received messages are checked here. The judge's guard limits the policy's actions, and with
-`--monitor` the safety monitor does too (`eval/judging/monitor.py`).
+Beyond a limit the companion computer, which runs the policy, hands over to the autopilot. The
+policy's actions are checked elsewhere: by the action guard, and with `--monitor` by the safety
+monitor (`eval/judging/monitor.py`).
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.input.ranges import Range
 
 DRIFT = 1e-3
-"""Largest relative drift of two clocks; a quartz has a tenth of it [1]."""
+"""Largest relative drift of two clocks; that of a quartz is a tenth [1]."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Beyond any of these the companion hands over."""
+    """Limits of states, images and times; beyond any of them the companion hands over."""
 
     silence_s: Annotated[float, Range(0.01, 10.0)] = 0.1
     """Hand over to the autopilot after this time without a state [s]."""
@@ -47,20 +48,22 @@ class Limits:
 
 @dataclass(frozen=True)
 class Box:
-    """The allowed region of the vehicle, world [m]."""
+    """The allowed region of the vehicle in the world frame."""
 
     low: np.ndarray
+    """(3,) lower corner [m]."""
     high: np.ndarray
+    """(3,) upper corner [m]."""
 
 
-def box_of(points_w: np.ndarray, limits: Limits) -> Box:
-    """Return the box around points (N, 3)."""
+def allowed_box(points_w: np.ndarray, limits: Limits) -> Box:
+    """Return the box around points (N, 3) [m], with the margin and the floor of `limits`."""
     low, high = points_w.min(0) - limits.margin_m, points_w.max(0) + limits.margin_m
     low[2] = limits.floor_m
     return Box(low, high)
 
 
-def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
+def state_fault(state: State, box: Box, limits: Limits) -> str | None:
     """Return the reason for which a state cannot be used, or None."""
     if state.fault:
         return state.fault
@@ -76,7 +79,7 @@ def trouble_with_state(state: State, box: Box, limits: Limits) -> str | None:
     return None
 
 
-def trouble_between(last: State, state: State, limits: Limits) -> str | None:
+def jump_fault(last: State, state: State, limits: Limits) -> str | None:
     """Return the reason for which a state does not continue the last one, or None.
 
     A jump of the estimator could count a gate that was not passed, or miss one.
@@ -95,28 +98,33 @@ class ClockCheck:
     """Checks that the vehicle's clock runs like ours, and that states do not arrive later."""
 
     def __init__(self, limits: Limits) -> None:
-        self._most = limits.clock_jump_s
-        self._offset: float | None = None
-        self._at = 0.0
+        self._limit_s = limits.clock_jump_s
+        self._offset_s: float | None = None
+        self._last_s = 0.0
 
     def add(self, stamp_s: float, now_s: float) -> str | None:
         """Return the reason for which a time stamp is wrong, or None.
 
-        It is compared with that of the state with the shortest delay, allowing for the drift of
-        clocks: a slowly growing delay is found like a jump.
+        The offset of the clocks is compared with the smallest one so far, which the state with the
+        shortest delay had. That may grow by `DRIFT` only, so that a slowly growing delay is found
+        like a jump.
+
+        Args:
+            stamp_s: the vehicle's clock in the state [s].
+            now_s: our clock at the state's arrival [s].
         """
-        offset = now_s - stamp_s
-        if self._offset is None:
-            self._offset = offset
+        offset_s = now_s - stamp_s
+        if self._offset_s is None:
+            self._offset_s = offset_s
         else:
-            self._offset += DRIFT * (now_s - self._at)
-        self._at = now_s
-        apart = offset - self._offset
-        if apart > self._most:
-            return f"clock jumped by {-apart:+.2f} s, or states are that late"
-        if apart < -self._most:
-            return f"clock jumped by {-apart:+.2f} s"
-        self._offset = min(self._offset, offset)
+            self._offset_s += DRIFT * (now_s - self._last_s)
+        self._last_s = now_s
+        jump_s = offset_s - self._offset_s
+        if jump_s > self._limit_s:
+            return f"clock jumped by {-jump_s:+.2f} s, or states are that late"
+        if jump_s < -self._limit_s:
+            return f"clock jumped by {-jump_s:+.2f} s"
+        self._offset_s = min(self._offset_s, offset_s)
         return None
 
 

@@ -1,4 +1,8 @@
-"""The dynamics of a rollout: the point mass, or the quadrotor around a vehicle file."""
+"""The interface of the trainer's dynamics, and `make_dynamics`, which selects one of two models.
+
+The models are a point mass and the differentiable quadrotor of a vehicle file. Both move B worlds
+(simulated scenes with a drone) at once and have gradients.
+"""
 
 from __future__ import annotations
 
@@ -49,10 +53,11 @@ class Dynamics(NamedTuple):
     """Pure functions over B worlds; state and parameters are pytrees of arrays (B, ...)."""
 
     start: Callable[[Any, jax.Array, jax.Array, jax.Array], Any]
-    """(constants, pos_w (B, 3), vel_w (B, 3), heading_w (B, 3)) -> body, upright."""
+    """(constants, pos_w (B, 3) [m], vel_w (B, 3) [m/s], heading_w (B, 3)) -> the state of upright
+    drones; `constants` are the worlds' parameters, heading_w are horizontal unit vectors."""
     step: Callable[[Any, Any, jax.Array, jax.Array, jax.Array], Any]
-    """(body, constants, action_b (B, 3), target_w (B, 3), keys (B,)) -> body one policy period
-    later."""
+    """(state, constants, action_b (B, 3) [m/s^2], target_w (B, 3) [m], keys (B,)) -> the state one
+    policy period later; the heading follows the direction to `target_w`."""
 
 
 def make_dynamics(config: TrainConfig) -> Dynamics:

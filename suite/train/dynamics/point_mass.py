@@ -29,7 +29,7 @@ class PointMassParams(NamedTuple):
     time_step: Array
     """(B,) [s]."""
     delay: Array
-    """(B,) delay of a command in time steps, within [0, 2]."""
+    """(B,) delay of a command, 0 to 2 [time steps]."""
 
 
 class PointMassState(NamedTuple):
@@ -40,7 +40,7 @@ class PointMassState(NamedTuple):
     vel_w: jax.Array
     """(B, 3) [m/s]."""
     thrust_w: jax.Array
-    """(B, 3) commanded net acceleration after the lag, without drag [m/s^2]."""
+    """(B, 3) net acceleration by thrust and gravity, after the lag and without drag [m/s^2]."""
     acc_w: jax.Array
     """(B, 3) net acceleration [m/s^2]."""
     rot_w: jax.Array
@@ -60,6 +60,7 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
     """
     force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
     size = jnp.linalg.norm(force, axis=-1, keepdims=True)
+    # In free fall the specific force has no direction: then z is world up.
     up = jnp.where(size > 1e-3, force / jnp.maximum(size, 1e-3), jnp.asarray([0.0, 0.0, 1.0]))
     left = jnp.cross(up, heading_w)
     left = left / jnp.maximum(jnp.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
@@ -67,7 +68,10 @@ def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
 
 
 def start(pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array) -> PointMassState:
-    """Return an upright body at pos_w (B, 3) [m] with constant velocity vel_w (B, 3) [m/s]."""
+    """Return upright bodies at pos_w (B, 3) [m] with velocity vel_w (B, 3) [m/s], without thrust.
+
+    heading_w (B, 3) are horizontal unit vectors.
+    """
     zero = jnp.zeros_like(pos_w)
     rot_w = attitude(zero, heading_w)
     commands = jnp.zeros((pos_w.shape[0], 2, 3), pos_w.dtype)
@@ -92,7 +96,7 @@ def step(
 
     Args:
         body: the present state.
-        constants: of each world.
+        constants: the parameters of each world.
         action_b: (B, 3) wanted net acceleration in the present body axes [m/s^2].
         target_w: (B, 3) the gate that the heading follows [m].
         gradient_decay: decay rate of the gradients of position and velocity [1/s].
@@ -102,23 +106,23 @@ def step(
     history = jnp.concatenate([command[:, None], body.commands_w], axis=1)
     age = jnp.arange(3.0)
     share = jnp.maximum(0.0, 1.0 - jnp.abs(constants.delay[:, None] - age))
-    wanted = (share[..., None] * history).sum(1)
+    delayed = (share[..., None] * history).sum(1)
 
     keep = jnp.exp(-constants.lag[:, None] * dt)
-    thrust = wanted * (1 - keep) + body.thrust_w * keep
+    thrust = delayed * (1 - keep) + body.thrust_w * keep
     rot = jax.lax.stop_gradient(body.rot_w)
-    air_b = to_local(rot, body.vel_w - constants.wind_w)
-    acc = thrust - to_world(rot, constants.drag * air_b)
+    airspeed_b = to_local(rot, body.vel_w - constants.wind_w)
+    acc = thrust - to_world(rot, constants.drag * airspeed_b)
     fade = jnp.exp(-gradient_decay * dt)
     pos, vel = faded(body.pos_w, fade), faded(body.vel_w, fade)
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
 
-    flat = jnp.asarray([1.0, 1.0, 0.0])
-    towards = jax.lax.stop_gradient(target_w - pos) * flat
-    towards = towards / jnp.maximum(jnp.linalg.norm(towards, axis=-1, keepdims=True), 1e-3)
+    horizontal = jnp.asarray([1.0, 1.0, 0.0])
+    to_gate = jax.lax.stop_gradient(target_w - pos) * horizontal
+    to_gate = to_gate / jnp.maximum(jnp.linalg.norm(to_gate, axis=-1, keepdims=True), 1e-3)
     blend = jnp.exp(-HEADING_RATE * dt)
-    heading = body.heading_w * blend + towards * (1 - blend)
+    heading = body.heading_w * blend + to_gate * (1 - blend)
     size = jnp.linalg.norm(heading, axis=-1, keepdims=True)
     heading = jnp.where(size > 1e-3, heading / jnp.maximum(size, 1e-3), body.heading_w)
     rot = attitude(jax.lax.stop_gradient(thrust), heading)

@@ -1,10 +1,11 @@
-"""The judge's quadrotor as the trainer's dynamics: one policy period with gradients.
+"""The differentiable quadrotor of the trainer: B vehicles fly one policy period, with gradients.
 
-The equations are those of the judge (`eval.quadrotor`: attitude, stepper, rigid body): the
-attitude loop computes collective thrust and body rates from the action at each of its steps; rate
-loop, mixer, rotors and effects give the motion. A period has a whole number of attitude steps and
-physics steps, so a step is a little shorter or longer than configured. By default there are half as
-many steps as in the judge.
+The equations are those of the judge, which flies policies in MuJoCo and scores them
+(`eval.quadrotor`: attitude, stepper, rigid body). The attitude loop computes collective thrust and
+body rates from the action at each of its steps; rate loop, mixer, rotors and effects (the physics
+beyond the nominal quadrotor, such as drag) give the motion. A period has a whole number of
+attitude steps and physics steps, so a step is a little shorter or longer than configured. By
+default there are half as many steps as in the judge.
 """
 
 from __future__ import annotations
@@ -56,13 +57,13 @@ class QuadrotorState(NamedTuple):
     heading_w: jax.Array
     """(B, 3) wanted heading, horizontal unit vectors."""
     plant: PlantState
-    """(B, ...): rotor speeds and delayed commands."""
+    """(B, ...) rotor speeds and delayed commands."""
     time_s: jax.Array
     """(B,) since the start [s]."""
 
 
 class Substeps(NamedTuple):
-    """The division of a policy period into steps."""
+    """X."""
 
     attitude: int
     """Steps of the attitude loop."""
@@ -84,8 +85,8 @@ def substeps(config: QuadrotorConfig, period_s: float) -> Substeps:
     return Substeps(attitude_steps, physics, period_s / (attitude_steps * physics))
 
 
-def cut_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """Return standard normal draws, truncated at 2."""
+def truncated_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return standard normal draws, clipped to -2 to 2."""
     return np.clip(rng.standard_normal(shape), -2.0, 2.0)
 
 
@@ -95,43 +96,45 @@ def draw_effects(
     """Return values (B, ...) of the effects that vary, drawn around the vehicle's own."""
     vehicle = config.vehicle
 
-    def own(name: str) -> Any:
+    def mean(name: str) -> Any:
+        """Return the vehicle's values of an effect, or the ones that do nothing."""
         return as_arrays(vehicle.effects.get(name, neutral(EFFECTS[name], vehicle)))
 
-    def either_way(*shape: int) -> np.ndarray:
+    def uniform(*shape: int) -> np.ndarray:
+        """Return draws (B, *shape) from -1 to 1."""
         return rng.uniform(-1.0, 1.0, (batch, *shape))
 
-    mass = own("mass_offset").offset + vehicle.mass
-    drag = own("linear_drag").coefficient + config.drag_spread * either_way(3)
-    delay = own("command_delay").delay + config.delay_spread_s * either_way()
+    mass = mean("mass_offset").offset + vehicle.mass
+    drag = mean("linear_drag").coefficient + config.drag_spread * uniform(3)
+    delay = mean("command_delay").delay + config.delay_spread_s * uniform()
     wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
     lightest = vehicle.mass + bound_value(EFFECTS["mass_offset"].parameters[0].low, vehicle)
 
-    def lag(either: np.ndarray) -> np.ndarray:
-        whole = own("motor_lag").time_constant * (1 + config.lag_spread * either)
-        return np.maximum(whole + config.lag_spread_s * either, 0.0)
+    def lag(draw: np.ndarray) -> np.ndarray:
+        scaled = mean("motor_lag").time_constant * (1 + config.lag_spread * draw)
+        return np.maximum(scaled + config.lag_spread_s * draw, 0.0)
 
     fields: dict[str, tuple[np.ndarray, ...]] = {
         "linear_drag": (np.maximum(drag, 0.0),),
-        "constant_wind": (own("constant_wind").velocity + wind,),
-        "motor_lag": (lag(either_way()),),
+        "constant_wind": (mean("constant_wind").velocity + wind,),
+        "motor_lag": (lag(uniform()),),
         "command_delay": (np.clip(delay, 0.0, longest_delay(config)),),
         "mass_offset": (
             np.maximum(mass * (1 + config.mass_std * rng.standard_normal(batch)), lightest)
             - vehicle.mass,
         ),
-        "rate_gain": (own("rate_gain").scale * (1 + config.gain_spread * either_way(3)),),
+        "rate_gain": (mean("rate_gain").scale * (1 + config.gain_spread * uniform(3)),),
     }
     # Only if they vary: each varying effect makes the plant's step slower.
     if config.thrust_spread:
-        scale = 1 + config.thrust_spread * either_way()
-        fields["thrust_scale"] = (own("thrust_scale").scale * scale,)
+        scale = 1 + config.thrust_spread * uniform()
+        fields["thrust_scale"] = (mean("thrust_scale").scale * scale,)
     if config.com_std_m:
-        offset = config.com_std_m * cut_normal(rng, batch, 3) * [1.0, 1.0, 0.0]
-        fields["com_offset"] = (own("com_offset").offset + offset,)
+        offset = config.com_std_m * truncated_normal(rng, batch, 3) * [1.0, 1.0, 0.0]
+        fields["com_offset"] = (mean("com_offset").offset + offset,)
     if config.trim_std:
-        torque = config.trim_std * cut_normal(rng, batch, 3) * TRIM_AXES
-        fields["torque_trim"] = (own("torque_trim").torque + torque,)
+        torque = config.trim_std * truncated_normal(rng, batch, 3) * TRIM_AXES
+        fields["torque_trim"] = (mean("torque_trim").torque + torque,)
     return {
         name: EFFECTS[name].values(*(np.asarray(x, np.float32) for x in values))
         for name, values in fields.items()
@@ -140,7 +143,7 @@ def draw_effects(
 
 @dataclass(frozen=True)
 class DrawnVehicle:
-    """A function that draws a vehicle, as training does for each world."""
+    """A callable that draws one vehicle, as training does for each world."""
 
     config: QuadrotorConfig
     """The vehicle and its randomisation."""
@@ -156,16 +159,16 @@ class DrawnVehicle:
 
 def longest_delay(config: QuadrotorConfig) -> float:
     """Return the longest delay of commands in any world [s]."""
-    own = config.vehicle.effects.get("command_delay")
+    effect = config.vehicle.effects.get("command_delay")
     limit = bound_value(EFFECTS["command_delay"].parameters[0].high, config.vehicle)
-    delay = 0.0 if own is None else float(own.delay)
+    delay = 0.0 if effect is None else float(effect.delay)
     return min(delay + config.delay_spread_s, max(limit, delay))
 
 
 def plant_of(
     config: QuadrotorConfig, effects: dict[str, Values], dt: float, varies: bool = True
 ) -> Plant:
-    """Return the plants of B worlds for steps of `dt` [s].
+    """Return the plants (mixer, rotors and effects) of B worlds for steps of `dt` [s].
 
     Args:
         config: the vehicle.
@@ -173,9 +176,9 @@ def plant_of(
         dt: length of a physics step [s].
         varies: whether the delay is among `effects`.
     """
-    own: dict[str, Any] = dict(config.vehicle.effects)
+    vehicle_effects: dict[str, Any] = dict(config.vehicle.effects)
     longest = longest_delay(config) if varies else None
-    return make_plant(config.vehicle, dt, {**own, **effects}, longest)
+    return make_plant(config.vehicle, dt, {**vehicle_effects, **effects}, longest)
 
 
 def start_state(
@@ -199,7 +202,7 @@ def start_state(
 def fly_period(
     vehicle: Vehicle,
     plant: Plant,
-    cut: Substeps,
+    steps: Substeps,
     body: QuadrotorState,
     action_b: jax.Array,
     heading: Callable[[jax.Array, jax.Array], jax.Array],
@@ -210,15 +213,15 @@ def fly_period(
 
     Args:
         vehicle: has the attitude loop's settings.
-        plant: of B worlds, for steps of `cut.dt`.
-        cut: division of the period.
+        plant: of B worlds, for steps of `steps.dt`.
+        steps: attitude and physics steps of the period.
         body: the present state.
         action_b: (B, 3) wanted net acceleration in body axes [m/s^2], held for the period.
         heading: (heading_w (B, 3), pos_w (B, 3)) -> the wanted heading an attitude step later.
         noise: (attitude, physics, B, 3) normal draws for random wind, or None.
         yaw_rate: (B,) commanded about body z, instead of following the heading [rad/s].
     """
-    controller, dt = vehicle.controller, cut.dt
+    controller, dt = vehicle.controller, steps.dt
 
     def physics(
         carry: tuple[PlantState, Motion, jax.Array], draws: jax.Array | None, command: Command
@@ -238,18 +241,18 @@ def fly_period(
             lambda c, d: physics(c, d, command),
             (state, motion, time_s),
             draws,
-            length=cut.physics,
-            unroll=min(cut.physics, 2),
+            length=steps.physics,
+            unroll=min(steps.physics, 2),
         )
         return (heading_w, *inner), None
 
     motion = Motion(body.pos_w, body.rot_w, body.vel_w, body.rate_b)
     start = (body.heading_w, body.plant, motion, body.time_s)
-    (heading_w, state, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=cut.attitude)
+    (heading_w, state, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=steps.attitude)
     return QuadrotorState(
         pos_w=motion.pos_w,
         vel_w=motion.vel_w,
-        acc_w=(motion.vel_w - body.vel_w) / (cut.attitude * cut.physics * dt),
+        acc_w=(motion.vel_w - body.vel_w) / (steps.attitude * steps.physics * dt),
         rot_w=motion.rot_w,
         rate_b=motion.rate_b,
         heading_w=heading_w,
@@ -268,17 +271,17 @@ def quadrotor_dynamics(
         period_s: policy period [s].
         gradient_decay: decay rate of the motion's gradients, back in time [1/s].
     """
-    cut = substeps(config, period_s)
-    left = float(np.exp(-gradient_decay * period_s))
-    turn_s = cut.physics * cut.dt
+    steps = substeps(config, period_s)
+    decay = float(np.exp(-gradient_decay * period_s))
+    attitude_step_s = steps.physics * steps.dt
 
     def start(
         constants: QuadrotorParams, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
     ) -> QuadrotorState:
-        return start_state(plant_of(config, constants.effects, cut.dt), pos_w, vel_w, heading_w)
+        return start_state(plant_of(config, constants.effects, steps.dt), pos_w, vel_w, heading_w)
 
     # The steps within a period are computed again in the backward pass: storing them would take
-    # many times the memory of the rest of a rollout.
+    # many times the memory of a whole rollout without them.
     @jax.checkpoint
     def step(
         body: QuadrotorState,
@@ -287,22 +290,22 @@ def quadrotor_dynamics(
         target_w: jax.Array,
         keys: jax.Array,
     ) -> QuadrotorState:
-        plant = plant_of(config, constants.effects, cut.dt)
+        plant = plant_of(config, constants.effects, steps.dt)
         noise = None
         if uses_noise(plant):
-            shape = (cut.attitude, cut.physics, 3)
+            shape = (steps.attitude, steps.physics, 3)
             gusts = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 3), shape))
             noise = jnp.moveaxis(gusts(keys), 0, 2)
 
-        def towards(heading_w: jax.Array, pos_w: jax.Array) -> jax.Array:
-            return blend_heading(heading_w, target_w - pos_w, turn_s)
+        def heading_to_gate(heading_w: jax.Array, pos_w: jax.Array) -> jax.Array:
+            return blend_heading(heading_w, target_w - pos_w, attitude_step_s)
 
         body = body._replace(
-            pos_w=faded(body.pos_w, left),
-            vel_w=faded(body.vel_w, left),
-            rot_w=faded(body.rot_w, left),
-            rate_b=faded(body.rate_b, left),
+            pos_w=faded(body.pos_w, decay),
+            vel_w=faded(body.vel_w, decay),
+            rot_w=faded(body.rot_w, decay),
+            rate_b=faded(body.rate_b, decay),
         )
-        return fly_period(config.vehicle, plant, cut, body, action_b, towards, noise)
+        return fly_period(config.vehicle, plant, steps, body, action_b, heading_to_gate, noise)
 
     return start, step

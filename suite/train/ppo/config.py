@@ -1,4 +1,7 @@
-"""All settings of a PPO run: those shared with the differentiable trainer, and its own."""
+"""All settings of a PPO run: those shared with the differentiable trainer, and those of PPO.
+
+PPO (proximal policy optimisation) is the baseline that the differentiable trainer is compared with.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ class PpoConfig:
     quadrotor: QuadrotorConfig | None = None
     """Train through this quadrotor; None: through the point mass of `physics`."""
     loss: LossConfig = field(default_factory=LossConfig)
-    """Only r_q is used, by the reward."""
+    """Only the safety radius r_q is used, by the reward."""
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     """Worlds and horizon; `stop_from` and `finish` are not used, since the critic learns the value
     of later steps and a world is reset at its end."""
@@ -44,7 +47,8 @@ class PpoConfig:
     trace: Share = 0.95
     """lambda of generalised advantage estimation (Schulman et al. 2016) [1]."""
     clip: Annotated[float, Range(0.0, 10.0, above=True)] = 0.2
-    """Limit of the rewarded change of an action's probability: the ratio's distance from 1."""
+    """epsilon: how far the ratio of an action's new to its old probability may be from 1 and still
+    count in the objective [1]."""
     epochs: Annotated[int, Range(1, 10_000)] = 4
     """Passes of the policy over a rollout."""
     minibatches: Annotated[int, Range(1, 10_000)] = 4
@@ -68,12 +72,12 @@ class PpoConfig:
 
     @property
     def shared(self) -> TrainConfig:
-        """The differentiable training in the same worlds and dynamics."""
-        same = {name: getattr(self, name) for name in SHARED}
-        return TrainConfig(**same, optimizer=OptimizerConfig(iterations=self.iterations))
+        """The differentiable training in the shared worlds and dynamics."""
+        shared = {name: getattr(self, name) for name in SHARED}
+        return TrainConfig(**shared, optimizer=OptimizerConfig(iterations=self.iterations))
 
 
 def ppo_like(config: TrainConfig, iterations: int) -> PpoConfig:
     """Return PPO with its default settings in the worlds and dynamics of `config`."""
-    same = {name: getattr(config, name) for name in SHARED}
-    return PpoConfig(**same, iterations=iterations)
+    shared = {name: getattr(config, name) for name in SHARED}
+    return PpoConfig(**shared, iterations=iterations)

@@ -36,22 +36,23 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
     the position with a finer scale nearby. Then the distances to solids now and at later times; the
     time and place at which the gate's plane is reached at constant velocity; the opening's half
     width; the number of remaining gates; and the commanded speed, if the policy has that input. F
-    is `features_of`. Gates and obstacles are evaluated without gradient.
+    is `feature_count`. Gates and obstacles are evaluated without gradient.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
     following, _ = target_gate(gates, target, ahead=1)
     times = jnp.asarray(AHEAD_S)[:, None]
     path_w = body.pos_w[:, None] + times * body.vel_w[:, None]
-    held_w = jax.lax.stop_gradient(path_w)
-    distance, away_w = nearest_obstacle(worlds.scene, held_w, NEAR)
-    distance = distance + ((path_w - held_w) * away_w).sum(-1)
+    fixed_w = jax.lax.stop_gradient(path_w)
+    distance, away_w = nearest_obstacle(worlds.scene, fixed_w, NEAR)
+    # The second term is 0 in value; it gives the distance its gradient, as in `gap_beyond`.
+    distance = distance + ((path_w - fixed_w) * away_w).sum(-1)
     pos_g = to_local(gate.rot_w, body.pos_w - gate.center_w)
     vel_g = to_local(gate.rot_w, body.vel_w)
     half_width = gate.opening_g.max((1, 2))[:, None]
-    until = jnp.clip(-pos_g[:, :1] / jnp.maximum(vel_g[:, :1], 0.1), 0.0, 2.0)
-    crossed = pos_g[:, 1:] + until * vel_g[:, 1:]
-    left = gates.center_w.shape[1] - target
+    time_to_plane = jnp.clip(-pos_g[:, :1] / jnp.maximum(vel_g[:, :1], 0.1), 0.0, 2.0)
+    crossing_g = pos_g[:, 1:] + time_to_plane * vel_g[:, 1:]
+    remaining = gates.center_w.shape[1] - target
     columns = [
         pos_g / 5.0,
         vel_g / 5.0,
@@ -63,36 +64,39 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
         jnp.tanh(2.0 * pos_g),
         jnp.clip(distance, -REACH_M, REACH_M),
         jnp.exp(-jnp.maximum(distance, -TOUCH_M) / TOUCH_M),
-        until,
-        jnp.clip(crossed / half_width, -3.0, 3.0),
+        time_to_plane,
+        jnp.clip(crossing_g / half_width, -3.0, 3.0),
         2.0 * half_width,
-        jnp.minimum(left, 2)[:, None] - 1.0,
+        jnp.minimum(remaining, 2)[:, None] - 1.0,
     ]
-    if worlds.wanted is not None:
-        columns.append(worlds.wanted[:, None])
+    if worlds.speed_command is not None:
+        columns.append(worlds.speed_command[:, None])
     return jnp.concatenate(columns, axis=-1)
 
 
-def features_of(spec: PolicySpec) -> int:
+def feature_count(spec: PolicySpec) -> int:
     """Return the number of the critic's inputs for a policy with `spec`."""
     return FEATURES + spec.speed_input
 
 
 def init(key: jax.Array, width: int, count: int = FEATURES) -> Params:
-    """Return fresh parameters for `count` features: two hidden layers of `width`, a small value."""
+    """Return random parameters of a critic with `count` inputs and two hidden layers of `width`.
+
+    The last layer's weights are small, so that the first values are near zero.
+    """
     sizes = [(count, width), (width, width), (width, 1)]
     params: Params = {}
     for number, (k, (rows, columns)) in enumerate(
         zip(jax.random.split(key, len(sizes)), sizes, strict=True)
     ):
-        last = 0.01 if columns == 1 else 1.0
-        params[f"weight{number}"] = last * rows**-0.5 * jax.random.normal(k, (rows, columns))
+        scale = 0.01 if columns == 1 else 1.0
+        params[f"weight{number}"] = scale * rows**-0.5 * jax.random.normal(k, (rows, columns))
         params[f"bias{number}"] = jnp.zeros(columns)
     return params
 
 
-def value(params: Params, seen: jax.Array) -> jax.Array:
-    """Return the values (...) of states with features (..., F)."""
-    x = jnp.tanh(seen @ params["weight0"] + params["bias0"])
+def value(params: Params, inputs: jax.Array) -> jax.Array:
+    """Return the values (...), expected returns of states with `features` (..., F)."""
+    x = jnp.tanh(inputs @ params["weight0"] + params["bias0"])
     x = jnp.tanh(x @ params["weight1"] + params["bias1"])
     return (x @ params["weight2"] + params["bias2"])[..., 0]

@@ -1,7 +1,8 @@
-"""The race in the trainer's worlds and dynamics, as pure functions: the environment of PPO.
+"""The race as a reinforcement-learning environment of pure functions, in the trainer's dynamics.
 
-`make_race` has B worlds at once, for the trainer's PPO; `JaxRace` is one world with the conventions
-of gymnax (Lange 2022), for other learners. Both run the same code.
+`make_race` steps B worlds at once (a world is one simulated scene and drone), for the trainer's
+PPO. `JaxRace` is one world with the interface of gymnax (Lange 2022), for other learners. Both run
+the same code.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from policies.spec import ActionSpec, PolicySpec
 from suite.train.config import TrainConfig
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.ppo.reward import COLLISION, RewardTerms, make_reward
-from suite.train.rollout import make_sight, observed_at_start, queue, world_keys
+from suite.train.rollout import make_observer, observed_at_start, queue, world_keys
 from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
 
@@ -32,20 +33,20 @@ class Episode(NamedTuple):
     """State of episodes between steps, (B, ...)."""
 
     state: Any
-    """Of the dynamics."""
+    """State of the dynamics."""
     target: jax.Array
     """(B,) gates passed, counted from the track's first."""
     action_b: jax.Array
     """(B, 3) the last action [m/s^2]."""
     images: jax.Array
-    """(B, image_delay, height, width) delayed, oldest first."""
+    """(B, image_delay, height, width) images that wait for their delay, oldest first."""
     observed: jax.Array
-    """(B, state_delay, state_size) delayed, oldest first."""
+    """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
     sensed: Any = ()
     """Memory of the sensor models."""
 
 
-class Flown(NamedTuple):
+class PeriodResult(NamedTuple):
     """Results of a policy period, (B,) each."""
 
     reward: RewardTerms
@@ -56,13 +57,13 @@ class Flown(NamedTuple):
 
 
 class Race(NamedTuple):
-    """Pure functions over B worlds, with a key (B,) for each world's noise."""
+    """The environment: pure functions over B worlds, with a key (B,) for each world's noise."""
 
     start: Callable[[Worlds], Episode]
     """worlds -> episodes."""
     observe: Callable[[Worlds, Episode, jax.Array], tuple[Observation, Episode]]
     """(worlds, episodes, keys) -> (observation, episodes'); called once before each step."""
-    fly: Callable[[Worlds, Episode, jax.Array, jax.Array], tuple[Episode, Flown]]
+    fly: Callable[[Worlds, Episode, jax.Array, jax.Array], tuple[Episode, PeriodResult]]
     """(worlds, episodes, action_b (B, 3) [m/s^2], keys) -> (episodes a policy period
     later, results)."""
 
@@ -70,7 +71,7 @@ class Race(NamedTuple):
 def make_race(config: TrainConfig) -> Race:
     """Return the race that `config` describes: its observation, dynamics, noise and delays."""
     spec, physics = config.spec, config.physics
-    sight, reward, dynamics = make_sight(config), make_reward(config), make_dynamics(config)
+    observer, reward, dynamics = make_observer(config), make_reward(config), make_dynamics(config)
 
     def start(worlds: Worlds) -> Episode:
         batch = worlds.pos_w.shape[0]
@@ -82,35 +83,35 @@ def make_race(config: TrainConfig) -> Race:
             # An image of zeros is embedded as zeros, which is how the trainer's rollouts start.
             images=jnp.zeros((batch, physics.image_delay, spec.camera.height, spec.camera.width)),
             observed=observed_at_start(worlds, state, config),
-            sensed=sight.start(worlds, state),
+            sensed=observer.start(worlds, state),
         )
 
     def observe(worlds: Worlds, episode: Episode, keys: jax.Array) -> tuple[Observation, Episode]:
-        seen, sensed = sight.see(
+        newest, sensed = observer.observe(
             worlds, episode.state, episode.target, episode.action_b, keys, episode.sensed
         )
-        state, observed = queue(episode.observed, seen.state)
-        image, images = queue(episode.images, seen.image)
+        state, observed = queue(episode.observed, newest.state)
+        image, images = queue(episode.images, newest.image)
         return Observation(state, image), episode._replace(
             images=images, observed=observed, sensed=sensed
         )
 
     def fly(
         worlds: Worlds, episode: Episode, action_b: jax.Array, keys: jax.Array
-    ) -> tuple[Episode, Flown]:
+    ) -> tuple[Episode, PeriodResult]:
         before, target = episode.state, episode.target
         _, target_w = target_gate(worlds.scene.gates, target)
         after = dynamics.step(before, worlds.constants, action_b, target_w, keys)
         terms, clearance, passed = reward(worlds, before, after, target)
         episode = episode._replace(state=after, target=target + passed, action_b=action_b)
-        return episode, Flown(terms, clearance < BODY_RADIUS_M, passed)
+        return episode, PeriodResult(terms, clearance < BODY_RADIUS_M, passed)
 
     return Race(start, observe, fly)
 
 
-def choose(where: jax.Array, ones: Any, others: Any) -> Any:
-    """Return the leaves (B, ...) of `ones` for worlds `where` (B,) is true, else of `others`."""
-    return jax.tree.map(lambda one, other: jax.vmap(jnp.where)(where, one, other), ones, others)
+def choose(where: jax.Array, if_true: Any, if_false: Any) -> Any:
+    """Return the leaves (B, ...) of `if_true` where `where` (B,) is true, else of `if_false`."""
+    return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(where, a, b), if_true, if_false)
 
 
 class RaceState(NamedTuple):
@@ -119,7 +120,7 @@ class RaceState(NamedTuple):
     world: jax.Array
     """Index in the pool of worlds."""
     episode: Episode
-    """Of a batch of one."""
+    """State of the episode, as a batch of one."""
     steps: jax.Array
     """Policy periods flown."""
 
@@ -130,8 +131,8 @@ class JaxRace:
 
         env = JaxRace(TrainConfig(quadrotor=QuadrotorConfig(load_vehicle("racer5"))))
         worlds = env.worlds(256)
-        seen, state = jax.vmap(env.reset, (0, None))(keys, worlds)
-        seen, state, reward, done, info = jax.vmap(env.step, (0, 0, 0, None))(
+        observation, state = jax.vmap(env.reset, (0, None))(keys, worlds)
+        observation, state, reward, done, info = jax.vmap(env.step, (0, 0, 0, None))(
             keys, state, action, worlds
         )
 
@@ -142,7 +143,8 @@ class JaxRace:
     """
 
     config: TrainConfig
-    """Observation, dynamics, randomisation and tracks; of the loss only r_q is used."""
+    """Observation, dynamics, randomisation and tracks; of the loss only the safety radius r_q is
+    used."""
     time_limit_s: float = 20.0
     """Longest episode [s]."""
     reward_scale: float = 0.01
@@ -156,7 +158,10 @@ class JaxRace:
 
     @property
     def contract(self) -> Contract:
-        """The contract for the file of a policy that is trained here."""
+        """The policy's contract: names, units, frames and rate of its inputs and outputs.
+
+        A policy that is trained here carries it in its file.
+        """
         return contract_of(self.spec)
 
     @functools.cached_property
@@ -172,51 +177,55 @@ class JaxRace:
         return jax.tree.map(jnp.asarray, drawn)
 
     def reset(self, key: jax.Array, worlds: Worlds) -> tuple[Observation, RaceState]:
-        """Start an episode in a world of the pool."""
+        """Start an episode in a world of the pool; return its first observation and its state."""
         pick, noise = jax.random.split(key)
-        world = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
-        one = _one(worlds, world)
-        return self._seen(noise, one, RaceState(world, self._race.start(one), jnp.zeros((), int)))
+        index = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
+        world = _batch_of_one(worlds, index)
+        state = RaceState(index, self._race.start(world), jnp.zeros((), int))
+        return self._observe(noise, world, state)
 
     def step(
         self, key: jax.Array, state: RaceState, action: jax.Array, worlds: Worlds
     ) -> tuple[Observation, RaceState, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Fly an action (3,) for a policy period; return (seen, state, reward, done, info).
+        """Fly an action (3,) for a policy period; return (observation, state, reward, done, info).
 
-        At an episode's end the next one starts, and `seen` is its first observation. `info` has
+        At an episode's end the next one starts, and the observation is its first one. `info` has
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
         and `truncated` (the time limit).
         """
-        air, pick, noise = jax.random.split(key, 3)
-        one = _one(worlds, state.world)
+        wind, pick, noise = jax.random.split(key, 3)
+        world = _batch_of_one(worlds, state.world)
         output = jnp.clip(action, -1.0, 1.0)
-        keys = world_keys(air, one)
-        episode, flown = self._race.fly(one, state.episode, ACTION_LIMIT * output[None], keys)
+        keys = world_keys(wind, world)
+        episode, result = self._race.fly(world, state.episode, ACTION_LIMIT * output[None], keys)
         steps = state.steps + 1
         gates = episode.target[0]
         tipped = episode.state.rot_w[0, 2, 2] < 0.0
         finished = gates >= worlds.scene.gates.center_w.shape[1]
-        collided = flown.collided[0]
+        collided = result.collided[0]
         over = collided | tipped | finished
         truncated = ~over & (steps >= round(self.time_limit_s * self.config.spec.rate_hz))
-        reward = self.reward_scale * (flown.reward.total()[0] + COLLISION * (tipped & ~collided))
+        reward = self.reward_scale * (result.reward.total()[0] + COLLISION * (tipped & ~collided))
         info = {
             "gates": gates, "collided": collided, "tipped": tipped, "finished": finished,
             "truncated": truncated,
         }  # fmt: skip
         done = over | truncated
-        world = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
-        world = jnp.where(done, world, state.world)
-        one = _one(worlds, world)
-        episode = choose(done[None], self._race.start(one), episode)
-        seen, after = self._seen(noise, one, RaceState(world, episode, jnp.where(done, 0, steps)))
-        return seen, after, reward, done, info
+        index = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
+        index = jnp.where(done, index, state.world)
+        world = _batch_of_one(worlds, index)
+        episode = choose(done[None], self._race.start(world), episode)
+        after = RaceState(index, episode, jnp.where(done, 0, steps))
+        observation, after = self._observe(noise, world, after)
+        return observation, after, reward, done, info
 
-    def _seen(self, key: jax.Array, one: Worlds, state: RaceState) -> tuple[Observation, RaceState]:
-        seen, episode = self._race.observe(one, state.episode, world_keys(key, one))
-        return Observation(seen.state[0], seen.image[0]), state._replace(episode=episode)
+    def _observe(
+        self, key: jax.Array, world: Worlds, state: RaceState
+    ) -> tuple[Observation, RaceState]:
+        batch, episode = self._race.observe(world, state.episode, world_keys(key, world))
+        return Observation(batch.state[0], batch.image[0]), state._replace(episode=episode)
 
 
-def _one(worlds: Worlds, number: jax.Array) -> Worlds:
+def _batch_of_one(worlds: Worlds, index: jax.Array) -> Worlds:
     """Return a world of the pool as a batch of one."""
-    return jax.tree.map(lambda leaf: leaf[number][None], worlds)
+    return jax.tree.map(lambda leaf: leaf[index][None], worlds)

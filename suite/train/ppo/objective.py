@@ -16,7 +16,7 @@ class Actor(NamedTuple):
     """The policy and its exploration."""
 
     params: network.Params
-    """The policy's."""
+    """The policy's parameters."""
     log_deviation: jax.Array
     """(3,) logarithm of the exploration's standard deviation on each axis [m/s^2]."""
 
@@ -43,7 +43,7 @@ def advantages(
 ) -> jax.Array:
     """Return the generalised advantage estimates (T, B) (Schulman et al. 2016, Eq. 16).
 
-    After the rollout's end an episode has the critic's value; after a collision its value is zero.
+    The return after the rollout's end is the critic's value; that after a collision is zero.
 
     Args:
         reward: (T, B).
@@ -55,12 +55,14 @@ def advantages(
     going = 1.0 - done
     error = reward + discount * going * value[1:] - value[:-1]
 
-    def back(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        delta, keep = now
-        total = delta + discount * trace * keep * later
+    def add_error(
+        later: jax.Array, step: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        error_now, going_now = step
+        total = error_now + discount * trace * going_now * later
         return total, total
 
-    return jax.lax.scan(back, jnp.zeros_like(error[0]), (error, going), reverse=True)[1]
+    return jax.lax.scan(add_error, jnp.zeros_like(error[0]), (error, going), reverse=True)[1]
 
 
 def action_means(params: network.Params, embeddings: jax.Array, sequences: Sequences) -> jax.Array:
@@ -83,16 +85,16 @@ def clipped_loss(
     """Return minus the clipped objective (Schulman et al. 2017, Eq. 7) and numbers of the curve.
 
     Args:
-        config: clip and weight of the entropy.
-        actor: with gradient.
+        config: has the clip limit and the weight of the entropy.
+        actor: the policy and its exploration, with gradient.
         embeddings: (T, B, hidden) of the images, with gradient.
-        sequences: the rollout's.
+        sequences: states, actions and advantages of the rollout.
     """
     mean = action_means(actor.params, embeddings, sequences)
     log_ratio = log_probability(mean, actor.log_deviation, sequences.action_b) - sequences.log_prob
     ratio = jnp.exp(log_ratio)
-    held = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
-    gain = jnp.minimum(ratio * sequences.advantage, held * sequences.advantage).mean()
+    clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+    gain = jnp.minimum(ratio * sequences.advantage, clipped * sequences.advantage).mean()
     # The entropy of a normal distribution, without its constant.
     entropy = actor.log_deviation.sum()
     numbers = {

@@ -1,8 +1,8 @@
 """The reward of one step, for any policy's rollout (Su et al. 2026, Table "Reward Function").
 
-It measures all training schemes alike, so its weights are constants, independent of the training's.
-Values that the table does not give are the differentiable trainer's: beta_2, the points of a step's
-path and r_q (`LossConfig.safety_radius_m`).
+It compares all training schemes on one scale, so its weights are constants and do not depend on
+those of the training. Values that the table does not give are the differentiable trainer's: beta_2,
+the points of a step's path and the safety radius r_q (`LossConfig.safety_radius_m`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def make_reward(
     progress of such a step is towards the next gate.
 
     Args:
-        config: r_q is that of its `loss`.
+        config: its `loss` has the safety radius r_q.
     """
     weights = replace(config.loss, pass_first=True, approach_m=0.0)
 

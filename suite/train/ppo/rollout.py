@@ -1,4 +1,7 @@
-"""A rollout with exploration and without gradients, in the trainer's worlds and dynamics."""
+"""The rollout of PPO: fly the policy with random exploration, without gradients, and record it.
+
+B worlds (simulated scenes with a drone) fly T policy periods in the trainer's dynamics.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ class Record(NamedTuple):
     """(B, 3) action with exploration [m/s^2]."""
     log_prob: jax.Array
     """Logarithm of the density of that action."""
-    seen: jax.Array
+    critic_inputs: jax.Array
     """(B, F) the critic's inputs before the step."""
     reward: RewardTerms
-    """Of the step."""
+    """Reward of the step."""
     done: jax.Array
     """Bool: the drone touched a solid, and the world is reset."""
     hidden: jax.Array
@@ -50,15 +53,15 @@ def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array
         log_deviation: (3,) logarithm of the standard deviation, the same in every state.
         action: (..., 3) [m/s^2].
     """
-    away = (action - mean) * jnp.exp(-log_deviation)
-    return -(0.5 * away * away + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
+    standardised = (action - mean) * jnp.exp(-log_deviation)
+    return -(0.5 * standardised * standardised + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
 
 
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:
-    """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), seen (B, F)).
+    """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), inputs (B, F)).
 
     An episode ends when the drone touches a solid; its world is then reset to its start, with the
-    same recurrent state. `seen` are the critic's inputs after the last step.
+    same recurrent state. `inputs` are the critic's inputs after the last step.
     """
     race = make_race(config)
 
@@ -72,24 +75,24 @@ def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]
         ) -> tuple[tuple[Episode, jax.Array], Record]:
             keys = world_keys(key, worlds)
             before, hidden = carry
-            seen, episode = race.observe(worlds, before, keys)
-            mean, hidden = network.step(params, hidden, seen.state, seen.image)
+            observation, episode = race.observe(worlds, before, keys)
+            mean, hidden = network.step(params, hidden, observation.state, observation.image)
             noise = jax.random.normal(jax.random.fold_in(key, 1), mean.shape)
             action = mean + jnp.exp(log_deviation) * noise
-            after, flown = race.fly(worlds, episode, action, keys)
+            after, result = race.fly(worlds, episode, action, keys)
             record = Record(
-                image=seen.image,
-                state=seen.state,
+                image=observation.image,
+                state=observation.state,
                 action_b=action,
                 log_prob=log_probability(mean, log_deviation, action),
-                seen=critic.features(worlds, before.state, before.target),
-                reward=flown.reward,
-                done=flown.collided,
+                critic_inputs=critic.features(worlds, before.state, before.target),
+                reward=result.reward,
+                done=result.collided,
                 hidden=hidden,
-                passed=flown.passed,
+                passed=result.passed,
                 speed=jnp.linalg.norm(after.state.vel_w, axis=-1),
             )
-            return choose(flown.collided, start, (after, hidden)), record
+            return choose(result.collided, start, (after, hidden)), record
 
         (last, _), records = jax.lax.scan(step, start, jax.random.split(key, config.episode.steps))
         return records, critic.features(worlds, last.state, last.target)

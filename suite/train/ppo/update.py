@@ -1,7 +1,8 @@
-"""A PPO run, and its iteration: a rollout, its advantages, passes of the policy and the critic.
+"""Train a policy with PPO: an iteration is a rollout, its advantages, and passes of both networks.
 
-A minibatch has whole worlds, with backpropagation through their whole rollouts. As in the
-differentiable trainer, the images of a minibatch are encoded at once, outside the loop over steps.
+The two networks are the policy (actor) and the critic. A minibatch has whole worlds (simulated
+scenes with a drone), with backpropagation through their whole rollouts. As in the differentiable
+trainer, the images of a minibatch are encoded at once, outside the loop over steps.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from suite.train.ppo import critic
 from suite.train.ppo.config import PpoConfig
 from suite.train.ppo.objective import Actor, Sequences, advantages, clipped_loss
 from suite.train.ppo.rollout import Record, make_rollout
-from suite.train.training_loop import Method, Outcome, Run, Watch, flight_note, train_in_folder
+from suite.train.training_loop import Outcome, Run, RunPhase, Watch, flight_note, train_in_folder
 from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.files import plain
 
@@ -45,9 +46,9 @@ class PpoState(NamedTuple):
     critic: critic.Params
     """Parameters of the critic."""
     optimizer: optax.OptState
-    """Of the actor."""
+    """State of the actor's optimiser."""
     critic_optimizer: optax.OptState
-    """Of the critic."""
+    """State of the critic's optimiser."""
     iteration: jax.Array
     """Number of finished iterations, a scalar."""
     hidden: jax.Array
@@ -75,20 +76,20 @@ def start_state(config: PpoConfig) -> PpoState:
     # With an explicit type: a weak type would compile the second iteration again.
     actor = Actor(params, jnp.full(3, math.log(config.deviation), jnp.float32))
     critic_key = jax.random.fold_in(jax.random.key(config.seed), 1)
-    value = critic.init(critic_key, config.critic_size, critic.features_of(config.spec))
+    critic_params = critic.init(critic_key, config.critic_size, critic.feature_count(config.spec))
     actor_optimizer, critic_optimizer = make_optimizers(config)
     return PpoState(
         actor=actor,
-        critic=value,
+        critic=critic_params,
         optimizer=actor_optimizer.init(actor),
-        critic_optimizer=critic_optimizer.init(value),
+        critic_optimizer=critic_optimizer.init(critic_params),
         iteration=jnp.zeros((), int),
         hidden=jnp.zeros((config.episode.batch, config.spec.hidden_size)),
     )
 
 
 def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
-    """Return indices (epochs * parts, count // parts); each epoch has all in a new order."""
+    """Return the indices (epochs * parts, count // parts) of each minibatch, shuffled per epoch."""
     orders = [jax.random.permutation(k, count) for k in jax.random.split(key, epochs)]
     return jnp.stack(orders).reshape(epochs * parts, count // parts)
 
@@ -118,7 +119,7 @@ def actor_gradient(
 
 
 def curve_numbers(records: Record) -> dict[str, jax.Array]:
-    """Return a rollout's numbers of the curve; gates and collisions are of the first episodes."""
+    """Return a rollout's numbers of the curve; gates are those of each world's first episode."""
     first = jnp.cumprod(
         1 - jnp.concatenate([jnp.zeros_like(records.done[:1]), records.done[:-1]]), 0
     )
@@ -149,15 +150,15 @@ def make_update(
     actor_optimizer, critic_optimizer = make_optimizers(config)
     seed = jax.random.key(np.uint32(config.seed))
 
-    def teach_actor(
+    def train_actor(
         state: PpoState, images: jax.Array, sequences: Sequences, key: jax.Array
     ) -> tuple[PpoState, dict[str, jax.Array]]:
         def learn(
-            held: tuple[Actor, optax.OptState], part: tuple[jax.Array, jax.Array]
+            carry: tuple[Actor, optax.OptState], part: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[Actor, optax.OptState], dict[str, jax.Array]]:
-            (actor, optimizer), (rows, key) = held, part
-            taken = Sequences(*(array[:, rows] for array in sequences))
-            gradient, numbers = actor_gradient(config, actor, images[:, rows], taken, key)
+            (actor, optimizer), (rows, key) = carry, part
+            minibatch = Sequences(*(array[:, rows] for array in sequences))
+            gradient, numbers = actor_gradient(config, actor, images[:, rows], minibatch, key)
             squares = [(leaf * leaf).sum() for leaf in jax.tree.leaves(gradient)]
             numbers["gradient_norm"] = jnp.sqrt(jnp.stack(squares).sum())
             change, optimizer = actor_optimizer.update(gradient, optimizer, actor)
@@ -169,21 +170,23 @@ def make_update(
         (actor, optimizer), numbers = jax.lax.scan(learn, (state.actor, state.optimizer), parts)
         return state._replace(actor=actor, optimizer=optimizer), numbers
 
-    def teach_critic(state: PpoState, seen: jax.Array, goal: jax.Array, key: jax.Array) -> PpoState:
+    def train_critic(
+        state: PpoState, inputs: jax.Array, goal: jax.Array, key: jax.Array
+    ) -> PpoState:
         def loss_of(params: critic.Params, rows: jax.Array) -> jax.Array:
-            return ((critic.value(params, seen[:, rows]) - goal[:, rows]) ** 2).mean()
+            return ((critic.value(params, inputs[:, rows]) - goal[:, rows]) ** 2).mean()
 
         def learn(
-            held: tuple[critic.Params, optax.OptState], rows: jax.Array
+            carry: tuple[critic.Params, optax.OptState], rows: jax.Array
         ) -> tuple[tuple[critic.Params, optax.OptState], None]:
-            params, optimizer = held
+            params, optimizer = carry
             gradient = jax.grad(loss_of)(params, rows)
             change, optimizer = critic_optimizer.update(gradient, optimizer, params)
             return (cast(critic.Params, optax.apply_updates(params, change)), optimizer), None
 
         rows = shuffled(key, batch, config.critic_epochs, config.minibatches)
-        held = state.critic, state.critic_optimizer
-        (params, optimizer), _ = jax.lax.scan(learn, held, rows)
+        first = state.critic, state.critic_optimizer
+        (params, optimizer), _ = jax.lax.scan(learn, first, rows)
         return state._replace(critic=params, critic_optimizer=optimizer)
 
     @jax.jit
@@ -191,8 +194,9 @@ def make_update(
         keys = jax.random.split(jax.random.fold_in(seed, state.iteration), 4)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
         actor = state.actor
-        records, last_seen = rollout(actor.params, actor.log_deviation, worlds, keys[0])
-        value = critic.value(state.critic, jnp.concatenate([records.seen, last_seen[None]]))
+        records, last_inputs = rollout(actor.params, actor.log_deviation, worlds, keys[0])
+        inputs = jnp.concatenate([records.critic_inputs, last_inputs[None]])
+        value = critic.value(state.critic, inputs)
         reward = config.reward_scale * records.reward.total()
         advantage = advantages(reward, value, records.done, config.discount, config.trace)
         goal = advantage + value[:-1]
@@ -204,8 +208,8 @@ def make_update(
             advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
             start=worlds.hidden[None],
         )
-        state, numbers = teach_actor(state, records.image, sequences, keys[1])
-        state = teach_critic(state, records.seen, goal, keys[2])
+        state, numbers = train_actor(state, records.image, sequences, keys[1])
+        state = train_critic(state, records.critic_inputs, goal, keys[2])
         step = jax.random.randint(keys[3], (batch,), 0, steps)
         hidden = records.hidden[step, jnp.arange(batch)]
         state = state._replace(iteration=state.iteration + 1, hidden=hidden)
@@ -231,7 +235,7 @@ def train_ppo(
 
     Args:
         config: the whole run.
-        folder: of the run; a run of the same configuration in it is resumed.
+        folder: where the run's files go; a run of the same configuration in it is resumed.
         console: shows progress.
         watch: measures the policy during the training; its steps are iterations.
 
@@ -241,7 +245,7 @@ def train_ppo(
     """
     shared = config.shared
     check(shared)
-    method = Method(
+    phase = RunPhase(
         end=config.iterations,
         spec=config.spec,
         frames=config.episode.batch * config.episode.steps,
@@ -251,4 +255,4 @@ def train_ppo(
     )
     origin = {"config": plain(config), "from": None, "delta": None, "method": "ppo"}
     run = Run(config, config.seed, origin, folder, estimate(config))
-    return train_in_folder([method], run, start_state(config), console, watch)
+    return train_in_folder([phase], run, start_state(config), console, watch)

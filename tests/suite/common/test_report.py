@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from suite.common.charts import DPI, png
 from suite.common.report import Details, Links, Picture, Report, Section, write_report
-from suite.judging.requests import parse_levels, parse_tracks
+from suite.judging.trials import parse_levels, parse_tracks
 from tracks.common.grid import Cell, Grid
 
 GRID = Grid(

@@ -7,7 +7,7 @@ import pytest
 
 from suite.common.console import Console, duration, size
 from suite.common.provenance import refuse_other_run, run_record, write_run_record
-from suite.common.stages import MARK, Estimate, Stage, announce, claim, do_stages
+from suite.common.stages import MARK, Estimate, Stage, announce, claim, run_stages
 from suite.judging.requests import Collection, Evaluation
 
 
@@ -36,18 +36,18 @@ def stages(done, broken=False):
 def test_a_stage_is_done_once_and_told_again(tmp_path, capfd):
     done = []
     with pytest.raises(RuntimeError):
-        do_stages(tmp_path, stages(done, broken=True), Console(), "the run")
+        run_stages(tmp_path, stages(done, broken=True), Console(), "the run")
     assert done == ["first", tmp_path / "first"] and not (tmp_path / "second" / MARK).exists()
     assert "the run: about 2.0 s" in capfd.readouterr().err
     done.clear()
-    took = do_stages(tmp_path, stages(done), Console(), "the run")
+    took = run_stages(tmp_path, stages(done), Console(), "the run")
     assert done == [tmp_path / "first", "second", tmp_path / "second"]
     assert list(took) == ["first", "second"]
     assert took["first"] == json.loads((tmp_path / "first" / MARK).read_text())["seconds"]
     said = capfd.readouterr().err
     assert "[1/2] doing the first: done before" in said and "[2/2] took" in said
     assert "the run: about 1.0 s" in said
-    do_stages(tmp_path, stages([]), Console(), "the run")
+    run_stages(tmp_path, stages([]), Console(), "the run")
     assert "about" not in capfd.readouterr().err
 
 
@@ -89,18 +89,18 @@ def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
 
 
 def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
-    from suite.experiments.study.training import commit_of
+    from suite.experiments.study.training import training_commit
 
     for commit in ("aaa", "aaa", "bbb"):
         monkeypatch.setattr(
             "suite.common.provenance.stamp", lambda c=commit, **_: {"git_commit": c}
         )
-        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, goes_on=True)
+        write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3, resumed=True)
     assert json.loads((tmp_path / "run.json").read_text())["earlier_commits"] == ["aaa"]
-    assert commit_of(tmp_path / "policy") == "aaa, bbb"
+    assert training_commit(tmp_path / "policy") == "aaa, bbb"
     write_run_record(tmp_path, Estimate(1.0, 2.0), seed=3)
-    assert commit_of(tmp_path / "policy") == "bbb", "another run in the same folder"
-    assert commit_of(tmp_path / "none" / "policy") == "unknown"
+    assert training_commit(tmp_path / "policy") == "bbb", "another run in the same folder"
+    assert training_commit(tmp_path / "none" / "policy") == "unknown"
 
 
 def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):

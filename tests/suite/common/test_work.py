@@ -7,8 +7,8 @@ import pytest
 
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
-from suite.common.running.apart import Job
-from suite.common.work import Silent, all_done, workers_given
+from suite.common.running.remote import Job
+from suite.common.work import Silent, do_jobs, read_workers_option
 from tracks.common.work import core_shares
 
 CORES = sorted(os.sched_getaffinity(0))
@@ -33,26 +33,26 @@ def diverge(job, console):
 
 def test_more_processes_than_cores_are_refused_where_each_needs_some(monkeypatch):
     monkeypatch.setattr("suite.common.work.usable_cores", lambda: 2)
-    assert workers_given("3") == 3 and workers_given("2", whole_cores=True) == 2
-    assert workers_given("a:1", whole_cores=True) == "tcp://a:1"
+    assert read_workers_option("3") == 3 and read_workers_option("2", whole_cores=True) == 2
+    assert read_workers_option("a:1", whole_cores=True) == "tcp://a:1"
     with pytest.raises(ValueError, match="--workers is 3; allowed is 1 to 2"):
-        workers_given("3", whole_cores=True)
+        read_workers_option("3", whole_cores=True)
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_jobs_come_back_in_order_from_processes_that_share_no_core():
-    found = all_done(double, jobs(5, 6, 7), 2, Console(), "doubling")
+    found = do_jobs(double, jobs(5, 6, 7), 2, Console(), "doubling")
     assert [value for value, _ in found] == [10, 12, 14]
     assert {tuple(cores) for _, cores in found} <= set(map(tuple, core_shares(2)))
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_a_process_that_dies_is_said():
-    with pytest.raises(WorkFailed, match=r"dying: a process ended badly.*exit code 7"):
-        all_done(die, jobs(1, 2), 2, Console(), "dying")
+    with pytest.raises(WorkFailed, match=r"dying: a process died; the products.*exit code 7"):
+        do_jobs(die, jobs(1, 2), 2, Console(), "dying")
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_work_that_fails_says_so_in_its_own_words():
     with pytest.raises(WorkFailed, match=r"^training 1 diverged$"):
-        all_done(diverge, jobs(1), 2, Console(), "training")
+        do_jobs(diverge, jobs(1), 2, Console(), "training")

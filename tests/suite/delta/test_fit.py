@@ -11,12 +11,12 @@ from suite.delta.fit import (
     FitConfig,
     _descend,
     _loss,
-    fit,
     fit_network,
+    fit_point_mass,
     identify,
     window_errors,
 )
-from suite.delta.replay import PointMassModel, nominal_model, replay
+from suite.delta.replay import PointMassModel, nominal_model, replay_point_mass
 from suite.delta.run import table
 from suite.delta.windows import cut_windows
 from suite.train.config import PointMassConfig
@@ -64,11 +64,11 @@ def logs():
 def test_a_delta_action_cuts_the_error_of_a_perturbed_point_mass(logs):
     known, held_out = (cut_windows(part, 0.6, 0.15) for part in (logs[:6], logs[6:]))
     shown = []
-    result = fit(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
+    result = fit_point_mass(CONFIG, PHYSICS, known, held_out, lambda *words: shown.append(words))
     assert result.without.position_m > 0.1
     assert result.with_delta.position_m < 0.3 * result.without.position_m
     assert result.with_delta.velocity_m_s < 0.4 * result.without.velocity_m_s
-    assert result.with_delta.position_m < result.rival.position_m
+    assert result.with_delta.position_m < result.identified_errors.position_m
     assert [row["iteration"] for row in result.curve] == [*range(0, 100, 2), 99]
     held_out = [row["held_out_m"] for row in result.curve]
     assert held_out[-1] == pytest.approx(result.with_delta.position_m, rel=1e-5)
@@ -82,7 +82,7 @@ def test_the_correction_that_is_found_is_the_known_one_to_two_per_cent():
     # Without a delay: what was pushed before a window begins is in no log.
     model = nominal_model(replace(PHYSICS, action_delay=(0.0, 0.0)))
     windows = cut_windows(fly(model, 4, extra_b=lambda *_: known_b), 0.6, 0.3)
-    nominal = partial(replay, model)
+    nominal = partial(replay_point_mass, model)
     config = FitConfig(horizon_s=0.6, iterations=150, batch=16, rate=2e-2, size_weight=0.0)
     found = fit_network(config, nominal, windows, windows)
     correction_b = np.asarray(nominal(windows, found.params)[2]).mean((0, 1))

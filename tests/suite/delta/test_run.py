@@ -11,7 +11,7 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from policies.formats.policy_file import load_delta
 from suite.common.console import Console
 from suite.delta.fit import FitConfig
-from suite.delta.replay import check_corrects, corrected, nominal_model
+from suite.delta.replay import check_corrects, describe_dynamics, nominal_model
 from suite.delta.run import fit_delta, flight_files, long_enough, split, table
 from suite.train.config import PointMassConfig, QuadrotorConfig
 from suite.train.recipes import race, race_paper
@@ -98,7 +98,7 @@ def kept(dynamics):
     """Return what stands in the checkpoint, as JSON gives it back."""
     import json
 
-    return json.loads(json.dumps(plain({"iterations": 3, **corrected(dynamics)})))
+    return json.loads(json.dumps(plain({"iterations": 3, **describe_dynamics(dynamics)})))
 
 
 def test_the_middle_of_the_ranges_is_what_counts():

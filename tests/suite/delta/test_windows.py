@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from policies.networks import delta_network
-from suite.delta.replay import PointMassModel, nominal_model, replay
+from suite.delta.replay import PointMassModel, nominal_model, replay_point_mass
 from suite.delta.windows import (
     BurnIn,
     _heading,
+    are_consecutive,
     burn_in_before,
     cut_windows,
     decision_period,
     decision_rate,
-    forgotten,
-    in_a_row,
     state_after,
+    without_memory,
 )
 from suite.train.config import PointMassConfig
 from suite.train.dynamics import point_mass
@@ -131,7 +131,7 @@ def test_the_rate_of_flights_is_that_of_their_policy():
 
 
 def test_decisions_in_a_row_are_less_than_one_and_a_half_periods_and_a_row_apart():
-    found = in_a_row(np.array([1.0, 1.99, 2.0]), period_s=1.0, row_s=0.5)
+    found = are_consecutive(np.array([1.0, 1.99, 2.0]), period_s=1.0, row_s=0.5)
     np.testing.assert_array_equal(found, [True, True, False])
 
 
@@ -164,14 +164,16 @@ def test_what_was_not_seen_is_not_remembered():
 
 def test_a_share_of_the_windows_forgets_what_it_saw():
     inputs = np.ones((5, 3, 9))
-    part = forgotten(BurnIn(inputs, np.ones((5, 3))), 0.4)
+    part = without_memory(BurnIn(inputs, np.ones((5, 3))), 0.4)
     np.testing.assert_array_equal(part.seen, [[0.0] * 3] * 2 + [[1.0] * 3] * 3)
-    assert forgotten(part, 0.0).seen.sum() == 9.0 and forgotten(part, 1.0).seen.sum() == 0.0
+    assert (
+        without_memory(part, 0.0).seen.sum() == 9.0 and without_memory(part, 1.0).seen.sum() == 0.0
+    )
     np.testing.assert_array_equal(part.inputs, inputs)
 
 
 def errors(plant, windows, delta=None):
-    pos, vel, _ = jax.jit(replay)(plant, windows, delta)
+    pos, vel, _ = jax.jit(replay_point_mass)(plant, windows, delta)
     return np.abs(pos - windows.pos_w[:, 1:]).max(), np.abs(vel - windows.vel_w[:, 1:]).max()
 
 
@@ -205,12 +207,12 @@ def test_a_fresh_delta_changes_nothing_and_a_constant_one_acts_as_the_action():
     plant = nominal_model(PointMassConfig())
     windows = cut_windows(fly(plant), 0.5, 0.3)
     delta = delta_network.init(jax.random.key(0))
-    plain = jax.jit(replay)(plant, windows, None)
-    same = jax.jit(replay)(plant, windows, delta)
+    plain = jax.jit(replay_point_mass)(plant, windows, None)
+    same = jax.jit(replay_point_mass)(plant, windows, delta)
     np.testing.assert_array_equal(plain[0], same[0])
     assert not np.any(same[2])
     delta["output.bias"] = jnp.asarray([1.0, -0.5, 0.2])
     shifted = windows._replace(action_b=windows.action_b + np.array([1.0, -0.5, 0.2], np.float32))
-    pos, _, correction = jax.jit(replay)(plant, windows, delta)
+    pos, _, correction = jax.jit(replay_point_mass)(plant, windows, delta)
     np.testing.assert_allclose(correction[:, 0], np.tile([1.0, -0.5, 0.2], (len(pos), 1)))
-    np.testing.assert_allclose(pos, jax.jit(replay)(plant, shifted, None)[0], atol=1e-5)
+    np.testing.assert_allclose(pos, jax.jit(replay_point_mass)(plant, shifted, None)[0], atol=1e-5)

@@ -4,10 +4,10 @@ import pytest
 
 from eval.judging.statistics import wilson
 from suite.common.errors import WorkFailed
-from suite.experiments.ablation import Config, _main, pooled, settings
+from suite.experiments.ablation import Config, _comparison_grid, pooled, settings
 from suite.experiments.pages.paper import ablation as printed
 from suite.experiments.study.summary import Spread, summaries
-from suite.experiments.study.training import Trained
+from suite.experiments.study.training import TrainingResult
 from suite.train import run as training_run
 from tests.support.documents import page, reproduce
 from tests.support.training import boxes_worlds
@@ -71,7 +71,7 @@ def runs_of(key, *cross, rate=1.0, v_max=5.0):
         numbers = {"success_cross": value, "collision_free": rate, "v_max": v_max + seed,
                    "v_max_most": v_max + 2, "gates": 4.0}  # fmt: skip
         diverged = "" if value is not None else "it diverged"
-        yield Trained(key, seed, "", 60.0, 5.0, "c", diverged, [] if diverged else [numbers])
+        yield TrainingResult(key, seed, "", 60.0, 5.0, "c", diverged, [] if diverged else [numbers])
 
 
 def test_spread_and_pooled_interval_by_hand():
@@ -88,6 +88,6 @@ def test_spread_and_pooled_interval_by_hand():
     assert (bare.seeds, bare.diverged) == (3, 1)
     assert pooled(bare, "success_cross", 10) == wilson(4, 20)
     assert not gone.at and gone.diverged == 1
-    line = [cell.text for cell in _main([field], 10).rows[0]]
+    line = [cell.text for cell in _comparison_grid([field], 10).rows[0]]
     assert line[2:5] == ["90 [80, 100]", "[74, 97]", "95"]
     assert line[8:11] == ["6.0 [5.0, 7.0]", "7.0", "6.5"]

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
-from suite.experiments.simulators import WHY, Config, changes, conditions
+from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
 from suite.experiments.study import disturbed
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
@@ -97,7 +97,7 @@ def test_a_policy_in_two_worlds_and_a_control(sky, rotorpy, tmp_path):
     labels = [entry["column"] for entry in numbers["success"]]
     assert labels == ["mujoco", "mujoco, the air of rotorpy", "rotorpy"]
     assert "| rotorpy | linear_drag: RotorPy's drag is proportional to the rotors' speed" in text
-    assert "ends alike" in text and numbers["changed"] == []
+    assert "same ending" in text and numbers["changed"] == []
 
 
 def test_why_is_told_by_the_controls(rotorpy):
@@ -106,13 +106,13 @@ def test_why_is_told_by_the_controls(rotorpy):
     assert flown_in[2].simulator == "mujoco" and flown_in[2].vehicle != flown_in[0].vehicle
     won = {base: "1111", single: "0111", aired: "1011", other: "0001"}
     tested = [
-        disturbed.Tested(
+        disturbed.ConditionResult(
             one, {"p": [trial_result(k, digit == "1") for k, digit in enumerate(won[one.name])]}
         )
         for one in flown_in
     ]
-    found = changes(tested)
+    found = changed_trials(tested)
     mine = {change["trial"].seed: change["why"] for change in found if change["column"] == other}
-    assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(WHY)
+    assert mine == {0: "rounding", 1: "air", 2: "rest"} and set(mine.values()) == set(REASONS)
     assert [change["why"] for change in found if change["column"] in (single, aired)] == [None] * 2
     assert found[0]["endings"][base] == tested[0].results["p"][0].ending

@@ -9,7 +9,7 @@ from eval.importers import import_log
 from eval.logs.faults.reading import readings_in
 from eval.logs.flight_log import FlightLog, write_flight
 from suite.experiments import faults
-from suite.experiments.injected.flights import flight_parts
+from suite.experiments.injected.flights import flight_signals
 from suite.experiments.injected.writers import WRITERS
 from tests.support import known_flight
 from tests.support.imported import near
@@ -29,7 +29,7 @@ def judged(tmp_path_factory):
 @pytest.mark.parametrize("format", WRITERS)
 def test_a_written_flight_comes_back(tmp_path, judged, format):
     _, log, truth = judged
-    parts = flight_parts(log, PLAIN, np.random.default_rng(0))
+    parts = flight_signals(log, PLAIN, np.random.default_rng(0))
     written = WRITERS[format](tmp_path, parts, PLAIN.full_thrust)
     back, findings = import_log(written.path, format, written.options)
     assert not [f for f in findings if f.fault and f.status in ("corrected", "doubt")]
@@ -40,7 +40,7 @@ def test_a_written_flight_comes_back(tmp_path, judged, format):
 
 def test_the_printed_order_of_motors_corrects_an_import(tmp_path, judged):
     _, log, _ = judged
-    parts = flight_parts(log, PLAIN, np.random.default_rng(0))
+    parts = flight_signals(log, PLAIN, np.random.default_rng(0))
     parts["motor"] = parts["motor"][:, [1, 3, 2, 0]]
     written = WRITERS["px4"](tmp_path, parts, PLAIN.full_thrust)
     options = replace(written.options, vehicle=PLAIN, fix=False)

@@ -56,7 +56,7 @@ def test_thousands_of_worlds_without_a_gpu_are_refused_with_what_to_do(tmp_path,
 def test_worlds_that_are_repeated_have_numbers_of_their_own(monkeypatch):
     monkeypatch.setattr(gpu, "SAMPLED", 2)
     phase = gpu.last_phase(gpu.Config(), "quadrotor", 5)
-    worlds = gpu.repeated(phase)
+    worlds = gpu.repeated_worlds(phase)
     assert worlds.number.tolist() == [0, 1, 2, 3, 4]
     assert (worlds.pos_w[0] == worlds.pos_w[2]).all() and (worlds.pos_w[0] != worlds.pos_w[1]).any()
 

@@ -6,7 +6,7 @@ from suite.experiments.ablation import Config as AblationConfig
 from suite.experiments.ablation import settings
 from suite.experiments.schemes import Config, first_times, schemes
 from suite.experiments.study.summary import Spread, summaries
-from suite.experiments.study.training import Trained
+from suite.experiments.study.training import TrainingResult
 from suite.train.config import TrainConfig
 from suite.train.ppo.config import PpoConfig
 from tests.suite.experiments.test_ablation import SMALL
@@ -63,7 +63,7 @@ def learnt(scheme, seed, pace, gates, diverged=""):
          "collision_free": 1.0, "success_cross": g / 4}
         for k, g in enumerate(gates)
     ]  # fmt: skip
-    return Trained(scheme, seed, "", 60.0, 5.0, "c", diverged, points)
+    return TrainingResult(scheme, seed, "", 60.0, 5.0, "c", diverged, points)
 
 
 def test_curves_and_first_times_by_hand():

@@ -12,7 +12,7 @@ from eval.judging.statistics import over_seeds, paired_success, wilson
 from eval.worlds.trial import TrialResult
 from suite.commands import compare
 from suite.common.console import Quiet
-from suite.judging.comparing import paired, read_runs, seeds_of
+from suite.judging.comparing import compare_runs, compare_seeds, read_runs
 
 
 @pytest.mark.parametrize("two", [False, True])
@@ -81,16 +81,16 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
     rng = np.random.default_rng(0)
     a = run_of(tmp_path / "a", rng.random(40) < 0.9)
     b = run_of(tmp_path / "b", rng.random(40) < 0.5)
-    found = paired(*read_runs(a), *read_runs(b))
+    found = compare_runs(*read_runs(a), *read_runs(b))
     assert found["trials"] == 40 and found["difference"].value > 0
     assert " minus " in found["sentence"] and "McNemar" in found["sentence"]
     answer = compare.run(compare.Config((a, b), seeds=True), Quiet())
     assert "2 training seeds" in answer["comparisons"][0]["sentence"]
     apart = run_of(tmp_path / "c", rng.random(40) < 0.5, time_limit_s=10.0)
     with pytest.raises(ValueError, match=r"another time_limit_s \(20.0 and 10.0\)"):
-        paired(*read_runs(a), *read_runs(apart))
+        compare_runs(*read_runs(a), *read_runs(apart))
     with pytest.raises(ValueError, match="10 trials are in only one of them"):
-        paired(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
+        compare_runs(*read_runs(a), *read_runs(run_of(tmp_path / "d", [True] * 30)))
     for folder, said in ((tmp_path, "no trials.parquet"), (None, "less than twice")):
         with pytest.raises(ValueError, match=said):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
@@ -126,7 +126,7 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
         for name, rate in (("a0", 0.9), ("a1", 0.95), ("b0", 0.4), ("b1", 0.3))
     }
     runs = {name: read_runs(folder)[0] for name, folder in folders.items()}
-    found = seeds_of([runs["a0"], runs["a1"]], [runs["b0"], runs["b1"]])
+    found = compare_seeds([runs["a0"], runs["a1"]], [runs["b0"], runs["b1"]])
     assert found["mean"].value == pytest.approx(
         np.mean(found["success_by_seed"][0]) - np.mean(found["success_by_seed"][1])
     )
@@ -136,6 +136,6 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
         ((), wilson(60, 60).low),
         ([same, same], paired_success(*[np.ones(60)] * 2).low),
     ):
-        found = seeds_of([same, same], others)["mean"]
+        found = compare_seeds([same, same], others)["mean"]
         assert found.low == pytest.approx(low) and found.low < found.value - 0.05
     assert json.loads((tmp_path / "a0" / "summary.json").read_text())["judged"]

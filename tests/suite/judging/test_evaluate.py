@@ -9,8 +9,7 @@ import eval.judging.judge
 import eval.logs.flight_log
 from eval.judging.results import read_trials
 from suite import cli
-from suite.judging.flying import load_in_manner, who_flies
-from suite.judging.requests import Manner
+from suite.judging.flying import Manner, load_in_manner, policy_for_workers
 
 
 def _eval(out, *args):
@@ -182,7 +181,7 @@ def test_with_a_monitor_each_policy_flies_twice_on_the_same_trials(pilots, tmp_p
     table = (tmp_path / "out" / "table.md").read_text()
     assert "| diver | zigzag" in table and "| diver+monitor | zigzag" in table
     loaded = load_in_manner(pilots["diver"], False, Manner(monitored=True))
-    make = who_flies(loaded, pilots["diver"], False, 2, Manner(monitored=True))
+    make = policy_for_workers(loaded, pilots["diver"], False, 2, Manner(monitored=True))
     assert callable(make) and make().name == "diver+monitor"
 
 
@@ -224,7 +223,9 @@ def test_trials_that_are_not_asked_for_again_are_kept_and_said(pilots, tmp_path,
         assert _eval(tmp_path, *asked, "--trials", "4") == 130
     capsys.readouterr()
     assert _eval(tmp_path, *asked, "--trials", "1") == 0
-    assert "2 further trials were flown before and are not asked for now" in _told(capsys)
+    assert "2 further trials were flown before, which this command does not request" in _told(
+        capsys
+    )
     assert len(read_trials(tmp_path / "trials.parquet")) == 1
     assert _eval(tmp_path, *asked, "--trials", "4") == 0
     assert "3 trials were flown before" in _told(capsys)

@@ -18,15 +18,16 @@ from policies.spec import PolicyError
 from suite import cli
 from suite.cli import parse
 from suite.judging.flying import (
-    flying_needs,
-    labels,
+    Manner,
+    flying_estimate,
     load_in_manner,
-    read_course,
-    trial_list,
-    who_flies,
+    manners,
+    policy_for_workers,
+    policy_labels,
     workers_for,
 )
-from suite.judging.requests import Collection, Evaluation, Manner, manners
+from suite.judging.requests import Collection, Evaluation
+from suite.judging.trials import read_trial_set, trial_list
 from tests.support.engines import STAND_IN
 from tests.support.vehicles import with_effects
 from tracks.common.work.pickling import pack
@@ -40,9 +41,13 @@ def _eval(out, *args):
 
 
 def test_policies_of_one_name_are_told_apart_and_none_flies_twice():
-    assert labels(["a/last", "b/last", "c"], ["last", "last", "c"]) == ["a/last", "b/last", "c"]
+    assert policy_labels(["a/last", "b/last", "c"], ["last", "last", "c"]) == [
+        "a/last",
+        "b/last",
+        "c",
+    ]
     with pytest.raises(ValueError, match="given twice"):
-        labels(["a", "a"], ["a", "a"])
+        policy_labels(["a", "a"], ["a", "a"])
 
 
 def test_a_trained_policy_has_the_name_of_its_run(tmp_path):
@@ -68,14 +73,14 @@ def test_a_track_file_is_flown_once_a_seed(pilots, tmp_path):
 def test_where_nothing_acts_by_chance_a_track_file_is_flown_once(tmp_path):
     """Further seeds are the same flight, and would make the interval of a rate too narrow."""
     track = str(ROOT / "tracks" / "examples" / "yard.toml")
-    course = read_course(Evaluation(track=f"{track},zigzag", difficulty="0", trials=3))
+    course = read_trial_set(Evaluation(track=f"{track},zigzag", difficulty="0", trials=3))
     assert [t.seed for t in course.trials if t.track == track] == [0]
     assert len(course.trials) == 4
     (note,) = course.notes
     assert "flown once, not 3 times" in note
     gusts = tmp_path / "gusts.toml"
     save_vehicle(with_effects(load_vehicle("reference"), gusts=(1.0, 5.0)), gusts, "for a test")
-    course = read_course(Evaluation(track=track, difficulty="0", trials=3, vehicle=str(gusts)))
+    course = read_trial_set(Evaluation(track=track, difficulty="0", trials=3, vehicle=str(gusts)))
     assert len(course.trials) == 3 and not course.notes
 
 
@@ -84,15 +89,15 @@ def test_trials_and_slow_worlds_take_more_processes_and_seconds(monkeypatch):
     assert [workers_for(n, None, "mujoco") for n in (1, 300, 3000)] == [1, 2, 4]
     assert workers_for(3000, None, "mjx") == 1
     assert [workers_for(10, asked, "mujoco") for asked in (3, "tcp://a:1")] == [3, "tcp://a:1"]
-    assert flying_needs(100, 1, "rotorpy").seconds > 3 * flying_needs(100, 1).seconds
+    assert flying_estimate(100, 1, "rotorpy").seconds > 3 * flying_estimate(100, 1).seconds
 
 
 def test_a_cluster_is_given_the_policy_and_this_machines_processes_its_name():
     policy = load_in_manner("race-paper", False)
-    assert who_flies(policy, "race-paper", False, 1) is policy
+    assert policy_for_workers(policy, "race-paper", False, 1) is policy
     here, there = (
-        who_flies(policy, "race-paper", False, 2),
-        who_flies(policy, "race-paper", False, "tcp://a:1"),
+        policy_for_workers(policy, "race-paper", False, 2),
+        policy_for_workers(policy, "race-paper", False, "tcp://a:1"),
     )
     assert len(pack(here)) < 1000 < 100_000 < len(pack(there))
 

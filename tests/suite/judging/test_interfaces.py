@@ -12,7 +12,7 @@ from eval.worlds.engine import refuse_start_contact
 from policies.contract import contract_of
 from suite.commands import check
 from suite.common.console import Quiet
-from suite.judging.flying import _in_millimetres
+from suite.judging.trials import _in_millimetres
 from tests.support.courses import straight
 
 

@@ -12,8 +12,9 @@ from suite import cli
 from suite.commands import view
 from suite.common.console import Quiet
 from suite.judging.evaluate import evaluate
+from suite.judging.flying import Manner, manners
 from suite.judging.replay import read_evaluation
-from suite.judging.requests import Evaluation, Manner, manners
+from suite.judging.requests import Evaluation
 from tests.support.recordings import columns
 
 
@@ -159,7 +160,7 @@ def test_view_of_something_else_is_refused(tmp_path, capsys):
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "journal-0.jsonl").write_text("{}\n")
     assert cli.main(["view", str(tmp_path / "begun")]) == 2
-    assert "not finished; give its command again" in " ".join(capsys.readouterr().err.split())
+    assert "not finished; repeat its command" in " ".join(capsys.readouterr().err.split())
     (tmp_path / "trials.parquet").write_text("no parquet")
     assert cli.main(["view", str(tmp_path)]) == 2
     assert "run.json" in capsys.readouterr().err

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from eval.judging.statistics import bootstrap_mean
-from suite.loop.compare import Line, compare, grids, verdict
+from suite.loop.compare import CellComparison, compare, policy_results
 from suite.loop.hidden_effect import LABELS
-from suite.loop.standings import cell_grid, overall_grid, standings
+from suite.loop.tables import cell_grid, comparison_grids, overall_grid, verdict
 from tests.support.loops import trial_result
 
 
@@ -41,7 +41,7 @@ def test_differences_are_of_the_same_trials():
     assert tuple(overall.v_mean.with_minus_without) == pytest.approx((0.5, 0.5, 0.5))
     assert tuple(overall.v_max.with_minus_before) == pytest.approx((0.5, 0.5, 0.5))
     assert overall.v_mean.before.high - overall.v_mean.before.low > 0.5
-    success = grids(lines)[0]
+    success = comparison_grids(lines)[0]
     assert [cell.text for cell in success.rows[-1]][:4] == ["all", "all", "40", "25 [14, 40]"]
     assert success.rows[-1][6].tone == "good" and success.rows[-1][6].text.startswith("+25 [+")
     assert "75 % of 40 trials succeed: more than" in verdict(overall)
@@ -51,11 +51,11 @@ def test_differences_are_of_the_same_trials():
 
 def test_no_difference_is_called_none():
     rows = [_result(k, k < 5, 3.0) for k in range(10)]
-    lines: list[Line] = compare({"before": rows, "without": rows, "with": rows})
+    lines: list[CellComparison] = compare({"before": rows, "without": rows, "with": rows})
     assert "not significantly different from" in verdict(lines[-1])
-    cell = grids(lines)[0].rows[-1][6]
+    cell = comparison_grids(lines)[0].rows[-1][6]
     assert cell.tone == "" and cell.text.startswith("+0 [")
-    speed = grids(lines)[2].rows[-1][6]
+    speed = comparison_grids(lines)[2].rows[-1][6]
     assert speed.text == "+0.00 [+0.00, +0.00]"
 
 
@@ -74,7 +74,7 @@ def test_standings_are_paired_by_trial():
     results = {
         name: [trial_result(k, k < count, k % 2) for k in range(40)] for name, count in won.items()
     }
-    stand = standings(results, ("before", "control", "nominal"))
+    stand = policy_results(results, ("before", "control", "nominal"))
     named = stand[4]
     assert named.success.value == pytest.approx(0.9) and named.gates.value == pytest.approx(7.5)
     assert [d.against for d in named.differences] == ["before", "control", "nominal"]
@@ -89,4 +89,4 @@ def test_standings_are_paired_by_trial():
     cells = cell_grid(stand, LABELS)
     assert len(cells.rows) == 2 and cells.rows[0][5].text.startswith("90 [")
     with pytest.raises(ValueError, match="same trials"):
-        standings({**results, "both": results["both"][::-1]}, ("before",))
+        policy_results({**results, "both": results["both"][::-1]}, ("before",))

@@ -17,8 +17,8 @@ from suite.loop import delta_action, hidden_effect, work
 from suite.loop.config import (
     DeltaLoopConfig,
     HiddenLoopConfig,
+    default_recipe,
     loop_by_content,
-    recipe_of,
     resolve,
 )
 from suite.loop.variants import DeltaModel, Variant
@@ -34,7 +34,7 @@ EXAMPLE = "examples/hidden.toml"
     [
         (["--recipe", "quik"], "Did you mean 'quick'?"),
         (["--policy", "nobody.onnx"], "give a checkpoint's folder"),
-        (["--track", "my.toml"], "cannot be held apart"),
+        (["--track", "my.toml"], "would be the same; give families"),
         (["--track", "zigzg"], "Did you mean 'zigzag'?"),
         (["--difficulty", "10"], "level 10 is not 0 to 9"),
         (["--vehicle", "referense"], "Did you mean 'reference'?"),
@@ -45,7 +45,7 @@ EXAMPLE = "examples/hidden.toml"
         (["--finetune-iterations", "0"], "--finetune-iterations is 0"),
         (["--fit-iterations", "0"], "--fit-iterations is 0"),
         (["--set", "loss.progres=1"], "Did you mean 'progress'?"),
-        (["--no-delta"], "without --hidden-vehicle the loop is about the Delta Action Model"),
+        (["--no-delta"], "without --hidden-vehicle the loop needs the Delta Action Model"),
         (["--set", "seed=5"], "this command sets seed; give --seed"),
         (["--set", "optimizer.iterations=5"], "give --iterations"),
         (
@@ -70,7 +70,7 @@ EXAMPLE = "examples/hidden.toml"
             "--fit-iterations is 5, but",
         ),
         (["--hidden-vehicle", EXAMPLE, "--policy", "nobody.onnx"], "give a checkpoint's folder"),
-        (["--hidden-vehicle", EXAMPLE, "--track", "my.toml"], "cannot be held apart"),
+        (["--hidden-vehicle", EXAMPLE, "--track", "my.toml"], "would be the same; give families"),
         (["--hidden-vehicle", EXAMPLE, "--flights", "0"], "--flights is 0"),
         (["--hidden-vehicle", EXAMPLE, "--set", "quadrotor.mas_std=0"], "Did you mean 'mass_std'"),
     ],
@@ -131,7 +131,7 @@ def test_sizes_are_the_recipes_and_options_go_first(root, monkeypatch):
 def test_a_policy_is_fine_tuned_by_its_own_recipe(policy, recipe, root, monkeypatch):
     monkeypatch.chdir(root)
     assert resolve(policy=policy) == resolve(policy=policy, recipe=recipe)
-    hidden = recipe_of(policy or shipped.DEFAULT)
+    hidden = default_recipe(policy or shipped.DEFAULT)
     assert resolve(policy=policy, hidden_vehicle=EXAMPLE) == resolve(
         policy=policy, hidden_vehicle=EXAMPLE, recipe=hidden
     )
@@ -256,7 +256,7 @@ def test_the_first_policy_is_trained_or_taken():
         stages = plan(run)
         assert stages[0].name == first and len(stages) == 9
         assert run.policy(run.loop.variants[0]) == Path("out") / first / "policy"
-        assert all(stage.needs.seconds > 0 for stage in stages if stage.name != "given")
+        assert all(stage.estimate.seconds > 0 for stage in stages if stage.name != "given")
     assert run.policy(run.loop.variants[2]) == Path("out/tuned-with/policy")
 
 

@@ -23,10 +23,17 @@ from suite import cli
 from suite.common.console import Quiet
 from suite.delta.run import flight_files
 from suite.loop import work
+from suite.loop.compare import policy_results
 from suite.loop.config import HiddenLoopConfig, resolve
-from suite.loop.hidden_effect import LABELS, LOOP, hidden_effects, place, verdict, what_is_hidden
+from suite.loop.hidden_effect import (
+    LABELS,
+    LOOP,
+    describe_hidden,
+    hidden_effects,
+    vehicle_phrase,
+    verdict,
+)
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
-from suite.loop.standings import standings
 from tests.support.engines import STAND_IN
 from tests.support.loops import Small, trial_result
 
@@ -193,7 +200,7 @@ def test_where_nothing_is_named_the_loop_ends_and_says_so(
     stub = Stub(monkeypatch, effects=())
     assert cli.main(["loop", *ARGS, "--out", str(out)]) == 1
     said = capfd.readouterr().err
-    assert "says unknown and names nothing to correct" in said and "--flights" in said
+    assert "has the verdict unknown and names nothing to correct" in said and "--flights" in said
     assert not stub.trained and not (out / "loop.json").exists()
 
 
@@ -219,14 +226,14 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
     judged = [work._evaluation(run, variant) for variant in LOOP.variants]
     assert [one.simulator for one in judged] == ["mujoco"] + ["rotorpy"] * 5
     assert [one.vehicle for one in judged] == ["reference"] + ["examples/rotorpy.toml"] * 5
-    assert place(config) == "the simulator rotorpy"
-    stored = what_is_hidden(config)
+    assert vehicle_phrase(config) == "the simulator rotorpy"
+    stored = describe_hidden(config)
     assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in stored[0] and "no linear_drag" in stored[0]
     assert "the rotors' drag acts at each hub" in stored[1]
     same = resolve(recipe="quick", simulator="rotorpy")
     assert isinstance(same, HiddenLoopConfig)
-    plain = what_is_hidden(same)
-    assert plain[0] == "The hidden vehicle's file is the simulation's."
+    plain = describe_hidden(same)
+    assert plain[0] == "The hidden vehicle's file is that of the simulation."
     assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in plain[1]
 
 
@@ -244,5 +251,5 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
 def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, how):
     won = {"nominal": nominal, "before": 10, "control": control, "named": named}
     results = {name: [trial_result(k, k < count) for k in range(40)] for name, count in won.items()}
-    words = verdict(standings(results, ("before", "control", "nominal")), answer([NAMED]), 40)
+    words = verdict(policy_results(results, ("before", "control", "nominal")), answer([NAMED]), 40)
     assert how in words

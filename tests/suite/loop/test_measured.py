@@ -8,7 +8,14 @@ import pytest
 
 from eval.logs.flight_log import read_flights, write_flight
 from suite.delta.replay import nominal_model
-from suite.loop.measured import CONTACT_MARGIN_S, Noise, cut_end, enough, measure, noisy
+from suite.loop.measured import (
+    CONTACT_MARGIN_S,
+    Noise,
+    add_measurement_noise,
+    cut_end,
+    first_files,
+    noisy,
+)
 from suite.train.config import PointMassConfig
 from tests.support.point_mass_flights import fly
 
@@ -45,7 +52,7 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
         rows[-1]["ended_by"] = ended_by
     rows.append({"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"})
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
-    files = measure(flights, tmp_path / "out", 0)
+    files = add_measurement_noise(flights, tmp_path / "out", 0)
     assert [file.name for file in files] == ["0.parquet", "1.parquet"]
     before, after = (
         [read_flights([folder / file.name])[0][0].duration_s for file in files]
@@ -57,13 +64,13 @@ def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_pa
         row["file"] = None
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
     with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
-        measure(flights, tmp_path / "none", 0)
+        add_measurement_noise(flights, tmp_path / "none", 0)
 
 
 def test_the_diagnosis_gets_five_flights_or_as_many_as_are_long_enough(logs, tmp_path):
     files = [tmp_path / f"{number}.parquet" for number in range(7)]
     for file in files:
         write_flight(file, logs[0])
-    assert enough(files, 1.0) == files[:5]
-    assert enough(files, 5.5 * logs[0].duration_s) == files[:6]
-    assert enough(files, 99.0 * logs[0].duration_s) == files
+    assert first_files(files, 1.0) == files[:5]
+    assert first_files(files, 5.5 * logs[0].duration_s) == files[:6]
+    assert first_files(files, 99.0 * logs[0].duration_s) == files

@@ -13,7 +13,8 @@ from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
 from policies.formats.checkpoint import WEIGHTS
 from suite import cli
-from suite.loop.compare import CAVEAT, VARIANTS
+from suite.loop.compare import VARIANTS
+from suite.loop.tables import CAVEAT
 from tests.support.loops import Small
 
 TUNED = ["--recipe", "quick", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]

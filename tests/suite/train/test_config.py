@@ -9,16 +9,16 @@ from suite.common.console import Console
 from suite.train import losses
 from suite.train.config import Phase, TrainConfig, check
 from suite.train.overrides import (
-    changed,
     check_owned,
     check_phases,
     in_every_phase,
     override,
     phase_configs,
     phase_ends,
+    with_changes,
     without_quadrotor,
 )
-from suite.train.recipes import RECIPES, at_rate, chosen_model, named_recipe, with_iterations
+from suite.train.recipes import RECIPES, at_rate, named_recipe, with_iterations, with_model
 from suite.train.run import train
 from tests.support.training import small_config
 
@@ -82,7 +82,7 @@ def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
 )
 def test_what_would_do_nothing_is_refused(change, need, given):
     run = named_recipe("race-paper")
-    with pytest.raises(ValueError, match=rf"does nothing where {need} is (0|False)"):
+    with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
         override(run, [change])
     # In whatever order they are given.
     assert override(run, [change, f"{need}={given}"]) == override(run, [f"{need}={given}", change])
@@ -118,18 +118,18 @@ def test_wrong_settings_are_refused_by_name(change, words):
 
 def test_a_model_is_asked_for_by_name_or_the_recipes_own():
     own = named_recipe("race-paper")
-    quad = chosen_model(own, "quad", "racer5")
+    quad = with_model(own, "quad", "racer5")
     assert quad.quadrotor is not None and quad.quadrotor.vehicle.name == "racer5"
-    assert chosen_model(quad, "point", None) == own == chosen_model(own, None, None)
+    assert with_model(quad, "point", None) == own == with_model(own, None, None)
     with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
-        chosen_model(own, None, "reference")
+        with_model(own, None, "reference")
 
 
 def test_the_default_recipe_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
     own = named_recipe("race")
     check(own)
     assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
-    other = chosen_model(own, "quad", "crazyflie21").quadrotor
+    other = with_model(own, "quad", "crazyflie21").quadrotor
     assert other is not None and other.vehicle.name == "crazyflie21"
     # What is a torque or a length goes with the vehicle's, all else is the recipe's.
     small, racer = other.vehicle.inertia, own.quadrotor.vehicle.inertia
@@ -138,10 +138,10 @@ def test_the_default_recipe_varies_its_quadrotors_widely_around_any_vehicle_that
     assert 0.2 < other.com_std_m / own.quadrotor.com_std_m < 0.5
     sizes = {"trim_std": own.quadrotor.trim_std, "com_std_m": own.quadrotor.com_std_m}
     assert replace(other, vehicle=own.quadrotor.vehicle, **sizes) == own.quadrotor
-    again = chosen_model(own, "quad", "racer5")
+    again = with_model(own, "quad", "racer5")
     assert again == own, "to the bit"
-    assert chosen_model(own, "point", None).quadrotor is None
-    check_phases(chosen_model(own, "point", None))
+    assert with_model(own, "point", None).quadrotor is None
+    check_phases(with_model(own, "point", None))
 
 
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
@@ -196,10 +196,10 @@ def test_phases_share_any_number_of_iterations_without_a_rest():
 
 
 def test_a_users_change_holds_in_every_phase_or_in_the_one_that_is_named():
-    everywhere = phase_configs(changed(RUN, ["loss.progress=0.4"]))
+    everywhere = phase_configs(with_changes(RUN, ["loss.progress=0.4"]))
     assert [one.loss.progress for one in everywhere] == [0.4] * 3
     assert everywhere[1].optimizer.rate == 1e-3, "other changes of the phase stay"
-    alone = phase_configs(changed(RUN, ["phases.3.loss.progress=0.4", "loss.jerk=0.5"]))
+    alone = phase_configs(with_changes(RUN, ["phases.3.loss.progress=0.4", "loss.jerk=0.5"]))
     assert [one.loss.progress for one in alone] == [1.2, 2.0, 0.4]
     assert [one.loss.jerk for one in alone] == [0.5] * 3
     always = phase_configs(in_every_phase(RUN, "loss", progress=0.7))
@@ -230,4 +230,4 @@ def test_phases_that_cannot_be_trained_are_refused(phases, words):
 def test_a_change_of_a_phase_that_is_not_there_is_refused():
     for number in ("0", "4", "x"):
         with pytest.raises(ValueError, match="this run has 3 phases"):
-            changed(RUN, [f"phases.{number}.loss.progress=1"])
+            with_changes(RUN, [f"phases.{number}.loss.progress=1"])

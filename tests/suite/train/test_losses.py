@@ -184,7 +184,7 @@ def test_progress_counts_up_to_the_speed_that_is_asked_for_and_what_is_faster_co
     """3 m/s towards the goal where 1, 3.5 and 6 m/s are asked for, the last one without a limit."""
     config = LossConfig(progress=0.4, speed_range=(1.0, 6.0))
     ahead = jnp.broadcast_to(jnp.array([3.0, 0.0, 0.0]), (3, 3))
-    step = a_step(3, vel_w=ahead, goal_w=ahead, wanted=jnp.array([0.0, 0.5, 1.0]))
+    step = a_step(3, vel_w=ahead, goal_w=ahead, speed_command=jnp.array([0.0, 0.5, 1.0]))
     np.testing.assert_allclose(weighted(config, step)["progress"], [0.4, -1.2, -1.2], rtol=1e-6)
 
     def total(vel):

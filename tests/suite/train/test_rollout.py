@@ -73,8 +73,10 @@ def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monk
     @partial(jax.jit, static_argnums=0)
     def rays_of(rays, state):
         camera = replace(SPEC.camera, rays=rays)
-        sight = rollout.make_sight(replace(config, spec=replace(SPEC, camera=camera)))
-        sight.see(worlds, state, jnp.asarray(worlds.target), state.pos_w, jax.random.split(KEY, 4))
+        observer = rollout.make_observer(replace(config, spec=replace(SPEC, camera=camera)))
+        observer.observe(
+            worlds, state, jnp.asarray(worlds.target), state.pos_w, jax.random.split(KEY, 4)
+        )
         return cast[-1]
 
     one, two = rays_of(1, state), rays_of(2, state)
@@ -266,7 +268,7 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     to_gate = target_gate(worlds.scene.gates, worlds.target)[1] - worlds.pos_w
     far = np.linalg.norm(to_gate, axis=-1)
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, 6:9], axis=-1), far, rtol=1e-5)
-    np.testing.assert_array_equal(found[:, 0, -1], worlds.wanted)
+    np.testing.assert_array_equal(found[:, 0, -1], worlds.speed_command)
 
 
 def test_a_stopped_world_leaves_the_loss_and_a_remembered_state_is_flown():

@@ -12,7 +12,7 @@ from eval.sensors.sensors_file import load_sensors, sensor_set
 from suite.commands.train import Config, resolve
 from suite.train.config import SensorsConfig
 from suite.train.dynamics.interface import make_dynamics
-from suite.train.rollout import make_sight, older, view_in, world_keys
+from suite.train.rollout import delayed_view, make_observer, view_in, world_keys
 from suite.train.worlds import sample_worlds
 from tests.support.training import KEY, boxes_worlds, small_config
 
@@ -27,7 +27,7 @@ def sensed(**changes):
 
 def seen(config, steps=2):
     """Return a function (worlds, start) of what is seen of a drone that moves on, and both."""
-    sight = make_sight(config)
+    observer = make_observer(config)
     worlds = boxes_worlds(config)
     start = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
     target = jnp.asarray(worlds.target)
@@ -37,10 +37,10 @@ def seen(config, steps=2):
             state, memory = carry
             keys = world_keys(jax.random.fold_in(KEY, step), worlds)
             state = state._replace(pos_w=state.pos_w + 0.05 * state.vel_w)
-            one, memory = sight.see(worlds, state, target, state.pos_w, keys, memory)
+            one, memory = observer.observe(worlds, state, target, state.pos_w, keys, memory)
             return (state, memory), one
 
-        begin = state, sight.start(worlds, state)
+        begin = state, observer.start(worlds, state)
         return jax.lax.scan(move, begin, jnp.arange(steps))[1]
 
     return of, worlds, start
@@ -97,7 +97,7 @@ def test_an_old_view_lies_between_two_decisions():
     before = now._replace(pos_w=now.pos_w - 1.0, gate_w=now.gate_w + 5.0, depth_m=now.depth_m * 2)
     first = before._replace(pos_w=now.pos_w - 3.0, depth_m=now.depth_m * 3)
     age = np.linspace(0.0, 2.0, BATCH)  # 0, 0.4, 0.8, 1.2, 1.6, 2
-    old = jax.jit(older)((now, before, first), age, np.round(age))
+    old = jax.jit(delayed_view)((now, before, first), age, np.round(age))
     away = np.array(now.pos_w - old.pos_w)[:, 0]
     assert away == pytest.approx([0.0, 0.4, 0.8, 1.4, 2.2, 3.0], abs=1e-5)
     assert np.array_equal(old.gate_w != now.gate_w, np.repeat(age[:, None] > 0.5, 3, 1))

@@ -15,7 +15,7 @@ from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.stages import Estimate
 from suite.train import training_loop as module
-from suite.train.training_loop import Method, Run, Watch, train_in_folder
+from suite.train.training_loop import Run, RunPhase, Watch, train_in_folder
 from tests.support.training import SPEC, fresh_params, small_config
 from tracks.common.files import plain
 
@@ -30,7 +30,7 @@ class Count(NamedTuple):
 FRESH = Count(fresh_params(), jnp.zeros((), int))
 
 
-def counting(iterations=10, stop=None, bad=None) -> Method:
+def counting(iterations=10, stop=None, bad=None) -> RunPhase:
     """Return a method whose loss is 100 less the iteration; `stop` interrupts, `bad` diverges."""
 
     def update(state, worlds):
@@ -40,7 +40,7 @@ def counting(iterations=10, stop=None, bad=None) -> Method:
         return state._replace(iteration=state.iteration + 1), {"loss": jnp.asarray(loss)}
 
     numbers: Any = lambda i: i  # noqa: E731  (worlds are numbers here)
-    return Method(iterations, SPEC, 24, numbers, lambda: update, str)
+    return RunPhase(iterations, SPEC, 24, numbers, lambda: update, str)
 
 
 def run_in(folder, config=CONFIG, start=None):

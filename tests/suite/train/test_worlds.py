@@ -54,12 +54,12 @@ def test_how_fast_to_fly_is_drawn_where_it_is_an_input_and_moves_nothing_else():
     config = small_config(batch=64)
     asked = replace(config, spec=replace(config.spec, speed_input=True))
     plain, worlds = sample_worlds(config, 2), sample_worlds(asked, 2)
-    assert plain.wanted is None and worlds.wanted is not None
-    races = worlds.wanted == 1.0
+    assert plain.speed_command is None and worlds.speed_command is not None
+    races = worlds.speed_command == 1.0
     assert 0.3 < races.mean() < 0.7
-    assert worlds.wanted.min() < 0.2 and 0.8 < worlds.wanted[~races].max() < 1.0
-    assert np.abs(worlds.wanted[~races].mean() - 0.5) < 0.15
-    jax.tree.map(np.testing.assert_array_equal, plain, worlds._replace(wanted=None))
+    assert worlds.speed_command.min() < 0.2 and 0.8 < worlds.speed_command[~races].max() < 1.0
+    assert np.abs(worlds.speed_command[~races].mean() - 0.5) < 0.15
+    jax.tree.map(np.testing.assert_array_equal, plain, worlds._replace(speed_command=None))
 
 
 def test_drag_along_the_bodys_z_has_a_range_of_its_own():

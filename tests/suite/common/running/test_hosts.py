@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 
 from policies.formats.checkpoint import load_arrays
-from suite.common.running.hosts import Joined, Member, member, several, writes
+from suite.common.running.hosts import (
+    Member,
+    ProcessOptions,
+    is_distributed,
+    is_writer,
+    read_member,
+)
 
 SLURM = {"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "SLURM_STEP_NODELIST": "node[001-004]"}
 OPEN_MPI = {
@@ -24,56 +30,56 @@ OPEN_MPI = {
 @pytest.mark.parametrize(
     ("asked", "environment", "found"),
     [
-        (Joined(), {}, Member(0, 1, None)),
-        (Joined("head:7777", 3, 2), {}, Member(2, 3, "head:7777")),
-        (Joined(), SLURM, Member(2, 4, None)),
-        (Joined(), OPEN_MPI, Member(1, 2, None)),
-        (Joined(), {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Member(0, 1, None)),
-        (Joined(processes=1), SLURM, Member(0, 1, None)),
+        (ProcessOptions(), {}, Member(0, 1, None)),
+        (ProcessOptions("head:7777", 3, 2), {}, Member(2, 3, "head:7777")),
+        (ProcessOptions(), SLURM, Member(2, 4, None)),
+        (ProcessOptions(), OPEN_MPI, Member(1, 2, None)),
+        (ProcessOptions(), {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Member(0, 1, None)),
+        (ProcessOptions(processes=1), SLURM, Member(0, 1, None)),
     ],
 )
 def test_a_process_finds_its_place(asked, environment, found):
-    assert member(asked, environment) == found
+    assert read_member(asked, environment) == found
 
 
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        (Joined(processes=2), "go together"),
-        (Joined("head:7777", 2, 2), "--process is 2; allowed is 0 to 1"),
-        (Joined("head", 2, 0), "--coordinator is 'head'; allowed is HOST:PORT"),
-        (Joined("head:99999", 2, 0), "allowed is HOST:PORT"),
+        (ProcessOptions(processes=2), "go together"),
+        (ProcessOptions("head:7777", 2, 2), "--process is 2; allowed is 0 to 1"),
+        (ProcessOptions("head", 2, 0), "--coordinator is 'head'; allowed is HOST:PORT"),
+        (ProcessOptions("head:99999", 2, 0), "allowed is HOST:PORT"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(asked, words):
     with pytest.raises(ValueError, match=words):
-        member(asked, {})
+        read_member(asked, {})
 
 
 def test_alone_it_writes():
-    assert writes() and not several()
+    assert is_writer() and not is_distributed()
 
 
 MEETING = """
 import os, sys
 import numpy as np
-from suite.common.running.hosts import agree, from_the_first, is_gone, join, member, several, writes
-from suite.common.running.hosts import Joined
-join(member(Joined(sys.argv[1], 2, int(sys.argv[2]))))
+from suite.common.running.hosts import broadcast_from_first, check_same, connect, read_member
+from suite.common.running.hosts import ProcessOptions, is_distributed, is_process_lost, is_writer
+connect(read_member(ProcessOptions(sys.argv[1], 2, int(sys.argv[2]))))
 number = int(sys.argv[2])
-assert several() and writes() == (number == 0)
-assert from_the_first({"a": np.arange(3) + number})["a"].tolist() == [0, 1, 2]
-agree({"the seed": 7})
+assert is_distributed() and is_writer() == (number == 0)
+assert broadcast_from_first({"a": np.arange(3) + number})["a"].tolist() == [0, 1, 2]
+check_same({"the seed": 7})
 try:
-    agree({"the size": 1, "the seed": number})
+    check_same({"the size": 1, "the seed": number})
 except ValueError as error:
     print(error, flush=True)
 if number == 0:
     os._exit(9)
 try:
-    from_the_first(np.ones(2))
+    broadcast_from_first(np.ones(2))
 except Exception as error:
-    print("gone" if is_gone(error) else repr(error), flush=True)
+    print("gone" if is_process_lost(error) else repr(error), flush=True)
 os._exit(0)
 """
 
@@ -96,7 +102,7 @@ def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
         for process in both:
             process.kill()
     assert [process.returncode for process in both] == [9, 0], said
-    assert all("they differ in the seed. Give" in words for words in said), said
+    assert all("processes differ in the seed. Give" in words for words in said), said
     assert said[1].strip().endswith("gone")
 
 

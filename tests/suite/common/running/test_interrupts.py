@@ -33,7 +33,7 @@ IN_C = """
 def test_what_python_cannot_stop_is_ended(number):
     code = textwrap.dedent(IN_C).format(number=number)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=15)
-    assert done.returncode == 130 and done.stderr == interrupts.WORDS
+    assert done.returncode == 130 and done.stderr == interrupts.MESSAGE
 
 
 def test_what_python_can_stop_is_interrupted_and_cleaned_up():

@@ -10,7 +10,7 @@ from policies.formats.c.compiler import find_compiler
 from suite import cli
 from suite.common.errors import WorkFailed
 from suite.experiments.bench import diagnose, judge, policy, sysid_baseline
-from suite.experiments.bench.compare import Comparison, Figure, compared, in_turn
+from suite.experiments.bench.compare import Comparison, Figure, compare_times, in_turn
 from tests.support.small_policy import small_checkpoint
 
 
@@ -43,7 +43,7 @@ def test_bench_times_both_sides_in_turn():
     taken = in_turn(sides, 3, clock=lambda: next(ticks))
     assert calls == ["ours", "baseline"] * 4
     assert taken == {"ours": [1] * 3, "baseline": [3] * 3}
-    assert compared("a", taken, 6.0, "steps/s", {}).baseline == Figure(2.0, "steps/s")
+    assert compare_times("a", taken, 6.0, "steps/s", {}).baseline == Figure(2.0, "steps/s")
     assert in_turn(sides, 3, most_s=0.0).keys() == {"ours", "baseline"} and len(calls) == 12
     figures = Figure(6.0, "steps/s"), Figure(2.0, "steps/s")
     assert Comparison("a", *figures).ratio == pytest.approx(3.0)

@@ -10,10 +10,10 @@ import pytest
 from eval.judging.statistics import Interval
 from suite.common.console import Console
 from suite.common.report import Picture
-from suite.experiments.pages.document import BEGIN, END, Made, check_page, write_document
+from suite.experiments.pages.document import BEGIN, END, PageContents, check_page, write_document
 from suite.experiments.pages.paper import goals
-from suite.experiments.study.cache import Place
-from suite.loop.compare import difference_cell
+from suite.experiments.study.cache import Workspace
+from suite.loop.tables import difference_cell
 from tests.support.judged_cells import cell
 from tracks.common.grid import Cell, table
 
@@ -30,11 +30,11 @@ class Config:
 def made(number="1"):
     picture = Picture(PNG, "A figure.")
     grid = table(["a", "b"], [[number, Cell("2", "good")]], note="Below.")
-    return Made({"recipe": "quick"}, {"Part": [grid, picture, picture]}, {"x": 1})
+    return PageContents({"recipe": "quick"}, {"Part": [grid, picture, picture]}, {"x": 1})
 
 
 def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
-    place = Place(tmp_path / "docs", tmp_path)
+    place = Workspace(tmp_path / "docs", tmp_path)
     said = write_document(place, "schemes", Config(7), made(), Console())
     text = (tmp_path / "docs" / "schemes.md").read_text()
     assert text.startswith("# schemes\n\nPPO, our method, and it without the field")
@@ -47,7 +47,7 @@ def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
 
 
 def test_a_page_made_again_keeps_the_text_around_what_is_made(tmp_path):
-    place, page = Place(tmp_path, tmp_path), tmp_path / "schemes.md"
+    place, page = Workspace(tmp_path, tmp_path), tmp_path / "schemes.md"
     write_document(place, "schemes", Config(7), made(), Console())
     page.write_text(page.read_text().replace("# schemes", "# My own title") + "\nWhat it means.\n")
     write_document(place, "schemes", Config(7), made("3"), Console())

@@ -14,15 +14,15 @@ from eval.sensors.sensors_file import PERFECT, sensor_set
 from eval.worlds.trial import TrialSpec
 from suite.common.console import Console
 from suite.experiments.study import cache, disturbed
-from suite.experiments.study.cache import Place, added_digest, code_digest, digest
+from suite.experiments.study.cache import Workspace, added_digest, code_digest, digest
 from suite.experiments.study.conditions import (
     Condition,
     effect_conditions,
     sweep_conditions,
     sweeps,
 )
-from suite.experiments.study.judging import Order, Setup, flown
-from suite.experiments.study.training import Row, Study, Unseen, curve_of
+from suite.experiments.study.judging import Setup, TrialRequest, fly_trials
+from suite.experiments.study.training import Setting, Study, UnseenWorlds, read_measurements
 from suite.train.recipes import named_recipe
 from tests.support.vehicles import with_effects
 from tracks.common import names as registry
@@ -32,7 +32,7 @@ RECIPE = named_recipe("race-paper")
 
 
 def test_rows_take_turns_where_they_are_to_meet_the_same_load():
-    rows, unseen = [Row("a", "", RECIPE), Row("b", "", RECIPE)], Unseen(0, 3, 9, 1.0)
+    rows, unseen = [Setting("a", "", RECIPE), Setting("b", "", RECIPE)], UnseenWorlds(0, 3, 9, 1.0)
     study = Study(rows, (4, 5), unseen)
     assert [(key, c.seed) for key, c in study.pieces()] == [("a", 4), ("a", 5), ("b", 4), ("b", 5)]
     turns = Study(rows, (4, 5), unseen, by_seed=True)
@@ -42,20 +42,20 @@ def test_rows_take_turns_where_they_are_to_meet_the_same_load():
 def test_the_same_setup_in_two_orders_flies_a_trial_once(sky, tmp_path):
     one, two = TrialSpec("zigzag", 0, 1), TrialSpec("zigzag", 0, 2)
     setup = Setup("race-paper", VEHICLE)
-    orders = {"a": Order(setup, [one, two]), "b": Order(setup, [two])}
-    found = flown(orders, Place(tmp_path, tmp_path), Console(), "flying")
+    orders = {"a": TrialRequest(setup, [one, two]), "b": TrialRequest(setup, [two])}
+    found = fly_trials(orders, Workspace(tmp_path, tmp_path), Console(), "flying")
     assert len(sky.flown) == 2 and found["b"] == found["a"][1:]
     assert [row.trial for row in found["a"]] == [one, two]
 
 
 def test_policies_fly_the_same_trials_under_every_condition(sky, tmp_path):
     trials = [TrialSpec("zigzag", 0, seed) for seed in (1, 2, 3)]
-    alone, grown = disturbed.chosen_conditions(VEHICLE, ("wind", "mass_offset"))
+    alone, grown = disturbed.select_conditions(VEHICLE, ("wind", "mass_offset"))
     assert [c.name for c in alone] == ["mass_offset"] * 2
     (wind,) = grown
     base, policies = Condition("undisturbed", 0.0, "", VEHICLE), {"p": "race-paper", "r": "race"}
-    (tested,), points = disturbed.flown_under(
-        [base], {wind: grown[wind][:2]}, policies, trials, Place(tmp_path, tmp_path), Console()
+    (tested,), points = disturbed.fly_conditions(
+        [base], {wind: grown[wind][:2]}, policies, trials, Workspace(tmp_path, tmp_path), Console()
     )
     assert [row.trial for row in tested.results["p"]] == trials
     assert len(points[wind]) == 2 and len(sky.flown) == 2 * 2 * 3, "the undisturbed once"
@@ -69,7 +69,7 @@ def test_time_leaves_compilation_out(tmp_path):
     watched = [{"iteration": k, "gates": float(k)} for k in (0, 3, 5)]
     for name, lines in (("metrics.jsonl", rows), ("validation.jsonl", watched)):
         (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    points, compiling = curve_of(tmp_path, 10)
+    points, compiling = read_measurements(tmp_path, 10)
     assert [(p["steps"], p["time"], p["gates"]) for p in points] == [
         (0, 0.0, 0.0), (30, 3 + 2 + 3, 3.0), (50, 3 + 2 + 3 + 3 + 4, 5.0),
     ]  # fmt: skip
@@ -134,7 +134,7 @@ def test_every_effect_that_touches_a_flight_is_flown_at_its_usual_size():
         others = {k: v for k, v in condition.vehicle.effects.items() if k != condition.name}
         own = {k: v for k, v in VEHICLE.effects.items() if k != condition.name}
         assert others == own and condition.sensors == PERFECT
-    by_words = {(c.name, c.words): c.vehicle.effects[c.name] for c in conditions}
+    by_words = {(c.name, c.size_text): c.vehicle.effects[c.name] for c in conditions}
     # The vehicle has drag of its own; what is more of the two stays, axis by axis.
     assert by_words["linear_drag", "coefficient (0.5, 0.5, 0.72) 1/s"].coefficient[2] == 0.72
     assert by_words["motor_lag", "time_constant 0.06 s"].time_constant == 0.06
@@ -201,8 +201,8 @@ def test_no_effect_is_beyond_what_a_vehicle_may_have(name):
     for condition in effect_conditions(vehicle):
         parameter = EFFECTS[condition.name].parameters[0]
         value = np.array(getattr(condition.vehicle.effects[condition.name], parameter.name))
-        assert (value >= bound_value(parameter.low, vehicle)).all(), condition.words
-        assert (value <= bound_value(parameter.high, vehicle)).all(), condition.words
+        assert (value >= bound_value(parameter.low, vehicle)).all(), condition.size_text
+        assert (value <= bound_value(parameter.high, vehicle)).all(), condition.size_text
 
 
 def test_all_drag_of_a_vehicle_grows_and_where_there_is_none_it_comes_anew():

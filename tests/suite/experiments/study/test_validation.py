@@ -9,8 +9,8 @@ import pytest
 
 from suite.experiments.study.validation import (
     make_flight,
-    measured,
-    scored,
+    mean_scores,
+    score_trials,
     validation_worlds,
 )
 from suite.train.step import BODY_RADIUS_M
@@ -41,7 +41,7 @@ def flight():
 
 def measure(worlds):
     """Return what coasting through these worlds comes to."""
-    return measured(flight()(params(), worlds))
+    return mean_scores(flight()(params(), worlds))
 
 
 def straight(wall_x):
@@ -82,7 +82,7 @@ def test_scores_by_hand():
     )
     speed = np.array([[1.0, 4, 2, 1], [2, 5, 3, 2], [9, 9, 4, 9], [9, 9, 1, 9]])
     arrays = jnp.asarray(passed), jnp.asarray(clearance), jnp.asarray(speed)
-    found = scored(*arrays, 2, jnp.ones((4, 4)))
+    found = score_trials(*arrays, 2, jnp.ones((4, 4)))
     # Both gates in two steps, a hit after it; a hit in step two; nothing; both in one step.
     assert found.gates.tolist() == [2, 1, 0, 1]
     assert found.crossed.tolist() == [True, False, False, False]
@@ -105,4 +105,4 @@ def test_a_policy_that_takes_a_speed_is_asked_for_its_own():
     spec = replace(CONFIG.spec, speed_input=True)
     asked = replace(CONFIG, spec=spec, episode=replace(CONFIG.episode, race_share=0.5))
     worlds = sample_worlds(validation_worlds(asked, 40, 9, 2.0), 0)
-    assert np.all(np.asarray(worlds.wanted) == spec.speed)
+    assert np.all(np.asarray(worlds.speed_command) == spec.speed)

@@ -34,12 +34,12 @@ class Bench:
     def show(self):
         """Send an image."""
         packets = image_packets(self.image, self.policy.spec.camera.range_m)
-        return self.companion.receive([self.wire.encoded(packet) for packet in packets])
+        return self.companion.receive([self.wire.encode(packet) for packet in packets])
 
     def tell(self, state=None):
         """Send a state; what the companion answers, decoded."""
-        datagram = self.wire.encoded(self.state() if state is None else state)
-        return self.wire.decoded(self.companion.receive([datagram]))
+        datagram = self.wire.encode(self.state() if state is None else state)
+        return self.wire.decode(self.companion.receive([datagram]))
 
     def fly(self, steps=5):
         """Fly so many states of 10 ms, with an image before the first."""

@@ -7,8 +7,8 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import TrialSpec
 from policies.spec import NoAnswer, PolicySpec
 from suite.judging.link.flights import write_log
-from suite.judging.link.messages import Note, SetPoint, State, Wire, dialect
-from suite.judging.link.watchdog import Limits, trouble_between
+from suite.judging.link.messages import OperatorText, SetPoint, State, Wire, dialect
+from suite.judging.link.watchdog import Limits, jump_fault
 from tests.support.pilots import Steady
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
@@ -29,7 +29,7 @@ def test_silence_hands_over_and_nothing_is_sent_any_more(bench):
     one.now += 0.085
     assert one.companion.receive([]) == []
     one.now += 0.01
-    (note,) = one.wire.decoded(one.companion.receive([]))
+    (note,) = one.wire.decode(one.companion.receive([]))
     assert "no state for 0.1 s" in note.text
     assert one.tell() == [] and not one.companion.flying
 
@@ -53,7 +53,7 @@ def test_a_state_that_cannot_be_flown_on_hands_over(bench, changed, reason):
     one = bench().fly()
     with np.errstate(invalid="ignore"):
         (note,) = one.tell(one.state(**changed))
-    assert isinstance(note, Note) and "hands over" in note.text
+    assert isinstance(note, OperatorText) and "hands over" in note.text
     assert reason in one.companion.over and reason in one.companion.events[-1]
 
 
@@ -70,7 +70,7 @@ def odometry(quality=0, frames=(1, 12), vel=(2.0, 0.0, 0.0)):
 
 def test_a_velocity_is_in_the_frame_that_its_message_says():
     for frames, vel_w in (((1, 12), [0.0, 2.0, 0.0]), ((1, 1), [2.0, 0.0, 0.0])):
-        (state,) = Wire(2, 1).decoded([odometry(frames=frames)])
+        (state,) = Wire(2, 1).decode([odometry(frames=frames)])
         assert isinstance(state, State) and state.fault == "" and state.resets == 3
         np.testing.assert_allclose(state.vel_w, vel_w, atol=1e-6)
 
@@ -101,10 +101,10 @@ def test_of_a_backlog_the_newest_state_is_flown_and_gates_are_counted_in_all(ben
     for k in range(1, 10):
         one.now += 0.01
         state = one.state(pos_w=place + 0.01 * k * through, vel_w=through)
-        backlog.append(one.wire.encoded(state))
+        backlog.append(one.wire.encode(state))
     newest = one.now
     # The newest came first: it was not the oldest that lay in the way.
-    answers = one.wire.decoded(one.companion.receive(backlog[::-1]))
+    answers = one.wire.decode(one.companion.receive(backlog[::-1]))
     assert [type(x) for x in answers] == [SetPoint] and one.companion.flying
     assert one.companion.rows[-1].state.time_s == pytest.approx(newest, abs=2e-6)
     assert one.companion.gate == 1 and len(one.companion.rows) == 2
@@ -136,7 +136,7 @@ def test_a_computer_that_stood_still_hands_over(bench):
     one = bench().fly()
     one.now += 0.2
     (note,) = one.tell()
-    assert isinstance(note, Note)
+    assert isinstance(note, OperatorText)
     assert one.companion.over == "this computer stood still for 0.21 s"
 
 
@@ -171,7 +171,7 @@ def test_a_policy_that_fails_hands_over_and_leaves_its_log(answer, reason, bench
     for _ in range(3):
         one.fly(40)
     (note,) = one.tell()
-    assert isinstance(note, Note) and one.companion.over == reason and one.tell() == []
+    assert isinstance(note, OperatorText) and one.companion.over == reason and one.tell() == []
     assert write_log(one.companion, TrialSpec("zigzag", 0, 0)._asdict(), tmp_path)
 
 
@@ -189,7 +189,7 @@ def test_late_answers_are_not_flown_and_hand_over_where_they_go_on(bench):
         assert isinstance(one.tell()[0], SetPoint)
         one.now += 0.01
     assert (one.companion.rows[-1].action_b == 0).all()
-    assert isinstance(one.tell()[0], Note)
+    assert isinstance(one.tell()[0], OperatorText)
     assert one.companion.over == "3 late answers in a row"
     assert one.companion.late_answers == 3
 
@@ -232,12 +232,12 @@ def test_a_camera_that_stops_hands_over(bench):
 def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(bench):
     one = bench().fly()
     for k in range(20):
-        datagram = one.wire.encoded(one.state())
+        datagram = one.wire.encode(one.state())
         one.companion.receive([datagram[: len(datagram) - 9 * (k % 2)]])
         one.now += 0.01
     assert one.companion.flying and any("broken" in event for event in one.companion.events)
     for _ in range(12):
-        one.companion.receive([one.wire.encoded(one.state())[:-9]])
+        one.companion.receive([one.wire.encode(one.state())[:-9]])
         one.now += 0.01
     assert one.companion.over == "no state for 0.1 s"
 
@@ -246,7 +246,7 @@ def test_another_system_is_not_listened_to(bench):
     one = bench().fly()
     other = Wire(9, 2)
     far = one.state(pos_w=np.array([0.0, 900.0, 1.0]))
-    assert one.companion.receive([other.encoded(far)]) == []
+    assert one.companion.receive([other.encode(far)]) == []
     assert one.companion.flying and "foreign" in one.companion.events[-1]
     old = one.state(time_s=one.now - 0.04)
     assert one.tell(old) == [] and one.companion.flying
@@ -270,4 +270,4 @@ def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads(off_m, jumped):
     vel_w = np.array([3.0, 0.0, 0.0])
     last = State(1.0, still, level, vel_w, still)
     state = State(1.1, np.array([0.3 + off_m, 0.0, 0.0]), level, vel_w, still)
-    assert (trouble_between(last, state, Limits()) is not None) == jumped
+    assert (jump_fault(last, state, Limits()) is not None) == jumped

@@ -14,25 +14,25 @@ from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from suite import cli
-from suite.judging.flying import read_course
-from suite.judging.link import commanded, server
+from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
 from suite.judging.link.flights import Flight, delays, fly_link, totals, warm_up, write_log
 from suite.judging.link.messages import (
-    Note,
+    ImageAssembler,
+    OperatorText,
     Packet,
-    Picture,
     SetPoint,
     State,
     Wire,
+    flip_axes,
+    flip_quat,
     image_packets,
-    turned,
-    turned_quat,
 )
 from suite.judging.link.simulated import LOST_S, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
 from suite.judging.requests import Evaluation
+from suite.judging.trials import read_trial_set
 from tests.support.pilots import Pursuit
 from tracks.geometry.rotation import quat_to_rot
 
@@ -44,11 +44,11 @@ def test_frames_are_one_half_turn_about_x():
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
     vector = rng.normal(size=3)
-    assert (turned(turned(vector)) == vector).all()
-    there = quat_to_rot(turned_quat(quat)) @ turned(vector)
-    np.testing.assert_allclose(there, turned(quat_to_rot(quat) @ vector), atol=1e-12)
+    assert (flip_axes(flip_axes(vector)) == vector).all()
+    there = quat_to_rot(flip_quat(quat)) @ flip_axes(vector)
+    np.testing.assert_allclose(there, flip_axes(quat_to_rot(quat) @ vector), atol=1e-12)
     # A climb is a negative "down"; a left turn a negative yaw rate.
-    assert turned([0, 0, 1.0])[2] == -1.0
+    assert flip_axes([0, 0, 1.0])[2] == -1.0
 
 
 def test_states_set_points_and_words_come_as_they_went():
@@ -58,28 +58,28 @@ def test_states_set_points_and_words_come_as_they_went():
     place, vel, rate = rng.normal(size=(3, 3))
     state = State(12.345678, place, quat, vel, rate)
     vehicle, companion = Wire(1, 2), Wire(2, 1)
-    (found,) = companion.decoded([vehicle.encoded(state)])
+    (found,) = companion.decode([vehicle.encode(state)])
     assert isinstance(found, State)
     assert found.time_s == pytest.approx(state.time_s, abs=2e-6)
     assert found[5:] == state[5:] == (0, "")
     for one, other in zip(found[:5], state[:5], strict=True):
         np.testing.assert_allclose(one, other, atol=2e-6)
     wanted = SetPoint(np.array([0.5, -0.25, 2.0]), 0.375)
-    (point,) = vehicle.decoded([companion.encoded(wanted)])
+    (point,) = vehicle.decode([companion.encode(wanted)])
     assert isinstance(point, SetPoint)
     assert (point.rate_b == wanted.rate_b).all() and point.thrust == wanted.thrust
-    assert vehicle.decoded([companion.encoded(Note("words"))]) == [Note("words")]
+    assert vehicle.decode([companion.encode(OperatorText("words"))]) == [OperatorText("words")]
 
 
 def test_an_image_comes_whole_or_not_at_all():
     rng = np.random.default_rng(2)
     depth = rng.uniform(0.1, 12.0, (24, 32))
     vehicle, companion = Wire(1, 2), Wire(2, 1)
-    sent = [vehicle.encoded(packet) for packet in image_packets(depth, 10.0)]
+    sent = [vehicle.encode(packet) for packet in image_packets(depth, 10.0)]
     assert len(sent) == 8
 
     def seen(datagrams, height=24):
-        picture, packets = Picture(height, 32, 10.0), companion.decoded(datagrams)
+        picture, packets = ImageAssembler(height, 32, 10.0), companion.decode(datagrams)
         found = [picture.add(packet) for packet in packets if isinstance(packet, Packet)]
         return [image for image in found if image is not None]
 
@@ -88,36 +88,36 @@ def test_an_image_comes_whole_or_not_at_all():
     assert seen(sent[:3] + sent[4:]) == []
     assert len(seen(sent[:3] + sent)) == 1
     assert seen(sent, height=20) == []
-    assert seen([companion.encoded(Packet(3, 0, b"x"))]) == []
+    assert seen([companion.encode(Packet(3, 0, b"x"))]) == []
     # The end of one and the announcement of the next are lost: no image is made of two.
-    later = [vehicle.encoded(packet) for packet in image_packets(depth + 1.0, 20.0)]
+    later = [vehicle.encode(packet) for packet in image_packets(depth + 1.0, 20.0)]
     assert seen(sent[:6] + sent[7:] + later[1:]) == []
     assert len(seen(sent[:6] + later)) == 1
 
 
 def test_what_is_cut_off_or_of_another_system_is_left_out_and_counted(bench):
     sender, stranger, companion = Wire(1, 2), Wire(9, 2), Wire(2, 1)
-    whole = sender.encoded(bench().state())
+    whole = sender.encode(bench().state())
     for length in (1, 5, len(whole) // 2, len(whole) - 1):
-        found = companion.decoded([whole[:length], whole])
+        found = companion.decode([whole[:length], whole])
         assert len(found) == 1 and isinstance(found[0], State)
     assert companion.broken == 4
-    assert companion.decoded([b"\xfd\xff" * 40, b"", b"\x00"]) == []
-    assert companion.decoded([stranger.encoded(bench().state())]) == []
+    assert companion.decode([b"\xfd\xff" * 40, b"", b"\x00"]) == []
+    assert companion.decode([stranger.encode(bench().state())]) == []
     assert companion.foreign == 1
     # A set point for another vehicle is none for this one.
-    assert sender.decoded([Wire(2, 7).encoded(SetPoint(np.zeros(3), 0.5))]) == []
+    assert sender.decode([Wire(2, 7).encode(SetPoint(np.zeros(3), 0.5))]) == []
 
 
 def test_an_image_of_more_bytes_than_16_bits_count_comes_whole():
     depth = np.linspace(0.1, 9.9, 256 * 256).reshape(256, 256)
-    wire, picture = Wire(1, 1), Picture(256, 256, 10.0)
-    packets = wire.decoded(wire.encoded(packet) for packet in image_packets(depth, 10.0))
+    wire, picture = Wire(1, 1), ImageAssembler(256, 256, 10.0)
+    packets = wire.decode(wire.encode(packet) for packet in image_packets(depth, 10.0))
     found = [picture.add(packet) for packet in packets if isinstance(packet, Packet)]
     assert found[-1] is not None
     np.testing.assert_allclose(found[-1], depth, atol=5.1e-4)
     with pytest.raises(ValueError, match="a camera of 4000 x 4000 pixels"):
-        Picture(4000, 4000, 10.0)
+        ImageAssembler(4000, 4000, 10.0)
 
 
 @pytest.fixture(scope="module")
@@ -204,13 +204,13 @@ def test_datagrams_are_taken_from_one_caller(bench):
 
 
 def test_who_does_not_speak_for_the_vehicle_does_not_take_the_link(bench):
-    waiting = UdpLink("udpin:127.0.0.1:0", bench().companion._wire.speaks)
+    waiting = UdpLink("udpin:127.0.0.1:0", bench().companion._wire.is_from_peer)
     stranger, other, vehicle = (UdpLink(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
     try:
         stranger.send([b"anybody there?"])
-        other.send([Wire(9, 2).encoded(bench().state())])
+        other.send([Wire(9, 2).encode(bench().state())])
         assert waiting.receive(1.0) == [] and waiting.receive(0.2) == []
-        said = Wire(1, 2).encoded(bench().state())
+        said = Wire(1, 2).encode(bench().state())
         vehicle.send([said])
         assert waiting.receive(1.0) == [said] and waiting.strangers == 2
     finally:
@@ -245,8 +245,8 @@ def test_a_vehicle_that_waits_to_be_called_is_called(bench):
     try:
         fly_link(one.companion, link, clock=lambda: next(times), wait_s=3.0)
         heard = vehicle.receive(1.0)
-        assert 2 <= len(heard) <= 4 and all(Wire(1, 2).speaks(datagram) for datagram in heard)
-        assert Wire(1, 2).decoded(heard) == []
+        assert 2 <= len(heard) <= 4 and all(Wire(1, 2).is_from_peer(datagram) for datagram in heard)
+        assert Wire(1, 2).decode(heard) == []
     finally:
         link.close()
         vehicle.close()
@@ -268,10 +268,10 @@ def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
     def refused(companion, link):
         companion.over = "outside the box at 0.0, 0.0, -3.0 m"
 
-    monkeypatch.setattr(commanded, "fly_link", lambda companion, link: None)
+    monkeypatch.setattr(fly, "fly_link", lambda companion, link: None)
     assert cli.main([*asked, "--confirm"]) == 1
     assert "no vehicle sent a state (ODOMETRY) and a depth image within 30 s" in printed(capsys)
-    monkeypatch.setattr(commanded, "fly_link", refused)
+    monkeypatch.setattr(fly, "fly_link", refused)
     assert cli.main([*asked, "--confirm"]) == 1
     assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in printed(capsys)
 
@@ -285,7 +285,7 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     def ended(companion, link):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commanded, "fly_link", ended)
+    monkeypatch.setattr(fly, "fly_link", ended)
     monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
     assert cli.main(asked) == 1
     assert "the operator" in printed(capsys) and len(sent) == 1 and b"the operator" in sent[0]
@@ -305,7 +305,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
         yield Flight(row, [])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commanded, "fly_simulated", interrupted)
+    monkeypatch.setattr(fly, "fly_simulated", interrupted)
     asked = ["fly", "--policy", "race", "--trials", "2", "--time-limit-s", "0.2"]
     assert cli.main([*asked, "--out", str(tmp_path / "a")]) == 130
     answer = json.loads((tmp_path / "a" / "fly.json").read_text())
@@ -317,7 +317,7 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
     fast = load_policy("race")
     assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
-    monkeypatch.setattr(commanded, "load_in_manner", lambda *_: fast)
+    monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
     assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
     assert "decides at 2000 Hz" in printed(capsys) and not (tmp_path / "b").exists()
 
@@ -325,8 +325,8 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
 def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsys):
     yard = root / "tracks" / "examples" / "yard.toml"
     asked = Evaluation(track=str(yard), trials=3)
-    assert len(read_course(asked).trials) == 1
-    assert [trial.seed for trial in read_course(asked, real_time=True).trials] == [0, 1, 2]
+    assert len(read_trial_set(asked).trials) == 1
+    assert [trial.seed for trial in read_trial_set(asked, real_time=True).trials] == [0, 1, 2]
     shutil.copytree(yard.parent, tmp_path / "other")
     both = f"{yard},{tmp_path / 'other' / 'yard.toml'}"
     assert cli.main(["fly", "--track", both, "--out", str(tmp_path / "out")]) == 2
@@ -348,7 +348,7 @@ def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, m
     asked, flown = ["fly", "--out", str(tmp_path), "--policy"], []
     assert cli.main([*asked, "race-paper", "--speed", "0.3"]) == 2
     assert "--speed 0.3: race-paper takes no speed" in capsys.readouterr().err
-    monkeypatch.setattr(commanded, "_real", lambda policy, *_: flown.append(policy) or {})
+    monkeypatch.setattr(fly, "_fly_real_vehicle", lambda policy, *_: flown.append(policy) or {})
     link = ["--link", "udpin:127.0.0.1:0", "--confirm"]
     assert cli.main([*asked, "race", "--speed", "0.3", *link]) == 0
     assert cli.main([*asked, "race", *link]) == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from suite import cli
-from suite.judging.link.messages import Note, SetPoint, Wire, signing_key
+from suite.judging.link.messages import OperatorText, SetPoint, Wire, signing_key
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
 
@@ -21,27 +21,27 @@ def key(tmp_path):
 
 def test_what_is_signed_is_heard_once(key):
     vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
-    sent = companion.encoded(POINT)
-    assert vehicle.speaks(sent) and vehicle.speaks(sent), "to look is not to take"
-    assert len(vehicle.decoded([sent])) == 1 and vehicle.broken == 0
-    assert vehicle.decoded([sent]) == [] and vehicle.broken == 1, "sent again by someone else"
-    assert vehicle.decoded([companion.encoded(Note("a"))]) == [Note("a")]
+    sent = companion.encode(POINT)
+    assert vehicle.is_from_peer(sent) and vehicle.is_from_peer(sent), "to look is not to take"
+    assert len(vehicle.decode([sent])) == 1 and vehicle.broken == 0
+    assert vehicle.decode([sent]) == [] and vehicle.broken == 1, "sent again by someone else"
+    assert vehicle.decode([companion.encode(OperatorText("a"))]) == [OperatorText("a")]
 
 
 def test_what_is_not_signed_or_by_another_is_left_out(key):
     vehicle, companion = Wire(1, 2, key), Wire(2, 1, key)
-    first = companion.encoded(POINT)
-    forged = bytearray(companion.encoded(Note("b")))
+    first = companion.encode(POINT)
+    forged = bytearray(companion.encode(OperatorText("b")))
     forged[-8:-6] = b"\xff\xff"  # of a later time, so that no true one would be later
-    for odd in (Wire(2, 1).encoded(POINT), Wire(2, 1, bytes(32)).encoded(POINT), bytes(forged)):
-        assert vehicle.decoded([odd]) == [] and not vehicle.speaks(odd)
-    assert vehicle.broken == 3 and len(vehicle.decoded([first])) == 1
+    for odd in (Wire(2, 1).encode(POINT), Wire(2, 1, bytes(32)).encode(POINT), bytes(forged)):
+        assert vehicle.decode([odd]) == [] and not vehicle.is_from_peer(odd)
+    assert vehicle.broken == 3 and len(vehicle.decode([first])) == 1
 
 
 def test_without_a_key_nothing_is_signed():
-    sent = Wire(2, 1).encoded(POINT)
+    sent = Wire(2, 1).encode(POINT)
     assert sent[2] == 0, "no flag of a signature"
-    assert len(Wire(1, 2).decoded([sent])) == 1 == len(Wire(1, 2).decoded([sent]))
+    assert len(Wire(1, 2).decode([sent])) == 1 == len(Wire(1, 2).decode([sent]))
 
 
 def test_a_key_is_of_a_file_with_a_phrase_and_of_a_real_link(tmp_path, capsys, monkeypatch):

@@ -58,7 +58,7 @@ def rewarded(before, body, sphere_w=(0, 0, 90), target=0, config=CONFIG, wanted=
     """Return (terms as numbers by name, their sum, clearance, passed) of the step."""
     worlds = worlds_with(sphere_w)
     if wanted is not None:
-        worlds = worlds._replace(wanted=jnp.asarray([wanted]))
+        worlds = worlds._replace(speed_command=jnp.asarray([wanted]))
     terms, clearance, passed = reward_of(config)(worlds, before, body, jnp.asarray([target]))
     named = {name: float(term[0]) for name, term in terms._asdict().items()}
     return named, float(terms.total()[0]), float(clearance[0]), bool(passed[0])
@@ -135,7 +135,7 @@ def test_a_trainings_own_weights_change_nothing():
 features = jax.jit(critic.features)
 
 
-def test_the_features_of_a_state():
+def test_the_feature_count_a_state():
     worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)
     pos, vel, ahead = ([-1.0, 0.5, 50.0], [2.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     body = point_mass.start(*(jnp.asarray([x]) for x in (pos, vel, ahead)))
@@ -175,11 +175,11 @@ def test_the_features_gradient_is_that_of_finite_differences():
 
 def test_the_last_number_is_how_fast_to_fly_where_the_policy_is_told():
     spec = PolicySpec(speed_input=True)
-    assert critic.features_of(PolicySpec()) == critic.FEATURES == critic.features_of(spec) - 1
-    worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)._replace(wanted=jnp.asarray([0.3]))
+    assert critic.feature_count(PolicySpec()) == critic.FEATURES == critic.feature_count(spec) - 1
+    worlds = worlds_with((-1.0, 2.0, 50.0), 0.5)._replace(speed_command=jnp.asarray([0.3]))
     body = point_mass.start(*(jnp.asarray([x]) for x in ([-1.0, 0, 50], [2.0, 0, 0], [1.0, 0, 0])))
     found = features(worlds, body, jnp.asarray([0]))
-    assert found.shape == (1, critic.features_of(spec)) and found[0, -1] == pytest.approx(0.3)
+    assert found.shape == (1, critic.feature_count(spec)) and found[0, -1] == pytest.approx(0.3)
 
 
 def test_a_fresh_value_is_near_zero_and_is_that_of_a_plain_loop():

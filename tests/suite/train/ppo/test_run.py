@@ -135,6 +135,8 @@ def test_a_world_that_crashed_starts_again_as_it_started():
     worlds = crashing(boxes_worlds(CONFIG.shared))
     _, records = flown(worlds)
     again = int(np.argmax(records.done[:, 0])) + 1
-    np.testing.assert_allclose(records.seen[again, 0], records.seen[0, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        records.critic_inputs[again, 0], records.critic_inputs[0, 0], atol=1e-6
+    )
     np.testing.assert_array_equal(records.state[again, 0], records.state[0, 0])
-    assert not np.allclose(records.seen[again, 1], records.seen[0, 1])
+    assert not np.allclose(records.critic_inputs[again, 1], records.critic_inputs[0, 1])

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from suite.common.running.apart import Job, content, do_apart, fill, parcels
 from suite.common.running.lock import one_writer
+from suite.common.running.remote import Job, content, do_remotely, parcels, replace_content
 
 
 @pytest.fixture
@@ -31,14 +31,14 @@ def count_on(mark, job):
 def make_job(folder):
     (folder / "in" / "deep").mkdir(parents=True)
     (folder / "in" / "deep" / "word").write_text("said")
-    fill(folder / "out", {"lines": b"before\n", "kept/deep": b"1"})
+    replace_content(folder / "out", {"lines": b"before\n", "kept/deep": b"1"})
     (folder / "out" / ".lock").touch()
     return Job(7, folder / "out", folder / "in")
 
 
 def test_a_folder_goes_there_and_comes_back_with_what_was_done(tmp_path, far):
     (parcel,) = parcels([make_job(tmp_path)])
-    ((result, files),) = do_apart(partial(count_on, ""), parcel)
+    ((result, files),) = do_remotely(partial(count_on, ""), parcel)
     assert result == 7 and files == {"lines": b"before\nsaid\n", "kept/deep": b"1"}
     assert content(tmp_path / "out")["lines"] == b"before\n" and not list(far.glob("*"))
 
@@ -47,8 +47,8 @@ def test_what_was_cut_off_there_is_gone_on_with(tmp_path, far):
     (parcel,) = parcels([make_job(tmp_path)])
     work = partial(count_on, str(tmp_path / "mark"))
     with pytest.raises(KeyboardInterrupt):
-        list(do_apart(work, parcel))
-    ((_, files),) = do_apart(work, parcel)
+        list(do_remotely(work, parcel))
+    ((_, files),) = do_remotely(work, parcel)
     assert files["lines"] == b"before\nsaid\nsaid\n"
 
 
@@ -56,9 +56,9 @@ def test_a_place_that_another_works_in_is_left_to_it(tmp_path, far):
     (parcel,) = parcels([make_job(tmp_path)])
     work = partial(count_on, str(tmp_path / "mark"))
     with pytest.raises(KeyboardInterrupt):
-        list(do_apart(work, parcel))
+        list(do_remotely(work, parcel))
     (place,) = far.glob("*")
     with one_writer(place):
-        ((_, files),) = do_apart(work, parcel)
+        ((_, files),) = do_remotely(work, parcel)
     assert files["lines"] == b"before\nsaid\n"
     assert os.listdir(place / "out") == ["lines", "kept"] or len(os.listdir(place / "out")) == 2

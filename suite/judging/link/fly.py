@@ -1,6 +1,7 @@
-"""`suite fly`: simulated flights compared with the judge's trials, or one flight over a real link.
+"""The work of `suite fly`: fly a policy over a MAVLink link, simulated or to a real vehicle.
 
-The judge is the simulator that scores policies (`eval.judging.judge`).
+Simulated flights are compared with the same trials of the judge, which flies policies in MuJoCo
+without a link and scores them.
 """
 
 from __future__ import annotations
@@ -17,26 +18,29 @@ from policies.policy import Policy
 from suite.common.console import Console
 from suite.common.errors import WorkFailed
 from suite.common.provenance import refuse_other_run, write_run_record
-from suite.judging.flying import (
-    Course,
-    about_policy,
-    default_policy,
-    load_in_manner,
-    read_course,
-    refuse_one_name,
-)
+from suite.judging.flying import default_policy, load_in_manner, manners, policy_record
 from suite.judging.link.companion import FINISHED, Companion
-from suite.judging.link.flights import Flight, delays, fly_link, fly_simulated, totals, write_log
+from suite.judging.link.flights import (
+    Flight,
+    delays,
+    fly_link,
+    fly_simulated,
+    totals,
+    warm_up,
+    write_log,
+)
 from suite.judging.link.messages import Wire, dialect
 from suite.judging.link.server import COMPANION, VEHICLE, WAIT_S
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
-from suite.judging.requests import Evaluation, manners
+from suite.judging.requests import Evaluation
+from suite.judging.trials import TrialSet, read_trial_set, refuse_equal_names
 from tracks.common.files import write_json
 from tracks.common.grid import rich_table, table
 from tracks.common.provenance import stamp
 
 FLY = "fly.json"
+"""Name of the result file in the output folder."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +52,12 @@ class LinkFlights:
     policy: dict[str, Any]
     """Name, source and digest of the policy."""
     limits: Limits
-    """Of the watchdog."""
+    """Limits of the watchdog."""
     link: str
     """The address, or "simulated"."""
 
 
-def fly_commanded(
+def fly_over_link(
     evaluation: Evaluation,
     policy: str,
     link: str,
@@ -62,15 +66,27 @@ def fly_commanded(
     console: Console,
     key: bytes | None = None,
 ) -> dict[str, Any]:
-    """Fly and write logs and fly.json into `out`.
+    """Fly, and write logs and fly.json into `out`.
+
+    Args:
+        evaluation: the trials.
+        policy: a name or path; "" flies the default policy.
+        link: address of a real vehicle; "" flies simulated ones.
+        limits: limits of the watchdog.
+        out: folder of the files.
+        console: shows progress and results.
+        key: 32 bytes that sign the messages to a real vehicle; None sends unsigned ones.
+
+    Returns:
+        The contents of fly.json, and `out`.
 
     Raises:
         ValueError: for invalid options, before the first flight.
         WorkFailed: if pymavlink is missing, or no vehicle answers.
     """
     dialect()
-    course = read_course(evaluation, real_time=True)
-    refuse_one_name({trial.track for trial in course.trials})
+    trial_set = read_trial_set(evaluation, real_time=True)
+    refuse_equal_names({trial.track for trial in trial_set.trials})
     name = policy or default_policy()
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
@@ -79,29 +95,29 @@ def fly_commanded(
     flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if evaluation.monitor:
         loaded, flying = Monitored(loaded), Monitored(flying)
-    settings = LinkFlights(evaluation, about_policy(name, loaded), limits, link or "simulated")
+    settings = LinkFlights(evaluation, policy_record(name, loaded), limits, link or "simulated")
     refuse_other_run(out, settings)
     rules = Rules(time_limit_s=evaluation.time_limit_s)
     # Before the flights, since the judge may refuse the policy.
-    judged = [] if link else _judged(loaded, course, rules)
+    judged = [] if link else _judged_successes(loaded, trial_set, rules)
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
     if link:
-        found = _real(flying, course, link, limits, out, console, key)
+        results = _fly_real_vehicle(flying, trial_set, link, limits, out, console, key)
     else:
         flights: list[Flight] = []
         try:
-            for flight in fly_simulated(flying, course, rules, limits, out, console):
+            for flight in fly_simulated(flying, trial_set, rules, limits, out, console):
                 flights.append(flight)
         except KeyboardInterrupt as error:
             interrupt = error
-        found = {**totals(flights, limits), "judge_successes": sum(judged[: len(flights)])}
-        found["flights"] = [flight.row for flight in flights]
-        _show(found, flights, console)
-    about = {"policy": settings.policy, "limits": limits, "link": settings.link}
+        results = {**totals(flights, limits), "judge_successes": sum(judged[: len(flights)])}
+        results["flights"] = [flight.row for flight in flights]
+        _show_results(results, flights, console)
     if isinstance(flying, Monitored):
-        found["interventions"] = flying.interventions
-    answer = {**stamp(1, evaluation.seed), **about, **found}
+        results["interventions"] = flying.interventions
+    inputs = {"policy": settings.policy, "limits": limits, "link": settings.link}
+    answer = {**stamp(1, evaluation.seed), **inputs, **results}
     write_json(out / FLY, answer)
     write_run_record(out, settings, evaluation.seed)
     if interrupt is not None:
@@ -109,40 +125,41 @@ def fly_commanded(
     return {**answer, "out": str(out)}
 
 
-def _judged(policy: Policy, course: Course, rules: Rules) -> list[bool]:
+def _judged_successes(policy: Policy, trial_set: TrialSet, rules: Rules) -> list[bool]:
     """Return whether the judge's flight of each trial succeeds."""
     from eval.judging.judge import JudgeOptions, fly
 
-    options = JudgeOptions(slots=min(16, len(course.trials)), workers=1, rules=rules)
-    results = fly(policy, course.trials, course.vehicle, options=options, tracks=course.tracks)
+    trials, tracks = trial_set.trials, trial_set.tracks
+    options = JudgeOptions(slots=min(16, len(trials)), workers=1, rules=rules)
+    results = fly(policy, trials, trial_set.vehicle, options=options, tracks=tracks)
     return [result.success for result in results]
 
 
-def _real(
+def _fly_real_vehicle(
     policy: Policy,
-    course: Course,
+    trial_set: TrialSet,
     address: str,
     limits: Limits,
     out: Path,
     console: Console,
     key: bytes | None,
 ) -> dict[str, Any]:
+    """Fly one flight with the vehicle at `address`, and return its results for fly.json."""
     from eval.worlds.trial import track_of
-    from suite.judging.link.flights import warm_up
 
-    if len(course.trials) != 1:
+    if len(trial_set.trials) != 1:
         raise ValueError(
-            f"--link flies one flight, and {len(course.trials)} are asked for; give one track, "
-            "one level and --trials 1"
+            f"--link flies one flight, and these options give {len(trial_set.trials)}; give one "
+            "track, one level and --trials 1"
         )
     if (out / FLY).is_file() or any(out.glob("*.parquet")):
-        raise ValueError(f"--out {out} holds an earlier flight; give each one a folder of its own")
-    (trial,) = course.trials
+        raise ValueError(f"--out {out} holds an earlier flight; give another --out")
+    (trial,) = trial_set.trials
     warm_up(policy)
     wire = Wire(COMPANION, VEHICLE, key)
-    link = UdpLink(address, wire.speaks)
-    track = track_of(course.tracks, trial)
-    companion = Companion(policy, track, course.vehicle, wire, time.monotonic, limits)
+    link = UdpLink(address, wire.is_from_peer)
+    track = track_of(trial_set.tracks, trial)
+    companion = Companion(policy, track, trial_set.vehicle, wire, time.monotonic, limits)
     console.say(
         f"waiting for states and images on {address}; Ctrl-C returns control to the autopilot"
     )
@@ -158,16 +175,16 @@ def _real(
         row = {**trial._asdict(), "handed_over": companion.over}
         file = write_log(companion, row, out)
     if not companion.rows:
-        why = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
+        reason = f"no vehicle sent a state (ODOMETRY) and a depth image within {WAIT_S:g} s"
         if companion.over is not None:
-            why = f"handed over before the first set point: {companion.over}"
+            reason = f"handed over before the first set point: {companion.over}"
         elif companion.wrong_image_size:
-            why += f" ({companion.wrong_image_size})"
-        raise WorkFailed(f"{address}: {why}; see docs/fly.md, 'When it hands over'")
+            reason += f" ({companion.wrong_image_size})"
+        raise WorkFailed(f"{address}: {reason}; see docs/fly.md, 'When it hands over'")
     console.say(f"handed over: {companion.over}; log: {file}")
     if link.strangers:
-        console.note(f"{link.strangers} datagrams of others than the vehicle were left out")
-    _warn_of_missed(companion.missed_decisions, console)
+        console.note(f"{link.strangers} datagrams from other senders were ignored")
+    _warn_of_missed_decisions(companion.missed_decisions, console)
     return {
         **delays(companion.rows, limits.deadline_s),
         "late_answers": companion.late_answers,
@@ -179,7 +196,8 @@ def _real(
     }
 
 
-def _show(found: dict[str, Any], flights: list[Flight], console: Console) -> None:
+def _show_results(results: dict[str, Any], flights: list[Flight], console: Console) -> None:
+    """Print the delays as a table, the successes, and the reasons of hand-overs."""
     headers = ("delay", "median [ms]", "p99 [ms]", "longest [ms]")
     names = {
         "answer_ms": "state's arrival to set point",
@@ -188,31 +206,29 @@ def _show(found: dict[str, Any], flights: list[Flight], console: Console) -> Non
         "image_age_ms": "image's arrival to decision",
     }
     lines = [
-        [text, *(f"{found[key][part]:.2f}" for part in ("median", "p99", "max"))]
+        [text, *(f"{results[key][part]:.2f}" for part in ("median", "p99", "max"))]
         for key, text in names.items()
-        if key in found
+        if key in results
     ]
     if lines:
         console.show(rich_table(table(headers, lines)))
-    count = found["trials"]
-    console.say(
-        f"{found['successes']} of {count} finished; the judge's: {found['judge_successes']}"
-    )
+    count, judged = results["trials"], results["judge_successes"]
+    console.say(f"{results['successes']} of {count} finished; without the link: {judged}")
     for flight in flights:
         if flight.row["handed_over"]:
             console.say(f"seed {flight.row['seed']}: handed over: {flight.row['handed_over']}")
-    if found["vehicle_slips"]:
+    if results["vehicle_slips"]:
         console.note(
-            f"warning: the simulated vehicle was late {found['vehicle_slips']} times; run again on "
-            "a free machine"
+            f"warning: the simulated vehicle was late {results['vehicle_slips']} times; run again "
+            "on a machine without other load"
         )
-    _warn_of_missed(found["missed_decisions"], console)
+    _warn_of_missed_decisions(results["missed_decisions"], console)
 
 
-def _warn_of_missed(count: int, console: Console) -> None:
+def _warn_of_missed_decisions(count: int, console: Console) -> None:
     if count:
         console.note(
-            f"warning: {count} decisions were missed: no state came in their time (send ODOMETRY "
+            f"warning: {count} decisions were missed: no state arrived in time (send ODOMETRY "
             "several times as often as the policy decides), or the policy took longer than one "
             "decision period"
         )

@@ -1,7 +1,8 @@
-"""Work whose product is a folder, on another machine: folders are sent as content.
+"""Do a job on another machine of a cluster, which gets and returns folders as content.
 
-The other machine works in a folder of the user's cache that is named by the digest of the work. So
-the next worker continues from the files of a killed one.
+A job is work whose product is a folder. The other machine works in a folder of the user's cache
+that is named by the SHA-256 of the job. So the next worker continues from the files of a killed
+one.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Job(NamedTuple):
     """Work whose product is a folder."""
 
     task: Any
-    """Description of the work."""
+    """Data that describe the work."""
     folder: Path
     """Folder of the product; the work continues from files of an earlier call."""
     reads: Path | None = None
@@ -39,10 +40,13 @@ class Parcel(NamedTuple):
     """A job with the content of its folders."""
 
     task: Any
+    """Data that describe the work."""
     name: str
-    """Name of its folder."""
+    """Name of the product's folder."""
     folder: Content
+    """Content of the product's folder."""
     reads: Content | None
+    """Content of the folder that the work reads, if there is one."""
 
 
 def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
@@ -52,21 +56,21 @@ def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
         yield Parcel(job.task, job.folder.name, content(job.folder), reads)
 
 
-def do_apart(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[Result, Content]]:
-    """Do a job on this machine and yield its result and the content of its folder."""
+def do_remotely(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[Result, Content]]:
+    """Do a received job on this machine; yield its result and the content of its folder."""
     keep_compiled()
-    with _place(hashlib.sha256(pack((do, parcel))).hexdigest()[:16]) as place:
-        folder, reads = place / parcel.name, None
+    with _work_folder(hashlib.sha256(pack((do, parcel))).hexdigest()[:16]) as parent:
+        folder, reads = parent / parcel.name, None
         if not folder.exists():
-            fill(folder, parcel.folder)
+            replace_content(folder, parcel.folder)
         if parcel.reads is not None:
-            reads = place / "reads"
-            fill(reads, parcel.reads)
+            reads = parent / "reads"
+            replace_content(reads, parcel.reads)
         result = do(Job(parcel.task, folder, reads))
-        found = content(folder)
+        product = content(folder)
         for path in filter(None, (folder, reads)):
             shutil.rmtree(path)
-    yield result, found
+    yield result, product
 
 
 def content(folder: Path) -> Content:
@@ -79,7 +83,7 @@ def content(folder: Path) -> Content:
     }
 
 
-def fill(folder: Path, files: Mapping[str, bytes]) -> None:
+def replace_content(folder: Path, files: Mapping[str, bytes]) -> None:
     """Replace `folder` by one with these files, completely or not at all."""
     with replacing_folder(folder) as new:
         for name, data in files.items():
@@ -88,12 +92,12 @@ def fill(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 @contextmanager
-def _place(name: str) -> Iterator[Path]:
-    """Lock a folder of that name in the user's cache, or make a temporary one."""
-    place = user_cache() / "pieces" / name
+def _work_folder(name: str) -> Iterator[Path]:
+    """Lock a folder of that name in the user's cache, or make a temporary one; yields it."""
+    folder = user_cache() / "pieces" / name
     with ExitStack() as stack:
         try:
-            stack.enter_context(one_writer(place))
+            stack.enter_context(one_writer(folder))
         except (OSError, ValueError):
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="suite-piece-")))
-        yield place
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="suite-piece-")))
+        yield folder

@@ -1,0 +1,204 @@
+"""The trials that a command flies: tracks and levels by name, with vehicle and sensors.
+
+A trial is one judged flight; its track, level (difficulty 0 to 9) and seed determine it. A track is
+a family, which draws it from the seed, or a file. `read_trial_set` reads all that the options of
+`suite eval`, `suite collect` and `suite fly` name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from tracks.input.ranges import check_ranges
+
+if TYPE_CHECKING:
+    from eval.sensors.sensors_file import SensorSet
+    from eval.vehicles.vehicle import Vehicle
+    from eval.worlds.trial import TrialSpec
+    from suite.common.console import Console
+    from suite.judging.requests import Collection, Evaluation
+    from tracks.track import Track
+
+LEVELS = tuple(range(10))
+"""The levels of difficulty, from easy to hard."""
+GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
+"""Larger sizes cause a note: the file may be in millimetres [m]."""
+
+
+def parse_levels(text: str) -> list[int]:
+    """Return the levels of "3", "0,3,9", "0-3", "0,5-9" or "all", in the order given.
+
+    Raises:
+        ValueError: for any other text, and for a level that is not 0 to 9.
+    """
+    if text.strip() == "all":
+        return list(LEVELS)
+    levels: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", part)
+        if not match:
+            raise ValueError(
+                f"--difficulty {text!r}: {part!r} is no level; give 0 to 9, a list (0,3,9), "
+                "a range (0-3), or all"
+            )
+        first, last = int(match[1]), int(match[2] or match[1])
+        for level in (first, last):
+            if level not in LEVELS:
+                raise ValueError(f"--difficulty {text!r}: level {level} is not 0 to 9")
+        if last < first:
+            raise ValueError(f"--difficulty {text!r}: the range {part!r} runs backwards")
+        levels += range(first, last + 1)
+    return list(dict.fromkeys(levels))
+
+
+def parse_tracks(text: str) -> list[str]:
+    """Return the tracks of "all" (the judged families), a name, a file, or a list of them.
+
+    A name that ends in ``.toml`` is a track file; others are families.
+
+    Raises:
+        ValueError: for an unknown family, with the most similar one.
+    """
+    from tracks.families import JUDGED, check_family
+
+    if text.strip() == "all":
+        return list(JUDGED)
+    names = [part.strip() for part in text.split(",")]
+    for name in names:
+        if not is_track_file(name):
+            check_family(name)
+    return list(dict.fromkeys(names))
+
+
+def is_track_file(name: str) -> bool:
+    """Return whether `name` is a track file and not a family."""
+    return name.endswith(".toml")
+
+
+def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
+    """Return the tracks of those `names` that are files.
+
+    Raises:
+        ValueError: for an invalid file, with its key.
+    """
+    from tracks.formats.custom import load_track
+
+    return {name: load_track(name) for name in names if is_track_file(name)}
+
+
+def trial_list(
+    tracks: Sequence[str], levels: Sequence[int], trials: int, seed: int, once: bool = False
+) -> list[TrialSpec]:
+    """Return the trials of every track at every level, with the seeds seed, seed + 1, ...
+
+    A track from a file has no levels: it is flown with every seed or, if `once`, with the first.
+    """
+    from eval.worlds.trial import TrialSpec
+
+    seeds = range(seed, seed + trials)
+    return [
+        TrialSpec(track, level, number)
+        for track in tracks
+        for level in ([0] if is_track_file(track) else levels)
+        for number in (seeds[:1] if once and is_track_file(track) else seeds)
+    ]
+
+
+class TrialSet(NamedTuple):
+    """The trials of a command, with tracks, vehicle and sensors read and checked."""
+
+    trials: list[TrialSpec]
+    """In the order of the results."""
+    tracks: dict[str, Track]
+    """Tracks from files, by their name in trials."""
+    vehicle: Vehicle
+    """The flown vehicle."""
+    sensors: SensorSet
+    """Errors in what policies see."""
+    differences: list[str]
+    """Differences between the simulator and the vehicle file, as sentences."""
+    notes: list[str]
+    """Other notes for the user, as sentences."""
+
+
+def read_trial_set(options: Evaluation | Collection, real_time: bool = False) -> TrialSet:
+    """Return the trials that a command's options describe.
+
+    A track from a file is flown only once if all its flights would be equal.
+
+    Args:
+        options: of the command.
+        real_time: whether flights are in real time, where no two are equal.
+
+    Raises:
+        ValueError: for an unknown simulator or track, too few trials, or an invalid file.
+    """
+    from eval.effects import EFFECTS
+    from eval.quadrotor.vehicle_file import load_vehicle
+    from eval.sensors.sensors_file import load_sensors
+    from eval.worlds import differences, world_class
+    from eval.worlds.engine import refuse_start_contact
+
+    world_class(options.simulator)
+    check_ranges(options, options=True)
+    names = parse_tracks(options.track)
+    vehicle = load_vehicle(options.vehicle)
+    sensors = load_sensors(options.sensors)
+    levels, tracks, notes = parse_levels(options.difficulty), custom_tracks(names), list[str]()
+    is_random = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
+    once = not (real_time or is_random)
+    if once and options.trials > 1:
+        notes = [
+            f"{name}: flown once, not {options.trials} times: without random effects (gusts, "
+            "noise) all flights on a track from a file are equal"
+            for name in tracks
+        ]
+    for name, track in tracks.items():
+        refuse_start_contact(name, track, vehicle)
+        notes += _in_millimetres(name, track)
+    trials = trial_list(names, levels, options.trials, options.seed, once)
+    simulator_differences = differences(options.simulator, vehicle)
+    return TrialSet(trials, tracks, vehicle, sensors, simulator_differences, notes)
+
+
+def _in_millimetres(name: str, track: Track) -> list[str]:
+    """Return a note if the size of the gates or the track suggests a file in millimetres."""
+    gates = track.scene.gates
+    opening = float((gates.opening_g.max(1) - gates.opening_g.min(1)).max())
+    extent = float((gates.center_w.max(0) - gates.center_w.min(0)).max())
+    if opening <= GATE_MOST_M and extent <= TRACK_MOST_M:
+        return []
+    return [
+        f"{name}: its largest gate is {opening:g} m wide and its gates are up to {extent:g} m "
+        "apart; is the file in millimetres? Lengths are in metres: divide them by 1000"
+    ]
+
+
+def log_name(track: str, difficulty: int, seed: int) -> str:
+    """Return the file name of a trial's log."""
+    return f"{Path(track).stem}-{difficulty}-{seed}.parquet"
+
+
+def refuse_equal_names(tracks: Iterable[str]) -> None:
+    """Refuse tracks whose logs or pictures would have the same names.
+
+    Raises:
+        ValueError: naming the tracks' common name.
+    """
+    stems = [Path(track).stem for track in tracks]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise ValueError(
+                f"--track: several tracks are called {stem!r}, and files are named after their "
+                "track; rename a track file, or fly each track with another --out"
+            )
+
+
+def show_notes(console: Console, simulator: str, trial_set: TrialSet) -> None:
+    """Print the differences and notes of `trial_set`."""
+    differences = [f"{simulator}: {difference}" for difference in trial_set.differences]
+    for sentence in [*differences, *trial_set.notes]:
+        console.note(sentence)
