@@ -46,8 +46,8 @@ class OwnRays(MujocoWorld):
             if self._scenes.get(slot, (None, None))[0] is not model:
                 self._scenes[slot] = model, mujoco.MjData(model)
                 mujoco.mj_kinematics(*self._scenes[slot])
-            # `_eye` is the policy's camera model; it casts the rays by `mj_multiRay`.
-            images.append(self._eye.image(*self._scenes[slot], pos_w[row], rot_w[row]))
+            # `_depth_camera` has the policy's camera model; it casts the rays by `mj_multiRay`.
+            images.append(self._depth_camera.image(*self._scenes[slot], pos_w[row], rot_w[row]))
         return np.array(images)
 
 

@@ -132,5 +132,5 @@ def test_a_network_that_steps_at_another_rate_is_refused():
     physics = race().physics
     fit = {**kept(physics), "rate_hz": 15.03}
     check_corrects(fit, physics, 15.0, WHERE)
-    with pytest.raises(ValueError, match="of 15 decisions a second, and this run has 30: .*=15"):
+    with pytest.raises(ValueError, match="with 15 decisions a second, and this run has 30: .*=15"):
         check_corrects(fit, physics, 30.0, WHERE)

@@ -67,7 +67,7 @@ def test_table2_and_all_levels(sky, tmp_path, capfd):
     assert all(goal["success_miss"] > 0 for goal in numbers["goals"]["ours"])
     assert "| 90.0 points | 97 % | 97.0 points |" in text
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
-    assert "seeds: 7 to 7, 1 trials a cell" in text
+    assert "seeds: 7 to 7, 1 trials per cell" in text
     # Other documents find the flights of this one.
     asked = ("--trials", "1", "--seed", "7", "--difficulty", "0", "--only", "wind")
     assert reproduce(tmp_path, "robustness", *asked) == 0

@@ -68,7 +68,7 @@ def test_a_run_whose_files_have_changed_is_not_flown_again(
     assert cli.main(view) == 2
     said = capsys.readouterr().err
     assert f"{what} {files[what]}: has changed since these trials were judged" in said
-    assert "put back what was judged" in said
+    assert "restore the judged version" in said
 
 
 def test_a_run_of_an_earlier_version_is_held_to_its_policy(pilots, tmp_path, capsys):
@@ -130,8 +130,8 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
     [
         ("{run} --seed 3", "--seed is 3, but"),
         ("{run} --speed 0.5", "--speed is 0.5, but"),
-        ("{run} --track zigzag", "flown again as they were"),
-        ("race --pick failed", "--pick is failed, but race is no run"),
+        ("{run} --track zigzag", "flown again unchanged"),
+        ("race --pick failed", "--pick is failed, but race is not a finished run"),
         ("race-paper --difficulty 0 --speed 0.4", "--speed 0.4: race-paper takes no speed"),
         ("race --difficulty 0 --speed 1.4", "--speed is 1.4"),
     ],
@@ -152,7 +152,7 @@ def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):
     assert found[eye, "Pinhole:resolution"][1] == [[[36.0, 20.0]]]
     layout = found[f"{eye}/depth", "DepthImage:format"][1][0][0]
     assert (layout["width"], layout["height"]) == (36, 20)
-    evaluation, *_ = view._chosen(view.Config(run="race", speed=0.4))
+    evaluation, *_ = view._choose_trials(view.Config(run="race", speed=0.4))
     assert manners(evaluation.speed, monitor=False) == [Manner(speed=0.4)]
 
 

@@ -37,7 +37,7 @@ def test_a_page_has_its_facts_its_tables_and_numbered_figures(tmp_path):
     place = Workspace(tmp_path / "docs", tmp_path)
     said = write_document(place, "schemes", Config(7), made(), Console())
     text = (tmp_path / "docs" / "schemes.md").read_text()
-    assert text.startswith("# schemes\n\nPPO, our method, and it without the field")
+    assert text.startswith("# schemes\n\nPPO, our method, and our method without the field")
     assert f"\n\n{BEGIN}\n\n- recipe: quick\n- command: `" in text and text.endswith(f"{END}\n")
     assert "## Part\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\nBelow." in text
     assert "![A figure.](schemes.png)" in text and "![A figure.](schemes-2.png)" in text

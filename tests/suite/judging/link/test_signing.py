@@ -53,4 +53,4 @@ def test_a_key_is_of_a_file_with_a_phrase_and_of_a_real_link(tmp_path, capsys, m
     with pytest.raises(ValueError, match="cannot be read"):
         signing_key(Path("nowhere"))
     assert cli.main(["fly", "--signing-key", "empty"]) == 2
-    assert "no --link is given" in capsys.readouterr().err
+    assert "--signing-key needs --link" in capsys.readouterr().err
