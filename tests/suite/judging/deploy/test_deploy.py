@@ -91,7 +91,7 @@ def test_an_export_of_another_policy_is_not_written_over(
     assert export(other) == 2
     said = capsys.readouterr().err
     assert (
-        f"{file} there was exported from {one} and would be overwritten by that of {other}" in said
+        f"{file} was exported from {one} and would be overwritten by the export of {other}" in said
     )
     assert (out / file).read_bytes() == kept
     shutil.rmtree(one)
@@ -100,7 +100,7 @@ def test_an_export_of_another_policy_is_not_written_over(
     assert export(other) == 0, "and now that of its content, too"
     (out / exporting.NOTE).unlink()
     assert export(other) == 2
-    assert f"{file} there was exported from an unrecorded policy" in capsys.readouterr().err
+    assert f"{file} was exported from an unrecorded policy" in capsys.readouterr().err
     (out / exporting.NOTE).write_text("[]")
     assert export(other) == 2
     assert "not a record of exports" in capsys.readouterr().err
