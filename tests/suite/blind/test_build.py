@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("short_flights")
 
 
 def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatch):
-    monkeypatch.setattr(module, "_judged", lambda *_: {})  # how strong it is takes longest
+    monkeypatch.setattr(module, "_expected_names", lambda *_: {})  # how strong it is takes longest
     first, again = build(SINGLE), made_set / "cases" / "case_001" / "flight_1.parquet"
     np.testing.assert_array_equal(first.logs[0].pos_w, read_flight(again).pos_w)
     stored = open_answers(made_set)["case_001"]

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("short_flights")
 def test_a_continuous_cases_vehicle_has_the_loop_that_flew(monkeypatch):
     """That a flight is the same to the bit again, test_continuous_flight.py asks."""
     judged = []
-    monkeypatch.setattr(module, "_judged", lambda *given: judged.append(given) or {})
+    monkeypatch.setattr(module, "_expected_names", lambda *given: judged.append(given) or {})
     first = build(SINGLE)
     conditions = first.answer["conditions"]
     assert first.nominal.controller.frequency == conditions["loop_hz"]
