@@ -55,12 +55,11 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
 def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:
     """Return the state before the first iteration, from `params` or, without, random parameters."""
-    if params is None:
-        params = network.init(jax.random.key(config.seed), config.spec)
+    start = network.init(jax.random.key(config.seed), config.spec) if params is None else params
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
     return TrainState(
-        params=params,
-        optimizer=make_optimizer(config.optimizer).init(params),
+        params=start,
+        optimizer=make_optimizer(config.optimizer).init(start),
         iteration=jnp.zeros((), int),
         hidden=hidden,
     )

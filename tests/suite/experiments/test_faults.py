@@ -54,12 +54,12 @@ def test_outcomes_are_counted_by_name(judged):
     path, *_ = judged
     cases = {
         "named": faults.Case("quaternion xyzw", "px4", path, 0),
-        "silent": faults.Case("gyro in deg/s", faults.OWN, path, 0),
+        "silent": faults.Case("gyro in deg/s", faults.FLIGHT_LOG, path, 0),
     }
     (answer,) = faults._check(cases["named"], "racer5", 1)
     assert faults._outcome(cases["named"], answer) == "named"
     assert faults._outcome(cases["silent"], []) == "silent"
     assert faults._outcome(cases["silent"], "refused for a reason") == "refused"
-    assert faults._reported(answer) and not faults._reported([])
+    assert faults._reported_faults(answer) and not faults._reported_faults([])
     grid = faults._kinds_grid([(cases["named"], answer)])
     assert "1 (100.0%)" in {cell.text for cell in grid.rows[-1]}

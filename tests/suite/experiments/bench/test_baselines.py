@@ -94,7 +94,7 @@ def test_both_sides_have_the_same_residuals(both):
     # The first tenth of a second: then 5 mm of the centre of mass have not turned much over, and
     # attitude errors as rotation vector and as twice a quaternion's part are the same.
     near = np.asarray(task.windows.row_s)[:, 1:] < 0.1
-    seen = np.asarray(task.windows.seen)[:, 1:, :12] & near[..., None]
+    seen = np.asarray(task.windows.valid)[:, 1:, :12] & near[..., None]
     assert seen.any(axis=(0, 1)).all()
     np.testing.assert_allclose(theirs[seen], ours[seen], rtol=2e-3, atol=2e-2)
 
