@@ -203,7 +203,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
         _without_hubs(pair),
         ("inseparable: the right set", "95 %", [v.exact for v in of("blurred")]),
         ("the same with separating flights", "95 %", [v.exact for v in of("separated")]),
-        ("cases with a spurious extra name", "", [v.extra > 0 for v in completed if v.hidden]),
+        ("cases with a false extra name", "", [v.extra > 0 for v in completed if v.hidden]),
         ("95 % intervals that contain the true value", "90-98 %",
          [x for v in verdicts for x in v.covered]),
         (f"gap after within {GAP_LIMIT} of the noise floor, where named", "all",

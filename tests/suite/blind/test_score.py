@@ -123,7 +123,7 @@ def test_a_diagnosis_that_failed_is_not_one_that_rightly_named_nothing():
     assert lines["nulls: something named"] == (1, 2)
     assert lines["nulls: verdict `no_gap`"] == (1, 3)
     assert lines["single effects: named, nothing else"] == (0, 1)
-    assert "cases with a spurious extra name" not in lines, "nothing was named where it failed"
+    assert "cases with a false extra name" not in lines, "nothing was named where it failed"
     assert lines["diagnosis failed"] == (2, 4)
 
 
