@@ -24,9 +24,9 @@ from eval.logs.faults.reading import MOTORS, read_rows
 from eval.logs.flight_log import FlightLog, log_from_columns
 
 COARSE_HZ = 100.0
-"""Largest row rate for the checks of the pose."""
+"""Largest row rate for the checks of the pose [Hz]."""
 SLOW_HZ = 40.0
-"""A signal below this rate gets a note."""
+"""A signal below this rate gets a note [Hz]."""
 SIGNAL_TEXTS = {
     "pos": "position",
     "quat": "attitude",
@@ -77,46 +77,50 @@ def assemble(
     if options.pose is not None:
         from eval.importers.pose import with_pose
 
-        recording, more = with_pose(recording, options)
-        findings += more
+        recording, more_findings = with_pose(recording, options)
+        findings += more_findings
     # An order of motors refers to the vehicle's order, so it is applied after `order_motors`.
     orders = tuple(
         (signal, steps) for signal, steps in options.read if signal in MOTORS and "," in steps
     )
     recording = with_readings(recording, tuple(r for r in options.read if r not in orders))
     _require_signals(recording, options.partial, findings)
+    # Checks of the clock, then of the frames of position, attitude and gyro.
     context = CheckContext(options.vehicle)
-    more, readings, _ = run_checks(
+    more_findings, readings, _ = run_checks(
         {"time": recording.signals[slowest(recording)].time_s}, CLOCK, context, options.fix
     )
-    findings += more
+    findings += more_findings
     recording = with_readings(recording, readings)  # rows need the time in seconds
     coarse = row_times(recording, COARSE_HZ, 0.0, None)
-    more, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
-    findings += more
+    more_findings, readings, _ = run_checks(rows_at(recording, coarse), POSE, context, options.fix)
+    findings += more_findings
     if options.fix:
         recording = with_readings(recording, readings)
-        recording, more = clean(recording)
-        findings += more
+        recording, more_findings = clean(recording)
+        findings += more_findings
     if {"quat", "rate"} <= recording.signals.keys() and options.pose is None:
-        recording, more = check_delay(recording, options.fix)
-        findings += more
+        recording, more_findings = check_delay(recording, options.fix)
+        findings += more_findings
+    # Cut the time on the ground, and resample to common rows.
     flight_span_s = (-np.inf, np.inf)
     if options.trim:
-        flight_span_s, more = airborne(recording)
-        findings += more
+        flight_span_s, more_findings = airborne(recording)
+        findings += more_findings
     time_s = row_times(recording, options.rate_hz, options.start_s, options.end_s, flight_span_s)
-    findings += _rate_notes(recording, time_s)
+    findings += _notes_on_rates(recording, time_s)
     rows = rows_at(recording, time_s)
+    # Convert the commands, and check them.
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
-    more, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix)
-    findings += more
+    more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix)
+    findings += more_findings
     rows = corrected_rows if options.fix else rows
     doubtful = {f.signal for f in findings if f.status == "doubt"}
     findings += thrust_command(rows, options, "accelerometer" not in doubtful)
     findings += _drop_half_commands(rows, options.partial)
+    # Empty the cells of slow signals in rows without a sample, and make the flight log.
     for name, is_sample in sampled_rows(recording, time_s).items():
         rows[name] = np.where(is_sample[:, None], rows[name], np.nan)
     columns = _columns(rows)
@@ -154,7 +158,7 @@ def _require_signals(recording: Recording, partial: bool, findings: list[Finding
         raise FlightLogError(recording.name, None, None, reason)
 
 
-def _rate_notes(recording: Recording, time_s: np.ndarray) -> list[Finding]:
+def _notes_on_rates(recording: Recording, time_s: np.ndarray) -> list[Finding]:
     """Return notes on the row rate, slow signals and gaps."""
     name = slowest(recording)
     row_rate = f"at {1.0 / median_step(time_s):.3g} Hz, by the {SIGNAL_TEXTS[name]}"
@@ -176,7 +180,7 @@ def _rate_notes(recording: Recording, time_s: np.ndarray) -> list[Finding]:
 
 
 def _drop_half_commands(rows: dict[str, np.ndarray], partial: bool) -> list[Finding]:
-    """Remove half a command in place: a thrust without rates or torques, or these without it.
+    """Remove an incomplete command in place: a thrust without rates or torques, or the reverse.
 
     A partial log keeps a thrust without rates.
     """

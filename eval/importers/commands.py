@@ -37,11 +37,12 @@ def order_motors(
     Args:
         rows: see `eval.importers.rows`.
         motor_side: (x forward, y left) of the file's motors 1 to 4; None: already in order.
-        vehicle: with the wanted order; None: that of the shipped vehicles.
+        vehicle: the vehicle whose motor order is wanted; None: the order of the shipped vehicles.
     """
     if motor_side is None or not ({"motor", "motor_cmd", "pwm"} & rows.keys()):
         return []
     hubs = SHIPPED_ORDER if vehicle is None else [hub[:2] for hub in vehicle.rotors.position]
+    # The best order is the one in which the hubs' directions from the centre agree best.
     file_hubs, wanted_hubs = _directions(motor_side), _directions(hubs)
     order = max(permutations(range(4)), key=lambda p: np.sum(file_hubs[list(p)] * wanted_hubs))
     for name in ("motor", "motor_cmd", "pwm"):
@@ -131,24 +132,24 @@ def _full_thrust(
 def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, float]:
     """Return thrust per mass at full throttle, and the standard deviation of the residual [m/s^2].
 
-    The fit is the median of the ratios of the accelerometer's z to the throttle, and the deviation
-    comes from the median too, so outliers do not count. NaN for too few samples.
+    The full thrust is the median ratio of the accelerometer's z to the throttle. The standard
+    deviation comes from a median too, so outliers do not count. Both are NaN for too few samples.
     """
-    good = np.isfinite(acc_z) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
-    if np.sum(good) <= 100:
+    usable = np.isfinite(acc_z) & np.isfinite(throttle) & (throttle > 0.02) & (throttle <= 1.5)
+    if np.sum(usable) <= 100:
         return np.nan, np.nan
-    full = float(np.median(acc_z[good] / throttle[good]))
-    residual = acc_z[good] - full * throttle[good]
+    full = float(np.median(acc_z[usable] / throttle[usable]))
+    residual = acc_z[usable] - full * throttle[usable]
     return full, MAD_TO_SD * float(np.median(np.abs(residual - np.median(residual))))
 
 
 def _check_mean_thrust(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
-    """Return a doubt where the mean of `thrust` (T,) [m/s^2] differs from the accelerometer's."""
+    """Return a doubt where the means of `thrust` (T,) [m/s^2] and of the accelerometer differ."""
     if "acc" not in rows:
         return []
-    good = np.isfinite(thrust) & np.isfinite(rows["acc"][:, 2])
-    measured = float(np.mean(rows["acc"][good, 2])) if good.any() else 0.0
-    ratio = float(np.mean(thrust[good])) / measured if measured > 1.0 else 1.0
+    usable = np.isfinite(thrust) & np.isfinite(rows["acc"][:, 2])
+    measured = float(np.mean(rows["acc"][usable, 2])) if usable.any() else 0.0
+    ratio = float(np.mean(thrust[usable])) / measured if measured > 1.0 else 1.0
     if 0.7 < ratio < 1.4:
         return []
     text = (
@@ -159,14 +160,14 @@ def _check_mean_thrust(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[
 
 
 def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:
-    """Replace `cmd_quat` of `rows` by `cmd_rate` [rad/s] in place, unless they have a rate command.
+    """Replace `cmd_quat` (commanded attitudes) of `rows` by `cmd_rate` [rad/s], in place.
 
-    The rate is the attitude gain times the rotation vector from the attitude to the set point,
-    clipped to the vehicle's `rate_max`.
+    A rate command that `rows` have already is kept. The rate is the attitude gain times the
+    rotation vector from the attitude to the set point, clipped to the vehicle's `rate_max`.
 
     Args:
         rows: see `eval.importers.rows`.
-        vehicle: with the attitude loop's gains; None: the set points are dropped, with a doubt.
+        vehicle: has the attitude loop's gains; None: the set points are dropped, with a doubt.
     """
     if "cmd_quat" not in rows:
         return []

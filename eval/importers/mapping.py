@@ -61,15 +61,16 @@ def recording_of(
             'leave it out, or add source = "mocap" and "estimate" to the mapping'
         )
     for signal, alternatives in mapping.columns.items():
-        column, part = _first(signal, alternatives, find, options.source, name)
+        column, part = _first_alternative(signal, alternatives, find, options.source, name)
         if part is None:
             if mapping.optional or signal == "time":
                 continue
-            first = next(c for c in alternatives[0].names if find((c,)) is None)
-            raise FlightLogError(name, first, None, missing(first))
+            missing_column = next(c for c in alternatives[0].names if find((c,)) is None)
+            raise FlightLogError(name, missing_column, None, missing(missing_column))
         used_columns[signal], parts[signal] = column, _in_log_unit(part, column, name)
     about, findings = _text_file(path, mapping)
     parts.pop("time", None)
+    # Angles become quaternions, unless the file has quaternions too.
     for angles, quat in (("euler", "quat"), ("cmd_euler", "cmd_quat")):
         if angles in parts:
             time_s, value = parts.pop(angles)
@@ -84,19 +85,22 @@ def recording_of(
         part = find((column,))
         if part is not None:
             parts[KEPT + column] = part
-    signals, more = collect(parts, name)
+    signals, more_findings = collect(parts, name)
     for signal in ("vel", "rate", "acc"):
         if signal in signals and used_columns[signal].other_axes:
             _change_axes(signals, signal, used_columns[signal])
     if "cmd_thrust" in signals and not used_columns["cmd_thrust"].per_mass:
         findings += _per_mass(signals, about.get("mass"), options)
-    return Recording(name, signals, (*findings, *more), mapping.motor_side, about)
+    return Recording(name, signals, (*findings, *more_findings), mapping.motor_side, about)
 
 
-def _first(
+def _first_alternative(
     signal: str, alternatives: tuple[Column, ...], find: Find, source: str, name: str
 ) -> tuple[Column, Part | None]:
-    """Return the first alternative in the file, with its samples; those of `source` come first."""
+    """Return the first alternative that the file has, with its samples.
+
+    The alternatives of `source` are tried first. Without any, the samples are None.
+    """
     preferred = [c for c in alternatives if source and c.source == source]
     for column in (*preferred, *(c for c in alternatives if c not in preferred)):
         part = find(column.names)
@@ -111,7 +115,10 @@ def _first(
 def _estimates(
     mapping: LogMap, used_columns: Mapping[str, Column], find: Find, name: str
 ) -> dict[str, Part]:
-    """Return the on-board estimates of signals taken from motion capture, as columns to keep."""
+    """Return the on-board estimates of signals taken from motion capture, as columns to keep.
+
+    Only estimates in the flight log's axes are kept: a velocity in world axes.
+    """
     estimates = {}
     for signal in ESTIMATED:
         if signal not in used_columns or used_columns[signal].source != "mocap":
@@ -123,8 +130,8 @@ def _estimates(
             part = _in_log_unit(part, column, name)
             time_s, value = _in_log_frame(signal, *part, column, mapping)
             value = continuous(value) if signal == "quat" else value
-            for k, log_column in enumerate(GROUPS[signal]):
-                estimates[f"{KEPT}{ESTIMATE}{log_column}"] = (time_s, value[:, k : k + 1])
+            for k, column_name in enumerate(GROUPS[signal]):
+                estimates[f"{KEPT}{ESTIMATE}{column_name}"] = (time_s, value[:, k : k + 1])
             break
     return estimates
 
@@ -145,7 +152,10 @@ def _in_log_unit(part: Part, column: Column, name: str) -> Part:
 def _in_log_frame(
     signal: str, time_s: np.ndarray, value: np.ndarray, column: Column, mapping: LogMap
 ) -> Part:
-    """Return a signal with z up and y left; vectors in world or body axes remain in these."""
+    """Return a signal in a z-up world or forward-left-up body.
+
+    A vector in world axes remains in world axes, and one in body axes in body axes.
+    """
     world_axes = signal == "pos" or (signal in ("vel", "rate", "acc") and _is_world(signal, column))
     if signal in ("quat", "cmd_quat"):
         quat = conjugate(value) if column.inverse else value
@@ -170,7 +180,7 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
     samples = signals.pop(signal)
     value = samples.value
     if signal == "acc" and not column.gravity:
-        value = value + [0.0, 0.0, GRAVITY]
+        value = value + [0.0, 0.0, GRAVITY]  # to the specific force, which contains gravity
     if "quat" not in signals:
         if signal == "acc":
             for k, axis in enumerate("xyz"):

@@ -22,6 +22,7 @@ from tracks.common.names import unknown_name
 from tracks.common.toml_table import Table, read_toml, shipped_names
 
 SHIPPED = Path(__file__).resolve().parent / "mappings"
+"""Folder of the mapping files that come with the suite."""
 DEG = float(np.pi / 180.0)
 RPM = float(2.0 * np.pi / 60.0)
 _LENGTH = {"m": 1.0, "cm": 0.01, "mm": 1e-3}
@@ -29,9 +30,9 @@ _BODY_RATE = {"rad/s": 1.0, "deg/s": DEG, "mrad/s": 1e-3}
 _ANGLE = {"rad": 1.0, "deg": DEG}
 _ACCELERATION = {"m/s^2": 1.0, "g": GRAVITY}
 _ROTOR_SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
-_SHARE = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
+_FRACTION = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
 PER_MASS = "N"
-"""Unit of a `cmd_thrust` that is divided by the mass."""
+"""Unit of a thrust command that the import divides by the mass; other units are per mass."""
 UNITS: dict[str, dict[str, float]] = {
     "time": TIMES,
     "pos": _LENGTH,
@@ -44,11 +45,11 @@ UNITS: dict[str, dict[str, float]] = {
     "cmd_euler": _ANGLE,
     "cmd_thrust": _ACCELERATION | {PER_MASS: 1.0},
     "cmd_torque": {"N m": 1.0},
-    "throttle": _SHARE,
+    "throttle": _FRACTION,
     "acc": _ACCELERATION,
     "motor": _ROTOR_SPEED,
     "motor_cmd": _ROTOR_SPEED,
-    "pwm": _SHARE,
+    "pwm": _FRACTION,
     "voltage": {"V": 1.0, "mV": 1e-3},
 }
 """Signal -> unit -> factor to the flight log's unit; the first unit is the default."""
@@ -90,10 +91,10 @@ class Column:
     other_axes: bool = False
     """Whether the signal has the second choice of `AXES`."""
     gravity: bool = True
-    """Whether an acceleration in world axes is a specific force; False: the velocity's
-    derivative."""
+    """Whether an acceleration in world axes contains gravity (specific force); False: it is the
+    derivative of the velocity."""
     inverse: bool = False
-    """Whether a quaternion maps world to body."""
+    """Whether a quaternion rotates world axes to body axes; False: body axes to world axes."""
     per_mass: bool = True
     """Whether a thrust is divided by the mass; False: it is in N."""
     mixer: str = ""
@@ -119,10 +120,10 @@ class LogMap:
     keep: tuple[str, ...] = ()
     """Columns that are kept unchanged, if present."""
     text_file: str = ""
-    """Name of a text file in the log's folder with lines `key: value`. {stem} in it is the log's
-    name without its ending, {number} the digits of that."""
+    """Name of a text file in the log's folder with lines `key: value`. In the name, {stem} stands
+    for the log's name without its ending, and {number} for the digits in {stem}."""
     mass_key: str = ""
-    """Key of the mass [kg] in that file."""
+    """Key of the mass [kg] in the text file."""
 
 
 def shipped_maps() -> list[str]:
@@ -228,36 +229,39 @@ def _alternatives(signal: str, top: Table) -> tuple[Column, ...]:
 def _column(signal: str, table: Table) -> Column:
     """Read one table of a mapping: columns, unit, sign and scale, and the keys of its signal."""
     width = WIDTHS[signal]
-    in_cells = width == 1 or table.has("column")
-    names = [table.text("column")] if in_cells else _strings(table, width)
+    is_list_column = width == 1 or table.has("column")
+    names = [table.text("column")] if is_list_column else _column_names(table, width)
     unit = table.choice("unit", tuple(UNITS[signal]))
     sign = table.vector("sign", width, [1.0] * width)
     if not np.all(np.abs(sign) == 1.0):
         raise table.error("sign", sign.tolist(), "1 or -1 for each column")
     scale = table.number("scale", 1.0, above=0.0)
-    inverse = other = False
+    inverse = has_other_axes = False
     gravity, mixer, source = True, "", ""
     if signal in ("quat", "cmd_quat"):
         if table.choice("order", ("wxyz", "xyzw")) == "xyzw":
             order = [3, 0, 1, 2]
-            names = names if in_cells else [names[k] for k in order]
-            if in_cells:
+            names = names if is_list_column else [names[k] for k in order]
+            if is_list_column:  # `column[3]`, `column[0]`, ... are entries of the cells' lists
                 names = [f"{names[0]}[{k}]" for k in order]
             sign = sign[order]
         inverse = table.choice("maps", ("body to world", "world to body")) == "world to body"
     if signal in AXES:
-        other = table.choice("axes", AXES[signal]) != AXES[signal][0]
-    if signal == "acc" and other:
+        has_other_axes = table.choice("axes", AXES[signal]) != AXES[signal][0]
+    if signal == "acc" and has_other_axes:
         gravity = table.choice("gravity", ("specific force", "removed")) == "specific force"
     if signal == "pwm" and table.has("mixer"):
         mixer = table.choice("mixer", tuple(MIXERS))
     if signal in ("pos", "quat", "euler", "vel") and table.has("source"):
         source = table.choice("source", SOURCES)
     factor = tuple(float(s) * scale * UNITS[signal][unit] for s in sign)
-    return Column(tuple(names), factor, other, gravity, inverse, unit != PER_MASS, mixer, source)
+    return Column(
+        tuple(names), factor, has_other_axes, gravity, inverse, unit != PER_MASS, mixer, source
+    )
 
 
-def _strings(table: Table, width: int) -> list[str]:
+def _column_names(table: Table, width: int) -> list[str]:
+    """Return the `width` names under `columns`; reject another number of names."""
     value = table.texts("columns")
     if len(value) != width:
         raise table.error("columns", value, f"{width} column names")

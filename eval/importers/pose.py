@@ -27,7 +27,7 @@ from eval.logs.files import MOST_ROWS
 from tracks.geometry.rotation import rot_to_quat
 
 FIRST_REACH_S = 15.0
-"""The fit begins with the samples within this time of the middle of the flight [s]."""
+"""The fit first uses only the samples within this time of the middle of the flight [s]."""
 COARSE_HZ = 100.0
 """Largest row rate for the checks of the path."""
 GRID_S = 0.005
@@ -56,9 +56,9 @@ USUAL_STEP_S = 1.0 / 150.0
 LONG_S = 7200.0
 """Longest recording that is aligned; longer ones have a wrong unit of time or a jump [s]."""
 DRIFT_MAX = 2e-3
-"""Largest plausible relative drift of two clocks."""
+"""Relative drift of two clocks above which the alignment is rejected as wrong."""
 DRIFT = 2e-4
-"""Largest relative drift of two crystals."""
+"""Largest relative drift of two sound crystals; a larger one is reported as a fault."""
 ROTATION_DEG = 15.0
 """Rotation between the body frames above which it is corrected [deg]; a smaller one may be a
 tilt of the markers."""
@@ -69,9 +69,9 @@ class Alignment:
     """Relation of the pose's clock and body frame to the log's."""
 
     offset_s: float
-    """Log time of the pose's time 0 [s]."""
+    """Time on the log's clock at which the pose's clock shows 0 [s]."""
     drift: float
-    """Log seconds per pose second, minus 1."""
+    """Seconds of the log's clock per second of the pose's clock, minus 1."""
     rotation: np.ndarray
     """(3, 3) rotation from the pose's body axes to the gyro's."""
     correlation: float
@@ -177,7 +177,7 @@ def _align_pose(
     unchanged = align(quat, rate, pose.name)
     if unchanged.correlation > SURE and unchanged.rotation_deg <= ROTATION_DEG:
         return quat, unchanged, []
-    # Another convention must at least halve what the correlation lacks to 1.
+    # Another convention must at least halve the distance of the correlation from 1.
     enough = max(SURE, 0.5 + 0.5 * unchanged.correlation)
     converted = {
         steps: Signal(quat.time_s, read_as("quat", quat.value, steps))
@@ -193,9 +193,9 @@ def _align_pose(
         finding = Finding("corrected", "pose attitude", text, *about)
         return converted[best], aligned[best], [finding]
     mirrored = align(quat, rate, pose.name, mirrored=True)
-    signed = max((mirrored, *(aligned[s] for s in SIGNS)), key=lambda fit: fit.correlation)
-    if signed.correlation > enough:
-        return quat, replace(signed, rotation=np.eye(3)), []
+    wrong_sign = max((mirrored, *(aligned[s] for s in SIGNS)), key=lambda fit: fit.correlation)
+    if wrong_sign.correlation > enough:
+        return quat, replace(wrong_sign, rotation=np.eye(3)), []
     if unchanged.correlation < CORRELATION_MIN or abs(unchanged.drift) > DRIFT_MAX:
         reason = (
             f"its clock cannot be aligned with the log's: at best the body rates correlate by "
@@ -232,9 +232,11 @@ def align(quat: Signal, rate: Signal, name: str, mirrored: bool = False) -> Alig
     reach, full_reach = FIRST_REACH_S, float(np.max(np.abs(centre_s - middle)))
     # From the middle outwards, because over a long flight the drift is too large for one step.
     while True:
-        near = np.abs(centre_s - middle) <= reach
+        in_reach = np.abs(centre_s - middle) <= reach
         for _ in range(20):
-            fit, change = _refine(centre_s[near], pose_rate_b[near], rate, middle, fit, mirrored)
+            fit, change = _refine(
+                centre_s[in_reach], pose_rate_b[in_reach], rate, middle, fit, mirrored
+            )
             if np.all(np.abs(change) < [1e-7, 1e-9]):
                 break
         if reach >= full_reach:
@@ -248,7 +250,7 @@ class _Fit(NamedTuple):
     """State of the least-squares fit; the fields of `Alignment`, with the offset in the middle."""
 
     offset: float
-    """Log time minus pose time in the middle [s]."""
+    """Log's clock minus pose's clock in the middle of the flight [s]."""
     drift: float
     rotation: np.ndarray
     correlation: float
@@ -266,11 +268,11 @@ def _refine(
 ) -> tuple[_Fit, np.ndarray]:
     """Return the result of one Gauss-Newton step from `fit`, and the change of offset and drift."""
     time_s = centre_s + fit.offset + fit.drift * (centre_s - middle)
-    inside = (time_s > rate.time_s[0] + SPAN_S) & (time_s < rate.time_s[-1] - SPAN_S)
-    if np.sum(inside) < MIN_SAMPLES:
+    in_gyro_log = (time_s > rate.time_s[0] + SPAN_S) & (time_s < rate.time_s[-1] - SPAN_S)
+    if np.sum(in_gyro_log) < MIN_SAMPLES:
         return fit, np.zeros(2)
-    time_s, pose_rate_b = time_s[inside], pose_rate_b[inside]
-    since = (centre_s - middle)[inside, None]
+    time_s, pose_rate_b = time_s[in_gyro_log], pose_rate_b[in_gyro_log]
+    since_middle_s = (centre_s - middle)[in_gyro_log, None]
     gyro = averaged(rate.time_s, rate.value, time_s, SPAN_S)
     step = 0.5 * SPAN_S  # the slope over a shorter time is mostly noise
     later = averaged(rate.time_s, rate.value, time_s + step, SPAN_S)
@@ -283,7 +285,7 @@ def _refine(
     scale = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
     residual = gyro - scale * rotated
     # residual = bias + slope * (error of the offset + error of the drift * since)
-    columns = [slope.ravel(), (slope * since).ravel()]
+    columns = [slope.ravel(), (slope * since_middle_s).ravel()]
     columns += [np.tile(axis, len(rotated)) for axis in np.eye(3)]
     design = np.stack(columns, axis=1)
     weight = _huber_weights(residual)
@@ -291,24 +293,27 @@ def _refine(
     solution = np.linalg.lstsq(normal, design.T @ (weight * residual.ravel()), rcond=None)[0]
     change = np.clip(solution[:2], [-0.05, -1e-3], [0.05, 1e-3])
     noise = float(np.mean(weight * (residual.ravel() - design @ solution) ** 2))
-    # Neighbouring differences share samples, which reduces the number of independent ones.
-    shared = max(1.0, SPAN_S / median_step(centre_s))
-    variance = shared * noise / np.maximum(np.diag(normal)[:2], 1e-12)
+    # Neighbouring body rates share samples, which reduces the number of independent body rates.
+    overlap = max(1.0, SPAN_S / median_step(centre_s))
+    variance = overlap * noise / np.maximum(np.diag(normal)[:2], 1e-12)
     offset, drift = fit.offset - change[0], fit.drift - change[1]
     correlation = _correlation(gyro, rotated)
     return _Fit(offset, drift, rotation, correlation, *np.sqrt(variance).tolist()), change
 
 
 def _pose_rates(quat: Signal) -> tuple[np.ndarray, np.ndarray]:
-    """Return the body rates (K, 3) [rad/s] over spans of `SPAN_S`, after their middles (K,) [s]."""
+    """Return mean body rates over spans of `SPAN_S`: middles of the spans (K,) [s], rates (K, 3).
+
+    The rates are in rad/s.
+    """
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
     step = median_step(quat.time_s)
     count = max(1, round(SPAN_S / step))
     duration = quat.time_s[count:] - quat.time_s[:-count]
-    good = duration < 1.5 * count * step
+    no_gap = duration < 1.5 * count * step
     relative = multiply(conjugate(value[:-count]), value[count:])
     rates = rotation_vector(relative) / duration[:, None]
-    return (0.5 * (quat.time_s[count:] + quat.time_s[:-count]))[good], rates[good]
+    return (0.5 * (quat.time_s[count:] + quat.time_s[:-count]))[no_gap], rates[no_gap]
 
 
 def grid(time_s: np.ndarray, name: str) -> np.ndarray:
@@ -331,10 +336,10 @@ def grid(time_s: np.ndarray, name: str) -> np.ndarray:
 
 
 def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, name: str) -> float:
-    """Return log time minus pose time [s] by the cross-correlation of the rates' magnitudes."""
+    """Return the log's clock minus the pose's clock [s], by correlating the rates' magnitudes."""
     pose_grid, log_grid = grid(centre_s, name), grid(rate.time_s, name)
-    least = int(OVERLAP_S / GRID_S)
-    if min(len(pose_grid), len(log_grid)) < least:
+    min_overlap = int(OVERLAP_S / GRID_S)
+    if min(len(pose_grid), len(log_grid)) < min_overlap:
         raise FlightLogError(name, None, None, f"less than {OVERLAP_S:g} s to align clocks by")
     pose = np.interp(pose_grid, centre_s, np.linalg.norm(pose_rate_b, axis=1))
     # The vector is averaged before its magnitude, because averaged magnitudes keep the noise.
@@ -352,8 +357,8 @@ def _coarse_offset(centre_s: np.ndarray, pose_rate_b: np.ndarray, rate: Signal, 
     )
     shared = correlate(np.ones(len(log)), np.ones(len(pose)))
     # A short overlap correlates by chance more easily, so its score is reduced.
-    trust = np.sqrt(np.clip(shared / min(len(pose), len(log)), 0.0, 1.0))
-    score = np.where(shared > least, product / energy * trust, -1.0)
+    overlap_weight = np.sqrt(np.clip(shared / min(len(pose), len(log)), 0.0, 1.0))
+    score = np.where(shared > min_overlap, product / energy * overlap_weight, -1.0)
     lag = int(np.argmax(score))
     lag = lag - size if lag > size // 2 else lag
     return float(log_grid[0] - pose_grid[0] + lag * GRID_S)
@@ -369,7 +374,10 @@ def _kabsch(source: np.ndarray, target: np.ndarray, mirrored: bool) -> np.ndarra
 
 
 def _huber_weights(residual: np.ndarray) -> np.ndarray:
-    """Return Huber's weights (3 K,) for residuals (K, 3); the three of one row are equal."""
+    """Return Huber's weights (3 K,) for residuals (K, 3), which reduce the effect of outliers.
+
+    The three residuals of a row have the same weight.
+    """
     size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
     limit = 2.5 * max(float(np.median(size)), 1e-9)
     return np.repeat(np.minimum(1.0, limit / np.maximum(size, 1e-12)), 3)

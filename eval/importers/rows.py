@@ -1,9 +1,10 @@
 """Resample signals of different rates to the rows of one flight log.
 
-The rows' times are the samples of the slowest of position, attitude and gyro (every n-th sample
-where it exceeds the wanted rate). So each measurement is in one row only, and the noise of
-different rows is independent, as a diagnosis assumes. Faster signals are smoothed over a row's
-period, so that vibration does not alias. A command is its mean until the next row.
+The rows have the sample times of the slowest of position, attitude and gyro. If that signal is
+faster than the wanted rate, only every n-th sample makes a row. So each measurement is in one row
+only, and the noise of different rows is independent, as a diagnosis assumes. Faster signals are
+smoothed over a row's period, so that vibration does not alias. A row has the mean of each command
+until the next row.
 """
 
 from __future__ import annotations
@@ -30,15 +31,18 @@ HELD = (
 """Signals that hold their value until the next sample."""
 GAP_S = 0.1
 GAP_STEPS = 5.0
-"""A pause between two samples is a gap where it exceeds both: in seconds, and in median steps."""
+"""A pause between two samples is a gap if it is longer than `GAP_S` seconds and longer than
+`GAP_STEPS` times the median time between samples."""
 HOLD_S = 0.5
-"""Longest time for which a command is held, unless ten of its steps are longer [s]."""
+"""Longest time for which a command is held [s]; for slow commands, ten times their time between
+samples if that is longer."""
 FASTER = 0.6
-"""A signal is smoothed where its step is below this share of a row's period."""
+"""A signal is smoothed if the time between its samples is below this share of a row's period."""
 LOST = 0.8
-"""A row further than this many steps from any velocity sample gets no velocity."""
+"""A row gets no velocity if the nearest velocity sample is further away than this many times the
+time between velocity samples."""
 SLOWER = 1.5
-"""A signal is slower than the rows where its step exceeds this many row periods."""
+"""A signal is slower than the rows if its time between samples exceeds this many row periods."""
 
 
 def rows_at(recording: Recording, time_s: np.ndarray) -> dict[str, np.ndarray]:
@@ -81,8 +85,9 @@ def row_times(
     Args:
         recording: holds at least one of pos, quat and rate.
         rate_hz: at most this many rows a second.
-        start_s: least time of the first row after the first common time of pos, quat and rate [s].
-        end_s: largest time of the last row, counted in the same way [s]; None: no limit.
+        start_s: least time of the first row [s], counted from the first time at which pos, quat
+            and rate all have samples.
+        end_s: largest time of the last row [s], counted in the same way; None: no limit.
         within: first and last allowed time on the recording's clock [s].
 
     Raises:
@@ -90,34 +95,36 @@ def row_times(
     """
     present = [name for name in NEEDED if name in recording.signals]
     needed = [recording.signals[name] for name in present]
-    first = max(s.time_s[0] for s in needed)
-    last = min(s.time_s[-1] for s in needed)
-    stop = last if end_s is None else min(last, first + end_s)
-    base = recording.signals[slowest(recording)].time_s
-    base = base[(base >= first) & (base <= last)]
-    step = median_step(base)
-    if step > 1.0 / LEAST_HZ and len(base) > 1:
+    # The rows lie in the time that all required signals share.
+    begin = max(s.time_s[0] for s in needed)
+    end = min(s.time_s[-1] for s in needed)
+    last_allowed = end if end_s is None else min(end, begin + end_s)
+    times = recording.signals[slowest(recording)].time_s
+    times = times[(times >= begin) & (times <= end)]
+    step = median_step(times)
+    # A slow signal: add rows between its samples, so that the rows have at least `LEAST_HZ`.
+    if step > 1.0 / LEAST_HZ and len(times) > 1:
         parts = int(np.ceil(step * LEAST_HZ - 1e-9))
-        if (rows := (len(base) - 1) * parts) > MOST_ROWS:
+        if (rows := (len(times) - 1) * parts) > MOST_ROWS:
             reason = (
                 f"{' and '.join(present)} are {step:.3g} s apart, which makes {rows:,} rows; "
                 f"at most {MOST_ROWS:,}: is its clock damaged, or its unit another one?"
             )
             raise FlightLogError(recording.name, "time", None, reason)
         share = np.arange(parts) / parts
-        between = base[:-1, None] + share * np.diff(base)[:, None]
+        between = times[:-1, None] + share * np.diff(times)[:, None]
         # No rows are added within a gap.
-        no_gap = np.diff(base)[:, None] < GAP_STEPS * step
-        base = np.append(between[no_gap | (share == 0.0)], base[-1])
+        no_gap = np.diff(times)[:, None] < GAP_STEPS * step
+        times = np.append(between[no_gap | (share == 0.0)], times[-1])
         step /= parts
-    every = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
-    inside = (base >= within[0]) & (base <= within[1])
-    time_s = base[inside & (base >= first + start_s) & (base <= stop)][::every]
+    stride = max(1, int(np.ceil(1.0 / (rate_hz * step) - 0.01)))
+    valid = (times >= within[0]) & (times <= within[1])
+    time_s = times[valid & (times >= begin + start_s) & (times <= last_allowed)][::stride]
     if len(time_s) < 2:
-        if inside.any():
+        if valid.any():
             reason = (
-                f"no row between --start and --end; rows are from {base[inside][0] - first:.1f} to "
-                f"{base[inside][-1] - first:.1f} s, counted from the file's first sample"
+                f"no row between --start and --end; rows are from {times[valid][0] - begin:.1f} to "
+                f"{times[valid][-1] - begin:.1f} s, counted from the file's first sample"
             )
         else:
             spans = ", ".join(
@@ -132,8 +139,9 @@ def row_times(
 def sampled_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.ndarray]:
     """Return which rows (T,) bool hold a sample, for each signal that is slower than the rows.
 
-    A sample belongs to the row nearest to it. Where a sample of the slowest signal is within half
-    a step, it belongs to that sample's row instead, so that some rows are complete.
+    A sample belongs to the row nearest to it. But if a row of the slowest signal is within half
+    the time between samples, the sample belongs to that row, so that some rows have all signals.
+    A velocity that is fast enough, but has gaps, is listed too.
 
     Args:
         recording: the signals on their own times.
@@ -147,16 +155,16 @@ def sampled_rows(recording: Recording, time_s: np.ndarray) -> Mapping[str, np.nd
             continue
         step = median_step(samples.time_s)
         if step <= SLOWER * row_step:
-            far = np.abs(samples.time_s[nearest(samples.time_s, time_s)] - time_s) > LOST * step
-            if name == "vel" and far.any():
-                is_sample[name] = ~far
+            is_far = np.abs(samples.time_s[nearest(samples.time_s, time_s)] - time_s) > LOST * step
+            if name == "vel" and is_far.any():
+                is_sample[name] = ~is_far
             continue
         row = nearest(time_s, samples.time_s)
         shared_row = slowest_rows[nearest(time_s[slowest_rows], samples.time_s)]
-        near = np.abs(time_s[shared_row] - samples.time_s) <= 0.5 * step
-        inside = np.abs(time_s[row] - samples.time_s) <= row_step
+        to_shared = np.abs(time_s[shared_row] - samples.time_s) <= 0.5 * step
+        to_nearest = np.abs(time_s[row] - samples.time_s) <= row_step
         is_sample[name] = np.zeros(len(time_s), dtype=bool)
-        is_sample[name][np.where(near, shared_row, row)[near | inside]] = True
+        is_sample[name][np.where(to_shared, shared_row, row)[to_shared | to_nearest]] = True
     return is_sample
 
 
@@ -202,10 +210,11 @@ def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
     before the first sample and long after the last one are NaN.
     """
     t, v = samples.time_s, samples.value
-    index = np.searchsorted(t, time_s, side="right") - 1
-    out = v[np.clip(index, 0, None)]
+    last_sample = np.searchsorted(t, time_s, side="right") - 1
+    out = v[np.clip(last_sample, 0, None)]
+    # The command between its samples is constant, so its integral is a sum of rectangles.
     ends = np.append(time_s[1:], time_s[-1])
-    changes = np.searchsorted(t, ends, side="left") - 1 > index
+    changes = np.searchsorted(t, ends, side="left") - 1 > last_sample
     area = np.diff(t)[:, None] * v[:-1]
     integral_at_t = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(area, 0)])
 
@@ -213,13 +222,13 @@ def held(samples: Signal, time_s: np.ndarray) -> np.ndarray:
         k = np.clip(np.searchsorted(t, until_s, side="right") - 1, 0, None)
         return integral_at_t[k] + (until_s - t[k])[:, None] * v[k]
 
-    rows = np.flatnonzero(changes & (index >= 0))
+    rows = np.flatnonzero(changes & (last_sample >= 0))
     if len(rows):
         span = (ends - time_s)[rows, None]
         out[rows] = (integral(ends[rows]) - integral(time_s[rows])) / span
-    age = time_s - t[np.clip(index, 0, None)]
-    old = max(HOLD_S, 10.0 * median_step(t)) if len(t) > 1 else np.inf
-    out[(index < 0) | (age > old)] = np.nan
+    age = time_s - t[np.clip(last_sample, 0, None)]
+    longest_age_s = max(HOLD_S, 10.0 * median_step(t)) if len(t) > 1 else np.inf
+    out[(last_sample < 0) | (age > longest_age_s)] = np.nan
     return out
 
 
@@ -233,6 +242,7 @@ def in_world(vel_b: Signal, quat: Signal) -> Signal:
 
 def continuous(quat_wxyz: np.ndarray) -> np.ndarray:
     """Return quaternions (T, 4) with signs chosen so that they change continuously."""
+    # A quaternion and its negative are the same attitude: avoid jumps between the two.
     flips = np.sum(quat_wxyz[1:] * quat_wxyz[:-1], axis=1) < 0
     sign = np.concatenate([[1.0], np.where(np.cumsum(flips) % 2, -1.0, 1.0)])
     return quat_wxyz * sign[:, None]
@@ -266,17 +276,17 @@ def smoothed(t: np.ndarray, v: np.ndarray, query_s: np.ndarray, width_s: float) 
     first = np.searchsorted(t, query_s - 0.5 * width_s)
     count = np.searchsorted(t, query_s + 0.5 * width_s, side="right") - first
     # Least squares: sums of u^0 ... u^4, and of u^0 ... u^2 times the samples.
-    moment, right = np.zeros((len(query_s), 5)), np.zeros((len(query_s), 3, v.shape[1]))
+    moments, right_side = np.zeros((len(query_s), 5)), np.zeros((len(query_s), 3, v.shape[1]))
     for offset in range(int(count.max(initial=0))):
         k = np.minimum(first + offset, len(t) - 1)
         u = (t[k] - query_s) / (0.5 * width_s)
         powers = np.where((offset < count)[:, None], u[:, None] ** np.arange(5), 0.0)
-        moment += powers
-        right += powers[:, :3, None] * v[k][:, None, :]
+        moments += powers
+        right_side += powers[:, :3, None] * v[k][:, None, :]
     out = _linear(t, v, query_s)
     enough = np.flatnonzero(count >= 3)
-    normal = moment[enough][:, np.arange(3)[:, None] + np.arange(3)]
-    out[enough] = np.linalg.solve(normal, right[enough])[:, 0]
+    normal = moments[enough][:, np.arange(3)[:, None] + np.arange(3)]
+    out[enough] = np.linalg.solve(normal, right_side[enough])[:, 0]
     return out
 
 

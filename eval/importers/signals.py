@@ -21,7 +21,7 @@ from eval.logs.faults.reading import TIMES, Readings, option, read_as
 NEEDED = ("pos", "quat", "rate")
 """Signals that a flight log must have; a partial log lacks some of them."""
 BACKWARDS_MAX = 0.05
-"""Largest share of rows with non-increasing time in an accepted signal."""
+"""Largest share of samples with non-increasing time in an accepted signal."""
 MAD_TO_SD = 1.4826
 """Factor from a median absolute deviation to the standard deviation of normal noise."""
 LEAST_STEP = 1e-15
@@ -60,8 +60,8 @@ def make_signal(
     """Return the finite samples with increasing time (None without any), and a note on the others.
 
     Args:
-        time_s: (N,) [s], NaN where unknown.
-        value: (N,) or (N, C); rows with a NaN are left out.
+        time_s: (N,) times of the samples [s], NaN where unknown.
+        value: samples (N,) or (N, C); samples with a NaN are left out.
         file: name of the file, for messages.
         name: the signal, for messages.
 
@@ -73,14 +73,15 @@ def make_signal(
     if not len(time_s):
         return None, None
     value = np.asarray(value, dtype=np.float64).reshape(len(time_s), -1)
-    known = np.isfinite(time_s) & np.isfinite(value).all(axis=1)
-    time_s, value = time_s[known], value[known]
+    finite = np.isfinite(time_s) & np.isfinite(value).all(axis=1)
+    time_s, value = time_s[finite], value[finite]
     if not len(time_s):
         return None, None
     largest = max(np.abs(time_s).max(), np.abs(value).max(initial=0.0))
     if largest > LARGEST:
         reason = f"holds numbers up to {largest:.3g}, allowed are {LARGEST:g}; log or copy it again"
         raise FlightLogError(file, name, None, reason)
+    # Keep a sample only if it is later than all samples before it.
     forward = np.ones(len(time_s), dtype=bool)
     forward[1:] = time_s[1:] - np.maximum.accumulate(time_s)[:-1] > LEAST_STEP
     backwards = int(np.sum(~forward))
@@ -150,7 +151,7 @@ def with_readings(recording: Recording, readings: Readings) -> Recording:
 
 
 def _next_attitude(quat: Signal | None, time_s: np.ndarray) -> np.ndarray:
-    """Return the unit quaternions wxyz (T, 4) of the first attitudes from `time_s` (T,) on."""
+    """Return for each time of `time_s` (T,) the first attitude from then on, wxyz (T, 4)."""
     if quat is None:
         raise ValueError("--read from-body, from-world and plus-gravity need an attitude")
     index = np.clip(np.searchsorted(quat.time_s, time_s), 0, len(quat.time_s) - 1)

@@ -1,8 +1,9 @@
 """Registry of the simulators ("worlds"), and the interface that each of them has.
 
-A world simulates trials, which are flights along a track, in a fixed number of slots. It does not
-depend on policies: it gets actions and returns views. The judge, which scores policies, connects
-both. Modules of worlds are imported on first use.
+A `World` is a simulator: it simulates trials, which are flights along a track, in a fixed number of
+slots (places for one trial at a time). It does not depend on policies: it gets actions and returns
+views (what a policy can observe). The judge, which scores policies, connects both. Modules of
+worlds are imported on first use.
 
 Another package adds a world with an entry point of the group `diffracing_suite.worlds`. A program
 adds one for its own process with `WORLDS.register(name, a_class)`.
@@ -34,14 +35,15 @@ WORLDS: Registry[Any] = Registry(
     },
     lambda name, world: None if callable(world) else f"{world!r}; must be a class (`World`)",
 )
-"""Name -> class (`World`), called with (vehicle, camera, layout, rules, slots=, threads=)."""
+"""Name of a simulator -> class (a `World`), called with (vehicle, camera, layout, rules, slots=,
+threads=). `REFERENCE` is a function instead."""
 
 
 class Rows(NamedTuple):
-    """States of all slots at one physics step; the slots in `due` get a row in their flight log."""
+    """States of all N slots at one physics step, for the rows of the trials' flight logs."""
 
     due: np.ndarray
-    """(N,) bool, slots that record this step."""
+    """(N,) bool, the slots whose flight log gets a row at this step."""
     time_s: np.ndarray
     """(N,) time since each trial's start [s]."""
     pos_w: np.ndarray
@@ -67,8 +69,8 @@ class World(Protocol):
 
     Optional attributes:
 
-    - `integrator` (`"euler"`) is written to flight logs, with the step; logs without it count as
-      continuous in time.
+    - `integrator` (`"euler"`) is written to flight logs, with the length of a step. A log without
+      it counts as continuous in time: a diagnosis assumes that its integrator has no error.
     - `cost` is the computing time of a trial relative to MuJoCo's, for estimates; default 1.
     - `compiles` is true where each number of slots needs a compilation. Such a world gets all
       trials at once, in one process.
@@ -94,7 +96,10 @@ class World(Protocol):
         ...
 
     def load(self, entries: list[tuple[int, Track, TrialSpec]]) -> None:
-        """Start trials from (slot, track, trial); one in contact at time 0 has ended already."""
+        """Start the trials `entries`, each (slot, track, trial).
+
+        A trial whose drone is in contact at time 0 has ended already.
+        """
         ...
 
     def view(self, wanted: np.ndarray) -> View:

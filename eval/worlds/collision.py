@@ -23,19 +23,20 @@ from tracks.geometry.rotation import cross, to_local, to_world
 from tracks.geometry.scene import Array, Counts, Rods, Scene
 
 NEAR = Counts(boxes=12, cylinders=4, capsules=4, spheres=4)
-"""Number of tested solids of each kind, the nearest ones; updated every `NEAR_STEPS`."""
+"""Number of solids of each kind that are tested: the nearest ones, updated every `NEAR_STEPS`."""
 NEAR_STEPS = 40
-"""Number of physics steps between updates: a drone flies 0.4 m at 5 m/s and 500 Hz."""
+"""Number of physics steps between updates of the nearest solids. Meanwhile a drone flies 0.4 m, at
+5 m/s and 500 Hz."""
 HALVINGS = 20
-"""Number of bisections of a capsule's length, to a millionth of it."""
+"""Number of bisections of a capsule's length, which find the nearest point to a millionth of it."""
 ROUNDS = 12
-"""Number of projections to a cylinder and back."""
+"""Number of projections from the box to a cylinder and back."""
 OVER_RELAXATION = 1.5
 """Factor of the step towards a cylinder's surface: above 1 the rounds converge faster, from 2 on
 they may diverge."""
 CONTACT_M = 1e-3
-"""A cylinder nearer than this counts as touched [m]: the accuracy of the rounds, and half the
-distance flown in a step at 1 m/s."""
+"""A cylinder nearer than this counts as touched [m]. It is the accuracy of the projections, and
+half the distance flown in a step at 1 m/s."""
 PARALLEL = 1e-3
 """Directions within this angle of parallel [rad] need no common normal: other axes cover them."""
 _CULLED = ("boxes", "cylinders", "capsules", "spheres")
@@ -46,21 +47,22 @@ _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(8, 3)
 def near_solids(scene: Scene, pos_w: Array) -> Scene:
     """Return the scene with the `NEAR` solids of each kind nearest to pos_w (N, 3), and all meshes.
 
-    Distances are to the surfaces. By bounding spheres, long walls would displace nearer solids.
+    Distances are to the surfaces. With distances to bounding spheres, a long wall would seem nearer
+    than solids that are in fact nearer.
     """
     solids = scene._replace(triangles=scene.triangles[:, :0])
-    distance, first, scores = distances(solids, pos_w)[0], 0, {}
+    distance, first_column, scores = distances(solids, pos_w)[0], 0, {}
     for kind in _CULLED:
         count = getattr(scene, kind)[0].shape[1]
-        scores[kind] = distance[:, first : first + count]
-        first += count
+        scores[kind] = distance[:, first_column : first_column + count]
+        first_column += count
     return keep_best(scene, scores, NEAR)
 
 
 def box_distances(
     scene: Scene, pos_w: Array, rot_w: Array, half_size: Array, middle_b: Array
 ) -> Array:
-    """Return lower bounds of the distances (N, S + 1) [m] of box and solids; 0 or less: contact.
+    """Return lower bounds of the distances of box and solids (N, S + 1) [m]; 0 or less: contact.
 
     Args:
         scene: batched scene (N, ...) with S solids.
@@ -70,8 +72,8 @@ def box_distances(
         middle_b: (3,) the box's centre in body axes [m].
 
     Returns:
-        The distances in the order boxes, cylinders, capsules, spheres, triangles, ground. In
-        contact the number is no penetration depth.
+        The distances in the order boxes, cylinders, capsules, spheres, triangles, ground. A
+        distance of 0 or less is not the depth of penetration.
     """
     middle_w, frame = pos_w + to_world(rot_w, middle_b), rot_w[:, None]
 
@@ -115,8 +117,8 @@ def _separation(
     """Return the largest separation of the box and a convex solid over a set of axes.
 
     Args:
-        axes: (..., 3) each, of any length; axes of length zero are ignored.
-        low_high: function that returns the solid's extent along an axis, its ends.
+        axes: directions, (..., 3) each, of any length; axes of length zero are ignored.
+        low_high: function that returns the two ends of the solid's extent along an axis.
         half_size: (3,) half extents of the box.
     """
     gaps = []
@@ -139,9 +141,11 @@ def _from_boxes(center: Array, sides: list[Array], extent: Array, half_size: Arr
     """
 
     def low_high(axis: Array) -> tuple[Array, Array]:
-        middle = (axis * center).sum(-1)
-        half = sum(jnp.abs((axis * side).sum(-1)) * extent[..., k] for k, side in enumerate(sides))
-        return middle - half, middle + half
+        center_along = (axis * center).sum(-1)
+        half_along = sum(
+            jnp.abs((axis * side).sum(-1)) * extent[..., k] for k, side in enumerate(sides)
+        )
+        return center_along - half_along, center_along + half_along
 
     return _separation([*_BOX_AXES, *sides, *_normals(sides)], low_high, half_size)
 
@@ -178,10 +182,10 @@ def _from_capsules(rods: Rods, half_size: Array) -> Array:
 
     def bisect(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
-        middle = 0.5 * (low + high)
-        point = rods.center_w + middle[..., None] * rods.axis_w
+        middle_of_ends = 0.5 * (low + high)
+        point = rods.center_w + middle_of_ends[..., None] * rods.axis_w
         grows = (_outwards(point, half_size) * rods.axis_w).sum(-1) > 0.0
-        return jnp.where(grows, low, middle), jnp.where(grows, middle, high)
+        return jnp.where(grows, low, middle_of_ends), jnp.where(grows, middle_of_ends, high)
 
     ends = (-rods.half_length, rods.half_length)
     low, high = jax.lax.fori_loop(0, HALVINGS, bisect, ends)
@@ -192,8 +196,8 @@ def _from_capsules(rods: Rods, half_size: Array) -> Array:
 def _from_cylinders(rods: Rods, half_size: Array) -> Array:
     """Return the distances (N, K) of cylinders minus `CONTACT_M`.
 
-    The projections start from two points of the box: the nearest to the cylinder's centre, and the
-    corner nearest to the cylinder. The smaller result counts.
+    The projections start from two points of the box: the point nearest to the cylinder's centre,
+    and the corner nearest to the cylinder. The smaller of the two distances counts.
     """
     single = jax.tree.map(lambda array: array[:, :, None], rods)
 

@@ -59,7 +59,7 @@ class DepthCamera:
             data: its data, with computed positions of the solids.
             pos_w: (3,) position of the camera [m].
             rot_w: (3, 3) attitude, body to world.
-            group: only geoms of this group are visible; None: all.
+            group: only geoms (MuJoCo's solids) of this group are visible; None: all.
         """
         # Rays have a component of 1 along the optical axis, so the ray parameter is planar depth.
         groups = None
@@ -117,10 +117,10 @@ def refuse_start_contact(name: str, track: Track, vehicle: Vehicle) -> None:
     data.qpos[:] = start_state(track)
     mujoco.mj_forward(model, data)
     if data.ncon:
-        half = " x ".join(f"{2 * size:g}" for size in vehicle.body.half_size)
+        sides = " x ".join(f"{2 * size:g}" for size in vehicle.body.half_size)
         raise ValueError(
             f"{name}: at start.position {np.round(track.start_pos_w, 3).tolist()} the body of "
-            f"{vehicle.name!r} ({half} m) touches {contact_name(model, data)}; move the start away"
+            f"{vehicle.name!r} ({sides} m) touches {contact_name(model, data)}; move the start away"
         )
 
 

@@ -3,8 +3,9 @@
 MuJoCo's JAX engine moves the free body. Its contacts are disabled: they take ten times the time of
 all other computations, and a trial ends at the first contact anyway. Collisions are found by signed
 distances instead, and depth images by analytic ray casting. The steps between two decisions of the
-policy are one compiled function. States are float32, so a flight departs slowly from the same one
-in `mujoco`. A trial's outcome does not depend on the other trials.
+policy are one compiled function. States are float32, so a flight departs slowly from the same
+flight in `mujoco`. A trial's outcome does not depend on the other trials. A slot is a place in the
+simulator for one trial at a time.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ with contextlib.redirect_stdout(io.StringIO()):  # the import prints a list of m
 PRECISION = "highest"
 """Precision of matrix products; the default of accelerators is too low for rotations."""
 FARTHEST_M = 1000.0
-"""Largest coordinate, at which a float32's resolution is 0.06 mm [m]."""
+"""Largest allowed coordinate [m]. There, the resolution of a float32 is 0.06 mm."""
 
 
 class SlotStates(NamedTuple):
-    """The state of all slots on the device."""
+    """The state of all N slots, on the accelerator."""
 
     qpos: Array
     """(N, 7) position [m] and quaternion wxyz."""
@@ -188,7 +189,12 @@ class MjxWorld:
     ) -> SlotStates:
         """Apply the rules to the `selected` slots (N,) bool; diverged slots are reset to rest.
 
-        `invalid` (N,) bool are the slots in which no step was possible, `near` the nearest solids.
+        Args:
+            state: states of all slots after the step.
+            selected: (N,) bool, slots to which the rules apply.
+            invalid: (N,) bool, slots in which no step was possible.
+            course: the gates of each slot's track.
+            near: the solids nearest to each drone.
         """
         motion = _motion(state.qpos, state.qvel)
         diverged = invalid | has_diverged(self._rules, motion)
@@ -237,7 +243,8 @@ class MjxWorld:
     def advance(self, action_b: np.ndarray, steps: np.ndarray, record: bool) -> list[Rows]:
         """Fly each slot's action (N, size) for its number of physics steps (N,)."""
         assert self._on_device is not None
-        # Periods between decisions differ by a step; with one length there is one compilation.
+        # Periods between decisions differ by one step. With the longest period for all calls, the
+        # program is compiled only once.
         self._max_steps = max_steps = max(self._max_steps, int(steps.max(initial=0)))
         noise = None
         if self._has_noise:
@@ -252,11 +259,12 @@ class MjxWorld:
             )  # fmt: skip
         if not record:
             return []
-        # Rows before commands and rows at the ends of trials, each field (max_steps, N, ...).
-        kinds = [jax.tree.map(np.asarray, kind) for kind in rows]
+        # `rows` holds rows before commands, and rows at the ends of trials; each field is
+        # (max_steps, N, ...).
+        row_sets = [jax.tree.map(np.asarray, row_set) for row_set in rows]
         return [
-            Rows(*(field[k] for field in kind)) for k in range(max_steps) for kind in kinds
-            if kind.due[k].any()
+            Rows(*(field[k] for field in row_set)) for k in range(max_steps) for row_set in row_sets
+            if row_set.due[k].any()
         ]  # fmt: skip
 
     @functools.partial(jax.jit, static_argnums=(0, 7, 8))
@@ -356,8 +364,8 @@ def _check_near(track: Track) -> None:
 
 def _motion(qpos: Array, qvel: Array) -> Motion:
     """Return the motion (N, ...) of free joints, with normalised quaternions."""
-    quat = qpos[:, 3:]
-    rot_w = quat_to_rot(quat / jnp.sqrt((quat * quat).sum(-1, keepdims=True)))
+    quat_wxyz = qpos[:, 3:]
+    rot_w = quat_to_rot(quat_wxyz / jnp.sqrt((quat_wxyz * quat_wxyz).sum(-1, keepdims=True)))
     return Motion(qpos[:, :3], rot_w, qvel[:, :3], qvel[:, 3:])
 
 

@@ -48,8 +48,8 @@ def fly_trial(
         vehicle: the vehicle that flies.
         rules: rules for the end of a trial; None: the defaults.
         limits: limits of actions; None: the defaults.
-        rows: number of rows of the policy's inputs, as in the batched simulators, since the output
-            of some policies depends on it; all rows but the first are zero.
+        rows: number of rows of the policy's inputs; all rows but the first are zero. It should be
+            that of the batched simulators, because the output of some policies depends on it.
         sensor_set: errors of the policy's observations.
 
     Raises:
@@ -69,7 +69,7 @@ def fly_trial(
     draws = np.zeros((1, 3))
     if uses_noise(autopilot.plant):
         draws = gust_draws(trial, round(rules.time_limit_s / dt) + 2)
-    camera, hidden = DepthCamera(spec.camera), policy.start(rows)
+    camera, policy_memory = DepthCamera(spec.camera), policy.start(rows)
     loops = start_autopilot(autopilot, motion_of(data), draws[:1] if len(draws) > 1 else None)
     sensors = None
     if view_models(sensor_set.models):
@@ -77,14 +77,14 @@ def fly_trial(
         sensors.start(0, trial)
     limits = limits_of(limits, spec.action, vehicle)
     action_b = first_action(spec.action, vehicle)[None]
-    outputs, bad, limited, late, decisions = Outputs(1, spec.action), 0, 0, 0, 0
+    outputs, bad_count, limited_count, late_count, decisions = Outputs(1, spec.action), 0, 0, 0, 0
     passed = passed_8s = passed_035 = 0
     speeds: list[float] = []
     before_w = data.qpos[:3].copy()
     ended_by, collided_with, step = None, None, 0
 
     while True:
-        # Check the state after the last step.
+        # Check the state after the last step, by the rules for the end and the score of a trial.
         motion = motion_of(data)
         pos_w = motion.pos_w[0]
         if not _is_flight(motion, rules):
@@ -127,13 +127,18 @@ def fly_trial(
             is_first = np.full(rows, decisions == 0)
             inputs = (_padded(x, rows) for x in (state, image))
             last_b = np.repeat(action_b, rows, 0)
-            guarded, hidden = call_policy(limits, policy, hidden, *inputs, is_first, last_b)
+            guarded, policy_memory = call_policy(
+                limits, policy, policy_memory, *inputs, is_first, last_b
+            )
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
-            bad, limited = bad + int(guarded.bad[0]), limited + int(guarded.limited[0])
+            bad_count, limited_count = (
+                bad_count + int(guarded.bad[0]),
+                limited_count + int(guarded.limited[0]),
+            )
             decisions += 1
             if guarded.late[0]:
-                ended_by, late = "timeout", 1
+                ended_by, late_count = "timeout", 1
                 break
 
         # Fly one step.
@@ -169,9 +174,9 @@ def fly_trial(
         v_mean=sum(speeds) / max(len(speeds), 1),
         gates_8s=passed_8s,
         gates_035=passed_035,
-        bad_actions=bad,
-        limited_actions=limited,
-        late_actions=late,
+        bad_actions=bad_count,
+        limited_actions=limited_count,
+        late_actions=late_count,
         **outputs.columns(0),
     )
 

@@ -1,10 +1,11 @@
 """The simulator `rotorpy`: RotorPy's multirotor flies the trials (Folk, Paulos and Kumar 2023).
 
-The suite's own code runs policy, autopilot, rate loop and mixer, since a vehicle file describes
-them, and scene, images, contacts and rules. RotorPy's batched multirotor gets the commanded rotor
-speeds and simulates the rotors' lag, thrust, drag, air and rigid body. Its integrator is
-Runge-Kutta of order 4 with a fixed step, at the rate loop's frequency. The adaptive integrator has
-one step size for all drones, so a trial would depend on the other trials.
+The suite's own code runs the autopilot, rate loop and mixer, since a vehicle file describes them.
+It also computes the policy, scene, images, contacts and rules. RotorPy's batched multirotor gets
+the commanded rotor speeds. It simulates the first-order response (lag) of the rotors, thrust, drag,
+air and rigid body. Its integrator is Runge-Kutta of order 4 with a fixed step, at the rate loop's
+frequency. RotorPy's adaptive integrator is not used: it has one step size for all drones, so a
+trial would depend on the other trials.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from tracks.geometry.camera import Camera
 from tracks.geometry.rotation import quat_to_rot, to_local
 
 MIN_LAG_STEPS = 1.0
-"""Least time constant of the rotors, in steps: RotorPy divides by it, and its integrator is
-inaccurate for a shorter one."""
+"""Least time constant of the rotors, in physics steps. RotorPy divides by the time constant, and
+its integrator is inaccurate for a shorter one."""
 XYZW = [1, 2, 3, 0]
 """Indices of x, y, z and w in a quaternion wxyz; RotorPy's are xyzw."""
 
@@ -48,7 +49,7 @@ class StepInput(NamedTuple):
 class RotorpyWorld(SceneSlots):
     """A world whose drones are RotorPy's `BatchedMultirotor`; the package is optional.
 
-    Its logs count as continuous in time, since it has no `integrator`.
+    It has no attribute `integrator`, so its flight logs count as continuous in time.
     """
 
     name = "rotorpy"
@@ -151,7 +152,7 @@ class Multirotor:
     def step(
         self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray, push: StepInput
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return qpos, qvel and rotor speeds after one step; the object has no state.
+        """Return qpos, qvel and rotor speeds after one step; the object keeps no state.
 
         Args:
             qpos: (N, 7) position [m] and quaternion wxyz.
@@ -173,9 +174,13 @@ class Multirotor:
         commanded = {"cmd_motor_speeds": torch.tensor(push.rotor_speed)}
         with _in_doubles():
             after = self._multirotor.step(state, commanded, self._dt, self._rows)
-        new = {name: value.numpy() for name, value in after.items()}
-        qpos = np.concatenate([new["x"], new["q"][:, [3, 0, 1, 2]]], axis=-1)
-        return qpos, np.concatenate([new["v"], new["w"]], axis=-1), new["rotor_speeds"]
+        after_arrays = {name: value.numpy() for name, value in after.items()}
+        qpos = np.concatenate([after_arrays["x"], after_arrays["q"][:, [3, 0, 1, 2]]], axis=-1)
+        return (
+            qpos,
+            np.concatenate([after_arrays["v"], after_arrays["w"]], axis=-1),
+            after_arrays["rotor_speeds"],
+        )
 
     def specific_force_b(
         self, qpos: np.ndarray, qvel: np.ndarray, rotor_speed: np.ndarray

@@ -2,8 +2,8 @@
 
 RotorPy's parameters describe rotors, body and air (Folk, Paulos and Kumar 2023, "RotorPy: A
 Python-based Multirotor Simulator with Aerodynamics"); the autopilot is this suite's. RotorPy's
-blade flapping has the opposite sign of the effect in our catalogue. Its drag and lift of a rotor
-act at the hub, and depend on the airspeed of the hub.
+blade flapping has the opposite sign of the effect in the suite's catalogue. In RotorPy, the drag
+and lift of a rotor act at the rotor's hub, and depend on the airspeed there.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def rotorpy_parameters(vehicle: Vehicle, shortest_lag_s: float = 0.0) -> dict[st
         **dict.fromkeys(("Ixy", "Ixz", "Iyz"), 0.0),
         "num_rotors": 4,
         "rotor_pos": {f"r{i + 1}": hub for i, hub in enumerate(constants.rotor_position_b)},
-        # RotorPy's sign is that of the torque on the body, ours that of the rotor's rotation.
+        # RotorPy gives the sign of the torque on the body, the suite that of the rotor's rotation.
         "rotor_directions": -np.array(modelled.rotors.spin),
         "rotor_speed_min": 0.0,
         "rotor_speed_max": _max_rotor_speed(modelled),

@@ -1,8 +1,8 @@
 """Base class of simulators ("worlds") that find contacts with MuJoCo's C engine, in many slots.
 
-A slot flies one trial at a time, a flight along a track. Every slot has its own MuJoCo model,
-padded to a common size, and its own MjData in a `mujoco.batch`. After each operation the contacts
-of the current state are up to date, so the rules are applied before the next step.
+A slot is a place for one trial at a time, a flight along a track. Every slot has its own MuJoCo
+model, padded to a common size, and its own MjData in a `mujoco.batch`. After each operation the
+contacts of the current state are up to date, so the rules are applied before the next step.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class SceneSlots(ABC):
         Args:
             vehicle: the vehicle that flies.
             camera: the policy's camera.
-            layout: sizes that fit every track.
+            layout: sizes of padded scenes, which fit every track.
             rules: rules for the end and the score of a trial.
             slots: number of trials that fly at the same time.
             threads: number of threads for physics; results do not depend on it.
@@ -118,8 +118,8 @@ class SceneSlots(ABC):
 
         Args:
             entries: the trials to fly.
-            vehicles: one vehicle for each entry, with the world's effects but other values. If one
-                call has vehicles, all calls must have them.
+            vehicles: one vehicle for each entry. They have the effects of the world's vehicle, with
+                other values. If one call has vehicles, all calls must have them.
         """
         if vehicles is not None:
             self._set_vehicles([slot for slot, _, _ in entries], vehicles)
@@ -157,9 +157,11 @@ class SceneSlots(ABC):
         for slot, vehicle in zip(slots, vehicles, strict=True):
             self._vehicles[slot] = vehicle
         values = {}
-        for name, first in self._vehicles[0].effects.items():
+        for name, values_of_first in self._vehicles[0].effects.items():
             rows = zip(*(vehicle.effects[name] for vehicle in self._vehicles), strict=True)
-            values[name] = type(first)(*(np.stack([np.asarray(x) for x in row]) for row in rows))
+            values[name] = type(values_of_first)(
+                *(np.stack([np.asarray(x) for x in row]) for row in rows)
+            )
         plant = make_plant(self._vehicles[0], self.dt, values, MAX_DELAY)
         self._autopilot = replace(self._autopilot, plant=plant)
 
@@ -173,9 +175,9 @@ class SceneSlots(ABC):
             )
             for scene in scenes
         ]
-        number = np.zeros(self.slots, int)
-        number[ids] = np.arange(len(ids))
-        new = take(stack(padded, layout.solids._replace(triangles=0), np.float64), number)
+        index_of_scene = np.zeros(self.slots, int)
+        index_of_scene[ids] = np.arange(len(ids))
+        new = take(stack(padded, layout.solids._replace(triangles=0), np.float64), index_of_scene)
         return select(started, new, self._scene or new)
 
     def _motion(self) -> Motion:
@@ -275,14 +277,17 @@ class SceneSlots(ABC):
         return rows
 
     def _draws(self, step: np.ndarray) -> np.ndarray | None:
-        """Return the gusts' draws (N, 3) after `step` (N,); -1 is before the start."""
+        """Return the random draws of the gusts (N, 3) for the step after `step` (N,).
+
+        -1 means before the start. None for a vehicle without gusts.
+        """
         if self._noise is None:
             return None
         pairs = zip(step.tolist(), self._noise, strict=True)
         return np.concatenate([draws.at(k + 1, 1) for k, draws in pairs])
 
     def _rows(self, due: np.ndarray, rotor_speed: np.ndarray) -> list[Rows]:
-        """Return the rows of the flight logs at this step; [] where no slot is in `due`."""
+        """Return the rows of the flight logs at this step; [] if no slot is `due` (N,) bool."""
         if not due.any():
             return []
         loops = self._loops

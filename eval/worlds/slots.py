@@ -73,8 +73,10 @@ def empty_course(slots: int, layout: Layout) -> Course:
 
 def pad_gates(gates: Gates, number: int, corners: int) -> Gates:
     """Return `gates` padded to `number` gates with `corners` corners, by repeating the last one."""
-    more = corners - gates.opening_g.shape[1]
-    opening = np.concatenate([gates.opening_g, np.repeat(gates.opening_g[:, -1:], more, 1)], 1)
+    missing_corners = corners - gates.opening_g.shape[1]
+    opening = np.concatenate(
+        [gates.opening_g, np.repeat(gates.opening_g[:, -1:], missing_corners, 1)], 1
+    )
     index = np.minimum(np.arange(number), len(gates.center_w) - 1)
     return Gates(*(field[index] for field in gates._replace(opening_g=opening)))
 
@@ -123,10 +125,10 @@ class GustDraws:
         if step < self._first:
             self._rewind()
         while self._first + len(self._rows) < step + count:
-            used = min(step - self._first, len(self._rows))
-            more = self._generator.standard_normal((GUSTS_AT_ONCE, 3))
-            self._rows = np.concatenate([self._rows[used:], more])
-            self._first += used
+            passed = min(step - self._first, len(self._rows))
+            new_rows = self._generator.standard_normal((GUSTS_AT_ONCE, 3))
+            self._rows = np.concatenate([self._rows[passed:], new_rows])
+            self._first += passed
         return self._rows[step - self._first :][:count]
 
 

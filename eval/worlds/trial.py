@@ -21,6 +21,7 @@ FLYING = 0
 ENDINGS = ("finished", "collision", "tipped", "timeout", "diverged")
 """Values of `TrialResult.ended_by`; `Progress.ended` is 1 + the index."""
 FINISHED, COLLISION, TIPPED, TIMEOUT, DIVERGED = range(1, 6)
+"""Codes in `Progress.ended` of the `ENDINGS`, in their order."""
 
 
 class TrialSpec(NamedTuple):
@@ -63,21 +64,22 @@ class TrialResult(NamedTuple):
     gates_8s: int
     """Number of gates passed within 8 s."""
     gates_035: int
-    """Number of gates by the baseline's rule: within 0.35 m of the centres, in order."""
+    """Number of gates passed by the rule of the baseline (Yu et al. 2025): within 0.35 m of their
+    centres, in order."""
     bad_actions: int
     """Number of actions that were not finite; the last finite one was flown instead."""
     limited_actions: int
     """Number of actions beyond the limit, which were reduced to it."""
     late_actions: int
-    """1 where the policy exceeded a set deadline or gave no answer, which ends a trial as timeout;
-    else 0."""
+    """1 if the policy exceeded a given deadline or gave no answer, else 0; either ends the trial as
+    a timeout."""
     decisions: int = 0
     """Number of decisions of the policy; 0 in files without this column."""
     output_max: float = 0.0
     """Largest absolute component of the policy's raw output; 0 without decisions."""
     action_up: float = 0.0
-    """Mean vertical component of wanted net accelerations [m/s^2], counted as 0 where the vehicle
-    does not climb; 0 for other actions."""
+    """Mean vertical component of the accelerations that the policy commands [m/s^2]. A decision at
+    which the drone does not climb counts as 0; other kinds of action have 0."""
 
     @property
     def trial(self) -> TrialSpec:
@@ -112,14 +114,14 @@ class Rules:
     rate_limit: float = 1e4
     """A body turning faster than this [rad/s] has diverged."""
     wrench_limit: float = 1e6
-    """A force [N] or torque [N m] on the body beyond this has diverged."""
+    """A trial with a force [N] or torque [N m] on the body beyond this has diverged."""
 
 
 class Course(NamedTuple):
     """The gates of N trials, padded to the same number by repeating the last one."""
 
     gates: Gates
-    """(N, G, ...) the gates."""
+    """Arrays (N, G, ...) of the gates."""
     count: Array
     """(N,) number of gates to pass, int32."""
 
@@ -225,18 +227,20 @@ def judge_state(
     xp = pos_w.__array_namespace__()
     flying = progress.ended == FLYING
     live = flying & ~diverged
-    free = live & ~contact
+    live_without_contact = live & ~contact
     gate = next_gate(course, progress.gates)
     passed, _ = crossing(gate.center_w, gate.rot_w, gate.opening_g, progress.pos_w, pos_w)
-    gates = progress.gates + (passed & free & (progress.gates < course.count))
-    near = is_near(next_centre(course, progress.gates_035), pos_w, rules.near_radius_m)
-    gates_035 = progress.gates_035 + (near & free & (progress.gates_035 < course.count))
+    gates = progress.gates + (passed & live_without_contact & (progress.gates < course.count))
+    is_at_next_centre = is_near(next_centre(course, progress.gates_035), pos_w, rules.near_radius_m)
+    gates_035 = progress.gates_035 + (
+        is_at_next_centre & live_without_contact & (progress.gates_035 < course.count)
+    )
     speed = xp.sqrt((vel_w * vel_w).sum(-1))
     last_step, short_step = round(rules.time_limit_s / dt), round(rules.short_window_s / dt)
 
-    ended = xp.where(free & (progress.step >= last_step), TIMEOUT, progress.ended)
-    ended = xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED, ended)
-    ended = xp.where(free & (gates >= course.count), FINISHED, ended)
+    ended = xp.where(live_without_contact & (progress.step >= last_step), TIMEOUT, progress.ended)
+    ended = xp.where(live_without_contact & (rot_w[:, 2, 2] < 0), TIPPED, ended)
+    ended = xp.where(live_without_contact & (gates >= course.count), FINISHED, ended)
     ended = xp.where(live & contact, COLLISION, ended)
     ended = xp.where(flying & diverged, DIVERGED, ended)
     return Progress(
@@ -245,7 +249,7 @@ def judge_state(
         gates=gates.astype(xp.int32),
         gates_8s=xp.where(progress.step <= short_step, gates, progress.gates_8s).astype(xp.int32),
         gates_035=gates_035.astype(xp.int32),
-        v_max=xp.where(free, xp.maximum(progress.v_max, speed), progress.v_max),
+        v_max=xp.where(live_without_contact, xp.maximum(progress.v_max, speed), progress.v_max),
         v_sum=xp.where(live, progress.v_sum + speed, progress.v_sum),
         pos_w=xp.where(live[:, None], pos_w, progress.pos_w),
     )

@@ -8,16 +8,16 @@ from eval.importers.signals import Recording, Signal
 from eval.logs.faults.finding import Finding
 
 RUNNING = 0.5
-"""Share of the usual effort in flight above which the motors carry the vehicle."""
+"""The motors carry the vehicle if their effort exceeds this share of its median in flight."""
 HOLD_S = 0.3
-"""Least time above `RUNNING` without a break [s]."""
+"""Least duration of a flight: time above `RUNNING` without a break [s]."""
 RISE_M = 0.05
 """Height above the ground from which the vehicle counts as flying [m]."""
 POWER = {
     **{"throttle": 1, "cmd_thrust": 1, "kept:cmd_force": 1},
     **{"pwm": 1, "motor": 2, "motor_cmd": 2},
 }
-"""Signals that measure the motors' effort, and their exponent in the thrust."""
+"""Signals that measure the motors' effort -> exponent with which each gives the thrust."""
 
 
 def airborne(recording: Recording) -> tuple[tuple[float, float], list[Finding]]:
@@ -60,23 +60,23 @@ def _motor_effort(recording: Recording) -> Signal | None:
         samples = recording.signals.get(name)
         if samples is None or len(samples.time_s) < 10:
             continue
-        level = np.mean(samples.value, axis=1) ** power
-        high = float(np.quantile(level, 0.95))
-        if high <= 0.0:
+        thrust_level = np.mean(samples.value, axis=1) ** power
+        high_level = float(np.quantile(thrust_level, 0.95))
+        if high_level <= 0.0:
             continue
-        usual = float(np.median(level[level > RUNNING * high]))
-        return Signal(samples.time_s, (level / usual)[:, None])
+        median_in_flight = float(np.median(thrust_level[thrust_level > RUNNING * high_level]))
+        return Signal(samples.time_s, (thrust_level / median_in_flight)[:, None])
     return None
 
 
 def _long_runs(time_s: np.ndarray, running: np.ndarray) -> np.ndarray:
     """Return which samples belong to a run of at least `HOLD_S`."""
     edges = np.flatnonzero(np.diff(running.astype(int))) + 1
-    out = np.zeros(len(running), dtype=bool)
-    for part in np.split(np.arange(len(running)), edges):
-        if running[part[0]] and time_s[part[-1]] - time_s[part[0]] >= HOLD_S:
-            out[part] = True
-    return out
+    in_long_run = np.zeros(len(running), dtype=bool)
+    for run in np.split(np.arange(len(running)), edges):
+        if running[run[0]] and time_s[run[-1]] - time_s[run[0]] >= HOLD_S:
+            in_long_run[run] = True
+    return in_long_run
 
 
 def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
@@ -85,15 +85,15 @@ def _off_ground(pos: Signal, start: float, stop: float) -> tuple[float, float]:
     The ground is the median height over the second before the start and after the stop.
     """
     height = pos.value[:, 2]
-    inside = (pos.time_s >= start) & (pos.time_s <= stop)
+    is_inside = (pos.time_s >= start) & (pos.time_s <= stop)
     if np.isfinite(start):
         before = height[(pos.time_s < start) & (pos.time_s > start - 1.0)]
-        ground = float(np.median(before)) if len(before) else float(height[inside][0])
-        up = np.flatnonzero(inside & (height > ground + RISE_M))
-        start = float(pos.time_s[up[0]]) if len(up) else start
+        ground = float(np.median(before)) if len(before) else float(height[is_inside][0])
+        above_ground = np.flatnonzero(is_inside & (height > ground + RISE_M))
+        start = float(pos.time_s[above_ground[0]]) if len(above_ground) else start
     if np.isfinite(stop):
         after = height[(pos.time_s > stop) & (pos.time_s < stop + 1.0)]
-        ground = float(np.median(after)) if len(after) else float(height[inside][-1])
-        up = np.flatnonzero(inside & (height > ground + RISE_M))
-        stop = float(pos.time_s[up[-1]]) if len(up) else stop
+        ground = float(np.median(after)) if len(after) else float(height[is_inside][-1])
+        above_ground = np.flatnonzero(is_inside & (height > ground + RISE_M))
+        stop = float(pos.time_s[above_ground[-1]]) if len(above_ground) else stop
     return start, stop

@@ -19,7 +19,7 @@ from eval.logs.velocity import velocity_from_position
 ACC_MAX = 60.0
 """Largest possible acceleration [m/s^2]."""
 POS_LEAST, VEL_LEAST = 0.02, 0.1
-"""Smaller jumps are kept [m, m/s]."""
+"""Jumps of position [m] and velocity [m/s] up to these sizes are kept."""
 GLITCH_SD = 8.0
 """A velocity further from the path's slope than this many standard deviations is a glitch."""
 EDGE_S = 0.1
@@ -29,12 +29,13 @@ MEDIAN_SAMPLES = 7
 REPEATED = 0.02
 """Share of repeated or interpolated samples above which they are removed."""
 COARSE = 4.0
-"""A signal is coarse where its median change is below this many of its resolution steps."""
+"""A signal is coarse if its median change between samples is below this many steps of its
+resolution. Repeated samples of a coarse signal may be real."""
 TEXTS = {"pos": "position", "quat": "attitude"}
 TURNING = 0.05
-"""Least body rate at which an interpolated attitude is identifiable [rad/s]."""
+"""Least body rate at which an interpolated attitude can be detected [rad/s]."""
 EXACT = 1e-3
-"""An attitude whose rate is constant within this share was interpolated."""
+"""Largest relative change of the body rate at an attitude that counts as interpolated."""
 
 
 def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -42,14 +43,14 @@ def clean(recording: Recording) -> tuple[Recording, list[Finding]]:
     signals, findings = dict(recording.signals), []
     findings += _drop_repeats(signals)
     if "quat" in signals and len(signals["quat"].time_s) > MEDIAN_SAMPLES:
-        signals["quat"], more = _without_interpolated(signals["quat"])
-        findings += more
+        signals["quat"], more_findings = _without_interpolated(signals["quat"])
+        findings += more_findings
     if "pos" in signals and len(signals["pos"].time_s) > MEDIAN_SAMPLES:
-        signals["pos"], more = _without_jumps(signals["pos"])
-        findings += more
+        signals["pos"], more_findings = _without_jumps(signals["pos"])
+        findings += more_findings
         if "vel" in signals and len(signals["vel"].time_s) > MEDIAN_SAMPLES:
-            signals["vel"], more = _without_glitches(signals["vel"], signals["pos"])
-            findings += more
+            signals["vel"], more_findings = _without_glitches(signals["vel"], signals["pos"])
+            findings += more_findings
     return replace(recording, signals=signals), findings
 
 
@@ -63,15 +64,17 @@ def _drop_repeats(signals: dict[str, Signal]) -> list[Finding]:
         samples = signals.get(name)
         if samples is None or len(samples.time_s) <= MEDIAN_SAMPLES:
             continue
-        new = np.ones(len(samples.time_s), dtype=bool)
-        new[1:] = np.any(samples.value[1:] != samples.value[:-1], axis=1)
-        share = float(np.mean(~new))
+        is_new = np.ones(len(samples.time_s), dtype=bool)
+        is_new[1:] = np.any(samples.value[1:] != samples.value[:-1], axis=1)
+        share = float(np.mean(~is_new))
         if share < REPEATED or _is_coarse(samples) or not _moves(samples):
             continue
         for other in ("pos", "quat", "vel"):
-            others = signals.get(other)
-            if others is not None and np.array_equal(others.time_s, samples.time_s):
-                signals[other] = _select(others, new)
+            samples_of_other = signals.get(other)
+            if samples_of_other is not None and np.array_equal(
+                samples_of_other.time_s, samples.time_s
+            ):
+                signals[other] = _select(samples_of_other, is_new)
         text = f"{100 * share:.0f} % of the poses repeat the one before: left out"
         return [Finding("corrected", TEXTS[name], text)]
     return []
@@ -84,12 +87,12 @@ def _is_coarse(samples: Signal) -> bool:
     if not len(change):
         return True
     # A low quantile, because rounding makes the very smallest change smaller than a step.
-    least = float(np.quantile(change, 0.02))
-    return float(np.median(change)) < COARSE * least
+    resolution_step = float(np.quantile(change, 0.02))
+    return float(np.median(change)) < COARSE * resolution_step
 
 
 def _moves(samples: Signal) -> bool:
-    """Return whether nearly every sample differs from the one a second later."""
+    """Return whether nearly every sample differs from the sample a second later."""
     later = max(1, int(1.0 / max(median_step(samples.time_s), 1e-6)))
     if later >= len(samples.value):
         return False
@@ -97,19 +100,19 @@ def _moves(samples: Signal) -> bool:
 
 
 def _without_interpolated(quat: Signal) -> tuple[Signal, list[Finding]]:
-    """Remove attitudes with the same body rate before and after: these were interpolated."""
+    """Remove attitudes at which the body rate does not change: these were interpolated."""
     value = continuous(quat.value / np.linalg.norm(quat.value, axis=1, keepdims=True))
     step = np.diff(quat.time_s)[:, None]
     rate = rotation_vector(multiply(conjugate(value[:-1]), value[1:])) / step
     change = np.linalg.norm(rate[1:] - rate[:-1], axis=1)
-    size = np.linalg.norm(rate[1:], axis=1)
-    between = np.zeros(len(value), dtype=bool)
-    between[1:-1] = (size > TURNING) & (change < EXACT * size)
-    share = float(np.mean(between))
+    rate_size = np.linalg.norm(rate[1:], axis=1)
+    is_interpolated = np.zeros(len(value), dtype=bool)
+    is_interpolated[1:-1] = (rate_size > TURNING) & (change < EXACT * rate_size)
+    share = float(np.mean(is_interpolated))
     if share < REPEATED:
         return quat, []
     text = f"{100 * share:.0f} % of its samples are interpolated: left out"
-    return _select(quat, ~between), [Finding("corrected", "attitude", text)]
+    return _select(quat, ~is_interpolated), [Finding("corrected", "attitude", text)]
 
 
 def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
@@ -118,12 +121,12 @@ def _without_jumps(pos: Signal) -> tuple[Signal, list[Finding]]:
     padded = np.concatenate([pos.value[:1]] * half + [pos.value] + [pos.value[-1:]] * half)
     windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_SAMPLES, axis=0)
     reach_s = half * median_step(pos.time_s)
-    far = np.abs(pos.value - np.median(windows, axis=-1)).max(axis=1)
-    bad = far > POS_LEAST + 0.5 * ACC_MAX * reach_s**2
-    bad[:half] = bad[len(bad) - half :] = False
+    jump_m = np.abs(pos.value - np.median(windows, axis=-1)).max(axis=1)
+    bad = jump_m > POS_LEAST + 0.5 * ACC_MAX * reach_s**2
+    bad[:half] = bad[len(bad) - half :] = False  # the padded median is no reference at the ends
     if not bad.any():
         return pos, []
-    worst = float(far[bad].max())
+    worst = float(jump_m[bad].max())
     text = f"{int(bad.sum())} samples jump by up to {worst:.2g} m and back: left out"
     return _select(pos, ~bad), [Finding("corrected", "position", text)]
 
@@ -133,12 +136,12 @@ def _without_glitches(vel: Signal, pos: Signal) -> tuple[Signal, list[Finding]]:
     path = velocity_from_position(pos.time_s, pos.value)
     slope = np.stack([np.interp(vel.time_s, pos.time_s, column) for column in path.T], axis=1)
     error = vel.value - slope
-    far = np.abs(error - np.median(error, axis=0))
-    error_sd = MAD_TO_SD * np.median(far, axis=0)
+    deviation = np.abs(error - np.median(error, axis=0))
+    error_sd = MAD_TO_SD * np.median(deviation, axis=0)
     speed = float(np.sqrt(np.mean(np.sum(slope**2, axis=1))))
     if np.linalg.norm(error_sd) > 0.3 * max(speed, VEL_LEAST):
         return vel, []
-    bad = np.any(far > np.maximum(GLITCH_SD * error_sd, VEL_LEAST), axis=1)
+    bad = np.any(deviation > np.maximum(GLITCH_SD * error_sd, VEL_LEAST), axis=1)
     # At the ends and next to gaps the slope uses positions on one side only.
     gaps = np.diff(pos.time_s) > 4.0 * median_step(pos.time_s)
     ends = pos.time_s[[0, -1]]

@@ -12,7 +12,7 @@ from eval.logs.faults.clock import LATE_S, LEAST_S, SURE, delay_of
 from eval.logs.faults.finding import Finding
 
 LATE = ("pos", "quat", "vel")
-"""Signals of one device, which share a delay."""
+"""Signals of the device that measures the pose; they share its delay."""
 
 
 def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Finding]]:
@@ -24,17 +24,17 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         fix: shift the pose; otherwise only report the delay.
     """
     quat, rate = recording.signals["quat"], recording.signals["rate"]
-    late = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
-    if late is None:
+    fit = delay_of(quat.time_s, quat.value, rate.time_s, rate.value)
+    if fit is None:
         return recording, []
-    delay, error = late.delay_s, late.error_s
+    delay, error = fit.delay_s, fit.error_s
     figures = f"it is {1e3 * delay:+.1f} ms (± {1e3 * error:.1f} ms) late against the gyro"
     is_late, findings = abs(delay) > max(LEAST_S, SURE * error), []
     option = "leave --no-fix out: the import shifts the pose"
     status = "corrected" if fix else "doubt"
-    if late.drifts:
-        about = ("clock_drift", late.drift, 0.95, option)
-        findings.append(Finding(status, "pose clock", late.drift_figures(), *about))
+    if fit.drifts:
+        about = ("clock_drift", fit.drift, 0.95, option)
+        findings.append(Finding(status, "pose clock", fit.drift_figures(), *about))
     if is_late:
         confidence = 0.95 if abs(delay) > LATE_S else 0.8
         text = f"{figures}: pose and velocity are shifted" if fix else f"{figures}; not corrected"
@@ -42,12 +42,12 @@ def check_delay(recording: Recording, fix: bool) -> tuple[Recording, list[Findin
         findings.append(Finding(status, "pose delay", text, *about))
     else:
         findings.append(Finding("ok", "pose delay", figures))
-    if not fix or not (is_late or late.drifts):
+    if not fix or not (is_late or fit.drifts):
         return recording, findings
-    drift = late.drift if late.drifts else 0.0
+    drift = fit.drift if fit.drifts else 0.0
     signals = dict(recording.signals)
     for name in LATE:
         if name in signals:
             time_s, value = signals[name]
-            signals[name] = Signal(time_s - (delay + drift * (time_s - late.middle_s)), value)
+            signals[name] = Signal(time_s - (delay + drift * (time_s - fit.middle_s)), value)
     return replace(recording, signals=signals), findings

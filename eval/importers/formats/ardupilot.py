@@ -43,10 +43,10 @@ MESSAGES = ("IMU", "ATT", "XKF1", "NKF1", "RATE", "CTUN", "RCOU", "ESC", "BAT", 
 OPEN_HANDLES = ("data_map", "filehandle")
 """Attributes of a pymavlink reader that must be closed."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
-"""Motors 1 to 4 of a quadrotor X (x forward, y left): front right, rear left, front left, rear
-right."""
+"""Positions of motors 1 to 4 of a quadrotor X (x forward, y left): front right, rear left, front
+left, rear right."""
 QUAD_PLUS = ((0.0, -1.0), (0.0, 1.0), (1.0, 0.0), (-1.0, 0.0))
-"""Motors 1 to 4 of a quadrotor plus: right, left, front, rear."""
+"""Positions of motors 1 to 4 of a quadrotor plus (x forward, y left): right, left, front, rear."""
 MOTOR_1 = 33
 """SERVOn_FUNCTION of motor 1; motors 2 to 4 have the next numbers."""
 DEG, RPM = np.pi / 180.0, np.pi / 30.0
@@ -108,8 +108,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         fault = ("motor_count", None, 0.95, "none: only quadrotors can be diagnosed")
         findings.append(Finding("doubt", "motors", text, *fault))
     motor_side = QUAD_PLUS if parameters.get("FRAME_TYPE", 1.0) == 0.0 else QUAD_X
-    signals, more = collect(parts, str(path))
-    return Recording(str(path), signals, (*findings, *more), motor_side, about)
+    signals, more_findings = collect(parts, str(path))
+    return Recording(str(path), signals, (*findings, *more_findings), motor_side, about)
 
 
 def _load(path: Path) -> tuple[dict[str, Rows], dict[str, float], dict[str, str]]:
@@ -183,14 +183,14 @@ def _columns(rows: list[dict[str, Any]], name: str) -> Rows:
     """Return the numeric columns of a message: of its first instance or core, or of all ESCs."""
     if name != "ESC":
         rows = [r for r in rows if not r.get("I", r.get("C", 0))] or rows
-    numbers = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
-    return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numbers}
+    numeric = [k for k, v in rows[0].items() if isinstance(v, (int, float))]
+    return {k: np.array([r.get(k, np.nan) for r in rows], dtype=np.float64) for k in numeric}
 
 
 def _outputs(parameters: Mapping[str, float]) -> list[int]:
-    """Return the outputs of motors 1 to 4; [] where only some of them have one.
+    """Return the numbers of the outputs of motors 1 to 4; [] if only some motors have an output.
 
-    A log without any assignment has the motors on the first four outputs.
+    Without any assignment in the log, these are outputs 1 to 4, ArduPilot's default.
     """
     output_of = {parameters.get(f"SERVO{k}_FUNCTION"): k for k in range(14, 0, -1)}
     outputs = [output_of.get(float(MOTOR_1 + k)) for k in range(4)]
@@ -201,7 +201,10 @@ def _outputs(parameters: Mapping[str, float]) -> list[int]:
 
 
 def _motors(esc: Rows, findings: list[Finding]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return rotor speeds [rad/s] at the times of the first ESC; the others are interpolated."""
+    """Return rotor speeds [rad/s] at the times of the first motor controller (ESC).
+
+    The speeds of the other three are interpolated to these times.
+    """
     name = "Instance" if "Instance" in esc else "I"
     instances = sorted(set(esc.get(name, np.zeros(0)).tolist()))
     findings += check_count(len(instances), "by the ESCs of the log")

@@ -30,21 +30,23 @@ from eval.logs.files import first_line, read_columns, read_head
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
 TAKES_MAP = TAKES_SOURCE = False
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Motors 1 to 4 (x forward, y left): rear right, front right, rear left, front left."""
+"""Positions of motors 1 to 4 (x forward, y left): rear right, front right, rear left, front
+left."""
 DSHOT, PULSES = (48.0, 2047.0), (1000.0, 2000.0)
 """Least and largest motor output, in steps of DShot or as pulses [us]."""
 ABOUT = {"Firmware revision": "firmware", "Craft name": "craft", "Board information": "board"}
+"""Entry of the log's header -> key in the flight log's metadata."""
 DEG = np.pi / 180.0
 _ROTATION = {"": DEG, "deg/s": DEG, "rad/s": 1.0}
 _ACCELERATION = {"": GRAVITY / ACC_1G, "g": GRAVITY, "m/s2": 1.0}
 _TIME = {"": 1e-6, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _VOLT = {"": 0.01, "V": 1.0, "mV": 1e-3}
-"""Unit in the header -> factor to our unit, for each quantity; "" is a column without a unit. Raw
-voltages of Betaflight 4 are in 10 mV."""
+"""Unit in a column's name -> factor to the suite's unit, for each quantity; "" is a column without
+a unit. Raw voltages of Betaflight 4 are in 10 mV."""
 LEAST_V, MOST_V = 2.5, 30.0
-"""Range of plausible voltages [V]. A higher one is ten times too large: `blackbox_decode` divides
-by ten to make volts, which was right before Betaflight 4 only. A quadrotor with more than seven
-cells is rarer than this error."""
+"""Range of plausible voltages [V]. A higher voltage is taken as ten times too large, because
+`blackbox_decode` divides by ten to make volts, which was right before Betaflight 4 only. A battery
+with more than seven cells is rarer than this error."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
 _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
 
@@ -95,11 +97,11 @@ class Blackbox:
         return self._units[name][1]
 
     def values(self, names: list[str], factor: Mapping[str, float]) -> np.ndarray:
-        """Return columns (N, C) in our unit.
+        """Return columns (N, C) in the suite's unit.
 
         Args:
             names: names of the columns, without units.
-            factor: unit in the file -> factor to our unit.
+            factor: unit in the file -> factor to the suite's unit.
 
         Raises:
             FlightLogError: for a column that is missing, has an unknown unit, or is not numeric.
@@ -152,13 +154,15 @@ def read(path: Path, options: ImportOptions) -> Recording:
         poles = int(box.settings("motor_poles", (poles,))[0])
     parts |= _motors(box, poles, findings)
     parts |= _outputs(box, findings)
-    signals, more = collect({name: (time_s, value) for name, value in parts.items()}, box.name)
-    about = {ours: str(box.header[key]) for key, ours in ABOUT.items() if box.header.get(key)}
-    return Recording(box.name, signals, (*findings, *more), MOTOR_SIDE, about)
+    signals, more_findings = collect(
+        {name: (time_s, value) for name, value in parts.items()}, box.name
+    )
+    about = {our_key: str(box.header[key]) for key, our_key in ABOUT.items() if box.header.get(key)}
+    return Recording(box.name, signals, (*findings, *more_findings), MOTOR_SIDE, about)
 
 
 def _volts(voltage: np.ndarray, unit: str, fix: bool, findings: list[Finding]) -> np.ndarray:
-    """Return voltages [V], corrected where their unit is not the one of the column's name."""
+    """Return voltages [V], corrected if their size contradicts the unit of the column's name."""
     median_v = float(np.nanmedian(voltage)) if np.isfinite(voltage).any() else 0.0
     raw = voltage / _VOLT[""]
     integers = np.all(np.mod(raw[np.isfinite(raw)], 1.0) == 0.0)

@@ -18,6 +18,7 @@ from eval.logs.columns import FlightLogError, quoted
 from eval.logs.faults.finding import Finding
 
 MARKER = b"H Product:Blackbox"
+"""Text that begins the header of each raw log in a file."""
 ACC_1G = 2048.0
 """Raw counts of accSmooth per g, on all boards of Betaflight 4."""
 MISSING = (

@@ -46,8 +46,8 @@ DEFAULT_MAP = Path("crazyflie")
 PACKED = "stateEstimateZ.quat"
 """Variable with a compressed quaternion; see `unpack_quaternion`."""
 BACK_S, AHEAD_S = 1.0, 10.0
-"""In a file without a checksum, an event that is further than this before or after the event before
-it is old content of the card [s]."""
+"""In a file without a checksum, the time from one event to the next must lie between -`BACK_S` and
+`AHEAD_S` [s]; otherwise the next event is old content of the card."""
 
 
 class Kind(NamedTuple):
@@ -121,10 +121,10 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
         findings.append(Finding("doubt", "file", text))
     stop = len(data) - 4 if complete else len(data)
     unit_s = 1e-3 if version == 1 else 1e-6
-    stamp = struct.Struct("<HI" if version == 1 else "<HQ")
+    id_and_time = struct.Struct("<HI" if version == 1 else "<HQ")
     records: dict[int, list[bytes]] = {number: [] for number in kinds}
     offset, last_s, last_kind = start, None, 0
-    while offset + stamp.size <= stop:
+    while offset + id_and_time.size <= stop:
         number = int.from_bytes(data[offset : offset + 2], "little")
         if number not in kinds:
             # A wrong checksum (four bytes) or old content of the card may follow the log.
@@ -133,10 +133,10 @@ def decode(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], li
             text = f"byte {offset} starts no known event; {stop - offset} bytes are not read"
             findings.append(Finding("doubt", "file", text))
             break
-        end = offset + stamp.size + kinds[number].layout.itemsize
+        end = offset + id_and_time.size + kinds[number].layout.itemsize
         if end > stop:
             break
-        time_s = stamp.unpack_from(data, offset)[1] * unit_s
+        time_s = id_and_time.unpack_from(data, offset)[1] * unit_s
         if not complete and last_s is not None and not -BACK_S < time_s - last_s < AHEAD_S:
             text = f"byte {offset} has a time {time_s - last_s:+.3g} s from the event before"
             text += "; the bytes from there are old content of the card, not read"
@@ -218,8 +218,8 @@ def _find(
     events: Mapping[str, Mapping[str, np.ndarray]], variables: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return time and values of `variables` from the kind of event with most samples of them."""
-    holding = [e for e in events.values() if all(v in e for v in variables)]
-    best = max(holding, key=lambda event: len(event["timestamp"]), default=None)
+    having_all = [e for e in events.values() if all(v in e for v in variables)]
+    best = max(having_all, key=lambda event: len(event["timestamp"]), default=None)
     if best is None or not len(best["timestamp"]):
         return None
     return best["timestamp"], np.stack([best[v] for v in variables], axis=1)

@@ -45,7 +45,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 }
 """Kind of message -> ROS types that hold it, without `/msg/`."""
 Stamped = tuple[int, int, Any]
-"""Time in the header [ns], time of recording [ns], message."""
+"""A message with its times: time in its header [ns], time of recording [ns], message."""
 IGNORE_RATES, IGNORE_THRUST, IGNORE_ATTITUDE = 7, 64, 128
 """Bits of `AttitudeTarget.type_mask` (MAVLink's ATTITUDE_TARGET_TYPEMASK)."""
 
@@ -87,8 +87,8 @@ def read(path: Path, options: ImportOptions) -> Recording:
         raise FlightLogError(str(path), None, None, reason)
     messages = _on_one_clock(chosen, findings)
     findings += _motor_count(messages)
-    signals, more = _signals(messages, str(path))
-    return Recording(str(path), signals, (*findings, *more), motor_side)
+    signals, more_findings = _signals(messages, str(path))
+    return Recording(str(path), signals, (*findings, *more_findings), motor_side)
 
 
 def _choices(
@@ -155,8 +155,8 @@ def _on_one_clock(
     if unset:
         text = f"headers of {', '.join(unset)} have stamp 0: all times are the recorder's"
         findings.append(Finding("corrected", "time", text, "time_stamps", None, 0.95))
-    clock = 1 if unset else 0
-    return {kind: [(m[clock], m[2]) for m in messages] for kind, messages in chosen.items()}
+    time_index = 1 if unset else 0
+    return {kind: [(m[time_index], m[2]) for m in messages] for kind, messages in chosen.items()}
 
 
 def _motor_count(messages: dict[str, list[tuple[int, Any]]]) -> list[Finding]:

@@ -55,9 +55,9 @@ QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 QUADROTOR = 2
 """MAV_TYPE of a quadrotor."""
 FIRST_MOTOR = 101
-"""`actuator_function` of Motor1."""
+"""Value of `actuator_function` for Motor1; Motor2 to Motor4 have the next values."""
 BODY_FRAME = 3
-"""`velocity_frame` of a velocity in body axes."""
+"""Value of `velocity_frame` for a velocity in body axes."""
 RPM = 2.0 * np.pi / 60.0
 
 Topic = Mapping[str, np.ndarray]
@@ -83,6 +83,7 @@ def read(path: Path, options: ImportOptions) -> Recording:
     topics: dict[str, Topic] = {}
     motor_side, findings = _motor_side(log.initial_parameters)
     findings += _check_file(log)
+    # A later instance overwrites an earlier one, so the sort leaves instance 0 of each topic.
     for data in sorted(log.data_list, key=lambda data: -data.multi_id):
         if "timestamp" in data.data:
             topics[data.name] = data.data
@@ -102,10 +103,10 @@ def read(path: Path, options: ImportOptions) -> Recording:
     findings += _no_position(topics)
     if "vehicle_local_position" in topics:
         findings += _resets(topics["vehicle_local_position"])
-    signals, more = collect(parts, str(path))
+    signals, more_findings = collect(parts, str(path))
     info = log.msg_info_dict
     about = {key: str(info[key]) for key in ("sys_name", "ver_hw", "ver_sw") if key in info}
-    return Recording(str(path), signals, (*findings, *more), motor_side, about)
+    return Recording(str(path), signals, (*findings, *more_findings), motor_side, about)
 
 
 class _TruncationSafeReader(io.BufferedReader):
@@ -279,7 +280,9 @@ def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> 
 
     `esc_count` is not used, because it counts ESCs that are connected, with or without a motor.
     """
-    kind, rotors = (int(_parameter(parameters, name)) for name in ("MAV_TYPE", "CA_ROTOR_COUNT"))
+    vehicle_type, rotors = (
+        int(_parameter(parameters, name)) for name in ("MAV_TYPE", "CA_ROTOR_COUNT")
+    )
     turning = 0
     for topic, name in (("esc_status", "esc[{}].esc_rpm"), ("actuator_motors", "control[{}]")):
         values = [np.asarray(topics.get(topic, {}).get(name.format(k), 0.0)) for k in range(12)]
@@ -287,15 +290,15 @@ def _motor_count(parameters: Mapping[str, Any], topics: Mapping[str, Topic]) -> 
         turning = max(turning, moved)
     if rotors not in (0, 4):
         return check_count(rotors, "by CA_ROTOR_COUNT")
-    if kind not in (0, QUADROTOR):
-        text = f"MAV_TYPE is {kind}, not {QUADROTOR}: no quadrotor; {turning} motors turn"
+    if vehicle_type not in (0, QUADROTOR):
+        text = f"MAV_TYPE is {vehicle_type}, not {QUADROTOR}: no quadrotor; {turning} motors turn"
         about = ("motor_count", float(turning), 0.95, "none: only quadrotors can be diagnosed")
         return [Finding("doubt", "motors", text, *about)]
     return check_count(turning, "of the log") if turning > 4 else []
 
 
 def _other_battery(parts: dict[str, Part], others: Sequence[Topic]) -> list[Finding]:
-    """Replace the first battery's voltage by another one's, in place, where it is impossible."""
+    """Replace an impossible voltage of the first battery by another battery's, in place."""
     if "voltage" not in parts or not check_voltage_fails(parts["voltage"][1]):
         return []
     for number, topic in enumerate(others, start=1):

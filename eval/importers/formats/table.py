@@ -55,8 +55,8 @@ def read_table(path: Path, map_path: Path | None, options: ImportOptions) -> Rec
     mapping = file_map or own_map(columns)
     name, about = str(path), {}
     if map_path is None:  # a flight log has metadata
-        about, more = flight_metadata(text, name)
-        warnings += more
+        about, more_warnings = flight_metadata(text, name)
+        warnings += more_warnings
     time_s = _time(columns, mapping, name, map_path is not None)
 
     def find(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -110,8 +110,8 @@ def numbers(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.nda
 
 
 def _missing(columns: Mapping[str, np.ndarray], column: str) -> str:
-    guess = closest(column, list(columns))
-    hint = f"; did you mean {guess!r}?" if guess else f"; there are: {', '.join(columns)}"
+    similar = closest(column, list(columns))
+    hint = f"; did you mean {similar!r}?" if similar else f"; there are: {', '.join(columns)}"
     return "missing" + hint
 
 
@@ -121,10 +121,10 @@ def _values(columns: Mapping[str, np.ndarray], column: str, name: str) -> np.nda
         if _holds_lists(columns[column]):
             return _lists(columns[column], column, name)
         return numbers(columns, column, name).astype(np.float64)[:, None]
-    entry = _LIST_ENTRY.match(column)
-    if entry is None or entry.group(1) not in columns:
+    list_entry = _LIST_ENTRY.match(column)
+    if list_entry is None or list_entry.group(1) not in columns:
         return None
-    list_column, index = entry.group(1), int(entry.group(2))
+    list_column, index = list_entry.group(1), int(list_entry.group(2))
     values = _lists(columns[list_column], list_column, name)
     return values[:, index : index + 1] if index < values.shape[1] else None
 
