@@ -28,7 +28,7 @@ from suite.diagnose.verdict.actuators import integrator_of
 SourceMaker = Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]
 """Makes sources from the input and the sources before it; None if it adds none."""
 SOURCES: dict[str, SourceMaker] = {"rollouts": by_rollouts, "views": by_views}
-"""Makers of the sources of evidence, by name, in their order."""
+"""Functions that make the sources of evidence, by name, in the order in which they are called."""
 
 
 def diagnose(
@@ -51,7 +51,7 @@ def diagnose(
         vehicle: the vehicle that the simulation used.
         references: flights of the same vehicle before a change, to find that change.
         by: the source of evidence, one of `SOURCES`, or "auto" for all that the logs allow.
-        drive: input of the model: "commands", "motors" (measured rotor speeds), or "auto".
+        drive: what drives the model: "commands", "motors" (measured rotor speeds), or "auto".
         integrator: integration of the flights' bodies: "continuous" for real ones, "euler" for
             MuJoCo's steps of the rate loop's period, or "auto" for the one that the logs state.
         say: receives a line of progress for people.
@@ -69,6 +69,8 @@ def diagnose(
     makers = [make for name, make in SOURCES.items() if by in ("auto", name)]
     result = _diagnose(given, makers, seed)
     main = result.main
+    # A delay of half a step between pose and rates is how MuJoCo integrates, not a fault. If that
+    # explains the named effects, repeat the diagnosis with its integrator.
     is_continuous = integrator == "auto" and integrator_of(logs, "auto") == "continuous"
     if main.source.rollouts and is_continuous and main.source.explained_by_steps(main.search):
         say("pose and rates differ by half a step: repeating with MuJoCo's Euler steps")
@@ -84,10 +86,12 @@ def diagnose(
 
 def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -> Diagnosis:
     """Return the diagnosis by the sources that `makers` make."""
+    # Make the sources.
     flights = SourceSet((), (), "")
     for make in makers:
-        more = make(given, flights.sources)
-        flights = flights if more is None else flights.joined(more)
+        made = make(given, flights.sources)
+        flights = flights if made is None else flights.joined(made)
+    # Search and test with each source; `findings` holds those of the sources before it.
     findings, warnings = list[Finding](), list(flights.warnings)
     for source in flights.sources:
         finding, notes = examine(source, findings, given.say, seed)
@@ -98,6 +102,7 @@ def _diagnose(given: DiagnosisInput, makers: Sequence[SourceMaker], seed: int) -
     tested, limits = tested_in(unique, flights), unique[0].source.limits
     names = [named for finding in unique for named in finding.names]
     verdict = verdict_on(unique, bool(tested or names), limits)
+    # Effects that leave most of the gap are not the cause: remove them, and decide again.
     if verdict.label == "unknown" and names:
         labels = ", ".join(named.candidate.label for named in names)
         warnings.append(f"nearest in the catalogue, but most of the gap remains: {labels}")
@@ -127,9 +132,9 @@ class Verdict(NamedTuple):
     """A verdict and its reasons."""
 
     label: str
-    """no_gap, named, partly or unknown."""
+    """One of no_gap, named, partly and unknown."""
     share_left: float = 0.0
-    """Share of the gap on held-out flights that remains [1]."""
+    """Share of the gap on held-out flights that remains with the named effects."""
     where: str | None = None
     """For people: quantity that the remaining error depends on."""
 
@@ -140,7 +145,7 @@ class Diagnosis:
 
     verdict: Verdict
     findings: tuple[Finding, ...]
-    """One for each source, in their order."""
+    """One finding for each source, in the order of the sources."""
     flights: SourceSet
     """The sources of evidence from these flights."""
     nominal: Vehicle
@@ -157,12 +162,12 @@ class Diagnosis:
 
     @property
     def label(self) -> str:
-        """no_gap, named, partly or unknown."""
+        """The verdict in a word: no_gap, named, partly or unknown."""
         return self.verdict.label
 
     @property
     def main(self) -> Finding:
-        """The finding with names, or else the one whose error can be explained best."""
+        """The finding with named effects, or else that with the best explainable error."""
         return main_of(self.findings)
 
     @property
@@ -182,12 +187,16 @@ class Diagnosis:
 
     @property
     def limits(self) -> Thresholds:
-        """Thresholds of its steps."""
+        """Thresholds of all steps."""
         return self.main.source.limits
 
 
 def main_of(findings: Sequence[Finding]) -> Finding:
-    """Return the finding with names, or else the one whose error can be explained best."""
+    """Return the main finding.
+
+    Findings with named effects come first. Among equals it is the one of whose error a black box
+    explains most.
+    """
     return max(findings, key=lambda one: (bool(one.names), one.remaining.explainable))
 
 
@@ -198,9 +207,10 @@ def tested_in(findings: Sequence[Finding], flights: SourceSet) -> tuple[TestedEf
 
 
 def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> Verdict:
-    """Return the verdict, by the findings with names, or by all if there are none.
+    """Return the verdict.
 
-    `named` is whether the search or a separate test named an effect. An oscillating force always
+    It follows from the findings with named effects, or from all findings if there are none. `named`
+    is whether the search or a separate test named an effect. An oscillating force (swing) always
     counts as unexplained, since no fitted parameter reproduces it.
     """
     judged = [one for one in findings if one.names] or findings
@@ -217,7 +227,7 @@ def verdict_on(findings: Sequence[Finding], named: bool, limits: Thresholds) -> 
 def with_names(
     nominal: Vehicle, findings: Sequence[Finding], tested: Sequence[TestedEffect]
 ) -> Vehicle:
-    """Return the vehicle with the named effects; they replace its own of the same names."""
+    """Return the nominal vehicle with the named effects; these replace effects that it has."""
     space = findings[0].source.space
     theta, names = np.array(space.array("start")), list[str]()
     for finding in findings:

@@ -1,7 +1,8 @@
 """Plans flights that separate effects which the diagnosed flights do not, and simulates them.
 
-Each flight is a trajectory: its parameters are in `plan.json`. A CSV has position, velocity,
-acceleration and yaw at every hundredth of a second, for autopilots that follow set points.
+Two effects are separated if only one of them explains the flights. Each planned flight is a
+trajectory. Its parameters are in `plan.json`, and its set points in a CSV for autopilots: position,
+velocity, acceleration and yaw at every hundredth of a second.
 """
 
 from __future__ import annotations
@@ -25,26 +26,27 @@ from tracks.common.provenance import stamp
 from tracks.input.reading import read_json
 
 RATE_HZ = 100.0
-"""Rate of set points, and largest rate of simulated logs; theirs divides the rate loop's [Hz]."""
+"""Rate of the set points, and largest rate of simulated logs. The rate of a log is the rate loop's
+frequency divided by a whole number [Hz]."""
 SECOND_DIRECTION = 2.1
-"""Rotation about z of the second flight of each trajectory [rad]. Two flights with different
-headings allow holding one out."""
+"""Rotation about z of the second flight of each trajectory [rad]. Each trajectory is flown twice,
+so that one flight can be held out."""
 MEASURES = {
     "motor": "Log the rotor speeds as well.",
     "voltage": "Log the battery's voltage as well.",
     "scale": "Better still: weigh the vehicle.",
 }
-"""Advice on further measurements, by the name in a `Separation`."""
+"""Advice on further measurements, by their names in `Separation.measure`."""
 ROTOR_NOISE, VOLTAGE_NOISE = 5.0, 0.02
-"""Noise of rotor speeds [rad/s] and voltage [V] where the diagnosed logs have none."""
+"""Noise of rotor speeds [rad/s] and voltage [V], if the diagnosed logs lack these signals."""
 FLIGHTS = "flights"
 """Folder of the simulated logs, in the plan's folder."""
 
 
 def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
-    """Return the flights that separate what a diagnosis did not, and advice in words.
+    """Return the flights that separate named effects from their alternatives, and advice in words.
 
-    `result` is the diagnosis's JSON: each effect with alternatives is to be separated from them.
+    `result` is the content of diagnosis.json.
     """
     trajectories: list[Trajectory] = []
     words: list[str] = []
@@ -69,19 +71,19 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
 
 
 def write_plan_of(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the plan for a diagnosis (its JSON), and return it; it may have no flights.
+    """Write the plan for a diagnosis into `folder`, and return the plan; it may have no flights.
 
-    An earlier plan in `folder` is removed with its simulated logs, so that they are not mistaken
-    for the new ones.
+    `result` is the content of diagnosis.json. An earlier plan in `folder` is removed with its
+    simulated logs, so that they are not mistaken for the new ones.
     """
     remove_plan(folder)
-    ways, words = trajectories_for(result)
-    if not ways:
+    trajectories, words = trajectories_for(result)
+    if not trajectories:
         return {
             "flights": [],
             "words": ["No effects are left to separate: no flight is planned."],
         }
-    return write_plan(folder, ways, words)
+    return write_plan(folder, trajectories, words)
 
 
 def fly_plan(
@@ -95,36 +97,38 @@ def fly_plan(
     """Fly `plan` in MuJoCo, and write logs with the noise of the diagnosed ones.
 
     Args:
-        plan: from `write_plan_of`.
-        sigma: (19,) noise of each channel in its unit; a channel with NaN is not logged.
+        plan: result of `write_plan_of`.
+        sigma: (19,) standard deviation of the noise of each channel, in the channel's unit; NaN for
+            a channel that is not logged.
         nominal: the vehicle that the position controller assumes.
         truth: the vehicle that flies.
         folder: the plan's folder.
         seed: seed of noise and random wind.
 
     Returns:
-        The plan, with each flight's log in `flown`, and `warnings` about flights that failed.
+        The plan, with the path of each flight's log in `flown`, and with `warnings` about flights
+        that failed.
     """
     frequency = truth.controller.frequency
     rate_hz = frequency / max(1, round(frequency / RATE_HZ))
     sensors = _sensors(sigma, rate_hz, plan["words"])
     flights, warnings = [], []
     for number, flight in enumerate(plan["flights"], 1):
-        way = Trajectory(**flight["trajectory"])
+        trajectory = Trajectory(**flight["trajectory"])
         rng = np.random.default_rng([seed, number])
         try:
             (recording,) = fly(
-                nominal, truth, [way], rate_hz, rng=rng, has_voltage=bool(sensors.voltage)
+                nominal, truth, [trajectory], rate_hz, rng=rng, has_voltage=bool(sensors.voltage)
             )
         except FlightFailed as error:
             warnings.append(f"plan: {flight['file']} could not be flown: {error}")
             flights.append(flight)
             continue
-        name = f"{FLIGHTS}/plan_{number}_{way.kind}.parquet"
+        name = f"{FLIGHTS}/plan_{number}_{trajectory.kind}.parquet"
         log = log_of(recording, truth, sensors, rng, name)
-        about = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
+        metadata = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
         (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
-        write_flight(folder / name, replace(log, about={**log.about, **about}))
+        write_flight(folder / name, replace(log, about={**log.about, **metadata}))
         flights.append({**flight, "flown": name})
     plan = {**plan, "flights": flights}
     if flights:
@@ -139,6 +143,7 @@ def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
     """
 
     def noise(group: str) -> float:
+        """Return the RMS noise of a group of channels; 0 (not logged) if it has none."""
         values = sigma[SLICES[group]]
         return float(np.sqrt(np.mean(values**2))) if np.isfinite(values).all() else 0.0
 
@@ -163,15 +168,15 @@ COLUMNS = (
     *(f"{stem}_{axis}" for stem in ("pos", "vel", "acc") for axis in "xyz"),
     "yaw",
 )
-"""Columns of a CSV: time [s], position [m], velocity [m/s], acceleration [m/s^2] in the world; yaw
-[rad]."""
+"""Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
+frame; yaw [rad]."""
 NAME = "plan.json"
 KEYS = ("file", "flown")
 """Keys of a flight's files in plan.json: its set points, and its log if it was simulated."""
 
 
 def remove_plan(folder: Path) -> None:
-    """Remove an earlier plan.json in `folder` and the files that it lists; other files stay."""
+    """Remove an earlier plan.json in `folder` and the files that it lists, but no other files."""
     path = folder / NAME
     if not path.is_file():
         return
@@ -180,16 +185,22 @@ def remove_plan(folder: Path) -> None:
     except (ValueError, KeyError, TypeError, AttributeError):
         return  # another program's file, which will be overwritten
     for name in listed:
+        # A name that leads out of the folder is not one that this command wrote.
         if isinstance(name, str) and (folder / name).resolve().is_relative_to(folder.resolve()):
             (folder / name).unlink(missing_ok=True)
     path.unlink()
 
 
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
-    """Write the trajectories `ways`, one a flight, into `folder`.
+    """Write plan.json and the set points of each flight into `folder`.
+
+    Args:
+        folder: folder for the files.
+        ways: one trajectory for each flight.
+        words: advice for people, which the plan contains.
 
     Returns:
-        The content of plan.json, with the advice in `words`.
+        The content of plan.json.
     """
     folder.mkdir(parents=True, exist_ok=True)
     flights = []
@@ -241,7 +252,8 @@ class Separation:
     separating: tuple[Trajectory, ...]
     """Further flights that separate them."""
     measure: tuple[str, ...] = ()
-    """Further measurements: `motor` (speeds), `voltage`, or `scale` for a weighing."""
+    """Further measurements that separate them: `motor` (rotor speeds), `voltage`, or `scale`
+    (weighing the vehicle)."""
 
 
 SEPARATIONS: tuple[Separation, ...] = (
@@ -328,22 +340,25 @@ SEPARATIONS: tuple[Separation, ...] = (
 def separations_of(names: Iterable[str]) -> list[Separation]:
     """Return the entries of `SEPARATIONS` whose two effects are both in `names`.
 
-    A composite counts as its effects.
+    A composite (several effects as one candidate) counts as its effects.
     """
     wanted = {effect for name in names for effect in effects_in(name)}
     return [entry for entry in SEPARATIONS if wanted.issuperset(entry.pair)]
 
 
 def plan_for(names: Iterable[str]) -> list[Trajectory]:
-    """Return the flights that separate `names`, each once.
+    """Return the trajectories that separate the effects `names`, each once.
 
-    Without an entry in `SEPARATIONS`, these are the flights with most excitation.
+    Without an entry in `SEPARATIONS`, these are the trajectories with the fastest changes.
     """
     separating = [way for entry in separations_of(names) for way in entry.separating]
     return list(dict.fromkeys(separating or [_RANGE, _SWEEP, _CHIRP, _FAST_WOBBLE]))
 
 
 def advice(name: str, rival: str) -> str:
-    """Return a line for people on the flight that separates the effects `name` and `rival`."""
+    """Return a line for people: how to fly to separate the effect `name` from `rival`.
+
+    `rival` is an alternative to the effect.
+    """
     entries = separations_of((name, rival))
     return f"{name} from {rival}: {entries[0].words if entries else OTHERWISE}"

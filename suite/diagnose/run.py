@@ -53,19 +53,20 @@ def diagnose_files(
 
     Args:
         paths: flight logs, or folders of them.
-        vehicle_name: a vehicle file or a shipped name.
+        vehicle_name: path of a vehicle file, or name of a shipped one.
         out: folder for the files.
         console: for progress and warnings.
-        drive: input of the model: "auto", "commands" or "motors" (measured rotor speeds).
-        integrator: integration of the bodies: "auto", "continuous" or "euler".
+        drive: what drives the model: "auto", "commands" or "motors" (measured rotor speeds).
+        integrator: integration of the bodies: "auto", "continuous" or "euler" (MuJoCo's steps).
         compare_delta: fit a Delta Action Model (a network that corrects the dynamics) to the same
             flights and compare it.
         plan: write flights that separate effects which these flights do not.
-        fly: fly the plan in simulation with this vehicle.
+        fly: vehicle with which the plan is flown in simulation, if any.
         recording: write a recording for rerun.
         seed: seed of all random draws.
         reference: flights of the same vehicle before a change, to find that change.
-        relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of a finding.
+        relevance: least force [m/s^2], torque [rad/s^2] and drift after a second [m] of an effect
+            that is named.
         accept: names of interface faults (wrong units, signs, clocks) that do not stop the command.
 
     Returns:
@@ -74,25 +75,28 @@ def diagnose_files(
     Raises:
         ValueError: if flights or vehicle file cannot be used.
     """
+    # Read the files, and check the logs for faults of interfaces.
     limits = replace(THRESHOLDS, relevance=relevance)
     vehicle = load_vehicle(vehicle_name)
     refuse_own_motion(vehicle)
     truth = None if fly is None else load_vehicle(fly)
     logs, warnings = read_flights(flight_files(paths), partial=True)
-    before, more = read_flights(flight_files(reference), partial=True) if reference else ([], [])
+    # `before` are the reference flights, before a change.
+    before, notes = read_flights(flight_files(reference), partial=True) if reference else ([], [])
     findings = check_before_diagnosis([*logs, *before], CheckContext(vehicle), accept)
-    warnings = [*warnings, *more, *lines_of(findings)]
+    warnings = [*warnings, *notes, *lines_of(findings)]
     logs, slow = without_slow_rotors(logs)
     before, slow_before = without_slow_rotors(before)
     warnings += [*slow, *slow_before]
     for warning in warnings:
         console.note(f"warning: {warning}")
-    shown = len(warnings)
+    shown_count = len(warnings)
     diagnosis = diagnose(
         logs, vehicle, before, drive=drive, integrator=integrator, say=console.note, seed=seed,
         limits=limits,
     )  # fmt: skip
     result: dict[str, Any] = diagnosis_json(diagnosis)
+    # Some options need rollouts. `flown` has them, and is None if only force and torque were used.
     flown, files = diagnosis.main.source.rollouts, {"vehicle.toml", "diagnosis.json"}
     if flown is None:
         wanted = {
@@ -125,6 +129,7 @@ def diagnose_files(
             fitted = diagnosis.main.theta if diagnosis.main.names else None
             write_rollouts(out / "recording.rrd", flown, fitted)
             files.add("recording.rrd")
+    # Write the results.
     result["findings"], result["not_examined"] = findings, not_examined(logs)
     result["identified"] = is_identified(vehicle_name)
     result = {**plain(result), **stamp(SCHEMA, seed)}
@@ -134,7 +139,7 @@ def diagnose_files(
     save_vehicle(diagnosis.vehicle, out / "vehicle.toml", header)
     toml = (out / "vehicle.toml").read_text(encoding="utf-8")
     write_report(out / "report.html", page(diagnosis, result, toml, files))
-    for warning in result["warnings"][shown:]:
+    for warning in result["warnings"][shown_count:]:
         console.note(f"warning: {warning}")
     if result["verdict"] == "no_gap" and result["not_examined"]:
         console.note(f"not examined: {', '.join(result['not_examined'])}")

@@ -1,7 +1,13 @@
 """Thresholds of all steps of a diagnosis and of its fits, with unit and reason.
 
-Terms: a window is a simulated stretch of 1 s; a view compares mean forces or torques instead; a
-name is an effect that the search reports; the null is the distribution without any effect.
+Values without a unit are dimensionless. Terms:
+
+- window: a simulated stretch of 1 s; a view compares mean forces or torques instead
+- gain: fall of chi-square (squared error in noise variances) by an effect, on left-out stretches
+- candidate: an effect that the search tries; name: an effect that the search reports
+- null: the distribution of a gain if there is no effect
+- rotor lag: the time constant with which the rotors follow their commands
+- trim: a constant offset of one flight
 """
 
 from __future__ import annotations
@@ -21,11 +27,11 @@ class Thresholds:
     most_rows: int = 100_000
     """Largest number of rows of all flights for force and torque; longer logs are thinned."""
     longest_hole_s: float = 0.1
-    """Rows further apart are a hole: no window or rotor lag reaches across it [s]."""
+    """Rows further apart are a hole. No window and no fit of a rotor lag reaches across it [s]."""
     fitted_loop_share: float = 0.5
-    """Largest residual of the rotor speeds by the nominal rate loop, relative to the standard
-    deviation of the measured ones. Above it another controller flew, and the measured rotor speeds
-    are the input [1]."""
+    """Largest RMS difference of measured rotor speeds and those by the nominal rate loop, relative
+    to the standard deviation of the measured ones. Above it another controller flew, and the
+    measured rotor speeds are the input."""
     speed_mean_s: float = 0.1
     """Rotor speeds are compared as means over this time, to average noise [s]."""
     still_speed: float = 10.0
@@ -37,9 +43,9 @@ class Thresholds:
     """Longest time constant of the rotors in the fit [s]."""
     lag_followed_share: float = 0.99
     """Least share of the rotor speeds' variance that commands and a lag must explain. If speeds
-    change little, noise of the rates in the commanded speeds resembles a lag [1]."""
+    change little, noise of the rates in the commanded speeds resembles a lag."""
     lag_closed_share: float = 0.25
-    """Least share of the squared error under the vehicle's own lag that another lag removes [1]."""
+    """Least share by which another lag lowers the squared error that the vehicle's own lag has."""
     lag_least_flights: int = 3
     """Least number of flights that must show the lag."""
     longest_delay_s: float = 0.06
@@ -53,94 +59,101 @@ class Thresholds:
     lone_fitted_share: float = 0.7
     """Share of a single flight that is fitted; its end is held out [1]."""
     noise_rows: int = 20
-    """Number of rows to which a polynomial is fitted. Its residual is noise, since a model's error
-    is smooth."""
+    """Number of neighbouring rows to which a polynomial is fitted, to estimate the noise. The
+    residual of the polynomial is noise, since a model's error is smooth."""
     rotor_noise_rows: int = 8
-    """The same for measured rotor speeds as an input, which change faster."""
+    """The same if measured rotor speeds are the input, since these change faster."""
     noise_degree: int = 3
     """Degree of that polynomial."""
     colour_degree: int = 3
     """Degree of the polynomial that is subtracted from a window before noise is modelled as
     coloured (correlated in time): errors of the start state resemble coloured noise."""
     colour_gain: float = 3.0
-    """Least rise of the log-likelihood to model noise as coloured, not white [1]."""
+    """Least rise of the log-likelihood to model noise as coloured, not white."""
     drift_gain: float = 3.0
-    """Least rise of the log-likelihood to assume an error of the model as well [1]."""
+    """Least rise of the log-likelihood to model an error of the model in addition to the noise."""
     colour_aside: float = 3.0
-    """Largest difference of row times between stretches that are compared, in rows."""
+    """Largest difference between the row times of stretches that are compared, in rows."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
-    """Lower limit of the noise (rounding, the model's steps) of position [m], attitude [rad],
-    velocity [m/s], rates [rad/s], accelerometer [m/s^2] and rotor speed [rad/s]."""
+    """Lower limit of the noise of position [m], attitude [rad], velocity [m/s], rates [rad/s],
+    accelerometer [m/s^2] and rotor speed [rad/s]. Rounding and the model's steps cause as much."""
 
     relevance: tuple[float, float, float] = (0.05, 0.5, 0.025)
-    """Smaller effects are not reported: force per mass [m/s^2] (0.5 % of the weight), angular
-    acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
+    """Sizes below which an effect is not reported: force per mass [m/s^2] (0.5 % of the weight),
+    angular acceleration [rad/s^2], and drift after 1 s [m], which such a force causes."""
 
     slow_degree: int = 5
-    """Degree of the polynomials over a window on which a model's error is measured."""
+    """Degree of the polynomials over a window. Their part of the residual (the slow errors)
+    measures the model's error."""
     rotor_knot_excess: float = 1.5
-    """Factor on the errors of rotor speeds, for errors between the knots [1]."""
+    """Factor on the estimated errors of rotor speeds. The errors are modelled at knots in time, and
+    the factor accounts for errors between them."""
     singular: float = 1e-5
-    """Smallest independent share of a column; below it Householder's QR is used [1]."""
+    """Smallest share of a column that is independent of the other columns. Below it, the
+    least-squares problem is solved by Householder's QR."""
     fit_rounds: int = 3
-    """Gauss-Newton steps of a fit without another stated number."""
+    """Gauss-Newton steps of a fit for which no other number is given."""
     converged: float = 0.05
-    """A fit ends if another step would lower chi-square by less than this [1]."""
+    """A fit ends if another step would lower chi-square by less than this."""
     sign_draws: int = 1999
-    """Draws of the null: p-values down to 1/2000."""
+    """Number of draws of the null, by random signs of the windows: p-values down to 1/2000."""
     folds: int = 5
-    """Parts of the windows in cross-validation; each is left out once."""
+    """Number of parts of the windows in cross-validation; each part is left out once."""
     strong_gain: float = 50.0
     """Gain that noise never reaches; candidates nearly as good as the best are then real, too."""
     alike_share: float = 0.5
-    """Share of the best gain from which a group of columns explains about as much [1]."""
+    """Share of the best gain from which a group of columns explains about as much as the best."""
     few_windows: int = 10
-    """Signs of fewer windows have too few permutations for a p-value of 1 %."""
+    """Least number of windows for a permutation test. The signs of fewer windows have too few
+    permutations for a p-value of 1 %."""
     name_p_value: float = 0.001
     """Probability of a false name at each step of the search."""
     most_names: int = 4
     """Largest number of named effects."""
     least_name_share: float = 0.003
-    """Least gain of a further effect, as a share of the first one's: the fit of the first is not
-    exact and has a residual of this size [1]."""
+    """Least gain of a further effect, as a share of the first effect's gain. The fit of the first
+    effect is not exact and has a residual of this size."""
     short_list: int = 5
-    """Candidates that are fitted with the nonlinear model at a step."""
+    """Number of candidates that are fitted with the nonlinear model at each step of the search."""
     near_share: float = 0.5
-    """Least linear gain of these candidates, as a share of the best one's [1]."""
+    """Least linear gain of these candidates, as a share of the best candidate's."""
     rival_chi2: float = 9.0
-    """A candidate whose chi-square is less than this above the named one's (three sigma) is an
-    alternative."""
+    """An alternative ("rival") is a candidate whose chi-square is less than this above the named
+    effect's (three sigma)."""
     rival_share: float = 0.25
-    """The same limit as a share of the chi-square that the name explains; the smaller limit counts
-    [1]."""
+    """The same limit as a share of the chi-square that the named effect explains. The smaller of
+    the two limits counts."""
     settle_rounds: int = 3
-    """Rounds in which names and alternatives are compared again."""
+    """Largest number of rounds in which named effects and alternatives are compared again."""
     trusted_horizons_s: tuple[float, ...] = (1.0, 0.5, 0.25)
-    """Lengths of a window; the longest over which the linearisation is valid is used [s]."""
+    """Allowed lengths of a window; the longest over which the linearisation is valid is used
+    [s]."""
     trusted_m: float = 0.15
     """Position error up to which the linearisation is valid [m]."""
     trusted_height_share: float = 0.25
-    """The same for the height, as a share of it: the ground effect depends on the height [1]."""
+    """Height error up to which the linearisation is valid, as a share of the height: the ground
+    effect depends on the height."""
     trusted_rad: float = 0.25
-    """The same for attitude [rad]."""
+    """Attitude error up to which the linearisation is valid [rad]."""
     bilinear_rounds: int = 6
     """Gauss-Newton steps of a fit of two effects if one acts through the other (wind by drag)."""
     last_rounds: int = 10
-    """Gauss-Newton steps of the last fit of all names: some effects saturate."""
+    """Gauss-Newton steps of the last fit of all named effects: some effects saturate."""
     first_order_chi2: float = 25.0
-    """A candidate is not fitted if its linear chi-square exceeds the best one's by more."""
+    """A candidate is not fitted with the nonlinear model if its linear chi-square exceeds the best
+    candidate's by more than this."""
     first_order_share: float = 0.1
-    """Further allowance, as a share of the best gain: large effects are not linear [1]."""
+    """Share of the best gain that is added to this limit: large effects are not linear."""
     diverged_m: float = 50.0
     """A simulated window that ends further from the flight has diverged and is left out [m]."""
     least_windows: int = 2
     """Least number of windows to fit; cross-validation leaves some out."""
     integrator_share: float = 0.6
-    """Largest time offset between pose and rates, as a share of a physics step, that an integrator
-    explains [1]."""
+    """Largest time offset between pose and rates that an integrator explains, as a share of its
+    step."""
 
     ground_thrust: float = 0.3
-    """Thrust, as a share of the weight, below which a vehicle at rest is on the ground [1]."""
+    """Thrust, as a share of the weight, below which a vehicle at rest is on the ground."""
     ground_speed: float = 0.3
     """Speed below which a vehicle is at rest [m/s]."""
     ground_margin_s: float = 1.0
@@ -148,62 +161,65 @@ class Thresholds:
     least_flights: int = 3
     """Least number of flights from which the spread of trims between flights is estimated."""
     longest_memory: int = 40
-    """Longest lag of the autocorrelation of a view's errors, in windows of the view."""
+    """Largest time difference in the autocorrelation of a view's errors, in windows of the view."""
     least_fast_share: float = 0.5
-    """An effect is rejected if fast changes significantly confirm less than this share of it
-    [1]."""
+    """Least share of an effect that fast changes of the error confirm. An effect with a
+    significantly smaller share is rejected."""
     least_view_share: float = 0.03
-    """Least share of a view's squared error that a named effect explains [1]."""
+    """Least share of a view's squared error that a named effect explains."""
     least_inertial_share: float = 0.06
-    """The same in flights without a position: the uncertainty of their pose has this size [1]."""
+    """The same for flights without a position: the uncertainty of their pose has this size."""
     implausible_times: float = 3.0
-    """An effect larger than this many times its usual size is implausible [1]."""
+    """An effect larger than this many times its usual size is implausible."""
     hopeless_chi2: float = 10.0
-    """Largest squared error a row, in units of the noise variance, after a fit of all effects
-    together. Above it force and torque are used, not rollouts of 1 s."""
+    """Largest mean squared error of a row, in noise variances, after a fit of all effects together.
+    If it is exceeded, force and torque are used instead of rollouts of 1 s."""
     hopeless_windows: int = 16
-    """Windows of that fit with the nonlinear model, if the linear one exceeds the limit."""
+    """Number of windows of that fit with the nonlinear model, which follows if the linear fit
+    exceeds the limit."""
     hopeless_rounds: int = 6
-    """Steps of that fit."""
+    """Number of Gauss-Newton steps of that fit."""
     view_left_share: float = 0.1
     """Largest share of a view's squared error that a black box explains beyond the named effects.
-    Above it an effect is missing [1]."""
+    If it is exceeded, an effect is missing."""
     unexplained_trim: float = 1.5
-    """An unexplained force counts above this many times the flights' constant offsets, which show
-    the accuracy of attitude and thrust in a log [1]."""
+    """An unexplained force is reported only above this many times the flights' constant offsets,
+    which show the accuracy of attitude and thrust in a log."""
     unexplained_force: float = 0.5
     """Upper limit of that threshold: an attitude error of 3 degrees, or 5 % of the weight
     [m/s^2]."""
     least_rotor_gain: float = 0.01
-    """Rotors with a smaller gain along an axis, as a share of the largest, count as without
-    influence there [1]."""
+    """Smallest influence of a rotor's thrust along an axis that counts, as a share of the largest
+    influence there."""
     carried_ridge: float = 0.01
-    """Ridge weight, for each mean, of the regression of the reference flights' residual [1]."""
+    """Ridge weight, for each mean, of the regression that predicts the reference flights' residual
+    in the flights after the change."""
     carried_least: float = 0.1
     """Least standard deviation of that regression's inputs [m/s, m/s^2, rad/s^2]."""
     gain_error: float = 0.5
-    """Relative error of a change along an axis by errors of the vehicle file: inertia, arms and
-    rotor torque that were not identified have such errors [1]."""
+    """Relative error of a change along an axis that errors of the vehicle file cause: inertia, arms
+    and rotor torque have such errors if they were not identified."""
     spread_freedom: int = 4
-    """Weight of the spread over all axes, relative to an axis's own, in degrees of freedom [1]."""
+    """Weight of the spread over all axes, relative to an axis's own, in degrees of freedom."""
     change_p_value: float = 0.02
     """Probability of a false name of a change, over all candidates and views."""
     change_draws: int = 9999
-    """Draws of the null of a change, all candidates together."""
+    """Number of draws of the null of a change, for all candidates together."""
     swing_periods_s: tuple[float, float] = (0.6, 3.5)
-    """Periods of pendulums of 0.1 to 3 m [s]."""
+    """Periods at which a swing (an oscillating force, as of a load on a line) is searched for:
+    those of pendulums of 0.1 to 3 m [s]."""
     swing_p_value: float = 0.001
-    """Probability of a false peak in the spectrum, over all periods."""
+    """Probability of a false peak in the spectrum of the force residual, over all periods."""
     swing_share: float = 0.15
-    """Least share of the force residual's power that oscillates [1]."""
+    """Least share of the force residual's power that oscillates at the period of the peak."""
     swing_driven: float = 0.5
-    """Least ratio of residual force to measured acceleration at that period. Below it the flight's
-    motion may excite a model error instead [1]."""
+    """Least ratio of residual force to measured acceleration at that period. Below it, the flight's
+    motion may excite a model error instead."""
     view_block_s: float = 2.0
     """Length of stretches whose errors count as independent in a view [s]."""
 
     bootstrap_draws: int = 1000
-    """Draws of the 95 % intervals of a gap."""
+    """Number of draws for the 95 % interval of a gap."""
     bootstrap_block: int = 4
     """Neighbouring windows that are drawn together, since they overlap (1 s long, 0.25 s apart)."""
     gap_stride_s: float = 0.25
@@ -211,52 +227,54 @@ class Thresholds:
     refuting_chi2: float = 25.0
     """Rise of chi-square on held-out flights above which a name is withdrawn (five sigma)."""
     shown_chi2: float = 9.0
-    """A name without a fall of chi-square on held-out flights is withdrawn if the expected fall is
-    above this (three sigma)."""
+    """Expected fall of chi-square on held-out flights (three sigma) above which a name has to lower
+    it. A name that does not is withdrawn."""
     least_next_to_rest: float = 0.5
     """Least fall of the held-out squared error by a name, as a share of the residual above the
-    noise, if that residual is significant [1]."""
+    noise, if that residual is significant."""
     cells: int = 4
-    """Grid points along x and y of a force that depends on the position."""
+    """Number of grid points along x and along y for a residual force that depends on position."""
     pieces: int = 5
-    """Straight pieces of a curve over one number."""
+    """Number of straight pieces of a residual force or torque that depends on one quantity."""
     thrust_reversal: float = 10.0
     """Rate of change of thrust above which only its sign counts [m/s^3]."""
     colours_s: tuple[float, ...] = (0.3, 0.03)
     """Correlation times of the tested random disturbances, as of gusts and of rotors [s]."""
     disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
-    """Quantiles of the information over all directions that set the tested disturbance sizes."""
+    """Quantiles of the information over all disturbance shapes. They set the sizes of disturbance
+    that are tested."""
     informed_share: float = 1e-9
-    """Directions with less than this share of the largest information do not count [1]."""
+    """Shapes with less than this share of the largest information are left out."""
     noise_error: float = 0.02
-    """Relative uncertainty of the measured noise power [1]."""
+    """Relative uncertainty of the measured noise power."""
     shape_p_value: float = 0.001
     """Largest p-value with which a function of the state counts as structure in the residual."""
     colour_p_value: float = 1e-4
-    """The same for the energy of a smooth disturbance along an axis."""
+    """Largest p-value with which a smooth disturbance along an axis counts as structure."""
     structure: float = 1.15
-    """Ratio of slow errors to their expectation above which they are not noise [1]."""
+    """Ratio of the energy of slow errors to its expectation, above which they are not noise."""
     structure_rotor_input: float = 1.3
-    """The same if measured rotor speeds are the input; their noise is less certain [1]."""
+    """The same if measured rotor speeds are the input; their noise is less certain."""
     unexplained_share: float = 0.7
-    """Largest remaining share of the gap for a verdict of `partly`; above it, `unknown` [1]."""
+    """Largest remaining share of the gap for the verdict `partly`; above it, it is `unknown`."""
     wind_lengths_m: tuple[float, float, int] = (0.5, 40.0, 25)
-    """Shortest and longest length scale of turbulence in the fit [m], and number of values."""
+    """Shortest and longest length scale of turbulence that is tried [m], and number of values."""
     wind_intensities: tuple[float, float, int] = (0.02, 8.0, 121)
-    """Least and largest intensity in the fit [m/s], and number of values."""
+    """Least and largest intensity of turbulence that is tried [m/s], and number of values."""
     wind_ratio: float = 10.0
-    """Least log-likelihood ratio of wind to no wind."""
+    """Least rise of the log-likelihood by wind, compared with no wind."""
     wind_rival_ratio: float = 8.0
     """Wind is rejected if a disturbance along the body axes has a log-likelihood higher by this."""
     wind_tail: float = 4.0
-    """Largest excess of wind's fourth moment over a normal variable's, in standard errors."""
+    """Largest excess of the fourth moment of the fitted wind over that of a normal variable, in
+    standard errors."""
     profile_fall: float = 1.92
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
     check_stride_s: float = 0.5
     """Time between windows in the comparison with a black box [s]."""
     slow_share: float = 0.6
-    """Share of the windows, the slowest, that a black box is fitted to; the faster ones are held
-    out [1]."""
+    """Share of the windows to which a black box is fitted: the slowest ones. The faster windows are
+    held out."""
     least_judged: int = 6
     """Least number of windows to fit, and to hold out, in that comparison."""
 

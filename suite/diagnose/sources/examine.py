@@ -1,7 +1,10 @@
 """The steps of a diagnosis for one source of evidence (rollouts, force or torque).
 
-They are search, test on held-out flights, test of relevance, and analysis of the remaining error.
-`diagnose.py` calls `examine` for each source, and then `one_cause` on all findings.
+A source compares flights with the model in one way (`source.py`). The steps are search, test on
+held-out flights, test of relevance, and analysis of the remaining error. `diagnose.py` calls
+`examine` for each source, and then `one_cause` on all findings.
+
+The argument `found` is always the result of a search: named effects and their fitted parameters.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from suite.diagnose.verdict.gap import EffectSize, Gap
 
 CONTRADICTION = 1.5
 """Two values of a parameter contradict each other if they differ by more than this many times the
-sum of their half-widths [1]."""
+sum of the half-widths of their 95 % intervals."""
 
 
 def examine(
@@ -30,14 +33,17 @@ def examine(
     """Search for named effects with one source, and test them.
 
     Args:
-        source: the source.
-        earlier: findings of other sources; the first of them may contradict a named effect.
+        source: the source to search.
+        earlier: findings of the sources before this one. Effects that contradict the first of them
+            are left out.
         say: receives a line for people about each step.
         seed: seed of all random draws.
 
     Returns:
         The finding, and warnings for people.
     """
+    # Search. If an earlier source contradicts some of the effects, search again without them.
+    # (Not if a change since reference flights is searched for, as `names_small` shows.)
     found, warnings = source.search(say, seed), list[str]()
     if earlier and not source.names_small:
         first = earlier[0]
@@ -51,9 +57,11 @@ def examine(
             excluded = set(indices_of([candidate for candidate, _ in refused]))
             allowed = [c for c in source.candidates if not set(c.indices) & excluded]
             found = replace(source, candidates=allowed).search(say, seed)
+    # The fallback is a second source, for the case that this one names nothing.
     if not found.named and source.fallback:
-        other = source.fallback.search(say, seed)
-        source, found = (source.fallback, other) if other.named else (source, found)
+        by_fallback = source.fallback.search(say, seed)
+        source, found = (source.fallback, by_fallback) if by_fallback.named else (source, found)
+    # Test on held-out flights: first all named effects together, then each one alone.
     before = after = source.gap(found, found.start.theta)
     if found.named:
         after = source.gap(found, found.estimate.theta)
@@ -65,6 +73,8 @@ def examine(
     warnings += [
         f"{label}: withdrawn, held-out flights are no better for it" for label in withdrawn
     ]
+    # Leave out effects that are too small. Depending on the source, the remaining error is still
+    # computed with them (`small_explains`).
     explained = found, (before, after)
     found, after, sizes, small = relevant_part(source, found, (before, after))
     for name, size in small:
@@ -73,6 +83,7 @@ def examine(
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
     if not source.small_explains:
         explained = found, (before, after)
+    # Analyse the remaining error.
     remaining = source.remaining(*explained, seed)
     if remaining.wind and found.named and not source.is_worse(after, before):
         # Several constant effects can imitate a wind that is correlated over seconds.
@@ -96,11 +107,16 @@ def examine(
 
 
 def without_names(finding: Finding, seed: int) -> Finding:
-    """Return `finding` without its named effects, for effects that do not explain the gap."""
-    bare, last = finding.search.refitted(()), finding.remaining
+    """Return `finding` without its named effects, if these leave most of the gap.
+
+    All of the error then counts as unexplained.
+    """
+    bare, with_names = finding.search.refitted(()), finding.remaining
     remaining = finding.source.remaining(bare, (finding.before, finding.before), seed)
-    swing = remaining.swing if last.swing else None
-    where = remaining.where or last.where
+    # Without the names an error of the model may oscillate. A swing (an oscillating force) counts
+    # only if it was there with the names, too.
+    swing = remaining.swing if with_names.swing else None
+    where = remaining.where or with_names.where
     remaining = remaining._replace(structured=True, share=1.0, where=where, wind=None, swing=swing)
     return replace(
         finding, search=bare, names=(), after=finding.before, without={}, half_width={}, sizes={},
@@ -114,20 +130,22 @@ def confirmed(
     """Withdraw the effects that do not lower the gap on held-out flights, one at a time.
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
-    to lower the gap by a share of the remaining error. An effect is kept if the held-out flights
-    are not sensitive to it, such as the ground effect in high flights. `gaps` are those before and
-    after the search.
+    to lower the squared error by a share of the remaining one. An effect is kept if the held-out
+    flights are not sensitive to it, such as the ground effect in high flights. `gaps` are the gap
+    without any named effect and the gap with all of them.
 
     Returns:
-        The result with the confirmed effects, its gap, the gaps without each of these effects, and
-        the labels of the withdrawn ones.
+        The result with the confirmed effects, the gap with them, the gap without each of them (by
+        its label), and the labels of the withdrawn effects.
     """
     (before, after), withdrawn, limits = gaps, list[str](), source.limits
     while found.named:
         without = _without_each(source, found)
-        # A mean score of 1 is noise; more is an error that no named effect explains.
-        misfit = found.judged.evidence.misfit_is_noise
-        excess = max(0.0, 1.0 - 1.0 / after.score.mean()) if misfit else 0.0
+        # A mean score of 1 is noise; more is an error that no named effect explains. `excess` is
+        # the share of that error in the score.
+        has_unexplained_error = found.judged.evidence.misfit_is_noise
+        excess = max(0.0, 1.0 - 1.0 / after.score.mean()) if has_unexplained_error else 0.0
+        # Without an effect that is real, the squared error is larger than this.
         least = (1.0 + limits.least_next_to_rest * excess) * after.energy.sum()
         refused = [
             one
@@ -136,9 +154,11 @@ def confirmed(
         ]
         if not refused:
             return found, after, without, withdrawn
+        # Withdraw the effect whose loss costs least; the others may be confirmed without it.
         label = min((one.label for one in refused), key=lambda k: float(without[k].energy.sum()))
         withdrawn.append(label)
         kept = tuple(named for named in found.named if named.candidate.label != label)
+        # Without the withdrawn effect another one may lose its influence, as a wind without a drag.
         if kept:
             found = found.refitted(kept)
             kept = _effective(found)
@@ -157,11 +177,11 @@ def relevant_part(
     """Leave out the effects below the threshold of relevance.
 
     If the gap is below that threshold from the start, only faults of the log may be named. `gaps`
-    are those before and after the search.
+    are the gap without any named effect and the gap with all of them.
 
     Returns:
-        The result with the relevant effects, its gap, the sizes of its effects by name, and the
-        names and sizes of the effects that were left out.
+        The result with the relevant effects, the gap with them, the sizes of these effects by name,
+        and the names and sizes of the effects that were left out.
     """
     (before, after), left_out = gaps, list[tuple[str, EffectSize]]()
     gap_is_small = bool(found.named) and not source.is_relevant(before)
@@ -186,10 +206,15 @@ def relevant_part(
 
 
 def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
-    """Return label and gap of a wrong effect: the best one that is neither named nor a rival."""
+    """Return label and gap of a wrong effect, or None if there is none.
+
+    It is the best effect that is neither named nor an alternative. Its gap shows how much an effect
+    that is surely wrong would lower the error.
+    """
     excluded = {candidate.name for candidate in found.candidates}
-    rivals = [rival for named in found.named for rival in named.rivals]
-    excluded |= {name for rival in rivals for name in effects_in(rival)}
+    alternatives = [label for named in found.named for label in named.rivals]
+    excluded |= {name for label in alternatives for name in effects_in(label)}
+    # A candidate with parts is a combination of effects.
     single = (score.candidate for score in found.first if not score.candidate.parts)
     wrong = next((candidate for candidate in single if candidate.name not in excluded), None)
     if wrong is None:
@@ -199,7 +224,10 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
 
 
 def _effective(found: SearchResult) -> tuple[NamedEffect, ...]:
-    """Return the named effects that influence these flights; a wind without a drag does not."""
+    """Return the named effects that influence these flights.
+
+    A wind without a drag has no influence: the flights have no information on it.
+    """
     information = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
     by_index = dict(zip(found.indices, information, strict=True))
     return tuple(
@@ -210,7 +238,7 @@ def _effective(found: SearchResult) -> tuple[NamedEffect, ...]:
 
 
 def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
-    """Return by the label of each named effect the gap if all others are fitted without it."""
+    """Return the gap without each named effect, by its label; the other effects are refitted."""
     start, gaps = found.start.theta, {}
     for one in found.candidates:
         others = [candidate for candidate in found.candidates if candidate is not one]
@@ -225,23 +253,27 @@ def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:
 
 
 def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate, str]]:
-    """Return the named effects of `found` that the evidence of `by` contradicts, with both values.
+    """Return the named effects of `found` that the evidence of `by` contradicts.
 
-    The effect's parameters are fitted to that evidence, together with the effects that `by` names.
-    They contradict if they differ significantly from those in `found`.
+    Each effect is fitted to that evidence, together with the effects that `by` names. It is
+    contradicted if a parameter differs significantly from its value in `found`.
+
+    Returns:
+        For each such effect, its candidate and a text with both values.
     """
     refused = []
     widths = dict(zip(found.indices, found.half_widths(), strict=True))
     evidence = by.judged.evidence
     for candidate in found.candidates:
-        own = list(candidate.indices)
-        if not evidence.linearise(by.estimate, own).acts().any() or candidate in by.candidates:
+        indices = list(candidate.indices)
+        # Evidence on which the effect does not act, or that names it too, cannot contradict it.
+        if not evidence.linearise(by.estimate, indices).acts().any() or candidate in by.candidates:
             continue
-        fitted = sorted({*by.indices, *own})
+        fitted = sorted({*by.indices, *indices})
         best, block = fit(evidence, by.estimate, fitted, limits=evidence.limits)
         equations = block.equations.along_numbers(fitted)
         half = intervals95(equations, evidence.flights_differ_p).half_width
-        for index in own:
+        for index in indices:
             value, other = found.estimate.theta[index], best.theta[index]
             other_half = float(half[fitted.index(index)])
             if abs(value - other) > CONTRADICTION * (widths[index] + other_half):
@@ -254,8 +286,8 @@ def contradicted(by: SearchResult, found: SearchResult) -> list[tuple[Candidate,
 def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[str]]:
     """Remove names so that each cause is named once.
 
-    If two sources name the same effect, the relatively narrower interval is kept. An effect that is
-    an alternative of another source's effect is removed.
+    If two sources name the same effect, the name with the relatively narrower interval is kept. An
+    effect is removed if one of its alternatives is named by another source.
 
     Returns:
         The findings with the remaining names, and a warning for each removed name.
@@ -269,14 +301,14 @@ def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[st
             remaining = []
             for named in kept[i].names:
                 label, source = named.candidate.label, finding.source.name
-                shared = set(named.rivals) & other_names
+                shared_alternatives = set(named.rivals) & other_names
                 is_same = any(one.candidate == named.candidate for one in other.names)
                 if is_same and _relative_width(other, named) < _relative_width(finding, named):
                     warnings.append(f"{label}: named by {source} as well")
-                elif not is_same and shared:
+                elif not is_same and shared_alternatives:
                     warnings.append(
                         f"{source}: {label} is not distinguishable from "
-                        f"{', '.join(sorted(shared))}, which {other.source.name} names"
+                        f"{', '.join(sorted(shared_alternatives))}, which {other.source.name} names"
                     )
                 else:
                     remaining.append(named)
@@ -285,7 +317,7 @@ def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[st
 
 
 def _relative_width(finding: Finding, named: NamedEffect) -> float:
-    """Return the mean width of the effect's intervals, relative to its mean change."""
+    """Return the mean half-width of the effect's intervals, relative to its mean change."""
     indices = list(named.candidate.indices)
     change = np.abs(finding.theta[indices] - finding.search.start.theta[indices])
     return float(np.mean([finding.half_width[i] for i in indices]) / max(change.mean(), TINY))

@@ -1,7 +1,8 @@
 """Makes the source of evidence `whole`, which compares simulated stretches of 1 s with flights.
 
 Such a stretch is a rollout: it starts from a measured state, and commands or rotor speeds drive it.
-Some stretches are fitted, the others held out.
+Some stretches are fitted, the others held out. `FlightWindows` holds the stretches, here also
+called windows; W is their number.
 """
 
 from __future__ import annotations
@@ -52,19 +53,20 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
 
     Args:
         given: the input of the diagnosis.
-        before: sources that exist already; rollouts come first or not at all.
+        before: sources that exist already; with any of them, this one is not made.
 
     Returns:
-        The source, or None if the logs lack a signal that a rollout needs. None also if no effect
-        of the catalogue brings rollouts of 1 s near the flights and this source was not chosen by
-        name.
+        The source, or None if the logs lack a signal that a rollout needs. Unless this source was
+        chosen by name, also None if even all effects of the catalogue together leave the rollouts
+        far from the flights.
 
     Raises:
-        ValueError: if no flight can be used, or not with the chosen drive.
+        ValueError: if no flight can be used, or none with the chosen drive (model input).
     """
     logs, vehicle = given.logs, given.vehicle
     if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
+    # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
     if given.drive == "auto" and not rotor_input:
@@ -74,6 +76,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
                 "the nominal rate loop does not reproduce the measured rotor speeds, so these are "
                 "the model's input"
             )
+    # Cut the flights into stretches, and simulate each with the given vehicle.
     space, limits = make_space(vehicle), given.limits
     voltage = all(log.voltage is not None for log in logs)
     model = RolloutModel(vehicle, space, rotor_input, voltage, integrator)
@@ -89,21 +92,25 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     )
     start = start_estimate(model, windows)
     linear = model.linearise(start.theta, start.free, windows, None)
-    good = _finite(linear, limits)
-    if not good.all():
-        diverged = int((~good).sum())
+    is_finite = _finite(linear, limits)
+    if not is_finite.all():
+        diverged = int((~is_finite).sum())
         warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
+    # Estimate the model's numerical error from the same stretches with steps of twice the length.
+    # The simulator's own Euler steps, driven by commands, have no such error.
     coarser = None
-    if integrator != "euler" or rotor_input:  # with a simulator's own steps there is no step error
+    if integrator != "euler" or rotor_input:
         coarser = cut(logs, vehicle, rotor_input, LENGTH_S, limits, integrator, windows)[0]
-    windows, linear = take(windows, good), _take(linear, good)
+    windows, linear = take(windows, is_finite), _take(linear, is_finite)
     if coarser is not None:
-        coarser = take(coarser, good)
+        coarser = take(coarser, is_finite)
         limits = with_model_error(model, start, windows, linear, coarser, limits)
+    # Give up if rollouts stay far from the flights whatever the effects.
     most = limits.hopeless_chi2
     if not given.chosen and best_fit_error(model, windows, linear, limits, most) > most:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
+    # Choose which stretches are held out.
     informed = information(linear, windows, model.size, limits)
     is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)
     count = int(is_fitted.sum())
@@ -113,11 +120,13 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
             f"{count} stretches of 1 s to fit: too few for a permutation test, so the null "
             "distribution is drawn from the measured noise"
         )
-    fitted, held_apart = take(windows, is_fitted), take(windows, ~is_fitted)
+    fitted, not_fitted = take(windows, is_fitted), take(windows, ~is_fitted)
+    # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
     single = candidates(space, voltage, signals if rotor_input else signals | {"command"})
-    given.say(f"{len(fitted.flight)} stretches of 1 s to fit, {len(held_apart.flight)} held out")
-    held = _held_out(given, rotor_input, held_apart, limits, integrator)
+    given.say(f"{len(fitted.flight)} stretches of 1 s to fit, {len(not_fitted.flight)} held out")
+    held = _held_out(given, rotor_input, not_fitted, limits, integrator)
+    # Of a lone flight the end is held out, from `since_s` on.
     is_lone_flight = bool(np.isin(held.flight, fitted.flight).any())
     since_s = float(np.min(held.start_s)) if is_lone_flight else 0.0
     rows_are_dense = all(
@@ -139,7 +148,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         small_explains=True,
         flown=Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits),
         coarser=take(coarser, is_fitted) if coarser is not None and rotor_input else None,
-        coarser_share=0.5 if rows_are_dense else 2.0,
+        coarser_share=0.5 if rows_are_dense else 2.0,  # see `RolloutSource.sizes`
     )
     driven_by = "measured rotor speeds" if rotor_input else "commands"
     return SourceSet((source,), names, driven_by, tuple(warnings))
@@ -148,8 +157,8 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
 def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
     """Return whether rollouts of these flights can be simulated.
 
-    The logs must have all signals of the state, and either measured rotor speeds or commands to a
-    rate loop without integrators and filters.
+    The logs must have all signals of the state. They must also have measured rotor speeds, or
+    commands to a rate loop without integrators and filters: these have an unknown state.
     """
     return not any(
         log.partial
@@ -159,10 +168,10 @@ def can_fly(logs: Sequence[FlightLog], vehicle: Vehicle) -> bool:
 
 
 def _needs_rotor_input(logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds) -> bool:
-    """Return whether another controller flew, so that the input must be measured rotor speeds.
+    """Return whether measured rotor speeds must be the input, because another controller flew.
 
     Raises:
-        ValueError: if so, and some flights have no rotor speeds.
+        ValueError: if they must be, and some flights have no rotor speeds.
     """
     if not flown_by_other_controller(logs, vehicle, limits):
         return False
@@ -186,6 +195,7 @@ def _check_count(count: int, limits: Thresholds) -> None:
 
 
 def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
+    """Return the linearisation of the `chosen` windows (W,) only."""
     return Linearisation(*(part[chosen] for part in linear))
 
 
@@ -193,17 +203,17 @@ def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
     """Return which windows (W,) the model simulates without divergence.
 
     Raises:
-        ValueError: if it diverges in all.
+        ValueError: if the model diverges in all windows.
     """
     residual = linear.residual
-    good = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
-    good &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
-    good &= (np.abs(residual[..., :3]) < limits.diverged_m).all(axis=(1, 2))
-    if not good.any():
+    is_finite = np.asarray(np.isfinite(residual).all(axis=(1, 2)))
+    is_finite &= np.isfinite(linear.slope).all(axis=(1, 2, 3))
+    is_finite &= (np.abs(residual[..., :3]) < limits.diverged_m).all(axis=(1, 2))  # the position
+    if not is_finite.any():
         raise ValueError(
             "the model diverges on every flight: check the vehicle file and the frames"
         )
-    return good
+    return is_finite
 
 
 def _held_out(
@@ -213,7 +223,10 @@ def _held_out(
     limits: Thresholds,
     integrator: str,
 ) -> FlightWindows:
-    """Return overlapping windows over the held-out time, which `windows` cover without overlap."""
+    """Return overlapping windows over the held-out time, for a more precise gap.
+
+    `windows` cover the same time without overlap.
+    """
     if not len(windows.flight):
         raise ValueError("no stretch can be held out: fly longer, or log a second flight")
     flights = np.unique(windows.flight).tolist()

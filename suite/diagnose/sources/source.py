@@ -1,9 +1,12 @@
 """Interface of a source of evidence, which compares flights with the model in one way.
 
-A source may compare, for example, whole flights (rollouts), forces or torques. It fits some flights
-and holds others out to test the result. A new source is one subclass of `Source` and one function
-that makes it from flights, with an entry in `SOURCES` (`suite/diagnose/diagnose.py`). Search,
-held-out test, relevance, verdict, JSON and report use only this interface.
+A source belongs to one view (part of the dynamics): whole flights (rollouts), forces or torques. It
+has the flights that are fitted and those that are held out to test the result. A new source is one
+subclass of `Source` and one function that makes it from flights, with an entry in `SOURCES`
+(`suite/diagnose/diagnose.py`). Search, held-out test, relevance, verdict, JSON and report use only
+this interface.
+
+Arrays of parameters have P entries: all parameters of all effects in the catalogue.
 """
 
 from __future__ import annotations
@@ -28,11 +31,14 @@ from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
 from suite.diagnose.verdict.rollout_gap import Rollouts
 
 LEAST_GAP = 1e-9
-"""A gap above the noise floor is at least this in divisions, in the gap's unit."""
+"""Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
 
 
 class TestedEffect(NamedTuple):
-    """An effect that a separate test named, not the search: rotor lag or random wind."""
+    """An effect that a separate test named, not the search: rotor lag or random wind.
+
+    (The rotor lag is the time constant with which rotors follow their commands.)
+    """
 
     name: str
     values: Any
@@ -40,48 +46,49 @@ class TestedEffect(NamedTuple):
     parameters: Mapping[str, Any]
     """Value, unit and 95 % interval of each parameter, as in diagnosis.json."""
     gap_removed: float | None
-    """Share of the gap that the effect explains [1]."""
+    """Share of the gap that the effect explains."""
     p_value: float
     view: str
     """Name of the source in which it was found."""
     words: str = ""
-    """A sentence for people, if its size needs an explanation."""
+    """A sentence for people, if the size of the effect needs an explanation."""
 
 
 class Remaining(NamedTuple):
     """The error that remains with the named effects."""
 
     structured: bool
-    """Whether it is significantly more than noise."""
+    """Whether the error is significantly more than noise."""
     share: float
-    """Its share of the gap above the noise floor [1]."""
+    """Share of the gap above the noise floor that remains."""
     where: str | None = None
-    """Quantity that it depends on, in words."""
+    """Quantity that the error depends on, in words."""
     explainable: float = 0.0
-    """Share of the gap that a black box (a regression without physics) explains, if fitted [1]."""
+    """Share of the gap that a black box (a regression without physics) explains; 0 if none was
+    fitted."""
     wind: TestedEffect | None = None
-    """Random wind that explains it."""
+    """Random wind that explains the error."""
     swing: Swing | None = None
-    """An oscillating force, as of a load on a line."""
+    """An oscillating force in the error, such as a load on a line causes."""
     details: Mapping[str, Any] = {}
     """Further entries of `unexplained` in diagnosis.json."""
     gap_details: Mapping[str, Any] = {}
-    """Further entries of `gap` there."""
+    """Further entries of `gap` in diagnosis.json."""
     channels: Mapping[str, Mapping[str, Any]] = {}
-    """Further entries of `gap.channels` there, by group and channel."""
+    """Further entries of `gap.channels` in diagnosis.json, by group and channel."""
 
 
 class Series(NamedTuple):
     """A held-out stretch as measured and as simulated, for a chart of N points."""
 
     time_s: np.ndarray
-    """(N,) time; NaN where a line breaks."""
+    """(N,) time of each point [s]; NaN where a line breaks."""
     measured: np.ndarray
     """(N,) measured values."""
     simulated: Mapping[str, np.ndarray]
-    """(N,) simulated values, by their label in the legend."""
+    """Simulated values (N,), by their label in the legend."""
     label: str
-    """Quantity, axis and unit."""
+    """Label of the vertical axis: quantity, direction and unit."""
     caption: str
     """Text below the chart."""
 
@@ -96,7 +103,7 @@ class Source(ABC):
     name: str
     """Name in `views` of diagnosis.json."""
     about: str
-    """For people: compared quantity, and the signals that are given."""
+    """For people: the compared quantity, and the signals that the model takes as measured."""
     subject: str
     """For people: the quantity whose error the gap is."""
     unit: str
@@ -106,7 +113,8 @@ class Source(ABC):
     horizon_s: float
     """Length of the windows over which the gap is measured [s]."""
     weighed: tuple[Evidence, Block]
-    """The fitted flights with weights at the start of the search, and their linearisation there."""
+    """The fitted flights with the weights of their residuals, and the linearisation of these
+    residuals, both at the start of the search."""
     start: Estimate
     """The vehicle file's parameters, from which the search starts."""
     candidates: Sequence[Candidate]
@@ -116,9 +124,10 @@ class Source(ABC):
     """Whether effects below the threshold of relevance are named. True for a change since reference
     flights, which is compared with the spread between flights instead."""
     small_explains: bool = False
-    """Whether the remaining error is computed with effects that are too small to be named."""
+    """Whether the remaining error is what remains with all fitted effects, including those that are
+    too small to be named."""
     fallback: Source | None = None
-    """Source that is searched if this one names nothing."""
+    """A second source, which is searched if this one names nothing."""
 
     @property
     def rollouts(self) -> Rollouts | None:
@@ -132,7 +141,12 @@ class Source(ABC):
 
     @abstractmethod
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
-        """Return the gap on the held-out flights at `theta` (P,), by the noise of `found`."""
+        """Return the gap on the held-out flights.
+
+        Args:
+            found: result of the search, with its estimate of the measurement noise.
+            theta: (P,) parameters of the model.
+        """
 
     @abstractmethod
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
@@ -140,7 +154,7 @@ class Source(ABC):
 
         Args:
             found: result of the search.
-            gaps: before and after it.
+            gaps: the gap without the named effects and the gap with them.
             seed: seed of random draws.
         """
 
@@ -151,8 +165,9 @@ class Source(ABC):
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether held-out flights contradict effects that change the gap to `after`.
 
-        Both the total error and the error within flights have to grow: a different trim of a
-        held-out flight may raise the total alone.
+        `before` is the gap without the effects. Both the total error and the error within flights
+        have to grow: a held-out flight with another trim (constant offset) may raise the total
+        alone.
         """
         return after.rms >= before.rms and float(after.energy.sum()) >= float(before.energy.sum())
 
@@ -165,9 +180,10 @@ class Source(ABC):
         return True
 
     def sizes(self, found: SearchResult) -> dict[str, tuple[EffectSize, EffectSize]]:
-        """Return by effect its size on these flights, and the upper end of that size's interval.
+        """Return the sizes of the named effects on these flights, by the effect's name.
 
-        Empty if the size has no physical unit; then no effect counts as too small.
+        Each entry is the size and the upper end of its 95 % interval. The result is empty if the
+        size has no physical unit; then no effect counts as too small.
         """
         return {}
 
@@ -190,22 +206,22 @@ def sizes_by_effect(
     size_of: Callable[[np.ndarray], EffectSize],
     model_error: float | np.ndarray = 0.0,
 ) -> dict[str, tuple[EffectSize, EffectSize]]:
-    """Return by named effect its size, and the upper end of the size's 95 % interval.
+    """Return the size of each named effect and the upper end of its 95 % interval, by name.
 
     Args:
         found: result of a search with K named parameters.
-        slope: (..., K) of the flights' errors along these parameters.
-        size_of: size of a change of the flights' errors.
-        model_error: (K,) changes of the parameters by the model's own error, which do not count at
-            the upper end.
+        slope: (..., K) derivatives of the flights' errors with respect to these parameters.
+        size_of: function from a change of the flights' errors to its size.
+        model_error: (K,) changes of the parameters that the model's own numerical error may cause.
+            They are subtracted before the upper end is computed.
     """
     entries, width, change = found.last.evidence.space.entries, found.half_widths(), found.moved
-    least = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
+    certain = np.sign(change) * np.maximum(np.abs(change) - model_error, 0.0)
     sizes = {}
     for name in dict.fromkeys(named.candidate.name for named in found.named):
-        own = [k for k, index in enumerate(found.indices) if entries[index].effect == name]
-        upper = upper_size(slope[..., own], least[own], width[own], size_of)
-        sizes[name] = (size_of(slope[..., own] @ change[own]), upper)
+        columns = [k for k, index in enumerate(found.indices) if entries[index].effect == name]
+        upper = upper_size(slope[..., columns], certain[columns], width[columns], size_of)
+        sizes[name] = (size_of(slope[..., columns] @ change[columns]), upper)
     return sizes
 
 
@@ -218,9 +234,9 @@ class DiagnosisInput:
     references: Sequence[FlightLog]
     """Flights of the same vehicle before a change."""
     drive: str
-    """Input of the model: "commands", "motors" or "auto"."""
+    """What drives the model: "commands", "motors" (measured rotor speeds) or "auto"."""
     integrator: str
-    """Integration of the flights' bodies: "continuous", "euler" or "auto"."""
+    """Integration of the flights' bodies: "continuous", "euler" (MuJoCo's steps) or "auto"."""
     say: Callable[[str], None]
     """Receives a line of progress for people."""
     limits: Thresholds
@@ -236,14 +252,15 @@ class SourceSet:
     held_out: Sequence[str]
     """Names of held-out flights or stretches."""
     driven_by: str
-    """Input of the model, for people."""
+    """Signals that drive the model, for people."""
     warnings: Sequence[str] = ()
     tested: tuple[TestedEffect, ...] = ()
+    """Effects that separate tests of the flights have named."""
     compares: tuple[str, ...] = ()
     """For people, if a change is searched for: how flights of the unchanged vehicle differ."""
 
     def joined(self, more: SourceSet) -> SourceSet:
-        """Return these and `more` together."""
+        """Return a set with the sources of this one and of `more`."""
         return SourceSet(
             (*self.sources, *more.sources),
             tuple(dict.fromkeys([*self.held_out, *more.held_out])),
@@ -256,10 +273,11 @@ class SourceSet:
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one source."""
+    """Result of the steps of a diagnosis (`examine.py`) for one source."""
 
     source: Source
     search: SearchResult
+    """Result of its search, with the effects that passed the tests."""
     names: tuple[NamedEffect, ...]
     """Named effects after the comparison with other sources."""
     before: Gap
@@ -267,7 +285,7 @@ class Finding:
     after: Gap
     """Gap with the named effects."""
     without: Mapping[str, Gap]
-    """By the label of a named effect: the gap with all others."""
+    """Gap without each named effect but with all others, by the label of the left-out effect."""
     half_width: Mapping[int, float]
     """Half-width of the 95 % interval, by the index of each named parameter."""
     sizes: Mapping[str, EffectSize]
@@ -276,7 +294,7 @@ class Finding:
     """Significant effects that are too small to be relevant."""
     remaining: Remaining
     control: tuple[str, Gap] | None = None
-    """A wrong effect that was fitted in the same way, and its gap."""
+    """Label and gap of a wrong effect that was fitted in the same way, for comparison."""
 
     @property
     def theta(self) -> np.ndarray:
@@ -284,14 +302,20 @@ class Finding:
         return self.search.estimate.theta
 
     def by_effect(self) -> dict[str, list[NamedEffect]]:
-        """Return the names by their effect; an effect of one motor is a separate name."""
+        """Return the named effects, grouped by the effect's name in the catalogue.
+
+        A group has several entries if the effect was named for several motors.
+        """
         groups: dict[str, list[NamedEffect]] = {}
         for named in self.names:
             groups.setdefault(named.candidate.name, []).append(named)
         return groups
 
     def removed(self, names: Sequence[NamedEffect]) -> float:
-        """Return the share of the gap that `names`, of one effect, remove when added last."""
+        """Return the share of the gap that `names` remove when they are added last.
+
+        All of `names` belong to one effect.
+        """
         without = max(self.without[named.candidate.label].rms for named in names)
         total = max(self.before.rms - self.before.floor, LEAST_GAP)
         return min(max((without - self.after.rms) / total, 0.0), 1.0)

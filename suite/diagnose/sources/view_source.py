@@ -1,8 +1,9 @@
 """The sources of evidence `force` and `torque`, which compare mean accelerations with the model.
 
-Each is a view: one part of the dynamics, with all other signals as measured. A black box, a ridge
-regression without physics, is fitted to the same flights. It estimates how much of the error any
-model could explain, and whether structure remains beyond the named effects.
+Each is a view: one part of the dynamics, with all other signals as measured. Accelerations are
+averaged over short windows; M is the number of these means. A black box, a ridge regression without
+physics, is fitted to the same flights. It estimates how much of the error any model could explain,
+and whether structure remains beyond the named effects.
 """
 
 from __future__ import annotations
@@ -37,14 +38,16 @@ class ViewSource(Source):
     held: ViewEvidence
     """The held-out flights."""
     floor: np.ndarray
-    """(3,) standard deviation of a mean acceleration by measurement noise, by body axis."""
+    """(3,) standard deviation of a mean acceleration that measurement noise causes, by body axis
+    [the view's unit]."""
     all_flights: ViewEvidence | None = None
     """All flights, to search for an oscillating force; None in a torque view."""
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
         data = self.held.residuals(theta)
-        # If only means of flights are compared, there is no error within a flight.
+        # A flight's mean error (its trim) is no error within the flight, and is subtracted. Where
+        # only means of flights are compared, there is nothing to subtract.
         within = data.residual if self.held.means else centred(data.residual, data.flight)
         error = np.sqrt((data.residual**2).mean(axis=0))
         channels = {
@@ -65,10 +68,14 @@ class ViewSource(Source):
         return sizes_by_effect(found, slope, lambda c: view_size(c, self.view.in_world))
 
     def remaining(self, found: SearchResult, gaps: tuple[Gap, Gap], seed: int) -> Remaining:
-        """Return the error that a black box explains beyond the named effects, see `Source`."""
+        """Return the error that a black box explains beyond the named effects, see `Source`.
+
+        In a force view, an oscillating force and a force that no signal predicts are tested too.
+        """
         shares = self._shares(found)
         by_axis = shares.beyond if found.named else shares.explainable
         share, beyond = shares.total(by_axis), shares.total(shares.beyond)
+        # Structure remains if the black box finds more than a small and irrelevant error.
         rms = float(np.sqrt(share * shares.variance.sum()))
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
@@ -106,10 +113,11 @@ class ViewSource(Source):
     def _unexplained_force(self, theta: np.ndarray, gap: Gap, seed: int) -> float:
         """Return the force [m/s^2] that remains within held-out flights, or 0 if insignificant.
 
-        It has to exceed the noise significantly. It also has to exceed the threshold of relevance
-        and the flights' constant offsets, which show the accuracy of attitude and thrust. The
-        torque has no such test, since noise of the rotor speeds dominates its remaining error.
-        `gap` is the gap at `theta` (P,).
+        With a force below two limits, the error has to exceed the noise significantly. The limits
+        are the threshold of relevance, and a multiple of the flights' constant offsets (trims),
+        which show the accuracy of attitude and thrust in the logs. The torque has no such test,
+        since noise of the rotor speeds dominates its remaining error. `gap` is the gap at the
+        parameters `theta` (P,).
         """
         assert self.all_flights is not None
         data, limits = self.all_flights.residuals(theta), self.limits
@@ -126,27 +134,30 @@ class ViewSource(Source):
         assert isinstance(evidence, ViewEvidence)
         before = self.held.residuals(found.start.theta)
         after = self.held.residuals(found.estimate.theta)
-        trim = np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
+        spread = np.where(np.isfinite(evidence.repeatability), evidence.repeatability, np.nan)
+        # Means of flights have no error within flights for a black box to explain.
         if self.held.means:
             power = (before.residual**2).mean(axis=0)
             closed = 1.0 - (after.residual**2).mean(axis=0) / np.maximum(power, TINY)
-            return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, trim)
+            return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, spread)
+        # Fit one black box to the error of the given vehicle, and a second one to the error that
+        # remains with the named effects. Both are tested on the held-out flights.
         start = evidence.residuals(found.start.theta)
         fitted = evidence.residuals(found.estimate.theta)
         inputs = np.concatenate([inputs_of(flight) for flight in evidence.flights])
         held_inputs = np.concatenate([inputs_of(flight) for flight in self.held.flights])
         black_box = fit_black_box(inputs, start.residual, start.flight)
-        beyond_box = fit_black_box(inputs, fitted.residual, fitted.flight)
+        second_box = fit_black_box(inputs, fitted.residual, fitted.flight)
         closed, explainable, with_both = (
             closed_share(before.residual, error, before.flight)
             for error in (
                 after.residual,
                 before.residual - black_box.predict(held_inputs),
-                after.residual - beyond_box.predict(held_inputs),
+                after.residual - second_box.predict(held_inputs),
             )
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
-        return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, trim)
+        return Shares(closed, np.maximum(explainable, closed), with_both - closed, variance, spread)
 
     def series(self, found: SearchResult) -> Series:
         """Return the stretch of a held-out flight that the named effects change most.
@@ -163,7 +174,7 @@ class ViewSource(Source):
         change = before.residual - (after.residual if found.named else 0.0)
         size = np.abs(change[rows, axis])
         count = max(int((middle < middle[0] + STRETCH_S).sum()), 2)
-        # The sum over each stretch of this length.
+        # The convolution sums the change over each stretch of `count` points.
         first = int(np.convolve(size, np.ones(min(count, len(size))), "valid").argmax())
         shown = slice(first, first + count)
         measured = (before.value + before.residual)[rows, axis][shown]
@@ -183,12 +194,14 @@ class ViewSource(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSource(ViewSource):
-    """A change since reference flights that shows only in motion.
+    """Source for a change since reference flights that shows only in motion.
 
-    It is tested if no flight's mean has changed.
+    It is the fallback of the source that compares means of flights: it is searched if no mean has
+    changed.
     """
 
     reference: ViewEvidence
+    """The reference flights, before the change."""
     fitted: ViewEvidence
     """The flights after the change."""
 
@@ -196,30 +209,30 @@ class MotionSource(ViewSource):
         """Search for an effect that has changed since the reference flights, see `Source`."""
         found = search_motion_change(self.reference, self.fitted, self.candidates)
         evidence, block = self.weighed
-        none = Evaluation(evidence, self.start, block)
-        return found or SearchResult((), self.start, none, none, [], 0.0)
+        unchanged = Evaluation(evidence, self.start, block)
+        return found or SearchResult((), self.start, unchanged, unchanged, [], 0.0)
 
 
 class Shares(NamedTuple):
-    """Explained shares of the error's variance within flights, by body axis (3,) [1]."""
+    """Shares of the error's variance within flights that models explain, by body axis (3,)."""
 
     closed: np.ndarray
     """Share that the named effects explain."""
     explainable: np.ndarray
-    """Share that a black box explains, fitted to the same flights."""
+    """Share that a black box explains, which is fitted to the same flights."""
     beyond: np.ndarray
-    """Share that a black box explains beyond the named effects."""
+    """Further share that a black box explains, beyond the named effects."""
     variance: np.ndarray
     """Variance of the error of the given vehicle [the view's unit squared]."""
     repeatability: np.ndarray
-    """Spread of flights' means [the view's unit]; NaN with too few flights."""
+    """Standard deviation of the flights' means [the view's unit]; NaN with too few flights."""
 
     def total(self, by_axis: np.ndarray) -> float:
-        """Return a share by axis (3,) as the share of all axes together, at least 0."""
+        """Return the share of all axes together from the shares by axis (3,); at least 0."""
         return float(max((by_axis * self.variance).sum() / max(self.variance.sum(), TINY), 0.0))
 
     def along(self, axis: int) -> dict[str, float | None]:
-        """Return the entries of an axis in diagnosis.json."""
+        """Return the entries of diagnosis.json for one axis."""
         values = {
             "repeatability": self.repeatability,
             "closed": self.closed,
@@ -232,13 +245,16 @@ class Shares(NamedTuple):
 
 
 def share_of_energy(before: Gap, after: Gap, noise_power: float) -> float:
-    """Return the ratio of the mean squared errors after and before, both minus `noise_power`."""
+    """Return the ratio of the mean squared errors after and before naming, minus the noise.
+
+    `noise_power` is the mean square of the noise, which is subtracted from both errors.
+    """
     remaining = max(float(after.energy.mean()) - noise_power, 0.0)
     return remaining / max(float(before.energy.mean()) - noise_power, remaining, TINY)
 
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge weights that are tried, relative to the weight of a mean."""
+"""Ridge weights that are tried, relative to the weight of the data."""
 
 
 class BlackBox(NamedTuple):
@@ -255,15 +271,15 @@ class BlackBox(NamedTuple):
 
 
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
-    """Return the black box's inputs (M, K) from a flight, averaged over the view's windows."""
+    """Return the inputs (M, K) of the black box for one flight, averaged over its windows."""
     return flight.form.mean @ _features(flight.rows)
 
 
 def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> BlackBox:
     """Fit the black box that explains `error` (M, 3) best in cross-validation over flights.
 
-    Each flight's mean, its trim, is subtracted from inputs (M, K) and error. `flight` (M,) is the
-    number of each row's flight; a single flight is split into thirds.
+    Each flight's mean (its trim) is subtracted from the inputs (M, K) and from the error. `flight`
+    (M,) is the number of each row's flight. A single flight is split into thirds.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -271,9 +287,11 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
     scaled = inputs / scale
 
     def solve(rows: np.ndarray, ridge: float) -> np.ndarray:
+        """Return the weights (K, 3) of a ridge regression on the chosen rows."""
         square = scaled[rows].T @ scaled[rows] + ridge * rows.sum() * np.eye(scaled.shape[1])
         return np.linalg.solve(square, scaled[rows].T @ error[rows])
 
+    # Squared error (3,) on the left-out groups, for each ridge weight.
     held_errors = []
     for ridge in RIDGES:
         total = np.zeros(3)
@@ -281,6 +299,7 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
             held = groups == group
             total += ((error[held] - scaled[held] @ solve(~held, ridge)) ** 2).sum(axis=0)
         held_errors.append(total)
+    # Each axis takes its best ridge weight, or weights of 0 if even that predicts worse than 0.
     best = np.argmin(held_errors, axis=0)
     all_rows = np.ones(len(groups), bool)
     columns = [solve(all_rows, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
@@ -289,28 +308,28 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
 
 
 def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the share (3,) of the errors' variance within flights that `after` no longer has.
+    """Return the share (3,) of the variance within flights that `before` has and `after` lacks.
 
-    Both errors are (M, 3); `flight` (M,) is the number of each row's flight.
+    Both are errors (M, 3); `flight` (M,) is the number of each row's flight.
     """
     power = (centred(before, flight) ** 2).sum(axis=0)
     return 1.0 - (centred(after, flight) ** 2).sum(axis=0) / np.maximum(power, TINY)
 
 
 PATTERNS = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [1, -1, 1, -1]])
-"""Sums and differences of the rotors' thrusts, as of collective thrust, roll, pitch and yaw."""
+"""Sums and differences of the four rotors' thrusts: collective thrust, roll, pitch and yaw."""
 
 
 def _features(rows: FlightRows) -> np.ndarray:
-    """Return the black box's inputs (N, K) on every row: flown signals and products of two."""
+    """Return the black box's inputs (N, K) on every row: signals and their pairwise products."""
     vel_b = rows.vel_b
     thrust = rows.rotor_speed**2
     thrust = thrust / np.maximum(thrust.mean(), 1e-9)
     mixed = thrust @ PATTERNS.T / 4.0
     # The height matters near the ground only.
-    near = 1.0 / (1.0 + np.maximum(rows.pos_w[:, 2:], 0.0))
+    nearness_to_ground = 1.0 / (1.0 + np.maximum(rows.pos_w[:, 2:], 0.0))
     drop = rows.voltage_drop[:, None]
-    signals = np.concatenate([vel_b, rows.rate_b, mixed, near, drop], axis=1)
+    signals = np.concatenate([vel_b, rows.rate_b, mixed, nearness_to_ground, drop], axis=1)
     row, column = np.triu_indices(signals.shape[1])
     speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
     return np.concatenate([signals, signals[:, row] * signals[:, column], speed * vel_b], axis=1)

@@ -1,7 +1,8 @@
 """Makes the sources of evidence `force` and `torque` from flights.
 
-They compare the flights with the vehicle file. With reference flights of the same vehicle, they
-search for a change since those instead.
+Each belongs to one view (part of the dynamics), and compares mean accelerations of the flights with
+the vehicle file. If reference flights of the same vehicle are given, they search for a change since
+the reference flights instead.
 """
 
 from __future__ import annotations
@@ -44,44 +45,49 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         before: sources that exist already.
 
     Returns:
-        The sources, or None if rollouts are used and these were not chosen by name.
+        The sources, or None if other sources exist and these were not chosen by name.
 
     Raises:
         ValueError: if flights cannot be used, or there is only one reference flight.
     """
     if before and not given.chosen:
         return None
+    # Smooth the flights, and set up the model and the effects that the search tries.
     vehicle, limits, references = given.vehicle, given.limits, given.references
     flights = ready(given.logs, vehicle, limits, given.references)
     logs = [given.logs[k] for k in flights.kept]
     space = make_space(vehicle)
     voltage = all(log.voltage is not None for log in [*logs, *references])
     model = ForceModel(vehicle, space, voltage)
-    allowed, unseen = candidates(space, voltage, ()), list[str]()
+    allowed, not_shown = candidates(space, voltage, ()), list[str]()
+    # Flights without a position (inertial logs) do not show wind.
     if any(is_inertial(log) for log in [*logs, *references]):
         allowed = [one for one in allowed if EFFECTS[one.name].wind is None]
         limits = replace(limits, least_view_share=limits.least_inertial_share)
-        unseen = [f"without a position these flights do not show {what}" for what in UNSEEN]
+        not_shown = [f"without a position these flights do not show {what}" for what in UNSEEN]
+    # `earlier` is the evidence of the reference flights by view; empty if there are none.
     earlier, spread, left_out = _references(given, flights, model, limits)
     rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
-    held_numbers, held_names = _choose_held_out(logs, flights, model, limits)
-    fitted, held = parted(flights, held_numbers, limits)
-    partial = any(log.partial for log in [*logs, *references])
+    held_indices, held_names = _choose_held_out(logs, flights, model, limits)
+    fitted, held = parted(flights, held_indices, limits)
+    partial = any(log.partial for log in [*logs, *references])  # logs that lack a required signal
+    # Make one source for each view.
     sources = []
     for view in flights.views:
         evidence = ViewEvidence(view, model, fitted[view.name], limits)
         held_evidence = replace(evidence, flights=held[view.name])
         floor = flights.floor[view.name]
         if spread is None:
-            every = flights.smoothed[FORCE.name]
-            all_flights = replace(evidence, flights=every) if view.in_world else None
+            force_flights = flights.smoothed[FORCE.name]
+            all_flights = replace(evidence, flights=force_flights) if view.in_world else None
             source = _since_file(evidence, held_evidence, all_flights, allowed, floor)
         else:
             reference = earlier[view.name]
             source = _since_reference(reference, evidence, held_evidence, spread, allowed, floor)
+            # Of partial logs only the means of flights are compared.
             source = replace(source, fallback=None) if partial else source
         sources.append(source)
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
@@ -89,14 +95,17 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         tuple(sources),
         held_names,
         flights.source,
-        (*flights.notes, *unseen, *left_out),
+        (*flights.notes, *not_shown, *left_out),
         (_lag_effect(lag),) if lag else (),
         _spread_words(spread, len(references)),
     )
 
 
 def _lag_effect(lag: RotorLag) -> TestedEffect:
-    """Return the rotors' lag as a named effect; force and torque do not depend on it."""
+    """Return the rotors' lag (their time constant) as a named effect.
+
+    A separate test finds it, since force and torque do not depend on it.
+    """
     low, high = max(lag.time_constant - lag.half_width, 0.0), lag.time_constant + lag.half_width
     parameters = {
         "time_constant": {"value": lag.time_constant, "unit": "s", "ci95": [low, high]},
@@ -110,7 +119,7 @@ def _lag_effect(lag: RotorLag) -> TestedEffect:
 
 
 def _descriptions(view: View) -> dict[str, Any]:
-    """Return those fields of a source that follow from its view."""
+    """Return the fields of a source that depend only on its view, by name."""
     about = {"about": view.about, "unit": view.unit}
     measure = MEASURE.format(**about, width=view.width_s)
     return {
@@ -126,7 +135,15 @@ def _since_file(
     allowed: Sequence[Candidate],
     floor: np.ndarray,
 ) -> ViewSource:
-    """Return the source that compares flights with the vehicle file."""
+    """Return the source that compares the flights of `evidence` with the vehicle file.
+
+    Args:
+        evidence: the flights to fit.
+        held: the held-out flights.
+        all_flights: both together, for a force view.
+        allowed: effects that the search may try.
+        floor: (3,) standard deviation of a mean acceleration that measurement noise causes.
+    """
     weighed = evidence.estimate_noise(evidence.start)
     return ViewSource(
         weighed=weighed,
@@ -150,8 +167,9 @@ def _since_reference(
 ) -> ViewSource:
     """Return the source that searches for a change since the `reference` flights.
 
-    It compares means of flights. If none has changed, its fallback searches for a change that shows
-    in motion.
+    It compares means of flights. If no mean has changed, its fallback searches for a change that
+    shows only in motion. `spread` is how much the rotors' thrusts vary between the flights of one
+    vehicle. The other arguments are those of `_since_file`.
     """
     difference, start = change_evidence(reference, evidence.flights, spread)
     weighed = difference.relinearise(start)
@@ -168,7 +186,7 @@ def _since_reference(
 
 
 def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
-    """Return for people how much the `count` reference flights differ."""
+    """Return a text for people on how much the `count` reference flights differ, if any."""
     if spread is None:
         return ()
     return (
@@ -182,13 +200,17 @@ def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
 def _references(
     given: DiagnosisInput, flights: ViewFlights, model: ForceModel, limits: Thresholds
 ) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Return the reference flights by view, their spread, and a note for each unusable flight.
+    """Prepare the reference flights.
+
+    Returns:
+        Their evidence by view, the spread between flights, and a note for each unusable flight.
 
     Raises:
-        ValueError: if there are less than two, or they differ from the others in their signals.
+        ValueError: if less than two are usable, or their signals differ from the other flights'.
     """
     if not given.references:
         return {}, None, ()
+    # `before` and `earlier` are the flights before the change, `flights` and `later` those after.
     before = ready(given.references, given.vehicle, limits, given.logs)
     if len(before.names) < 2:
         raise ValueError(
@@ -215,7 +237,7 @@ def _references(
 
 
 def _view_words(flights: ViewFlights) -> str:
-    """Return in words the views of flights, with their axes and the width of their windows."""
+    """Return a text with the views of flights, their axes and the width of their windows."""
     return " and ".join(
         f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
         for view in flights.views
@@ -225,7 +247,10 @@ def _view_words(flights: ViewFlights) -> str:
 def _choose_held_out(
     logs: Sequence[FlightLog], flights: ViewFlights, model: ForceModel, limits: Thresholds
 ) -> tuple[list[int], list[str]]:
-    """Return the numbers and the names of the held-out flights, chosen by their information."""
+    """Return the indices and the names of the held-out flights.
+
+    They are chosen by their information on the parameters, so that the fitted flights keep enough.
+    """
     view = flights.views[0]
     evidence = ViewEvidence(view, model, flights.smoothed[view.name], limits)
     block = evidence.estimate_noise(evidence.start)[1]
