@@ -1,1 +1,1 @@
-"""What is missing: candidates, rivals, names."""
+"""The search for the effects that explain flights, and for changes since reference flights."""

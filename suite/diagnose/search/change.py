@@ -1,14 +1,15 @@
 """Finds what has changed in a vehicle since reference flights, earlier flights of the same vehicle.
 
-The vehicle file need not be right: the residual of the reference flights, its mean and its
-dependence on velocity, is subtracted from that of the later flights. The reference flights also
-give the spread of flights of an unchanged vehicle (`rotor_spread`); the error of their mean is
-common to all later flights. A change is named if it is large compared with that spread, with all
-candidates tested together (`chance`).
+The vehicle file need not be right: the residual of the reference flights (its mean, and its
+dependence on velocity) is subtracted from the residual of the later flights. The reference flights
+also show how much flights of an unchanged vehicle differ (`rotor_spread`). Their mean has an error,
+too, which is common to all later flights. A change is named if it is large compared with that
+spread; all candidates are tested together (`search/chance.py`).
 
-Where no mean has changed, an effect that only acts in motion, such as a drag, is fitted to each
-flight alone. The values before and after are compared by Welch's test (Welch 1947, doi
-10.1093/biomet/34.1-2.28) with a Bonferroni correction over all candidates and their parameters.
+Some effects, such as a drag, only act in motion, and hardly change the mean of a flight. So where
+no mean has changed, each candidate is fitted to each flight alone. The fitted values of the
+reference flights and of the later ones are compared by Welch's test (Welch 1947, doi
+10.1093/biomet/34.1-2.28), with a Bonferroni correction over all candidates and their parameters.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResu
 
 
 def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
-    """Return inputs (M, 9) of a regression of a model's error on motion, less flights' means.
+    """Return the inputs (M, 9) of a regression that explains a model's error by the motion.
 
-    They are velocity, speed times velocity, and the accelerations of the model at the parameters
-    `theta` (P,): these explain an error of the model's gain or delay.
+    They are the velocity, the speed times the velocity, and the model's accelerations at the
+    parameters `theta` (P,), which stand for an error of the model's gain or delay. Each flight's
+    mean is subtracted.
     """
     motion = []
     for flight in task.flights:
@@ -58,12 +60,12 @@ def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
 
 
 BALANCE = {"force": (("thrust_scale",),), "torque": (("com_offset",), ("torque_trim",))}
-"""By view, the effects that are fitted to the reference flights, one group after another, so that
-the search for changes starts from a vehicle that is in balance as the real one was."""
+"""Effects that are fitted to the reference flights, by view and one group after another. So the
+search for changes starts from a vehicle whose mean forces and torques are those of the real one."""
 
 
 def fit_balance(reference: ViewEvidence) -> np.ndarray:
-    """Return the parameters (P,) that balance the mean forces of the reference flights."""
+    """Return parameters (P,) with which the model has the mean accelerations of `reference`."""
     space = reference.model.space
     theta, weights = space.array("start"), None
     for names in BALANCE[reference.view.name]:
@@ -80,44 +82,46 @@ def less_reference_residual(
 ) -> ViewEvidence:
     """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
 
-    That residual is a mean and a ridge regression on the motion, at the balanced parameters `theta`
-    (P,).
+    The residual is described by its mean and by a ridge regression on the motion. It is that at the
+    parameters `theta` (P,) of `fit_balance`.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
     spread = np.maximum(inputs.std(axis=0), reference.limits.carried_least)
     scaled = inputs / spread
     ridge = reference.limits.carried_ridge * len(scaled) * np.eye(scaled.shape[1])
-    weight = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ deviation)
+    slope_of_error = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ deviation)
     mean = means_of(data.residual, data.flight).mean(axis=0)
     task = replace(reference, flights=flights)
-    return replace(task, carried=_motion_inputs(task, theta) / spread @ weight + mean)
+    return replace(task, carried=_motion_inputs(task, theta) / spread @ slope_of_error + mean)
 
 
 @dataclass(frozen=True)
 class ChangeEvidence(ViewEvidence):
-    """Evidence of a change since reference flights: means of flights, next to their usual spread.
+    """Evidence of a change since reference flights: means of flights, and their usual spread.
 
-    The noise `weights` of the fits allow for errors of the vehicle file's gains.
+    A gain is the acceleration that a change gives; it is wrong if the vehicle file has wrong
+    inertia, arms or rotor torque. The noise `weights` of the fits contain this error.
     """
 
     exact_weights: Weights | None = None
-    """The same without these errors. The first name is tested by it; what then remains is not
-    significant if a gain may be wrong."""
+    """Noise without errors of the gains, for the test of the first name. Further names must be
+    significant with these errors, since the first change times a wrong gain leaves a residual."""
     spread: RotorSpread | None = None
+    """Spread of flights of the unchanged vehicle."""
 
     @property
     def repeatability(self) -> np.ndarray:
-        """(3,) standard deviation of flights' means, with exact gains."""
+        """(3,) standard deviation of flights' means, without errors of the gains."""
         return np.full(3, np.inf) if self.exact_weights is None else self.exact_weights.trim
 
     @property
     def name_p_value(self) -> float:
-        """Probability that a step of the search names a change falsely."""
+        """Probability that a step of the search names a change although nothing has changed."""
         return self.limits.change_p_value
 
     def estimate_noise(self, at: Estimate) -> tuple[ChangeEvidence, ViewBlock]:
-        """Return this with its noise unchanged, as it is known, see `Evidence`."""
+        """Return this evidence with its noise unchanged, since it is known; see `Evidence`."""
         return self, self.linearise(at)
 
     def scores(
@@ -131,7 +135,7 @@ class ChangeEvidence(ViewEvidence):
     ) -> list[CandidateScore]:
         """Return the scores of all candidates close to the best, best first, see `Evidence`.
 
-        The means of few flights contain little information, so nearly every candidate is close.
+        The means of few flights contain little information: nearly every candidate is close.
         """
         assert isinstance(block, ViewBlock) and self.spread and self.exact_weights and self.weights
         weights = self.weights if named else self.exact_weights
@@ -155,13 +159,13 @@ class ChangeEvidence(ViewEvidence):
     def explained_share(
         self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return the share that a candidate explains, see `Evidence`."""
+        """Return the share of the error that a candidate explains; see `Evidence`."""
         if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
             return None
         return Evidence.explained_share(self, before, at, after, candidate, gains)
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
-        """Return a key: plausible candidates first, then fewer parameters, then usual effects."""
+        """Return a sort key: plausible candidates, then few parameters, then the catalogue."""
         far, _, place = usual_first(self.space, at.theta, candidate)
         return far, len(candidate.indices), place
 
@@ -171,24 +175,26 @@ def change_evidence(
 ) -> tuple[ChangeEvidence, Estimate]:
     """Return the evidence of changes in `flights` since `reference`, and the start of its search.
 
-    `spread` is that of flights of the unchanged vehicle.
+    `spread` is the spread of flights of the unchanged vehicle.
     """
     start = fit_balance(reference)
     task, count = less_reference_residual(reference, start, flights), len(reference.flights)
     gain, data = rotor_gain(task), task.residuals(start)
     weights = weights_of(data, task.limits)
-    # Changes within a flight are errors of the model, too, so only means of flights are compared.
+    # Residuals also vary within a flight, by errors of the model. So only the flights' means are
+    # compared, with the noise that such a mean has.
     moments = np.unique(data.flight, return_counts=True)[1].mean()
     of_mean = weights.scatter * np.sqrt(weights.memory / moments)
     weights = weights._replace(scatter=of_mean, memory=np.ones(3))
     trim = spread.along[task.view.name] * gain
     if task.view.in_world:
-        trim[:2] = np.inf  # an attitude's trim, which few flights do not identify
+        trim[:2] = np.inf  # forces across the thrust: a tilted attitude would look the same
     base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
     weights = weights._replace(trim=trim, base=base)
     mean_change = np.abs(means_of(data.residual, data.flight).mean(axis=0))
     wide = weights._replace(trim=np.hypot(trim, task.limits.gain_error * mean_change))
-    # The means contain little information: every candidate that explains them is an alternative.
+    # The means contain little information: every candidate that explains them is an alternative,
+    # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
         task.view, task.model, flights, limits, task.carried, True, wide, weights, spread
@@ -197,11 +203,11 @@ def change_evidence(
 
 
 BOUND_SHARE = 0.1
-"""Share of a change by which its parameters may exceed their physical bounds, due to noise."""
+"""Parameters may exceed their physical bounds by this share of a change, because of noise."""
 
 
 def within_flights(data: ViewData) -> ViewData:
-    """Return `data` with residual and slope less their flights' means."""
+    """Return `data` with each flight's mean subtracted from its residuals and slopes."""
     return data._replace(
         residual=centred(data.residual, data.flight), slope=centred(data.slope, data.flight)
     )
@@ -211,9 +217,9 @@ def fit_each_flight(inside: ViewData, indices: Sequence[int], scatter: np.ndarra
     """Return the change (F, K) of K parameters that fits each of F flights alone.
 
     Args:
-        inside: from `within_flights`.
-        indices: the parameters.
-        scatter: (3,) noise by axis.
+        inside: residuals without the flights' means, from `within_flights`.
+        indices: places of the fitted parameters in the vector of all.
+        scatter: (3,) noise along each axis.
     """
     changes = []
     for number in np.unique(inside.flight):
@@ -229,9 +235,10 @@ class _MotionChange(NamedTuple):
 
     name: NamedEffect
     before: np.ndarray
-    """(K,) change of the candidate's parameters that fits the reference flights."""
+    """(K,) change of the candidate's parameters that fits the reference flights, from those that
+    the search starts with."""
     theta: np.ndarray
-    """(P,) all parameters, with those that fit the later flights."""
+    """(P,) all parameters; the candidate's have the values that fit the later flights."""
 
 
 def search_motion_change(
@@ -239,11 +246,12 @@ def search_motion_change(
 ) -> SearchResult | None:
     """Return the candidate that has changed since `reference`; None where none is significant.
 
-    The parameters of the result are totals, not changes. Both sets need at least two flights.
+    The parameters of the result are total values, not changes. Both sets of flights need at least
+    two flights; otherwise the result is None.
 
     Args:
-        reference: flights before a change.
-        task: flights after it.
+        reference: evidence of the flights before a change.
+        task: evidence of the flights after it.
         among: the candidates.
     """
     start, limits = fit_balance(reference), task.limits
@@ -267,6 +275,7 @@ def search_motion_change(
         share = float(gains.sum() / total)
         theta = start.copy()
         theta[indices] += mean_after
+        # Reject values that are physically impossible by more than noise.
         possible = np.clip(theta, space.array("low"), space.array("high"))
         beyond = np.linalg.norm((possible - theta)[indices])
         allowed = BOUND_SHARE * np.linalg.norm(mean_after - mean_before)
@@ -278,13 +287,16 @@ def search_motion_change(
             changes.append(_MotionChange(name, mean_before, possible))
     if not changes:
         return None
+    # Of the candidates that explain about as much as the best, the most usual one is named.
     least = (1.0 - limits.rival_share) * max(one.name.share for one in changes)
     close = [one for one in changes if one.name.share >= least]
-    best, *others = sorted(close, key=lambda one: usual_first(space, one.theta, one.name.candidate))
+    best, *alternatives = sorted(
+        close, key=lambda one: usual_first(space, one.theta, one.name.candidate)
+    )
     indices = list(best.name.candidate.indices)
     theta_before = start.copy()
     theta_before[indices] += best.before
-    rivals = tuple(dict.fromkeys(other.name.candidate.name for other in others))
+    rivals = tuple(dict.fromkeys(other.name.candidate.name for other in alternatives))
     at = Estimate(best.theta)
     last = Evaluation(evidence, at, evidence.linearise(at, sorted(indices)))
     named = (replace(best.name, rivals=rivals),)
@@ -294,18 +306,22 @@ def search_motion_change(
 def _error_falls(
     inside: ViewData, indices: list[int], before: np.ndarray, after: np.ndarray, scatter: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the fall (F,) of each flight's squared error, and the sum of the errors before it.
+    """Return the fall (F,) of each later flight's squared error, and the sum of the old errors.
 
-    Compared are the parameters of the reference flights, `before` (K,), and the mean of those that
-    the other later flights fit, from `after` (F, K).
+    The error falls from that with the parameters of the reference flights, `before` (K,), to that
+    with parameters fitted to later flights, `after` (F, K). For each flight these are the mean of
+    the fits to all other later flights.
     """
     falls, total = [], 0.0
-    for k, number in enumerate(np.unique(inside.flight)):
+    for place, number in enumerate(np.unique(inside.flight)):
         rows = inside.flight == number
-        slope, others = inside.slope[rows][..., indices], np.delete(after, k, axis=0).mean(axis=0)
+        slope, by_others = (
+            inside.slope[rows][..., indices],
+            np.delete(after, place, axis=0).mean(axis=0),
+        )
         errors = [
             float((((inside.residual[rows] - slope @ change) / scatter) ** 2).sum())
-            for change in (before, others)
+            for change in (before, by_others)
         ]
         falls.append(errors[0] - errors[1])
         total += errors[0]

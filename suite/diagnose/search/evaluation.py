@@ -1,6 +1,7 @@
-"""Fits candidate effects from one estimate of the parameters, and holds the result of a search.
+"""Fits candidate effects from one estimate of the parameters; defines the result of a search.
 
-A candidate is an effect (or several, as one hypothesis) that may explain the residuals of flights.
+A candidate is an effect, or several as one hypothesis (a composite), that may explain the residuals
+of flights. A block is what a linearisation gives: residuals and slopes (`estimate/block.py`).
 """
 
 from __future__ import annotations
@@ -26,19 +27,20 @@ class NamedEffect:
     candidate: Candidate
     p_value: float
     gain: float
-    """Fall of chi-square on left-out stretches when it is added last."""
+    """Fall of chi-square on left-out stretches when this effect is added last."""
     rivals: tuple[str, ...] = ()
-    """Names of effects that explain the flights about as well."""
+    """Names of the alternatives: effects that explain the flights about as well."""
     worse_by: dict[str, float] = field(default_factory=dict)
-    """Rise of chi-square plus the number of parameters, by label of a candidate in its place."""
+    """How much worse another candidate in place of this effect fits, by its label: the rise of
+    chi-square plus number of parameters."""
     gains: tuple[float, ...] = ()
     """Fall of each flight's squared error, with the parameters fitted to the other flights."""
     share: float = 0.0
-    """Share of the squared error that it explains [1]."""
+    """Share of the squared error that the effect explains."""
 
 
 class Evaluation(NamedTuple):
-    """Evidence at one estimate, with its block there."""
+    """Evidence and one estimate of the parameters, with the block at that estimate."""
 
     evidence: Evidence
     at: Estimate
@@ -55,8 +57,13 @@ def evaluated_at(
 ) -> Evaluation:
     """Return the evaluation at an estimate, with further columns for inactive parameters.
 
-    A wind, for one, acts through a drag alone: without a drag its column is zero, and a second
-    column is added with the drag at its usual size (see `estimate/composites.py`).
+    A wind acts only through a drag: without a drag the wind's column of slopes is zero. Then a
+    second column is added, computed with a drag of usual size (see `estimate/composites.py`).
+
+    Args:
+        linearised: the evidence and its block at the estimate.
+        at: the estimate.
+        among: the candidates.
     """
     evidence, block = linearised
     inactive = inactive_at(evidence.space, at.theta, among, block.acts())
@@ -76,13 +83,17 @@ def evaluated_at(
 def fit_with(
     start: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[Estimate, Block]:
-    """Fit `candidate` together with the parameters at `others`, from the estimate of `start`."""
+    """Fit `candidate` together with the parameters at `others`, from the estimate of `start`.
+
+    Returned are the fitted estimate and the block there.
+    """
     evidence, limits, estimate = start.evidence, start.evidence.limits, start.at
     indices = sorted({*others, *candidate.indices})
     inactive = [index for index in start.equations.repeated() if index in candidate.indices]
     if not candidate.parts or not inactive:
         rounds = limits.bilinear_rounds if acts_through(candidate) else None
         return fit(evidence, estimate, indices, rounds, start.block, limits)
+    # A composite with an inactive part: begin where a linear fit with the second columns leads.
     change, information = linear_change(start, others, candidate)
     theta = begin_of(evidence.space, estimate.theta, candidate, inactive, change, information)
     begin = Estimate(theta, estimate.free)
@@ -92,9 +103,9 @@ def fit_with(
 def linear_change(
     start: Evaluation, others: Sequence[int], candidate: Candidate
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change (P,) of all parameters by one linear fit, and the information on each.
+    """Return the change (P,) of all parameters by one linear fit, and the information (P,) on each.
 
-    Only the parameters of `candidate` and those at `others` are fitted.
+    Only the parameters of `candidate` and those at `others` are fitted; the others do not change.
     """
     equations, theta = start.equations, start.at.theta
     fitted = equations.take(sorted({*others, *equations.columns_of(candidate)}))
@@ -108,9 +119,9 @@ def linear_change(
 def cross_validated_chi2(
     evidence: Evidence, block: Block, at: Estimate, indices: Sequence[int]
 ) -> np.ndarray:
-    """Return the squared error (G,) of each group of stretches, fitted on the other groups.
+    """Return the squared error (G,) of each group of stretches, fitted to the other groups.
 
-    The fit is linear about `at`, of the parameters at `indices`.
+    The fit is linear about the estimate `at`. Fitted are the parameters at `indices`.
     """
     equations = block.equations.along_numbers(sorted(indices))
     return chi2_by_group(equations, at.theta, evidence.space, evidence.groups(block))
@@ -124,10 +135,10 @@ class SearchResult:
     start: Estimate
     """Estimate from which the search began."""
     last: Evaluation
-    """At the fit of all names, weighted by the noise that was estimated with them."""
+    """Evaluation at the fit of all named effects, weighted by the noise estimated at this fit."""
     judged: Evaluation
-    """The same, by which names, rivals and intervals were decided. If the model leaves more than
-    noise, its whole residual counts as noise here."""
+    """Evaluation that decided names, alternatives and intervals. It is `last`, unless the best
+    model leaves more than noise: then the whole residual counts as noise."""
     first: list[CandidateScore]
     """Scores of all candidates before any effect was named, best first."""
     explained: float
@@ -145,7 +156,7 @@ class SearchResult:
 
     @property
     def indices(self) -> list[int]:
-        """Places of the named effects' parameters in the vector."""
+        """Places of the named effects' parameters in the vector of all."""
         return indices_of(self.candidates)
 
     @property
@@ -159,7 +170,7 @@ class SearchResult:
         return intervals95(equations, self.judged.evidence.flights_differ_p).half_width
 
     def refitted(self, named: Sequence[NamedEffect]) -> SearchResult:
-        """Return this with only those of its names that are in `named`, fitted again."""
+        """Return this result with only the effects `named`, fitted again."""
         indices = indices_of([one.candidate for one in named])
         theta = self.start.theta.copy()
         theta[indices] = self.estimate.theta[indices]

@@ -1,9 +1,10 @@
-"""Searches for the effects that explain flights: forward selection, then a test against rivals.
+"""Searches for the effects that explain flights: forward selection, then a test of each name.
 
-A candidate (an effect of the catalogue) is named if it lowers the error on left-out stretches of
-the flights by more than the best of all candidates does by chance, and if it passes further tests
-of the evidence. A rival is another candidate that explains the same flights about as well; it is
-listed as an alternative. All kinds of evidence use this search.
+A candidate is an effect of the catalogue, or several as one hypothesis (a composite). It is named
+if it lowers the error on left-out stretches of the flights by more than the best of all candidates
+does by chance, and if it passes further tests of the evidence. An alternative (`rivals` in the
+code) is another candidate that explains the same flights about as well; the diagnosis prints it as
+`A or B`. All kinds of evidence use this search.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class SearchTask(NamedTuple):
     say: Callable[[str], None]
     """Receives a line for people about each step."""
     seed: int
-    """Of the permutation test."""
+    """Seed of the permutation test."""
     limits: Thresholds
 
 
@@ -46,9 +47,10 @@ class _Trial(NamedTuple):
     """A fitted candidate."""
 
     cost: float
-    """Chi-square plus the number of the candidate's parameters."""
+    """Chi-square plus the number of the candidate's parameters, which makes sizes comparable."""
     name: NamedEffect
     at: Estimate
+    """Estimate with the candidate fitted."""
 
 
 def search(
@@ -62,11 +64,11 @@ def search(
     """Return the candidates of `among` that explain the residual of the evidence at `start`.
 
     Args:
-        evidence: of the flights.
+        evidence: evidence of the flights.
         start: the vehicle file's parameters.
         among: the candidates.
         say: receives a line for people about each step.
-        seed: of the permutation test.
+        seed: seed of the permutation test.
         known: result of `evidence.estimate_noise(start)`, if it was computed before.
     """
     limits = evidence.limits
@@ -74,6 +76,7 @@ def search(
     here = evaluated_at(known or evidence.estimate_noise(start), start, among)
     first = _scores(task, here, [], among)
     named: list[NamedEffect] = []
+    # Forward selection: add the best candidate, then drop names that it has made unnecessary.
     for _ in range(2 * limits.most_names):  # a name that was dropped may be named again
         best = None
         if len(named) < limits.most_names:
@@ -82,12 +85,13 @@ def search(
         if best is None or (named and best[0].gain <= limits.least_name_share * first[0].gain):
             break
         name, at = best
-        new = _split(name)
+        new = _one_name_per_effect(name)
         known = here.evidence.estimate_noise(at)
         named, at = _drop_unneeded(task, known[0], at, [*named, *new], len(new) == 1)
         here = evaluated_at(known if at is best[1] else known[0].relinearise(at), at, among)
     named, at = _settle(task, here.evidence, here.at, named)
     last = judged = _final_fit(here.evidence, at, named)
+    # If even the best model leaves more than noise, decide again with the residual as noise.
     misfit = last.evidence.misfit_as_noise(last.at, last.block)
     if misfit is not None:
         say("the model leaves more than noise: names are judged by what it leaves")
@@ -103,22 +107,24 @@ def search(
 
 
 def _indices(named: Sequence[NamedEffect]) -> list[int]:
+    """Return the places of the named effects' parameters in the vector of all."""
     return indices_of([name.candidate for name in named])
 
 
-def _split(name: NamedEffect) -> list[NamedEffect]:
-    """Return one name for each effect of a composite; else the name alone."""
+def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
+    """Return a name for each effect of a composite, or the given name of a single effect."""
     return [replace(name, candidate=single) for single in name.candidate.singles]
 
 
 def _scores(
     task: SearchTask, here: Evaluation, others: Sequence[int], among: Sequence[Candidate]
 ) -> list[CandidateScore]:
+    """Return the scores of `among`, each fitted in addition to the parameters at `others`."""
     return here.evidence.scores(here.block, here.equations, here.at.theta, others, among, task.seed)
 
 
 def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
-    """Fit all names to convergence, as some effects saturate; without names keep the estimate."""
+    """Fit all names with many steps, as some effects saturate; without names keep the estimate."""
     indices, limits = _indices(named), evidence.limits
     rounds = limits.last_rounds if indices else 0
     return Evaluation(evidence, *fit(evidence, at, indices, rounds, None, limits))
@@ -137,18 +143,19 @@ def _best_candidate(
     None where no candidate passes all tests.
 
     Args:
-        task: the search.
+        task: inputs of the search.
         here: evaluation without the candidate.
-        named: names that are fitted with every candidate.
+        named: names that are fitted together with every candidate.
         among: the candidates.
-        known: their scores, if they were computed before.
-        tested: a name that is tested against its rivals, and missing from `here`. If given, all
-            candidates that could replace it are fitted, also those that are not significant.
+        known: scores of the candidates, if they were computed before.
+        tested: candidate of a name that was taken out of `here` to be tested against alternatives.
+            If given, all candidates that could replace it are fitted, significant or not.
     """
     limits, evidence, space = task.limits, here.evidence, here.evidence.space
     others = _indices(named)
     free = [c for c in among if not set(c.indices) & set(others)]
     scores = {s.candidate: s for s in known or _scores(task, here, others, free)}
+    # Choose the candidates that are worth a fit: those with good scores (`near`) ...
     near = list(scores)
     if tested is None:
         least = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
@@ -157,12 +164,14 @@ def _best_candidate(
             for c, score in scores.items()
             if score.p_value <= evidence.name_p_value and score.gain >= least
         ]
+    # ... that could be the best to first order, and of the single effects only the first few.
     columns, theta = here.equations.columns_of, here.at.theta
     falls = {c: chi2_fall(here.equations, theta, space, [*others, *columns(c)]) for c in near}
     near = [c for c in near if c == tested or could_be_best(falls, c, limits)]
     if tested is None:
         single = [c for c in near if not c.parts][: limits.short_list]
         near = [c for c in near if c.parts or c in single]
+    # Fit each of them, and keep those that pass the tests of the evidence.
     before = cross_validated_chi2(evidence, here.block, here.at, others)
     total, trials = float(here.equations.chi2.sum()), list[_Trial]()
     for candidate in near:
@@ -185,18 +194,22 @@ def _best_candidate(
     trials = [trial for trial in trials if needs_all_parts(costs, trial.name.candidate, limits)]
     if not trials:
         return None
+    # Those about as good as the lowest cost are `close`. Of these, the significant one that the
+    # evidence prefers is named, and the others are its alternatives.
     lowest = min(trial.cost for trial in trials)
     explained = total - chi2_fall(here.equations, theta, space, others) - lowest
-    slack = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
-    close = [trial for trial in trials if trial.cost - lowest <= slack]
+    allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
+    close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
     if not significant:
         return None
     best = min(significant, key=lambda t: (*evidence.preference(t.at, t.name.candidate), t.cost))
-    own = best.name.candidate
-    rivals = dict.fromkeys(c.name for c in (t.name.candidate for t in close) if c.name != own.name)
+    chosen = best.name.candidate
+    rivals = dict.fromkeys(
+        c.name for c in (t.name.candidate for t in close) if c.name != chosen.name
+    )
     worse_by = {
-        t.name.candidate.label: t.cost - best.cost for t in trials if t.name.candidate != own
+        t.name.candidate.label: t.cost - best.cost for t in trials if t.name.candidate != chosen
     }
     return replace(best.name, rivals=tuple(rivals), worse_by=worse_by), best.at
 
@@ -209,9 +222,10 @@ def _replace_or_drop(
     place: int,
     among: Sequence[Candidate],
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Test the name at `place` as if added last, against the candidates `among`.
+    """Test the name at `place` of `named` as if it were added last, against the candidates `among`.
 
-    The best of them takes its place, which may be the name itself. Without any it is dropped.
+    The best candidate takes its place; that may be the same effect. If none passes, the name is
+    dropped. Returned are the new names and the fit with them.
     """
     tested, theta = named[place].candidate, at.theta.copy()
     theta[list(tested.indices)] = evidence.space.array("start")[list(tested.indices)]
@@ -222,20 +236,20 @@ def _replace_or_drop(
     best = _best_candidate(task, here, others, among, None, tested)
     if best is None:
         return others, without
-    return [*named[:place], *_split(best[0]), *named[place + 1 :]], best[1]
+    return [*named[:place], *_one_name_per_effect(best[0]), *named[place + 1 :]], best[1]
 
 
 def _drop_unneeded(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect], last_tested: bool
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Return the names that are significant in addition to all others.
+    """Return the names that are significant in addition to all others, and the fit with them.
 
-    With `last_tested` the last name has just been tested.
+    With `last_tested` the last name has just been tested, and is not tested again.
     """
     place = 0
     while place < len(named) - last_tested:
-        single = [named[place].candidate]
-        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, single)
+        itself = [named[place].candidate]
+        remaining, refitted = _replace_or_drop(task, evidence, at, named, place, itself)
         if len(remaining) < len(named):
             named, at = remaining, refitted
         else:
@@ -246,7 +260,10 @@ def _drop_unneeded(
 def _settle(
     task: SearchTask, evidence: Evidence, at: Estimate, named: list[NamedEffect]
 ) -> tuple[list[NamedEffect], Estimate]:
-    """Refit all names jointly and test each against its rivals, until no name changes."""
+    """Refit all names together and test each against all candidates, until no name changes.
+
+    Returned are the names and the fit with them.
+    """
     for _ in range(task.limits.settle_rounds):
         before = [name.candidate for name in named]
         if not before:
@@ -256,7 +273,7 @@ def _settle(
         while place < len(named):
             count = len(named)
             named, at = _replace_or_drop(task, evidence, at, named, place, task.among)
-            place += len(named) >= count
+            place += len(named) >= count  # if the name was dropped, the next one is here now
         if [name.candidate for name in named] == before:
             break
     return named, at
@@ -267,21 +284,23 @@ def could_be_best(
 ) -> bool:
     """Return whether `candidate` could be the best after a fit of the full model.
 
-    `falls` holds the fall of chi-square by candidate, to first order, which is inexact for large
-    effects. Several effects together have to explain more than each of them alone.
+    `falls` holds the fall of chi-square by each candidate, computed to first order. That is inexact
+    for large effects, so a candidate may be somewhat below the largest. A composite also has to
+    explain clearly more than each of its parts.
     """
-    own, largest = falls.get(candidate, -np.inf), max(falls.values())
+    fall, largest = falls.get(candidate, -np.inf), max(falls.values())
     by_part = max((falls.get(part, 0.0) for part in candidate.parts), default=-np.inf)
     slack = limits.first_order_chi2 + limits.first_order_share * abs(largest)
-    return own >= largest - slack and own > by_part + limits.rival_chi2
+    return fall >= largest - slack and fall > by_part + limits.rival_chi2
 
 
 def needs_all_parts(
     costs: Mapping[Candidate, float], candidate: Candidate, limits: Thresholds
 ) -> bool:
-    """Return whether no part of a composite alone explains as much as the whole.
+    """Return whether no single part of a composite explains about as much as the composite.
 
-    `costs` holds chi-square plus the number of parameters, by fitted candidate.
+    `costs` holds chi-square plus the number of parameters, by fitted candidate. True for a
+    candidate that is not a composite.
     """
     limit = costs[candidate] + limits.rival_chi2
     return all(limit < costs.get(part, np.inf) for part in candidate.parts)

@@ -1,1 +1,1 @@
-"""The verdict: gaps, relevance, structure in the residual, actuators."""
+"""What the verdict is based on: gaps, sizes of effects, structure in the residual, actuators."""

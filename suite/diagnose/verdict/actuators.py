@@ -1,10 +1,11 @@
 """Compares measured rotor speeds with commanded ones: controller and motors without aerodynamics.
 
-Flight controllers have integrators and filters that the nominal rate loop (the vehicle file's
-proportional one) lacks, so a difference between commanded and measured rotor speeds is not missing
-aerodynamics. Here the nominal rate loop, mixer and rotor lag compute the rotor speeds of the logged
-commands at the measured body rates. By the same comparison the diagnosis chooses the model's input
-(commands or measured rotor speeds) and estimates the rotors' lag.
+The rate loop turns commanded body rates into torques; the nominal one is the proportional loop of
+the vehicle file. Flight controllers have integrators and filters that it lacks. So a difference
+between commanded and measured rotor speeds does not mean that aerodynamics are missing. Here the
+nominal rate loop, the mixer (torques to rotor thrusts) and the rotors' lag (a first-order delay)
+compute rotor speeds from the logged commands and the measured body rates. By this comparison the
+diagnosis chooses the model's input (commands or measured rotor speeds) and estimates the lag.
 """
 
 from __future__ import annotations
@@ -23,18 +24,13 @@ from eval.quadrotor.continuous import INTEGRATORS
 from eval.quadrotor.plant import Command, Plant, make_plant
 from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.sampling import (
-    follow_lag,
-    hold,
-    interpolate,
-    on_every_row,
-)
+from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
 from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class ActuatorMismatch(NamedTuple):
-    """How measured rotor speeds differ from the commanded ones; as diagnosis.json has it."""
+    """How measured rotor speeds differ from commanded ones; written to diagnosis.json as it is."""
 
     commanded_by: str
     """"nominal rate loop" or "logged motor commands"."""
@@ -45,18 +41,19 @@ class ActuatorMismatch(NamedTuple):
     time_constant: float
     """Time constant of the best-fitting lag [s]."""
     delay: float
-    """Delay of the commands before that lag [s]."""
+    """Best-fitting delay of the commands, in addition to that lag [s]."""
     scale: tuple[float, ...]
-    """Measured over commanded speed, by rotor, with that lag and delay."""
+    """Ratio of measured to commanded speed of each rotor, with that lag and delay."""
     rms_fitted: float
-    """RMS residual with that lag, delay and scale [rad/s]."""
+    """RMS difference with that lag, delay and scale [rad/s]."""
     rms_own: float
-    """The same with the vehicle file's lag and the delay that fits best with it [rad/s]."""
+    """RMS difference with the vehicle file's lag, and its best delay and scales [rad/s]."""
     thrust: tuple[float, float]
     """Mean and standard deviation of measured minus commanded collective thrust, over the nominal
     mass [m/s^2]."""
     turn: tuple[tuple[float, float], ...]
-    """The same for the angular acceleration about body x, y, z [rad/s^2]."""
+    """Mean and standard deviation of measured minus commanded angular acceleration, about body x,
+    y and z each [rad/s^2]."""
 
     @property
     def followed(self) -> float:
@@ -69,11 +66,11 @@ Commanded = Callable[[float], np.ndarray]
 
 
 class _Stretch(NamedTuple):
-    """Rows of a flight without a hole, with commanded speeds on the model's time steps."""
+    """N rows of a flight without a hole (a long time without a value)."""
 
     commanded: Commanded
     row: np.ndarray
-    """(N,) step at whose start each measured row was taken."""
+    """(N,) number of the time step at whose start each measured row was taken."""
     measured: np.ndarray
     """(N, 4) measured rotor speeds [rad/s]."""
 
@@ -81,10 +78,10 @@ class _Stretch(NamedTuple):
 def actuator_mismatches(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> list[ActuatorMismatch]:
-    """Return how measured rotor speeds differ from those by the rate loop and by motor commands.
+    """Compare measured rotor speeds with those by the rate loop and those by motor commands.
 
-    Each of the two comparisons is made where the logs have its signals. Logs without measured rotor
-    speeds and the effects of `vehicle` are ignored.
+    Returned is one mismatch for each of the two comparisons that the logs allow. Logs without
+    measured rotor speeds are ignored, and so are the effects of `vehicle`.
     """
     plant = make_plant(vehicle, step_s(vehicle), {})
     mismatches = []
@@ -105,7 +102,8 @@ def actuator_mismatches(
 def rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
     """Return the rotor speeds commanded by the rate loop of `plant` at the measured body rates.
 
-    `step_time_s` (S,) are the starts of the steps [s]. None where the log has no commands.
+    `step_time_s` (S,) are the starts of the time steps [s]. None where the log has no commands. The
+    plant is the model of the vehicle: its rotors, delays and rate loop.
     """
     if log.thrust_cmd is None or log.rate_cmd_b is None:
         return None
@@ -121,6 +119,7 @@ def rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> C
 
 
 def _logged_speeds(log: FlightLog, step_time_s: np.ndarray) -> Commanded | None:
+    """Return the rotor speeds that the log has as motor commands; None where it has none."""
     command = log.rotor_speed_cmd
     if command is None:
         return None
@@ -145,13 +144,14 @@ def _stretches(
         if not len(rows):
             continue
         time_s = log.time_s[rows] - log.time_s[rows[0]]
-        if time_s[-1] < 4.0 * limits.lag_settled_s:
+        if time_s[-1] < 4.0 * limits.lag_settled_s:  # too short next to the time left out below
             continue
         step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
         commanded = commanded_of(log, step_time_s)
         if commanded is None or not np.isfinite(commanded(0.0)).all():
             continue
         step = np.round(time_s / dt).astype(int)
+        # The rotor speeds before the stretch are unknown; their effect decays first.
         settled = (step * dt >= limits.lag_settled_s) & (step <= len(step_time_s))
         stretches.append(_Stretch(commanded, step[settled], log.rotor_speed[rows[settled]]))
     return stretches
@@ -160,7 +160,7 @@ def _stretches(
 def _mismatch(
     commanded_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle, limits: Thresholds
 ) -> ActuatorMismatch:
-    """Fit lag, delay and scales of the rotors, and return all differences."""
+    """Fit lag, delay and scales of the rotors, and return how the rotor speeds differ."""
     dt, nominal_lag = step_s(vehicle), vehicle.rotors.time_constant
     measured = np.concatenate([stretch.measured for stretch in stretches])
 
@@ -187,7 +187,9 @@ def _mismatch(
 
     delay, _ = _best_delay(lambda delay: best_lag(delay)[0], limits)
     _, time_constant = best_lag(delay)
-    _, own = _best_delay(lambda delay: squared_error(commanded(delay), nominal_lag), limits)
+    _, nominal_error = _best_delay(
+        lambda delay: squared_error(commanded(delay), nominal_lag), limits
+    )
     nominal = lagged(commanded(0.0), nominal_lag)
     fitted = lagged(commanded(delay), time_constant)
     scale = scales(fitted)
@@ -200,7 +202,7 @@ def _mismatch(
         delay=delay,
         scale=tuple(float(s) for s in scale),
         rms_fitted=_rms(measured - scale * fitted),
-        rms_own=float(np.sqrt(own)),
+        rms_own=float(np.sqrt(nominal_error)),
         thrust=(float(thrust.mean()), float(thrust.std())),
         turn=tuple((float(t.mean()), float(t.std())) for t in turn.T),
     )
@@ -209,26 +211,32 @@ def _mismatch(
 def _best_delay(cost: Callable[[float], float], limits: Thresholds) -> tuple[float, float]:
     """Return the delay of the commands with the smallest `cost` [s], and that cost."""
     grid = np.linspace(0.0, limits.longest_delay_s, limits.delays_tried)
-    place = int(np.argmin([cost(delay) for delay in grid]))
-    bounds = (grid[max(place - 1, 0)], grid[min(place + 1, limits.delays_tried - 1)])
+    best_index = int(np.argmin([cost(delay) for delay in grid]))
+    bounds = (grid[max(best_index - 1, 0)], grid[min(best_index + 1, limits.delays_tried - 1)])
     options = {"xatol": 2e-4}
-    refined = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
-    best, without = float(refined.fun), cost(0.0)
-    return (0.0, without) if without <= best else (float(refined.x), best)
+    refinement = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
+    lowest, undelayed = float(refinement.fun), cost(0.0)
+    return (0.0, undelayed) if undelayed <= lowest else (float(refinement.x), lowest)
 
 
-def _at_rows(speed: np.ndarray, row: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
-    """Return commanded speeds (S, 4) of steps `dt` [s] at the rows (N, 4), behind the lag [s]."""
+def _at_rows(
+    speed: np.ndarray, step_of_row: np.ndarray, dt: float, time_constant: float
+) -> np.ndarray:
+    """Return rotor speeds (N, 4) at measured rows, behind commanded `speed` (S, 4) by a lag.
+
+    `dt` is the length of a step [s], and `step_of_row` (N,) the step that starts at each row.
+    """
     # The speed at the end of step k is that at the start of step k + 1.
-    return np.concatenate([speed[:1], follow_lag(speed, dt, time_constant)])[row]
+    return np.concatenate([speed[:1], follow_lag(speed, dt, time_constant)])[step_of_row]
 
 
 def wrench_difference(
     measured: np.ndarray, commanded: np.ndarray, vehicle: Vehicle
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what rotor speeds `measured` (N, 4) do beyond `commanded` (N, 4) ones [rad/s].
+    """Return the accelerations by `measured` rotor speeds less those by `commanded` ones.
 
-    These are thrust over mass (N,) [m/s^2] and angular acceleration (N, 3) [rad/s^2], body axes.
+    Both speeds are (N, 4) [rad/s]. The result is the difference of thrust over mass (N,) [m/s^2],
+    and that of the angular acceleration in body axes (N, 3) [rad/s^2].
     """
     thrust = vehicle.rotors.thrust_coefficient * (measured**2 - commanded**2)
     wrench = thrust @ rotor_mixer(vehicle).T
@@ -244,8 +252,9 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
 
     Args:
         logs: flights.
-        drive: the user's choice: "commands", "motors" or "auto", which prefers commands.
-        vehicle: whose rate loop would follow the commands.
+        drive: the user's choice of the input: "commands", "motors" or "auto". With "auto" it is the
+            commands where that is possible.
+        vehicle: the vehicle whose rate loop would follow the commands.
 
     Raises:
         ValueError: for an unknown `drive`, or one that the logs or the rate loop do not allow.
@@ -271,9 +280,10 @@ def rotors_are_input(logs: Sequence[FlightLog], drive: str, vehicle: Vehicle) ->
 
 
 def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
-    """Return the integrator that made the bodies' motion in `logs`, "continuous" or "euler".
+    """Return the integrator of the simulation that made `logs`, "continuous" or "euler".
 
-    `integrator` is the user's choice; with "auto" it is "euler" where all logs have that.
+    `integrator` is the user's choice. With "auto" the result is "euler" if all logs state it, and
+    "continuous" otherwise, as for real flights.
 
     Raises:
         ValueError: for an unknown `integrator`.
@@ -289,28 +299,30 @@ def integrator_of(logs: Sequence[FlightLog], integrator: str) -> str:
 def flown_by_other_controller(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> bool:
-    """Return whether the measured rotor speeds are not those of the nominal rate loop.
+    """Return whether the measured rotor speeds contradict the nominal rate loop.
 
-    The loop is computed at the measured rates, so only the controller and the rotors are compared:
-    aerodynamics or a shifted centre of mass change the rates themselves.
+    The loop is computed at the measured rates, so only the controller and the rotors are compared.
+    Aerodynamics or a shifted centre of mass act on the rates, and so do not count as a difference.
     """
     dt, plant = step_s(vehicle), make_plant(vehicle, step_s(vehicle))
     delay, lag = float(plant.constants.delay), float(plant.constants.time_constant)
-    error, change, count = 0.0, 0.0, 0
+    error, variation, count = 0.0, 0.0, 0
     for log in logs:
         commanded_of = partial(rate_loop_speeds, plant=plant)
         for stretch in _stretches(log, vehicle, commanded_of, limits):
             commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
-            place = (stretch.row * dt / limits.speed_mean_s).astype(int)
-            bins, number = np.unique(place, return_inverse=True)
-            sums = np.zeros((len(bins), 8))
-            np.add.at(sums, number, np.concatenate([stretch.measured, commanded], axis=1))
-            measured, by_loop = np.split(sums / np.bincount(number)[:, None], 2, axis=1)
+            bin_of_row = (stretch.row * dt / limits.speed_mean_s).astype(int)
+            used_bins, bin_index = np.unique(bin_of_row, return_inverse=True)
+            sums = np.zeros((len(used_bins), 8))
+            np.add.at(sums, bin_index, np.concatenate([stretch.measured, commanded], axis=1))
+            measured, by_loop = np.split(sums / np.bincount(bin_index)[:, None], 2, axis=1)
             error += float(((measured - by_loop) ** 2).sum())
-            change += float(((measured - measured.mean(axis=0)) ** 2).sum())
+            variation += float(((measured - measured.mean(axis=0)) ** 2).sum())
             count += measured.size
-    still = count * limits.still_speed**2
-    return bool(error > still and error > limits.fitted_loop_share**2 * max(change, still))
+    negligible = count * limits.still_speed**2
+    return bool(
+        error > negligible and error > limits.fitted_loop_share**2 * max(variation, negligible)
+    )
 
 
 LAG = "motor_lag"
@@ -325,11 +337,11 @@ class RotorLag(NamedTuple):
     known: float
     """The vehicle file's time constant [s]."""
     half_width: float
-    """Half the 95 % interval over flights, plus half a step of the model [s]."""
+    """Half the 95 % interval over flights, plus half a time step of the model [s]."""
     closed: float
     """Share of the rotor speeds' squared error under the vehicle's lag that this lag removes."""
     p_value: float
-    """Of the hypothesis that the vehicle file's lag is right."""
+    """p-value of the hypothesis that the vehicle file's lag is right."""
 
 
 def find_rotor_lag(
@@ -338,9 +350,9 @@ def find_rotor_lag(
     """Return the rotors' lag where it differs significantly from that of `vehicle`, else None.
 
     Args:
-        logs: flights. Ignored are those without commands or rotor speeds, and those whose speeds
-            the nominal rate loop does not explain: a firmware's filters are not a lag.
-        vehicle: the one that the simulation uses.
+        logs: flights. Flights without commands or rotor speeds are ignored. So are flights whose
+            speeds the nominal rate loop does not explain: a firmware's filters are not a lag.
+        vehicle: the nominal vehicle.
         limits: significance.
     """
     if has_firmware_loop(vehicle):
@@ -350,19 +362,21 @@ def find_rotor_lag(
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
     mismatches = []
     for log in logs:
-        one = _loop_mismatch(log, vehicle, limits)
+        mismatch = _loop_mismatch(log, vehicle, limits)
         unexplained = 1.0 - limits.lag_followed_share
-        if one is not None and one.rms_fitted**2 <= unexplained * one.spread**2:
-            mismatches.append(one)
+        if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2:
+            mismatches.append(mismatch)
     if len(mismatches) < limits.lag_least_flights:
         return None
-    lags = np.array([one.time_constant for one in mismatches])
+    lags = np.array([mismatch.time_constant for mismatch in mismatches])
     half_step = 0.5 * step_s(vehicle)
     standard_error = float(lags.std(ddof=1)) / np.sqrt(len(lags))
     half_width = float(stats.t.ppf(0.975, len(lags) - 1)) * standard_error + half_step
     difference = float(abs(lags.mean() - known))
-    before = sum(one.rms_own**2 for one in mismatches)
-    closed = 1.0 - sum(one.rms_fitted**2 for one in mismatches) / max(before, 1e-12)
+    nominal_error = sum(mismatch.rms_own**2 for mismatch in mismatches)
+    closed = 1.0 - sum(mismatch.rms_fitted**2 for mismatch in mismatches) / max(
+        nominal_error, 1e-12
+    )
     if difference <= half_width or closed < limits.lag_closed_share:
         return None
     t = (difference - half_step) / max(standard_error, 1e-9)

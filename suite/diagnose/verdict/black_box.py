@@ -1,11 +1,11 @@
 """Compares named effects with a black box, on held-out flights and at speeds above the fitted ones.
 
-The black box is a Delta Action Model: a network that adds a correction to the simulated quadrotor.
-The paper's network (Su et al. 2026, Sec. III-D) takes the velocity in body axes, the attitude and
-the commanded net acceleration. Its output is added to the body's linear acceleration. Three further
-outputs are added to the angular acceleration, as these commands contain body rates. The network is
-fitted by gradients through rollouts (simulated stretches of 1 s), to the same errors as the named
-effects.
+A black box is a regression without physics. This one is a Delta Action Model: a network that adds a
+correction to the simulated quadrotor. The network of Su et al. 2026 (Sec. III-D) takes the velocity
+in body axes, the attitude and the commanded net acceleration. Its output is added to the body's
+linear acceleration. Here three further outputs are added to the angular acceleration, because the
+commands contain body rates, too. The network is fitted by gradients through rollouts (simulated
+stretches of 1 s), to the same errors as the named effects.
 """
 
 from __future__ import annotations
@@ -56,18 +56,20 @@ from tracks.geometry.rotation import to_local
 
 
 class BlackBoxComparison(NamedTuple):
-    """The gap (held-out error) on windows that took no part in any fit."""
+    """Gaps (held-out errors) of three models, on windows (1 s stretches) that no fit has used."""
 
     judged_on: str
-    """Which windows these are, for people."""
+    """Description of the windows on which the gaps are computed, for people."""
     fitted: int
-    """Number of windows that were fitted."""
+    """Number of windows to which the models were fitted."""
     judged: int
-    """Number of windows of the gap."""
+    """Number of windows on which the gaps are computed."""
     before: Gap
+    """With the vehicle file as it is."""
     named: Gap | None
     """With the named effects, fitted to the same windows as the black box; None without any."""
     black_box: Gap
+    """With the network's correction."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,10 @@ class BlackBoxComparisons:
     """The comparisons on held-out flights and at higher speeds."""
 
     held_out: BlackBoxComparison
-    """On the flights that the diagnosis held out."""
+    """Comparison on the flights that the diagnosis held out."""
     outside: BlackBoxComparison | None
-    """Fitted to slow windows, judged on fast ones; None where there are too few."""
+    """Comparison of models that are fitted to slow windows and tested on fast ones; None where
+    there are too few of either."""
     split_m_s: float
     """Speed between slow and fast [m/s]."""
     seconds: float
@@ -94,9 +97,9 @@ def compare_black_box(
 
     Args:
         flown: the flights as rollouts.
-        finding: names and gaps of these rollouts.
-        config: of the fits.
-        progress: called with (share done, words).
+        finding: the named effects and the gaps that the diagnosis found with these rollouts.
+        config: settings of the fits.
+        progress: called with the share that is done, 0 to 1, and a line for people.
 
     Raises:
         FloatingPointError: where a fit diverges.
@@ -108,6 +111,7 @@ def compare_black_box(
     def show(fit_number: int) -> Callable[[int, str], None]:
         return lambda step, words: progress(0.5 * (fit_number + step / config.iterations), words)
 
+    # First comparison: fitted to the flights that are not held out, tested on the held-out ones.
     training = _not_held_out(flown.cut(limits.check_stride_s), held)
     params = fit_black_box(model, training, noise, config, show(0))
     held_out = BlackBoxComparison(
@@ -118,6 +122,7 @@ def compare_black_box(
         named=finding.after if search.named else None,
         black_box=black_box_gap(model, params, held, noise, limits),
     )
+    # Second comparison: fitted to slow windows, tested on faster ones.
     windows = flown.cut(LENGTH_S)
     top, mean = _speeds(flown.logs, windows)
     split = float(np.quantile(top, limits.slow_share))
@@ -144,7 +149,7 @@ def compare_black_box(
 
 
 def _not_held_out(windows: FlightWindows, held: FlightWindows) -> FlightWindows:
-    """Return those of `windows` that do not overlap the held-out ones."""
+    """Return those of `windows` that do not overlap the windows `held` out."""
     training = ~np.isin(windows.flight, held.flight)
     if not training.any():  # of a single flight only the end is held out
         training = np.asarray(windows.start_s) + LENGTH_S <= float(np.min(held.start_s)) + 1e-6
@@ -152,7 +157,7 @@ def _not_held_out(windows: FlightWindows, held: FlightWindows) -> FlightWindows:
 
 
 def _speeds(logs: Sequence[FlightLog], windows: FlightWindows) -> tuple[np.ndarray, np.ndarray]:
-    """Return the top and the mean speed in each window (W,) [m/s]."""
+    """Return the largest speed in each window (W,) and the mean speed in each (W,) [m/s]."""
     speeds = []
     for flight, start_s in zip(windows.flight, windows.start_s, strict=True):
         log = logs[int(flight)]
@@ -176,7 +181,7 @@ class BlackBoxConfig:
     """Settings of the fit of the black box."""
 
     iterations: int = 300
-    """Number of gradient steps, with a dozen windows each."""
+    """Number of gradient steps. Each uses a dozen windows."""
     rate: float = 5e-3
     """Peak learning rate; it falls to zero as a cosine."""
     seed: int = 0
@@ -196,8 +201,8 @@ def fit_black_box(
         model: the simulation that the network corrects.
         windows: W stretches to fit.
         noise: measurement noise of the channels, by which errors are weighted.
-        config: of the fit.
-        show: called with (iteration, words) after each step.
+        config: settings of the fit.
+        show: called after each step with the number of steps and a line for people.
 
     Raises:
         FloatingPointError: where the fit diverges.
@@ -244,14 +249,17 @@ def black_box_gap(
     theta = model.space.array("start")
     offset = true_starts(model, theta, windows)
     linear = model.linearise(theta, offset, windows, model.starts)
-    fly = jax.jit(lambda x, w: _errors(model, theta, params, x, w))
+    fly = jax.jit(lambda start_offset, batch: _errors(model, theta, params, start_offset, batch))
     with jax.enable_x64(True):
-        errors = [np.asarray(fly(x, w))[:count] for x, w, count in batches(offset, windows)]
+        errors = [
+            np.asarray(fly(start_offset, batch))[:count]
+            for start_offset, batch, count in batches(offset, windows)
+        ]
     return gap_of(linear._replace(residual=-np.concatenate(errors)), windows, noise, limits)
 
 
 def _initial_weights(seed: int) -> dict[str, Any]:
-    """Return random weights whose output is zero."""
+    """Return random weights, but with a last layer of zeros, so that the correction begins at 0."""
     params = {k: jnp.asarray(v, float) for k, v in delta_network.init(jax.random.key(seed)).items()}
     params["output.weight"] = jnp.zeros((delta_network.HIDDEN, len(OUTPUT_SCALE)))
     params["output.bias"] = jnp.zeros(len(OUTPUT_SCALE))
@@ -261,14 +269,18 @@ def _initial_weights(seed: int) -> dict[str, Any]:
 def _errors(
     model: RolloutModel, theta: Any, params: Any, offset: Any, windows: FlightWindows
 ) -> Any:
-    """Return simulated - measured (B, N, 19) with the network's correction."""
-    count, steps = len(offset), max(1, round(PERIOD_S / model.dt))
+    """Return simulated - measured (B, N, 19) with the correction of the network `params`.
+
+    The start states are corrected by `offset`.
+    """
+    count, network_steps = len(offset), max(1, round(PERIOD_S / model.dt))
     scale, body_z = jnp.asarray(OUTPUT_SCALE), jnp.array([0.0, 0.0, 1.0])
 
     def correct(carry: Any, motion: Motion, inputs: Inputs, index: Any) -> tuple[Any, Any]:
         assert inputs.command is not None
         thrust = inputs.command.thrust
-        if inputs.rotor_speed is not None:  # the input is rotor speeds: there may be no command
+        # Where measured rotor speeds are the input there may be no command: their thrust is used.
+        if inputs.rotor_speed is not None:
             nominal = model.given.nominal
             force = nominal.thrust_coefficient * (inputs.rotor_speed**2).sum(-1)
             thrust = force / nominal.mass
@@ -277,11 +289,14 @@ def _errors(
             up_b = motion.rot_w[:, 2]  # world z in body axes
             action_b = thrust[:, None] * body_z - GRAVITY * up_b
             vel_b = to_local(motion.rot_w, motion.vel_w)
-            push, hidden = delta_network.step(params, carry[0], vel_b, up_b, action_b)
-            return hidden, scale * push
+            correction, memory = delta_network.step(params, carry[0], vel_b, up_b, action_b)
+            return memory, scale * correction
 
-        carry = jax.lax.cond(index % steps == 0, run_network, lambda _: carry, None)
+        carry = jax.lax.cond(index % network_steps == 0, run_network, lambda _: carry, None)
         return carry, carry[1]
 
-    start = (jnp.zeros((count, delta_network.HIDDEN)), jnp.zeros((count, len(OUTPUT_SCALE))))
-    return model.fly(theta, offset, windows, None, Feedback(start, correct))[0]
+    initial_carry = (
+        jnp.zeros((count, delta_network.HIDDEN)),
+        jnp.zeros((count, len(OUTPUT_SCALE))),
+    )
+    return model.fly(theta, offset, windows, None, Feedback(initial_carry, correct))[0]

@@ -1,14 +1,15 @@
 """Detects forces that no fitted parameter reproduces: a swinging load and random wind.
 
-A load on a line causes a narrow peak in the spectrum of the horizontal residual force (measured
-less simulated), at one period in all flights. A wrong model causes peaks at the periods of the
-flight's own motion, too, but there the residual force is a small share of the acceleration. Spectra
-are compared by their likelihood (Whittle 1953) with and without a peak on a smooth background.
+A load on a line swings. It causes a narrow peak in the spectrum of the horizontal residual force
+(measured minus simulated), at one period in all flights. A wrong model also causes peaks, at the
+periods of the vehicle's own motion, but there the residual force is a small share of the
+acceleration. So the test compares the likelihood of each spectrum (Whittle 1953) with a peak on a
+smooth background and without.
 
-Random wind is normally distributed with the covariance of the effect `gusts`. Through the drag of
-the vehicle it adds a covariance to the residuals of rollouts, at the knots (support points in time)
-of every 1 s window. Intensity and length scale maximise the likelihood of the residuals. The
-alternative hypothesis is a random disturbance along the body axes.
+Random wind is normally distributed with the covariance of the effect `gusts`. It acts through the
+drag of the vehicle and makes the errors of rollouts (simulated 1 s windows) correlated. The wind is
+represented at the knots (support points in time) of each window. Its intensity and length scale
+maximise the likelihood. The competing hypothesis is any random force along the body axes.
 """
 
 from __future__ import annotations
@@ -41,15 +42,15 @@ BAND_HZ = (0.15, 3.0)
 CORNERS_HZ = (0.2, 0.5, 1.2)
 """Corner frequencies of the smooth backgrounds that fall with frequency [Hz]."""
 WIDTHS = (0.03, 0.1)
-"""Tested half widths of a peak, over its frequency [1]."""
+"""Tested half widths of a peak, as shares of its frequency."""
 HANN_BINS = 1.5
-"""Width of a spectral line under a Hann window, which is also its correlation length [bins]."""
+"""Width of a spectral line after a Hann window, and of the correlation of bins [frequency bins]."""
 ROUNDS = 60
 """Number of multiplicative updates in the fit of a spectrum."""
 LEAST_MEANS = 8
-"""Least number of mean accelerations in a flight for a spectrum."""
+"""Smallest number of mean accelerations in a flight that gives a spectrum."""
 LEAST_FILLED = 0.7
-"""Least share of the time grid with a measurement for a spectrum."""
+"""Smallest share of the time grid that must have measurements for a spectrum."""
 LEAST_BINS = 12
 """Least number of frequencies in a spectrum."""
 
@@ -61,9 +62,9 @@ class Swing(NamedTuple):
     ci95: tuple[float, float]
     """95 % interval of the period [s]."""
     share: float
-    """Share of the residual force's power within `BAND_HZ` [1]."""
+    """Share of the residual force's power within `BAND_HZ` that is in the peak."""
     p_value: float
-    """After Bonferroni's correction for all periods."""
+    """p-value after Bonferroni's correction for all tested periods and widths."""
 
     @property
     def length_m(self) -> float:
@@ -81,10 +82,10 @@ class Swing(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """Power of one flight by frequency, both horizontal axes together."""
+    """Power of one flight at J frequencies, both horizontal axes together."""
 
     frequency_hz: np.ndarray
-    """(J,)."""
+    """(J,) frequencies [Hz]."""
     residual: np.ndarray
     """(J,) power of the residual force."""
     measured: np.ndarray
@@ -96,7 +97,7 @@ class Spectrum(NamedTuple):
 def residual_swing(task: ViewEvidence, theta: np.ndarray) -> Swing | None:
     """Return the oscillation in the residual force of `task` at the parameters `theta` (P,).
 
-    None where there is none, or where the flights do not show both horizontal axes.
+    None where there is none, or where the view does not contain both horizontal axes.
     """
     if not {0, 1} <= set(task.view.axes):
         return None
@@ -113,7 +114,7 @@ def find_swing(
     """Return the oscillation in the residual force of `flights`; None where there is none.
 
     Args:
-        flights: of the force view.
+        flights: measured accelerations of each flight, in the force view.
         residual_b: residual force of each flight, (M, 3) body axes [m/s^2].
         limits: significance and size.
     """
@@ -132,9 +133,14 @@ def find_swing(
     largest = float(gain[width, best])
     independent = (frequency_hz[-1] - frequency_hz[0]) / np.mean([s.width_hz for s in spectra])
     p_value = float(chi2.sf(2.0 * largest, 2 * len(spectra))) * independent * len(WIDTHS)
+    # Reject a peak that is not significant, small, or small next to the acceleration there.
     centre_hz = float(frequency_hz[best])
-    driven, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
-    if p_value > limits.swing_p_value or share < limits.swing_share or driven < limits.swing_driven:
+    force_ratio, share = _peak_shares(spectra, centre_hz, [one[width, best] for one in heights])
+    if (
+        p_value > limits.swing_p_value
+        or share < limits.swing_share
+        or force_ratio < limits.swing_driven
+    ):
         return None
     # 95 % interval by the profile likelihood.
     likely = frequency_hz[gain[width] >= largest - limits.profile_fall]
@@ -149,15 +155,15 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
     if len(middle_s) < LEAST_MEANS:
         return None
     step_s = float(np.median(np.diff(middle_s)))
-    place = np.round((middle_s - middle_s[0]) / step_s).astype(int)
-    count = int(place[-1]) + 1
-    if count * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * count:
+    grid_index = np.round((middle_s - middle_s[0]) / step_s).astype(int)
+    grid_size = int(grid_index[-1]) + 1
+    if grid_size * step_s * BAND_HZ[0] < 1.0 or len(middle_s) < LEAST_FILLED * grid_size:
         return None
     rot_w = np.asarray(flight.rows.rot_w)[flight.form.middle_row]
     residual_w = (rot_w @ residual_b[..., None])[..., 0][:, :2]
     yaw = np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0])
     time = np.linspace(-1.0, 1.0, len(middle_s))
-    # A force that turns with the heading, or drifts, is not an oscillation.
+    # Subtracted first: forces that are constant, drift, or turn with the heading do not oscillate.
     zero, one = np.zeros_like(time), np.ones_like(time)
     trend = np.stack(
         [
@@ -166,28 +172,25 @@ def _spectrum(flight: SmoothedFlight, residual_b: np.ndarray) -> Spectrum | None
         ],
         axis=1,
     )
-    columns = trend.reshape(-1, trend.shape[-1])
-    window = np.hanning(count)[:, None]
+    trend_columns = trend.reshape(-1, trend.shape[-1])
+    window = np.hanning(grid_size)[:, None]
     powers = []
     for series in (residual_w, flight.measured[:, :2]):
-        fit = np.linalg.lstsq(columns, series.reshape(-1), rcond=None)[0]
-        detrended = np.zeros((count, 2))
-        detrended[place] = series - trend @ fit
-        lines = np.fft.rfft(detrended * window, axis=0) / np.sqrt((window**2).sum())
-        powers.append((np.abs(lines) ** 2).sum(axis=1))
-    frequency_hz = np.fft.rfftfreq(count, step_s)
+        trend_weights = np.linalg.lstsq(trend_columns, series.reshape(-1), rcond=None)[0]
+        detrended = np.zeros((grid_size, 2))
+        detrended[grid_index] = series - trend @ trend_weights
+        transform = np.fft.rfft(detrended * window, axis=0) / np.sqrt((window**2).sum())
+        powers.append((np.abs(transform) ** 2).sum(axis=1))
+    frequency_hz = np.fft.rfftfreq(grid_size, step_s)
     in_band = (frequency_hz >= BAND_HZ[0]) & (frequency_hz <= BAND_HZ[1])
     if in_band.sum() < LEAST_BINS:
         return None
     residual, measured = (power[in_band] for power in powers)
-    return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (count * step_s))
+    return Spectrum(frequency_hz[in_band], residual, measured, HANN_BINS / (grid_size * step_s))
 
 
 def _peak_gains(spectrum: Spectrum, centre_hz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gain in log-likelihood by a peak at each of `centre_hz`, and the peak's height.
-
-    Both are (widths, frequencies).
-    """
+    """Return gains in log-likelihood by peaks, and their heights, (widths, `centre_hz`) each."""
     frequency = spectrum.frequency_hz
     background = np.stack(
         [
@@ -217,13 +220,13 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
     multiplicative updates (Itakura-Saito distance; Fevotte, Bertin and Durrieu 2009).
     """
     scale = shapes.mean(axis=2, keepdims=True)
-    unit = shapes / scale
-    weights = np.full(unit.shape[:2], float(power.mean()) / unit.shape[1])
+    unit_shapes = shapes / scale
+    weights = np.full(unit_shapes.shape[:2], float(power.mean()) / unit_shapes.shape[1])
     for _ in range(ROUNDS):
-        model = np.einsum("ct,ctj->cj", weights, unit)
-        numerator = np.einsum("ctj,cj->ct", unit, power / model**2)
-        weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit, 1.0 / model))
-    model = np.einsum("ct,ctj->cj", weights, unit)
+        model = np.einsum("ct,ctj->cj", weights, unit_shapes)
+        numerator = np.einsum("ctj,cj->ct", unit_shapes, power / model**2)
+        weights = weights * np.sqrt(numerator / np.einsum("ctj,cj->ct", unit_shapes, 1.0 / model))
+    model = np.einsum("ct,ctj->cj", weights, unit_shapes)
     likelihood = -(2.0 / HANN_BINS) * (np.log(model) + power / model).sum(axis=1)
     return likelihood, weights / scale[..., 0]
 
@@ -231,13 +234,13 @@ def _fit_spectrum(power: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np
 def _peak_shares(
     spectra: Sequence[Spectrum], centre_hz: float, heights: Sequence[float]
 ) -> tuple[float, float]:
-    """Return the ratio of residual force to acceleration at a peak, and the peak's power share."""
+    """Return the residual force over the acceleration at a peak, and the peak's share of power."""
     residual = measured = peak = total = 0.0
     for spectrum, height in zip(spectra, heights, strict=True):
-        near = np.abs(spectrum.frequency_hz - centre_hz) <= spectrum.width_hz
-        residual += float(spectrum.residual[near].sum())
-        measured += float(spectrum.measured[near].sum())
-        peak += float(np.minimum(height, spectrum.residual[near]).sum())
+        in_peak = np.abs(spectrum.frequency_hz - centre_hz) <= spectrum.width_hz
+        residual += float(spectrum.residual[in_peak].sum())
+        measured += float(spectrum.measured[in_peak].sum())
+        peak += float(np.minimum(height, spectrum.residual[in_peak]).sum())
         total += float(spectrum.residual.sum())
     return float(np.sqrt(residual / max(measured, 1e-12))), peak / max(total, 1e-12)
 
@@ -246,13 +249,13 @@ class Turbulence(NamedTuple):
     """Estimated random wind."""
 
     intensity: float
-    """Standard deviation of its speed [m/s]."""
+    """Standard deviation of the wind's speed [m/s]."""
     intensity_ci95: tuple[float, float]
     length: float
     """Length scale [m]."""
     length_ci95: tuple[float, float]
     ratio: float
-    """Log-likelihood ratio to no wind."""
+    """Logarithm of the likelihood ratio of this wind to no wind."""
 
     @property
     def effect(self) -> str:
@@ -273,7 +276,7 @@ def find_turbulence(
 ) -> Turbulence | None:
     """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
 
-    None also where no drag transmits a wind, or where another random force explains more.
+    None also without a drag that transmits it, with a better random force, or by outliers alone.
     """
     transmission = _wind_transmission(model, theta, disturbance.knot)
     if np.abs(transmission).max() < 1e-6:
@@ -300,7 +303,7 @@ def find_turbulence(
 
 
 def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:
-    """Return the accelerations per m/s of wind in the world at each knot, (W, 6 KNOTS, 3 KNOTS)."""
+    """Return the accelerations per m/s of wind along world axes, (W, 6 KNOTS, 3 KNOTS)."""
     given = model.given
     values = {n: v for n, v in model.space.effects(theta).items() if EFFECTS[n].by_state}
     steady_w = np.asarray(values[CONSTANT_WIND.name].velocity)
@@ -325,9 +328,9 @@ def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> n
 
 
 def _wind_root(knot: Flown, length_m: float) -> np.ndarray:
-    """Return a root (W, 3 KNOTS, 3 KNOTS) of the wind's covariance for an intensity of 1 m/s.
+    """Return a matrix root (W, 3 KNOTS, 3 KNOTS) of the covariance of a wind of intensity 1 m/s.
 
-    The correlation decays exponentially with the distance flown, over the length scale.
+    The correlation decays exponentially with the distance flown over the length scale `length_m`.
     """
     speed = np.maximum(np.sqrt((np.asarray(knot.track.vel_w) ** 2).sum(axis=-1)), 1.0)
     step = 0.5 * (speed[:, 1:] + speed[:, :-1]) / (KNOTS - 1) / length_m
@@ -349,7 +352,7 @@ def _diagonalised(
 
 
 def _likelihood(equations: DisturbanceEquations, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood ratio of disturbances root @ normal to none, for `sizes`."""
+    """Return log-likelihood ratios of disturbances size * root @ z (z normal) to none, by size."""
     information, gradient = _diagonalised(equations, root)
     information = np.maximum(information, 0.0)
     variance = sizes[:, None, None] ** 2
@@ -364,8 +367,8 @@ def _has_outliers(
     """Return whether the disturbance has heavier tails than a normal wind of this `size`.
 
     The fourth power of a normal variable of variance 1 has mean 3 and variance 96; the measured
-    mean may exceed 3 by `tail` standard errors. A force at some places or speeds only has a higher
-    one. Fewer than eight directions with information are not tested.
+    mean may exceed 3 by `tail` standard errors. A force that acts only at some places or speeds has
+    a higher mean. With fewer than eight directions that contain information the result is False.
     """
     information, gradient = _diagonalised(equations, root)
     informed = size**2 * information > 1.0
@@ -380,7 +383,7 @@ def _has_outliers(
 def _free_likelihood(equations: DisturbanceEquations) -> float:
     """Return the largest log-likelihood ratio of a random disturbance along the body axes.
 
-    Free are the logarithms of a size for each of the six axes and of one correlation time.
+    Fitted are the logarithms of a size for each of the six axes and of one correlation time.
     """
     time = np.linspace(0.0, 1.0, KNOTS)
 

@@ -1,13 +1,14 @@
 """Error of a model on held-out flights (the gap), and the size of an effect on these flights.
 
-The gap is the RMS error of one model on flights that took no part in any fit, and is compared with
-the error by measurement noise alone. Each source of evidence (`suite/diagnose/sources/`) computes
-its own: rollouts from the slow errors of simulated stretches of 1 s, force and torque from the
-errors of mean accelerations.
+The gap is the RMS error of a model on held-out flights, which took no part in any fit. It is
+compared with the error that measurement noise alone gives (the noise floor). Each kind of evidence
+(`suite/diagnose/sources/`) has its own gap. That of rollouts is computed from the slow errors of
+simulated stretches of 1 s, that of force or torque from the errors of mean accelerations.
 
-With little noise every difference is significant, also the model's numerical errors. So an effect
-is left out, however small its p-value, if the upper end of the 95 % interval of its size is below
-all thresholds of relevance (equivalence testing; Lakens 2017, doi 10.1177/1948550617697177).
+The size of an effect is how much it changes these flights. With little noise every difference is
+significant, even the model's numerical errors. So an effect is not named, however small its
+p-value, if the upper end of the 95 % interval of its size is below all thresholds of relevance
+(equivalence testing; Lakens 2017, doi 10.1177/1948550617697177).
 """
 
 from __future__ import annotations
@@ -27,30 +28,30 @@ def rms_length(vectors: np.ndarray) -> float:
 
 
 class Channel(NamedTuple):
-    """Error of one channel of a gap, as the position after 1 s."""
+    """Error of a model in one channel, such as the position after 1 s."""
 
     error: float
-    """RMS, in the channel's unit."""
+    """RMS error, in the channel's unit."""
     floor: float
-    """RMS by measurement noise alone."""
+    """RMS error that measurement noise alone gives, in the channel's unit."""
 
 
 class Gap(NamedTuple):
     """Errors of a model on W held-out stretches of flight."""
 
     score: np.ndarray
-    """(W,) mean squared error, in the unit of the floor."""
+    """(W,) mean squared error of each stretch, in the squared unit of `floor`."""
     energy: np.ndarray
-    """(W,) squared error by which models are compared. What belongs to one flight or stretch alone,
-    such as its trim or its start state, is subtracted."""
+    """(W,) squared error of each stretch, by which models are compared. Errors that belong to one
+    flight or stretch alone are subtracted: its trim (constant force or torque) or start state."""
     channels: Mapping[str, Mapping[str, Channel]]
-    """By group of channels (such as a horizon) and channel."""
+    """Error of each channel, by group (such as the time since the start) and channel."""
     floor: float = 1.0
-    """RMS by measurement noise alone."""
+    """RMS error that measurement noise alone gives."""
 
     @property
     def rms(self) -> float:
-        """Root of the mean score."""
+        """RMS error over all stretches: the root of the mean score."""
         return float(np.sqrt(self.score.mean()))
 
     def ci95(self, seed: int, limits: Thresholds = THRESHOLDS) -> tuple[float, float]:
@@ -65,13 +66,13 @@ class Gap(NamedTuple):
     def exceeds(self, before: Gap, weight: float, seed: int, limits: Thresholds) -> bool:
         """Return whether the energy is significantly larger than that of `before`.
 
-        Parameters that were fitted to other flights raise the squared error by about one each,
-        which does not contradict them: the rise has to be larger than that.
+        A parameter that was fitted to other flights raises the squared error by about one, even if
+        the model is right. So the rise has to be clearly larger than that.
 
         Args:
             before: gap of another model on the same stretches.
-            weight: share of a stretch that no other one overlaps, so that each row counts once.
-            seed: of the bootstrap.
+            weight: factor on sums over stretches, so that rows in overlapping ones count once.
+            seed: seed of the bootstrap.
             limits: least significant rise.
         """
         rise = self.energy - before.energy
@@ -80,36 +81,39 @@ class Gap(NamedTuple):
 
 
 def remaining_share(before: Gap, after: Gap) -> float:
-    """Return the share of the gap above the noise floor that remains, 0 to 1."""
+    """Return the share (0 to 1) of the gap `before` above the noise floor that remains `after`."""
     remaining = max(after.rms - after.floor, 0.0)
     return remaining / max(before.rms - before.floor, remaining, 1e-9)
 
 
 def _bootstrap_means(values: np.ndarray, seed: int, limits: Thresholds) -> np.ndarray:
-    """Return the means (D,) of draws of `values` (W,) in blocks of neighbouring stretches."""
+    """Return the means (D,) of D draws of `values` (W,), in blocks of neighbouring stretches.
+
+    Blocks keep the correlation between neighbours. `-(-a // b)` is a / b, rounded up.
+    """
     rng, block = np.random.default_rng(seed), limits.bootstrap_block
     blocks = max(1, -(-len(values) // block))
-    first = rng.integers(0, max(len(values) - block + 1, 1), (limits.bootstrap_draws, blocks))
-    rows = np.minimum(first[..., None] + np.arange(block), len(values) - 1)
+    block_start = rng.integers(0, max(len(values) - block + 1, 1), (limits.bootstrap_draws, blocks))
+    rows = np.minimum(block_start[..., None] + np.arange(block), len(values) - 1)
     return values[rows.reshape(limits.bootstrap_draws, -1)].mean(axis=1)
 
 
 FORCE_S, TORQUE_S = 0.5, 0.1
-"""Times over which an effect's mean linear and angular accelerations are computed [s]. The second
-is short, as the rate loop soon counteracts a rotation."""
+"""Times over which an effect's mean linear and angular accelerations are computed [s]. The time for
+the angular one is short, as the rate loop soon counteracts a rotation."""
 DRIFT_S = 1.0
-"""Time after which an effect's drift is measured [s]."""
+"""Time after which an effect's drift, the change of the position, is measured [s]."""
 
 
 class EffectSize(NamedTuple):
     """RMS over a set of flights of the accelerations and the drift that an effect causes."""
 
     force: float
-    """Linear acceleration [m/s^2]."""
+    """Change of the linear acceleration [m/s^2]."""
     torque: float
-    """Angular acceleration [rad/s^2]."""
+    """Change of the angular acceleration [rad/s^2]."""
     drift: float | None
-    """Distance after a second [m]; None where no rollout was flown."""
+    """Change of the position after a second [m]; None where no rollout was simulated."""
 
     def relevant(self, limits: Thresholds) -> bool:
         """Return whether the size reaches one of the thresholds of relevance."""
@@ -125,10 +129,10 @@ class EffectSize(NamedTuple):
 def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
     """Return the size of an effect that shifts the simulated values of `windows`.
 
-    A fault of the log has the size of the motion that would change the log as much.
+    A fault of the log gets the size of the motion that would change the logged values as much.
 
     Args:
-        shift: (W, N, 19) difference that the effect makes, by channel.
+        shift: (W, N, 19) change of the simulated values by the effect, by row and channel.
         windows: W stretches of 1 s.
     """
     row_s, valid = np.asarray(windows.row_s), np.asarray(windows.valid)
@@ -144,6 +148,7 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
         row = (stretch, last_row[stretch])
         return rms_length(shift[row][:, SLICES[group]] / row_s[row][:, None] ** power)
 
+    # The velocity grows with the acceleration times t, the position with half of it times t^2.
     force = growth("velocity", FORCE_S, 1) or 2.0 * growth("position", FORCE_S, 2)
     has_acc = valid[..., SLICES["accelerometer"]].all(axis=-1)
     if has_acc.any():
@@ -154,7 +159,7 @@ def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:
 def view_size(shift: np.ndarray, in_world: bool) -> EffectSize:
     """Return the size of an effect that shifts a view's mean accelerations by `shift` (M, 3).
 
-    A view is the force alone (`in_world`) or the torque alone.
+    A view is a part of the dynamics: here the force (with `in_world` true) or the torque.
     """
     rms = rms_length(shift)
     return EffectSize(rms, 0.0, None) if in_world else EffectSize(0.0, rms, None)
@@ -170,14 +175,14 @@ def upper_size(
 
     Args:
         slope: (..., K) derivative of the simulated values along the effect's K parameters.
-        change: (K,) fitted parameters less those of the vehicle file.
-        half_width: (K,) of the parameters' 95 % intervals.
-        size_of: size of an effect from the shift (...) of the simulated values.
+        change: (K,) fitted parameters minus those of the vehicle file.
+        half_width: (K,) half-widths of the parameters' 95 % intervals.
+        size_of: function that takes a shift (...) of the simulated values to its size.
     """
     size = size_of(slope @ change)
-    by_width = [size_of(slope[..., k] * width) for k, width in enumerate(half_width)]
+    widths = [size_of(slope[..., k] * width) for k, width in enumerate(half_width)]
     force, torque, drift = (
-        float(np.sqrt(sum((one[i] or 0.0) ** 2 for one in by_width))) for i in range(3)
+        float(np.sqrt(sum((one[i] or 0.0) ** 2 for one in widths))) for i in range(3)
     )
     total_drift = None if size.drift is None else size.drift + drift
     return EffectSize(size.force + force, size.torque + torque, total_drift)

@@ -1,10 +1,11 @@
 """Tests rollout residuals for structure: a force or torque that depends on the state.
 
-Whatever the model lacks is represented by a disturbance: an additional force and torque, piecewise
-linear in time between the knots (support points) of every 1 s window. Two tests need no effect of
-the catalogue. The first fits shapes, which are simple functions of the state such as the square of
-the speed, and tests whether one lowers the error on left-out windows. The second tests whether the
-disturbance has more energy than noise gives (a score test of a smooth random disturbance).
+A residual is the error that remains after a fit. What the model lacks is represented by a
+disturbance: an additional force and torque, piecewise linear in time between the knots (support
+points) of every 1 s window. Both tests work without the catalogue of effects. The first one fits
+shapes, which are simple functions of the state such as the square of the speed, and tests whether a
+shape lowers the error on left-out windows. The second one tests whether the disturbance has more
+energy than noise gives (a score test of a smooth random disturbance).
 """
 
 from __future__ import annotations
@@ -27,15 +28,19 @@ AXES = ("force x", "force y", "force z", "torque x", "torque y", "torque z")
 
 
 class DisturbanceEquations(NamedTuple):
-    """Normal equations of a disturbance at the knots of W windows."""
+    """Normal equations of a disturbance at the knots of W windows.
+
+    J is the derivative of the whitened residuals r by three forces and three torques at each knot.
+    """
 
     hessian: np.ndarray
-    """(W, 6 KNOTS, 6 KNOTS)."""
+    """(W, 6 KNOTS, 6 KNOTS) J'J, the information on the disturbance."""
     gradient: np.ndarray
-    """(W, 6 KNOTS)."""
+    """(W, 6 KNOTS) J'r."""
     knot: Flown
     """(W, KNOTS, ...) simulated state at the knots."""
     shapes: ShapeLibrary
+    """The shapes that are fitted."""
 
 
 class ShapeScore(NamedTuple):
@@ -50,9 +55,9 @@ class ResidualStructure(NamedTuple):
     """Results of both tests."""
 
     shapes: list[ShapeScore]
-    """All shapes, the best first."""
+    """Scores of all shapes, the best first."""
     coloured: dict[str, float]
-    """By axis: p-value of a smooth random disturbance along it."""
+    """p-value of a smooth (autocorrelated) random disturbance along each of `AXES`, by axis."""
 
 
 def disturbance_equations(
@@ -65,11 +70,11 @@ def disturbance_equations(
     """Return the normal equations of a disturbance that would explain the residual at `estimate`.
 
     Args:
-        model: the rollout.
+        model: the model that simulates the windows.
         windows: W stretches of 1 s.
-        whitening: by the noise of these windows.
+        whitening: scales residuals by the noise of these windows.
         estimate: parameters and start states.
-        limits: size of the shapes.
+        limits: numbers of pieces and cells of the shapes.
     """
     response = model.respond(estimate.theta, estimate.free, windows)
     linear = model.linearise(estimate.theta, estimate.free, windows, [])
@@ -85,14 +90,15 @@ def residual_structure(
     seed: int = 0,
     limits: Thresholds = THRESHOLDS,
 ) -> ResidualStructure:
-    """Return the structure in the residual.
+    """Test the residual for structure, by both tests.
 
     Args:
-        equations: of the disturbance.
-        fold: (W,) cross-validation fold of each window; a fold is left out at a time.
-        seed: of the permutation test.
-        limits: draws and thresholds.
+        equations: normal equations of the disturbance.
+        fold: (W,) cross-validation fold of each window; one fold is left out at a time.
+        seed: seed of the permutation test.
+        limits: number of draws, and thresholds.
     """
+    # From forces and torques at the knots to coefficients of the shapes.
     along, groups = equations.shapes.unit, equations.shapes.groups
     transposed = np.swapaxes(along, 1, 2)
     hessian = transposed @ equations.hessian @ along
@@ -117,12 +123,12 @@ def residual_structure(
 def _energy_p_value(equations: DisturbanceEquations, axis: int, limits: Thresholds) -> float:
     """Return the p-value of a random disturbance along `axis`, over several correlation times.
 
-    For one correlation time, the eigenvectors of the information are directions in which the
-    disturbance is uncorrelated before and after the data. The squared gradient along each, over its
-    information l, is weighted as in the likelihood of a disturbance of size s, by
-    s^2 l / (1 + s^2 l): a small s weights slow directions, a large one all. The weighted sum is
-    approximately gamma distributed (Satterthwaite 1946). The smallest p-value is multiplied by the
-    number of tests (Bonferroni).
+    For one correlation time, the eigenvectors of the information are independent directions of the
+    disturbance. Along each direction, the squared gradient over the information l measures the
+    energy. It is weighted by s^2 l / (1 + s^2 l), as in the likelihood of a disturbance of size s.
+    With a small s, directions with much information (slow changes) count most; with a large s, all
+    directions count. The weighted sum is approximately gamma distributed (Satterthwaite 1946). The
+    smallest p-value is multiplied by the number of tests (Bonferroni).
     """
     entries = np.arange(KNOTS) * 6 + axis
     hessian = equations.hessian[:, entries][:, :, entries]
@@ -149,17 +155,19 @@ class ShapeGroup(NamedTuple):
     """One shape along several axes, as columns of `ShapeLibrary.unit`."""
 
     label: str
-    """For people, as "force with the speed"."""
+    """Name of the shape for people, such as "force with the speed"."""
     columns: tuple[int, ...]
+    """Numbers of its columns."""
 
 
 class ShapeLibrary(NamedTuple):
     """All shapes at the knots of W windows."""
 
     unit: np.ndarray
-    """(W, KNOTS * 6, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes, for a
-    coefficient of 1 of each of J columns."""
+    """(W, KNOTS * 6, J) linear [m/s^2] and angular [rad/s^2] acceleration in body axes that each of
+    J columns gives with a coefficient of 1."""
     groups: tuple[ShapeGroup, ...]
+    """The shapes, as groups of columns."""
 
 
 def shape_library(
@@ -169,7 +177,7 @@ def shape_library(
 
     Args:
         knot: (W, KNOTS, ...) simulated states.
-        start_s: (W,) start of each window, since the start of its flight [s].
+        start_s: (W,) start of each window, from the start of its flight [s].
         limits: number of pieces and cells.
     """
     pos_w, rot_w, vel_w, rate_b = (np.asarray(field) for field in knot.track)
@@ -180,6 +188,7 @@ def shape_library(
     speed = np.sqrt((vel_w**2).sum(axis=-1))
     yaw = np.arctan2(rot_w[..., 1, 0], rot_w[..., 0, 0])
     time = start_s[:, None] + np.linspace(0.0, 1.0, KNOTS)
+    # Keys must differ: two have a trailing space, which their labels below do not.
     scalars = {
         "nothing: it is constant": np.ones_like(speed),
         "the time in flight": time,
@@ -210,20 +219,23 @@ def shape_library(
         groups.append(ShapeGroup(label, tuple(range(len(columns), len(columns) + len(shapes)))))
         columns.extend(shapes)
 
-    six = np.eye(6)
+    # Each scalar times a force along each body axis, and times a torque about each body axis.
+    unit_axes = np.eye(6)
     for label, scalar in scalars.items():
-        along = scalar[..., None, None] * six
+        along = scalar[..., None, None] * unit_axes
         add(f"force with {label.rstrip()}", [along[..., i, :] for i in range(3)])
         add(f"torque with {label.rstrip()}", [along[..., i, :] for i in range(3, 6)])
+    # A drag whose dependence on the speed is free.
     motion = [hat[..., None] * vel_b for hat in _hats(speed, limits.pieces)]
     add("force with the motion, by its speed", [
-        along_b[..., i, None] * six[i] for along_b in motion for i in range(3)
+        along_b[..., i, None] * unit_axes[i] for along_b in motion for i in range(3)
     ])  # fmt: skip
     for label, scalar in (("thrust", thrust), ("climb", vel_w[..., 2]), ("height", pos_w[..., 2])):
         add(
             f"force along body z, by the {label}",
-            [h[..., None] * six[2] for h in _hats(scalar, limits.pieces)],
+            [h[..., None] * unit_axes[2] for h in _hats(scalar, limits.pieces)],
         )
+    # Forces along world axes, everywhere or near a place.
     world = np.concatenate([axes_b, np.zeros_like(axes_b)], axis=-2)
     add("force along fixed directions", [world[..., i] for i in range(3)])
     add("force with the place", [
@@ -237,11 +249,14 @@ def shape_library(
 
 
 def _hats(scalar: np.ndarray, pieces: int) -> list[np.ndarray]:
-    """Return hat functions over quantiles of `scalar` (W, KNOTS), each (W, KNOTS)."""
-    places = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
-    if len(places) < 2:
+    """Return hat functions (piecewise linear bumps) of `scalar` (W, KNOTS), each (W, KNOTS).
+
+    They stand on quantiles of the scalar.
+    """
+    corners = np.unique(np.quantile(scalar, np.linspace(0.0, 1.0, pieces + 1)))
+    if len(corners) < 2:
         return [np.ones_like(scalar)]
-    return [np.interp(scalar, places, one) for one in np.eye(len(places))]
+    return [np.interp(scalar, corners, heights) for heights in np.eye(len(corners))]
 
 
 def _bumps(pos_w: np.ndarray, cells: int) -> list[np.ndarray]:
