@@ -1,9 +1,10 @@
 """The sensor model `delay` in the judge: the policy observes states and images of an earlier time.
 
-A view (the observable state, with the depth image) is taken between decisions, at the physics step
-that precedes its decision by the age, and stored until then. With jitter, each decision has its own
-random age from the trial's seed. At the start of a trial, before any view is old enough, the policy
-gets the first view. A slot is a place in the simulator, in which one trial (flight) is flown.
+A view is the observable state with the depth image; its age is the delay after which the policy
+uses it. A view is taken at the physics step that precedes its decision by the age, and is stored
+until the decision. With jitter, each decision has its own random age from the trial's seed. At the
+start of a trial, before any view is old enough, the policy gets the first view. A slot is a place
+in the simulator, in which one trial (flight) is flown.
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ from tracks.common.masks import select
 
 
 class Due(NamedTuple):
-    """Views to take before the next decision, for one later decision."""
+    """Views that must be taken before the next decision, all for the same later decision."""
 
     pause: np.ndarray
-    """(N,) physics steps between the last decision and the view."""
+    """(N,) number of physics steps from the last decision to the view."""
     rows: np.ndarray
-    """(N,) bool: slots with such a view."""
+    """(N,) bool, slots in which such a view must be taken."""
     place: int
-    """Index among the stored views."""
+    """Index of the view among the stored views."""
 
 
 class Moment(NamedTuple):
     """A time between two decisions at which views are taken."""
 
     pause: np.ndarray
-    """(N,) physics steps after the last decision, at least those of the previous moment."""
+    """(N,) number of physics steps after the last decision, not below that of an earlier moment."""
     images: np.ndarray
-    """(N,) bool: slots whose image is needed."""
+    """(N,) bool, slots whose image is needed."""
     taken: list[tuple[Aged, Due]]
-    """Where to store the view; `Due.rows` are the slots that have this time."""
+    """Storages of the view; `Due.rows` are the slots whose view is taken at this time."""
 
 
 class Aged:
@@ -54,15 +55,15 @@ class Aged:
         Args:
             age_s: mean age [s].
             jitter: ages are uniformly distributed between (1 - jitter) and (1 + jitter) times the
-                mean [1].
+                mean.
             slots: number of slots.
-            period_steps: physics steps between decisions.
+            period_steps: number of physics steps between decisions.
             dt: length of a physics step [s].
         """
         self._mean, self._jitter, self._period = age_s / dt, jitter, period_steps
         longest = self._mean * (1.0 + jitter)
         self.ahead = math.ceil(longest / period_steps - 1e-9)
-        """Largest number of decisions between taking a view and using it."""
+        """Largest number of decisions from taking a view to using it."""
         self._rngs = [np.random.default_rng(0)] * slots
         self._ages = np.full((self.ahead, slots), self._mean)
         self._stored: list[View] = []
@@ -76,7 +77,7 @@ class Aged:
 
         Args:
             now: the view without delay.
-            fresh: (N,) bool, slots whose trial begins: they get `now`.
+            fresh: (N,) bool, slots whose trial begins; they get `now`.
             flying: (N,) bool, slots in flight.
         """
         if not self.ahead:
@@ -98,6 +99,8 @@ class Aged:
 
     def due(self) -> Iterator[Due]:
         """Yield the views to take before the next decision."""
+        # A view belongs to this period between decisions if its age, rounded up to periods, is the
+        # number of periods until its decision.
         periods = np.maximum(np.ceil(self._ages / self._period - 1e-9), 1)
         for place, ages in enumerate(self._ages):
             rows = periods[place] == place + 1

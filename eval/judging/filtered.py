@@ -37,7 +37,7 @@ from tracks.geometry.rotation import exp_rot, to_local, to_world
 from tracks.geometry.scene import Gates
 
 NEAR_M = 0.2
-"""Corners nearer than this are not detected [m]."""
+"""Gate corners nearer to the camera than this are not detected [m]."""
 
 
 class Pending(NamedTuple):
@@ -48,7 +48,7 @@ class Pending(NamedTuple):
     seen: np.ndarray
     """(N, K) bool, whether a corner was detected."""
     due: np.ndarray
-    """(N,) physics step at which it reaches the filter; -1 for none."""
+    """(N,) number of the physics step at which the frame reaches the filter; -1 for no frame."""
 
 
 class Filtered:
@@ -133,20 +133,20 @@ class Filtered:
             fresh: (N,) bool, slots whose trial starts now.
             flying: (N,) bool, slots in flight.
         """
-        new = fresh & flying
-        if new.any():
-            self._begin(truth, new)
-            self._detect(new)
+        starting = fresh & flying
+        if starting.any():
+            self._begin(truth, starting)
+            self._detect(starting)
         assert self.filters is not None
         state = current_state(self.filters)
         estimate = View(state.pos_w, state.rot_w, state.vel_w, *view[3:])
         return select(flying, estimate, view)
 
-    def _begin(self, truth: View, new: np.ndarray) -> None:
-        """Start the filters and the IMU's state in the slots `new`."""
+    def _begin(self, truth: View, starting: np.ndarray) -> None:
+        """Start the filters and the IMU's state in the slots `starting`."""
         truth = truth._replace(depth_m=None, gate_number=None)
-        pose = View(*truth[:3], *(np.zeros(len(new)),) * 4)
-        self._truth = pose if self._truth is None else select(new, pose, self._truth)
+        pose = View(*truth[:3], *(np.zeros(len(starting)),) * 4)
+        self._truth = pose if self._truth is None else select(starting, pose, self._truth)
         error, sigma = self._error, self._settings.start_sigma
         # Truth = estimate + error; the attitude error is in the body axes of the estimate.
         initial = start(
@@ -156,7 +156,7 @@ class Filtered:
             sigma,
         )
         started = start_delayed(initial, self._delay_steps)
-        filters = started if self.filters is None else select(new, started, self.filters)
+        filters = started if self.filters is None else select(starting, started, self.filters)
         self.filters = make_contiguous(filters)
         memory = {
             name: start_of(values, Moment(truth, self._trial[name], self._dt, self._camera))
@@ -164,7 +164,7 @@ class Filtered:
             else ()
             for name, values in self._imu.items()
         }
-        self._memory = memory if self._memory is None else select(new, memory, self._memory)
+        self._memory = memory if self._memory is None else select(starting, memory, self._memory)
 
     def follow(self, view: View, flew: np.ndarray) -> None:
         """Advance the filters by one physics step.
@@ -174,9 +174,9 @@ class Filtered:
             flew: (N,) bool, slots that made the step.
         """
         assert self._truth is not None and self.filters is not None and self._memory is not None
-        before, dt = self._truth, np.full(len(flew), self._dt)
+        truth_before, dt = self._truth, np.full(len(flew), self._dt)
         with np.errstate(invalid="ignore", over="ignore"):  # values in empty slots are undefined
-            sample = inertial(before, view, self._dt)
+            sample = inertial(truth_before, view, self._dt)
             for name, values in self._imu.items():
                 measure = SENSORS[name].measure
                 assert measure is not None
@@ -187,8 +187,8 @@ class Filtered:
                 self._memory[name] = select(flew, memory, self._memory[name])
             imu = sample.rate_b, sample.acc_b, dt, flew
             self.filters = make_contiguous(step(self.filters, *imu, self._settings.imu))
-        now = View(view.pos_w, view.rot_w, view.vel_w, *before[3:])
-        self._truth = select(flew, now, before)
+        truth_now = View(view.pos_w, view.rot_w, view.vel_w, *truth_before[3:])
+        self._truth = select(flew, truth_now, truth_before)
         self._steps += flew
         self._arrive(flew)
         self._detect(flew & (self._steps == np.rint(self._frame * self._period)))
@@ -211,7 +211,7 @@ class Filtered:
         share, length_s = np.asarray(settings.dropout), np.asarray(settings.dropout_s)
         lost = markov_step(self._lost[rows], chance, share, length_s, 1.0 / settings.frame_hz)
         self._lost[rows] = lost
-        # Frames are stored in turn in the entries of `_pending`.
+        # Frames are stored in turn in the entries of `_pending`, a ring buffer.
         entry = self._frame[rows] % len(self._pending)
         for number in np.unique(entry).tolist():
             chosen = entry == number
@@ -247,22 +247,26 @@ def _with_rows(array: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarr
 
 
 def single_steps(steps: np.ndarray) -> list[np.ndarray]:
-    """Split numbers of steps (N,) into single steps: 1 in slots with remaining steps, else 0."""
+    """Split numbers of steps (N,) into a list of single steps.
+
+    Each entry (N,) is 1 in slots that have steps left, else 0.
+    """
     return [(steps > done).astype(int) for done in range(int(steps.max(initial=0)))]
 
 
 def corners_of(gates: Gates) -> np.ndarray:
-    """Return the corners (K, 3) of all gate openings in the world, each once [m]."""
+    """Return the corners (K, 3) of all gate openings in world axes, without repetitions [m]."""
     opening = np.asarray(gates.opening_g)
     corner_g = np.concatenate([np.zeros((*opening.shape[:2], 1)), opening], axis=-1)
     corner_w = gates.center_w[:, None] + to_world(gates.rot_w[:, None], corner_g)
+    # An opening with fewer corners than others is padded by repeating its last corner.
     repeated = np.zeros(opening.shape[:2], bool)
     repeated[:, 1:] = (opening[:, 1:] == opening[:, :-1]).all(-1)
     return corner_w[~repeated]
 
 
 def inertial(before: View, after: View, dt: float) -> Inertial:
-    """Return the measurements of an ideal IMU, means over a step, in body axes at its middle."""
+    """Return the measurements of an ideal IMU: means over a step, in body axes at mid-step."""
     # The axis of the rotation times the sine of its angle, and from it the rotation vector.
     sine_b = rotation_since(after.rot_w, before.rot_w)
     sine = np.sqrt((sine_b**2).sum(-1))[..., None]

@@ -22,51 +22,54 @@ class ActionLimits:
     """Limits of a policy's actions."""
 
     size: float = 50.0
-    """Largest norm of an acceleration [m/s^2]; larger ones are scaled down to it. It exceeds the
-    net acceleration of a thrust-to-weight ratio of 5, so that it affects only faulty outputs."""
+    """Largest norm of an acceleration [m/s^2]; larger ones are scaled down to it. It exceeds what a
+    thrust of five times the weight can give, so that it affects only faulty outputs."""
     deadline_s: float | None = None
     """Time limit for the policy's output [s]; a late output is not flown, and its trials end by
     timeout. None: no limit. With a limit, outcomes depend on the machine's load."""
     action: ActionSpec = field(default_factory=ActionSpec)
     """The policy's kind of action."""
     low: tuple[float, ...] = ()
-    """Smallest value of each component in SI units; () for accelerations."""
+    """Smallest value of each component of other actions, in SI units; () for accelerations."""
     high: tuple[float, ...] = ()
-    """Largest value of each component."""
+    """Largest value of each component of other actions, in SI units; () for accelerations."""
 
 
 def limits_of(limits: ActionLimits, action: ActionSpec, vehicle: Vehicle) -> ActionLimits:
-    """Return `limits` with those of a kind of action, which come from the vehicle file."""
+    """Return `limits` with `low` and `high` for a kind of action, from the vehicle file."""
     low, high = (), ()
     if action.kind == "ctbr":
         rate = vehicle.controller.rate_max
-        low, high = (0.0, *(-most for most in rate)), (vehicle.full_thrust, *rate)
+        low, high = (0.0, *(-largest for largest in rate)), (vehicle.full_thrust, *rate)
     elif action.kind == "motors":
         low, high = (0.0,) * 4, (1.0,) * 4
     return replace(limits, action=action, low=low, high=high)
 
 
 def first_action(action: ActionSpec, vehicle: Vehicle) -> np.ndarray:
-    """Return the action of a hover (size,) in SI units, the "last action" when a trial starts."""
+    """Return the action of a hover (size,) in SI units.
+
+    When a trial starts, the policy gets it as its last action.
+    """
     if action.kind == "acceleration":
         return np.zeros(3)
     if action.kind == "ctbr":
         return np.array([GRAVITY, 0.0, 0.0, 0.0])
-    share = np.full(4, GRAVITY / vehicle.full_thrust)
-    return np.sqrt(share) if action.motors == "speed" else share
+    thrust_share = np.full(4, GRAVITY / vehicle.full_thrust)
+    return np.sqrt(thrust_share) if action.motors == "speed" else thrust_share
 
 
 class Guarded(NamedTuple):
     """Checked actions, and their faults."""
 
     action_b: np.ndarray
-    """(N, size) float64, in SI units."""
+    """(N, size) actions to fly, in SI units, float64."""
     bad: np.ndarray
-    """(N,) whether it was not finite, and is replaced by the last valid action."""
+    """(N,) bool, whether the action was not finite and is replaced by the last flown action."""
     limited: np.ndarray
-    """(N,) whether it was scaled down to the limit, or a component was clipped."""
+    """(N,) bool, whether the action was scaled down to the limit, or a component was clipped."""
     late: np.ndarray
-    """(N,) whether it was late or missing, and is replaced by the last valid action."""
+    """(N,) bool, whether the action was late or missing and is replaced by the last flown one."""
     largest: np.ndarray
     """(N,) largest absolute component of the policy's raw output; NaN if bad."""
 
@@ -92,7 +95,7 @@ def call_policy(
         state: (N, spec.state_size) state observations.
         image: (N, height, width) encoded depth images.
         fresh: (N,) bool, rows in which a new trial starts.
-        last_b: (N, size) last flown actions in SI units, at the start those of `first_action`.
+        last_b: (N, size) last flown actions in SI units; at the start, `first_action`.
 
     Raises:
         ValueError: where the output is not an array of actions.
@@ -115,8 +118,8 @@ def guard_action(
     Args:
         limits: limits of the actions.
         action_b: the policy's output, which should be (N, size) real numbers.
-        last_b: (N, size) last flown actions in SI units, at the start those of `first_action`.
-        took_s: time that the policy took [s].
+        last_b: (N, size) last flown actions in SI units; at the start, `first_action`.
+        took_s: computing time of the policy [s].
         policy: name of the policy, for messages.
 
     Raises:

@@ -1,9 +1,9 @@
 """The judge: it flies many trials (flights) of one policy in one simulator, and scores them.
 
-On one machine, a trial's outcome depends on (track, difficulty, seed) only, to the bit. To this
-end, policies are always called with the same number of rows, every row is computed separately, and
-trials share no random numbers. Trials are flown in slots, places of the simulator; a slot takes the
-next trial when its trial has ended.
+On one machine, a trial's outcome depends on (track, difficulty, seed) only, to the bit. So policies
+are always called with the same number of rows, every row is computed separately, and trials share
+no random numbers. Trials are flown in slots, places in the simulator for one trial at a time. A
+slot takes the next trial when its trial has ended.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from tracks.families import check_family
 from tracks.track import Track
 
 COMPILED_SLOTS = 64
-"""Simulators that compile a program for their number of slots use multiples of this."""
+"""Numbers of slots are multiples of this in simulators that compile a program for each number."""
 MOST_A_PIECE = 640
-"""Most trials of a piece, which one process flies at a time."""
+"""Largest number of trials of a piece: the trials that one process flies at a time."""
 Trial = TypeVar("Trial")
 OnResult = Callable[[TrialResult, Flight | None], None]
-"""A function that is called when a trial ends, in any order, with its flight if recorded."""
+"""A function that is called at the end of each trial, in any order, with the flight if recorded."""
 Numbered = tuple[int, TrialSpec]
-"""A trial and its index in the request."""
+"""Index of a trial in the argument `trials` of `fly`, and the trial."""
 Ended = tuple[int, TrialResult, Flight | None]
 """The index of a trial, its result, and its flight if recorded."""
 
@@ -87,7 +87,7 @@ class JudgeOptions:
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of a process that flies a share of the trials; the fields are those of `fly`."""
+    """Arguments of a process that flies a share of the trials, as in `fly`."""
 
     policy: Any
     vehicle: Vehicle
@@ -109,11 +109,11 @@ def fly(
 ) -> list[TrialResult]:
     """Fly every trial and return the results in the order of `trials`.
 
-    An interrupt ends it at once; results that were passed to `on_result` before are final.
+    An interrupt ends this function at once; results already passed to `on_result` are final.
 
     Args:
-        policy: the policy, or a function without arguments that returns it; several processes need
-            one that can be pickled, such as `functools.partial(load_policy, name)`.
+        policy: the policy, or a function without arguments that returns it. For several processes
+            it must be picklable, such as `functools.partial(load_policy, name)`.
         trials: the trials to fly.
         vehicle: the vehicle that flies.
         world: name of the simulator, in `eval.worlds.WORLDS`.
@@ -146,10 +146,10 @@ def fly(
             on_result(result, flight)
 
     workers = _workers(task, len(trials))
-    most = len(trials) if compiles(world) else MOST_A_PIECE
+    most_a_piece = len(trials) if compiles(world) else MOST_A_PIECE
     count = worker_count(workers)
     groups = ([(index, trials[index]) for index in group] for group in slot_groups(trials, tracks))
-    shares = [share for group in groups for share in pieces_of(group, count, most)]
+    shares = [share for group in groups for share in pieces_of(group, count, most_a_piece)]
     run_pieces(partial(fly_share, task), shares, workers, keep)
     return [results[index] for index in range(len(trials))]
 
@@ -165,9 +165,10 @@ def check_records(world: str) -> None:
 def pieces_of(
     trials: Sequence[Trial], processes: int, most: int = MOST_A_PIECE
 ) -> list[Sequence[Trial]]:
-    """Divide trials into pieces of at most `most`, an equal number for each process.
+    """Divide trials into pieces of at most `most` trials, with equally many pieces a process.
 
-    Small pieces lose little when a process dies, but some slots are empty at the end of each.
+    Small pieces lose little when a process dies, but at the end of each piece some slots are empty.
+    One process gets all trials in one piece.
     """
     if processes == 1:
         return [trials] if trials else []
@@ -218,7 +219,7 @@ def fly_share(task: Task, share: Sequence[Numbered]) -> Iterator[Ended]:
 
 
 def _check_rate(policy: Policy, vehicle: Vehicle, dt: float) -> None:
-    """Refuse a policy that decides faster than the physics step by `dt` [s]."""
+    """Refuse a policy that decides more often than every physics step of `dt` [s]."""
     rate = policy.spec.rate_hz
     if not 0 < rate <= 1 / dt * (1 + 1e-9):
         raise ValueError(
@@ -244,27 +245,27 @@ class _Slots:
         self._limits = limits_of(task.options.limits, action, task.vehicle)
         self._first = first_action(action, task.vehicle)
         self._steps_a_decision = 1 / (rate * world.dt)
-        n = world.slots
-        self._index = np.full(n, -1)
-        self._trial: list[TrialSpec | None] = [None] * n
-        self._decision = np.zeros(n)
-        self._action_b = np.tile(self._first, (n, 1))
-        self._outputs = Outputs(n, action)
-        self._faults = np.zeros((n, 3), int)
-        self._late = np.zeros(n, bool)
-        self._fresh = np.ones(n, bool)
-        self._hidden = policy.start(n)
-        self._recorder = Recorder(n, task.record.depth, self._first) if task.record else None
+        slots = world.slots
+        self._index = np.full(slots, -1)
+        self._trial: list[TrialSpec | None] = [None] * slots
+        self._decision = np.zeros(slots)
+        self._action_b = np.tile(self._first, (slots, 1))
+        self._outputs = Outputs(slots, action)
+        self._faults = np.zeros((slots, 3), int)
+        self._late = np.zeros(slots, bool)
+        self._fresh = np.ones(slots, bool)
+        self._hidden = policy.start(slots)
+        self._recorder = Recorder(slots, task.record.depth, self._first) if task.record else None
         sensors, self._sensors, self._delays = task.options.sensors, None, None
         self._filtered = None
         if sensors.estimator:
             layout = layout_of(task.tracks.values())
             corners = layout.gates * layout.corners
-            self._filtered = Filtered(sensors, n, world.dt, policy.spec.camera, corners)
+            self._filtered = Filtered(sensors, slots, world.dt, policy.spec.camera, corners)
         if view_models(sensors.models):
-            self._sensors = Sensors(sensors, n, rate, policy.spec.camera)
+            self._sensors = Sensors(sensors, slots, rate, policy.spec.camera)
         if sensors.has_delay:
-            self._delays = Delays(sensors.ages, n, self._steps_a_decision, world.dt)
+            self._delays = Delays(sensors.ages, slots, self._steps_a_decision, world.dt)
 
     def run(self, share: Sequence[Numbered]) -> Iterator[Ended]:
         """Fly the numbered trials; a slot takes the next one when its trial has ended."""

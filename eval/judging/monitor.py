@@ -1,10 +1,10 @@
 """A safety monitor around any policy: limits of tilt and speed, and evasive manoeuvres.
 
 It uses the policy's observation only. The limits change an action; a manoeuvre replaces it, but
-only when necessary. The manoeuvres are: stop, climb, left, right, back and up. The path of each is
-predicted for a start now and for a start one decision later, and compared with the points of the
-depth image. While a manoeuvre is still possible one decision later, the policy's action is flown.
-The judge and real-time flights (`suite fly`) use the same monitor.
+only when necessary. The five manoeuvres are: stop, climb, left, right, and back with climb. The
+path of each is predicted for a start now and for a start one decision later, and compared with the
+points of the depth image. While a manoeuvre is still possible one decision later, the policy's
+action is flown. The judge and real-time flights (`suite fly`) use the same monitor.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from tracks.geometry.camera import Camera, pixel_rays_b
 from tracks.input.ranges import Range
 
 SAMPLES = 24
-"""Points of a predicted path, which are 13 cm apart at 5 m/s."""
+"""Number of points of a predicted path, which are 13 cm apart at 5 m/s."""
 FIRST_S = 0.025
-"""Time of the first point [s]."""
+"""Time of the first point of a predicted path [s]."""
 HIT_SHARE = 0.99
 """Depths below this share of the camera's range count as an object."""
 LIFT_LEAST = 1.0
-"""Least vertical specific force from which the largest horizontal one is computed [m/s^2]."""
+"""Vertical specific forces below this count as this, when the largest horizontal one is computed
+[m/s^2]."""
 STOP_SPEED = 0.5
-"""Speed below which the manoeuvre to stop becomes weaker [m/s]."""
+"""Speed below which the deceleration of the manoeuvre "stop" becomes weaker [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Seen(NamedTuple):
     points_b: np.ndarray
     """(N, P, 3) points of the depth image, body axes [m]."""
     hit: np.ndarray
-    """(N, P) whether the pixel shows an object within range."""
+    """(N, P) bool, whether the pixel shows an object within the camera's range."""
 
 
 @dataclass
@@ -87,7 +88,7 @@ class Monitored:
 
     @property
     def name(self) -> str:
-        """Name in tables."""
+        """Name of the monitored policy in tables."""
         return f"{self.policy.name}+monitor"
 
     @property
@@ -136,14 +137,14 @@ def limited(limits: MonitorLimits, action_b: np.ndarray, seen: Seen) -> np.ndarr
     force_b = action_b + GRAVITY * seen.up_b
     lift = (force_b * seen.up_b).sum(-1, keepdims=True)
     horizontal_b = force_b - lift * seen.up_b
-    most = np.tan(np.radians(limits.tilt_deg)) * np.maximum(lift, LIFT_LEAST)
+    largest_horizontal = np.tan(np.radians(limits.tilt_deg)) * np.maximum(lift, LIFT_LEAST)
     size = np.linalg.norm(horizontal_b, axis=-1, keepdims=True)
-    horizontal_b *= np.minimum(1.0, most / np.maximum(size, 1e-6))
+    horizontal_b *= np.minimum(1.0, largest_horizontal / np.maximum(size, 1e-6))
     return lift * seen.up_b + horizontal_b - GRAVITY * seen.up_b
 
 
 def ways_out(limits: MonitorLimits, seen: Seen) -> np.ndarray:
-    """Return the actions (K, N, 3) of the K manoeuvres: stop, climb, left, right, back and up."""
+    """Return the actions (5, N, 3) [m/s^2]: stop, climb, left, right, and back with climb."""
     speed = np.linalg.norm(seen.vel_b, axis=-1, keepdims=True)
     back = -seen.vel_b / np.maximum(speed, STOP_SPEED)
     left = np.cross(seen.up_b, -back)
@@ -168,17 +169,19 @@ def last_moment(
     rows = np.flatnonzero(policy_clearance < limits.clearance_m)
     if not len(rows):
         return action_b, replaced
-    part, policy_b = Seen(*(x[rows] for x in seen)), action_b[rows]
-    ways = ways_out(limits, part)
-    later = np.stack([clearance(limits, part, policy_b, way, times, period_s) for way in ways])
-    now = np.stack([clearance(limits, part, way, None, times, period_s) for way in ways])
+    seen_blocked, policy_b = Seen(*(x[rows] for x in seen)), action_b[rows]
+    ways = ways_out(limits, seen_blocked)
+    later = np.stack(
+        [clearance(limits, seen_blocked, policy_b, way, times, period_s) for way in ways]
+    )
+    now = np.stack([clearance(limits, seen_blocked, way, None, times, period_s) for way in ways])
     best = now.argmax(0)
-    index = np.arange(len(rows))
+    columns = np.arange(len(rows))
     blocked_later = (later < limits.clearance_m).all(0)
-    is_better = now[best, index] > np.maximum(policy_clearance[rows], later.max(0))
+    is_better = now[best, columns] > np.maximum(policy_clearance[rows], later.max(0))
     chosen = blocked_later & is_better
     flown_b = action_b.copy()
-    flown_b[rows[chosen]] = ways[best, index][chosen]
+    flown_b[rows[chosen]] = ways[best, columns][chosen]
     replaced[rows[chosen]] = True
     return flown_b, replaced
 
@@ -194,10 +197,10 @@ def clearance(
     """Return the least distance (N,) of a path from the points of the image [m].
 
     Args:
-        limits: gives the lag, for which the last action still acts.
+        limits: its `lag_s` is used, for which the last action still acts.
         seen: observations of N rows.
         first_b: (N, 3) the action from now on [m/s^2].
-        then_b: (N, 3) the action after one period; None: the same.
+        then_b: (N, 3) the action after one period [m/s^2]; None: `first_b` continues.
         times: (T,) times of the path's points [s].
         period_s: time between decisions [s].
     """
@@ -219,5 +222,5 @@ def clearance(
 
 
 def _displacement(action_b: np.ndarray, times: np.ndarray, since_s: float) -> np.ndarray:
-    """Return the displacement (N, T, 3) by an acceleration since `since_s` [m]."""
+    """Return the displacement (N, T, 3) [m] by an acceleration (N, 3) that begins at `since_s`."""
     return 0.5 * action_b[:, None] * np.maximum(times - since_s, 0.0)[:, None] ** 2

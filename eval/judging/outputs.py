@@ -21,15 +21,15 @@ from policies.spec import ActionSpec, Note, PolicySpec
 LIMITED_MOST = 0.05
 """Share of limited actions above which there is a warning."""
 UNIT = 1.0 + 1e-6
-"""Largest output of a policy whose action space is -1 to 1."""
+"""Outputs up to this size are probably those of an action space from -1 to 1."""
 UP_MOST = 6.0
-"""Largest mean vertical acceleration of outputs that do not contain gravity [m/s^2]. Decisions in
-which the vehicle does not climb enter the mean as 0, since a correct policy commands upwards while
-a vehicle with too little thrust sinks."""
+"""Above this mean vertical acceleration [m/s^2], outputs probably contain gravity. A decision at
+which the vehicle does not climb enters the mean as 0, since even a correct policy commands upwards
+while a vehicle with too little thrust sinks."""
 
 LIFT = 3.0
-"""A policy whose vertical acceleration is always above this, even towards a gate below, has gravity
-in its outputs [m/s^2]."""
+"""If a policy's vertical acceleration is always above this [m/s^2], even towards a gate below, its
+outputs probably contain gravity."""
 CLEAR = 0.5
 """Smallest difference of outputs between gates on opposite sides that counts [m/s^2]."""
 UNIT_FIX = "check the unit of its output"
@@ -37,9 +37,9 @@ SCALE_FIX = (
     "export it with the contract (units, scales, frames) of its environment, or set action.scale; "
     "after a very short training this is no fault"
 )
-"""Advice for outputs of a wrong unit and a wrong scale."""
+"""Advice (with `UNIT_FIX`) for outputs of a wrong scale and of a wrong unit."""
 IMAGE_FACTOR, NO_CHANGE = 1.5, 1e-3
-"""Factor on a test image, and the largest relative change of output that counts as no change."""
+"""Factor on a test image; relative change of the output below which it counts as unchanged."""
 VEL_B, UP_B, GATE_B = slice(0, 3), slice(3, 6), slice(6, 9)
 """Parts of a state observation (`policies.observation`), in body axes: velocity, the world's z
 axis, the next gate's centre."""
@@ -133,7 +133,7 @@ class FromFile(Protocol):
     """A policy that was loaded from a file."""
 
     notes: tuple[Note, ...]
-    """Assumptions that were made where its file says nothing."""
+    """Assumptions about the policy that its file does not state."""
 
 
 def notes_of(policy: Policy) -> tuple[Note, ...]:
@@ -183,7 +183,10 @@ def probable_faults(policy: Policy) -> tuple[Note, ...]:
 
 
 def _divides_images(policy: Policy) -> bool:
-    """Return whether a policy ignores the scale of an image but uses its contents."""
+    """Return whether a policy ignores the scale of an image but uses its contents.
+
+    The test compares its outputs for an image, for the scaled image and for the flipped image.
+    """
     spec = policy.spec
     rows = np.linspace(0.5, 2.0, spec.image_shape[-2])[:, None]
     falling = np.broadcast_to(rows if not spec.depth.uint8 else 50 * rows, spec.image_shape)
@@ -203,8 +206,8 @@ def probe(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     """
     spec = policy.spec
     offset = ASIDE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
-    far = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
-    image = np.full((len(offset), *spec.image_shape), far, np.float32)
+    no_object = 0.0 if spec.depth.uint8 else spec.depth.bounds(spec.camera.range_m)[0]
+    image = np.full((len(offset), *spec.image_shape), no_object, np.float32)
     return _run(policy, _level_states(spec, offset), image)
 
 
@@ -213,13 +216,13 @@ def _level_states(spec: PolicySpec, offset: np.ndarray) -> np.ndarray:
     state = np.zeros((len(offset), spec.state_size), np.float32)
     state[:, VEL_B], state[:, UP_B] = (SPEED, 0, 0), (0, 0, 1)
     state[:, GATE_B] = np.insert(offset, 0, AHEAD_M, axis=1)
-    first = spec.base_size
-    for key, numbers in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
+    next_entry = spec.base_size
+    for key, size in (("second_gate", 3), ("gate_axis", 3), ("second_axis", 3)):
         if getattr(spec, key):
-            state[:, first : first + numbers] = (1, 0, 0)
+            state[:, next_entry : next_entry + size] = (1, 0, 0)
             if key == "second_gate":
-                state[:, first : first + 3] = state[:, GATE_B] + (AHEAD_M, 0, 0)
-            first += numbers
+                state[:, next_entry : next_entry + 3] = state[:, GATE_B] + (AHEAD_M, 0, 0)
+            next_entry += size
     if spec.speed_input:
         state[:, -1] = spec.speed
     return state
@@ -234,6 +237,6 @@ def _run(policy: Policy, state: np.ndarray, image: np.ndarray) -> tuple[np.ndarr
         output, hidden = policy.act(hidden, state, image, fresh)
         outputs.append(output)
         action = np.asarray(spec.action.to_si(output), np.float32)
-        size = np.linalg.norm(action, axis=-1, keepdims=True)
-        state[:, ACTION_B] = action * np.minimum(1.0, ActionLimits().size / np.maximum(size, 1e-6))
+        norm = np.linalg.norm(action, axis=-1, keepdims=True)
+        state[:, ACTION_B] = action * np.minimum(1.0, ActionLimits().size / np.maximum(norm, 1e-6))
     return np.asarray(action, float), np.array(outputs, float)

@@ -2,8 +2,8 @@
 
 A plan is a trajectory that was computed with knowledge of the whole track, by a local search over
 B-splines with the differentiable quadrotor. The judge then flew it in MuJoCo with the vehicle
-`reference`. Its lap time is an upper bound of the shortest one. The planner is in commit c6d768a
-(`suite reproduce laps --trials 2`), and docs/archive/laps.md describes it.
+`reference`. Its lap time is an upper bound of the shortest lap time. The planner is in commit
+c6d768a (`suite reproduce laps --trials 2`), and docs/archive/laps.md describes it.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class OverPlan(NamedTuple):
     """Lap time over planned lap time: median over tracks with its 95 % bootstrap interval; NaN if
     no track was finished."""
     finished: int
-    """Number of flown tracks with a plan that the policy finished."""
+    """Number of trials on planned tracks that the policy finished."""
     planned: int
-    """Number of flown tracks with a plan."""
+    """Number of trials of the policy on planned tracks."""
 
 
 @functools.cache

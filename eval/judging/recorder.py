@@ -1,6 +1,7 @@
 """Record the flights of trials while the judge flies them.
 
-Trials are flown in slots, places of the simulator; each slot records its own flight.
+Trials are flown in slots, places in the simulator for one trial at a time. Each slot records its
+own flight.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _EMPTY = (
     np.zeros(3),  # action
     False,  # whether the action is new
 )
-"""A row from which a flight without rows takes its shapes, for a trial that ended at its start."""
+"""A row of zeros that gives the columns of an empty flight their shapes; a flight is empty if its
+trial ended at the start."""
 
 
 class Recorder:
@@ -36,7 +38,7 @@ class Recorder:
 
         Args:
             slots: number of trials that fly at once.
-            depth: whether depth images are recorded (3 kB each at 24 x 32).
+            depth: whether depth images are recorded (3 kB each at 24 x 32 pixels).
             first: (size,) action that is recorded before the first decision; None: an acceleration
                 of zero (3,).
         """
@@ -65,12 +67,12 @@ class Recorder:
     def add(self, rows: Rows) -> None:
         """Add one row to the flight of each slot that is recorded at this step (`rows.due`)."""
         for slot in np.flatnonzero(rows.due):
-            new = bool(self._is_new[slot])
+            is_new = bool(self._is_new[slot])
             self._is_new[slot] = False
-            if new and self._depth:
+            if is_new and self._depth:
                 self._images[slot].append(self._last_image[slot])
             values = (np.copy(field[slot]) for field in rows[1:])
-            self._rows[slot].append((*values, self._action[slot].copy(), new))
+            self._rows[slot].append((*values, self._action[slot].copy(), is_new))
 
     def finish(self, slot: int, about: dict[str, Any]) -> Flight:
         """Return the flight in `slot`, with `about` as its metadata."""
@@ -78,7 +80,7 @@ class Recorder:
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         if not self._rows[slot]:
             columns = [column[:0] for column in columns]
-        time_s, pos, quat, vel, rate, thrust, rate_cmd, rotor, gate, action, new = columns
+        time_s, pos, quat, vel, rate, thrust, rate_cmd, rotor, gate, action, is_new = columns
         images = None
         if self._depth:
             images = np.stack(self._images[slot]) if self._images[slot] else np.zeros((0, 0, 0))
@@ -93,7 +95,7 @@ class Recorder:
             rate_cmd,
             rotor,
             action,
-            new,
+            is_new,
             gate.astype(np.int32),
             images,
             about,

@@ -22,9 +22,9 @@ from tracks.input.reading import LOG_BYTES, check_file, parse_json, read_bytes
 SCHEMA = 1
 """Version of the result files."""
 MOST_TRIALS = 1_000_000
-"""Most rows of a trials.parquet; they take about a gigabyte of memory."""
+"""Largest number of rows of a trials.parquet that is read; they take about a gigabyte of memory."""
 MOST_TEXT = 1000
-"""Most characters of a name in a trials.parquet."""
+"""Largest number of characters of a name in a trials.parquet."""
 JOURNAL = "trials.journal.jsonl"
 """Name of the journal in the output folder."""
 
@@ -73,7 +73,7 @@ def write_trials(
 
 
 def _kinds() -> dict[str, str]:
-    """Return the type of each field of `TrialResult` as its text; a ForwardRef is unwrapped."""
+    """Return name -> type, as text, of each field of `TrialResult`."""
     annotations = TrialResult.__annotations__.items()
     return {name: getattr(kind, "__forward_arg__", kind) for name, kind in annotations}
 
@@ -111,16 +111,16 @@ def read_trials(path: str | os.PathLike[str]) -> list[TrialResult]:
         present = [name for name in kinds if name in schema.names]
         _check_columns(path, schema, present)
         # Texts stay dictionary-encoded; a long text in every row would not fit into memory.
-        texts = [name for name in present if kinds[name].startswith("str")]
-        with pq.ParquetFile(path, read_dictionary=texts) as file:
+        text_columns = [name for name in present if kinds[name].startswith("str")]
+        with pq.ParquetFile(path, read_dictionary=text_columns) as file:
             table = file.read(present)
         columns = [_cells(path, name, table[name], kinds[name]) for name in present]
     except MemoryError:  # also a subclass of ArrowException
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        first = str(error).splitlines()[0]  # Arrow's messages have several lines
+        first_line = str(error).splitlines()[0]  # Arrow's messages have several lines
         raise ValueError(
-            f"{path}: not a readable Parquet file ({first}); run suite eval again"
+            f"{path}: not a readable Parquet file ({first_line}); run suite eval again"
         ) from error
     rows = zip(*columns, strict=True)
     return [TrialResult(**dict(zip(present, row, strict=True))) for row in rows]
@@ -184,7 +184,7 @@ def _cells(path: str | os.PathLike[str], name: str, column: Any, kind: str) -> l
 
 
 class Journal:
-    """A file of finished trials, one a line, to which an interrupted evaluation returns.
+    """A file of finished trials, one a line, from which an interrupted evaluation continues.
 
     The first line has the evaluation's settings. If a kill left an incomplete last line, it is
     dropped.
@@ -205,20 +205,20 @@ class Journal:
         self.done: dict[TrialSpec, TrialResult] = {}
         """Results read from the file and appended since, by trial."""
         about = plain(about)
-        keep = 0
+        kept_bytes = 0
         if self.path.exists():
-            keep = self._read(about)
+            kept_bytes = self._read(about)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path, "r+" if keep else "w", encoding="utf-8") as file:
-            if keep:
-                file.truncate(keep)
+        with open(self.path, "r+" if kept_bytes else "w", encoding="utf-8") as file:
+            if kept_bytes:
+                file.truncate(kept_bytes)
             else:
                 file.write(to_json({"about": about}) + "\n")
         self._file: TextIO | None = None
 
     def _read(self, about: dict[str, Any]) -> int:
-        """Fill `done`; return the number of bytes of complete lines."""
-        keep = 0
+        """Fill `done` from the file; return the number of bytes of its complete lines."""
+        kept_bytes = 0
         for number, line in enumerate(read_bytes(self.path, LOG_BYTES).splitlines(keepends=True)):
             if not line.endswith(b"\n"):
                 break
@@ -237,8 +237,8 @@ class Journal:
                     f"{self.path}: holds trials flown otherwise ({difference}); give another --out "
                     "or move the file away"
                 )
-            keep += len(line)
-        return keep
+            kept_bytes += len(line)
+        return kept_bytes
 
     def append(self, result: TrialResult) -> None:
         """Add a finished trial; when this returns, it survives a kill of this process."""

@@ -24,7 +24,7 @@ from tracks.geometry.camera import Camera
 
 
 class Sensors:
-    """The sensors of N slots, with the errors of the trial that flies in each."""
+    """The sensors of N slots, with the errors of the trial that flies in each slot."""
 
     def __init__(self, wanted: SensorSet, slots: int, rate_hz: float, camera: Camera) -> None:
         """Make the sensors.

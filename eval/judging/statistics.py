@@ -14,7 +14,7 @@ CONFIDENCE = 0.95
 NORMAL_QUANTILE = 1.959964
 """97.5 % quantile of the standard normal distribution."""
 AT_ONCE = 10_000_000
-"""Most resampled values of a bootstrap in memory at once."""
+"""Largest number of resampled values that a bootstrap holds in memory at once."""
 
 
 class Interval(NamedTuple):
@@ -29,15 +29,17 @@ class PairedDifference(NamedTuple):
     """Difference of two success rates on the same trials."""
 
     value: float
-    """First minus second."""
+    """First success rate minus second success rate."""
     low: float
+    """Lower end of the confidence interval."""
     high: float
+    """Upper end of the confidence interval."""
     p_value: float
-    """Exact McNemar test, two-sided."""
+    """Two-sided p-value of the exact McNemar test."""
     only_first: int
-    """Trials in which only the first succeeded."""
+    """Number of trials in which only the first succeeded."""
     only_second: int
-    """Trials in which only the second succeeded."""
+    """Number of trials in which only the second succeeded."""
 
 
 def wilson(successes: float, trials: int, confidence: float = CONFIDENCE) -> Interval:
@@ -71,7 +73,7 @@ def bootstrap_median(
 ) -> Interval:
     """Return the median of values (n,) with its percentile bootstrap interval (Efron 1979).
 
-    Without values all three are NaN. The same seed gives the same interval.
+    Without values, estimate and interval are NaN. The same seed gives the same interval.
     """
     return _bootstrap(np.median, values, seed, confidence, resamples)
 
@@ -81,15 +83,15 @@ def bootstrap_mean(
 ) -> Interval:
     """Return the mean of values (n,) with its percentile bootstrap interval (Efron 1979).
 
-    Without values all three are NaN. The same seed gives the same interval.
+    Without values, estimate and interval are NaN. The same seed gives the same interval.
     """
     return _bootstrap(np.mean, values, seed, confidence, resamples)
 
 
 def expected_largest(values: np.ndarray, among: int) -> float | None:
-    """Return the expected largest of `among` values, chosen at random from values (n,).
+    """Return the expected maximum of `among` values that are drawn at random from values (n,).
 
-    None if n is less than `among`.
+    Each value is drawn at most once. None if n is less than `among`.
     """
     count = len(values)
     if count < among:
@@ -125,7 +127,7 @@ def _bootstrap(
 def paired_bootstrap(
     first: np.ndarray, second: np.ndarray, seed: int = 0, confidence: float = CONFIDENCE
 ) -> Interval:
-    """Return the median of first - second, (n,) each on the same trials, with its interval.
+    """Return the median of first - second with its interval; both are (n,), on the same trials.
 
     Raises:
         ValueError: where the lengths differ.
@@ -142,8 +144,8 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
         only_first: pairs in which only the first succeeded.
         only_second: pairs in which only the second succeeded.
     """
-    n, few = only_first + only_second, min(only_first, only_second)
-    tail = sum(comb(n, k) for k in range(few + 1))
+    n, fewer = only_first + only_second, min(only_first, only_second)
+    tail = sum(comb(n, k) for k in range(fewer + 1))
     return min(1.0, 2 * tail / 2**n)
 
 
@@ -199,7 +201,9 @@ def paired_success(
 def over_seeds(
     first: np.ndarray, second: np.ndarray | None = None, seed: int = 0, draws: int = 4000
 ) -> Interval:
-    """Return a mean, or the difference of two, with its 95 % interval over seeds and trials.
+    """Return a mean, or the difference of two means, with its 95 % interval.
+
+    The interval is over training seeds and trials.
 
     It is a hierarchical bootstrap: training seeds and trials are resampled, with the same trials
     for all seeds of a resample. With few seeds its interval is too narrow (Owen 2007, The
@@ -219,9 +223,9 @@ def over_seeds(
     from scipy.stats import t as student
 
     groups = [np.asarray(group, float) for group in (first, second) if group is not None]
-    count = groups[0].shape[1]
+    trial_count = groups[0].shape[1]
     for group in groups:
-        if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != count:
+        if group.ndim != 2 or min(group.shape) < 2 or group.shape[1] != trial_count:
             raise ValueError(
                 f"values are {[each.shape for each in groups]}; expected (seeds, trials), two or "
                 "more of each, and the same trials"
@@ -230,26 +234,37 @@ def over_seeds(
     value = sum(sign * group.mean() for sign, group in zip(signs, groups, strict=True))
     trial_means = sum(sign * group.mean(0) for sign, group in zip(signs, groups, strict=True))
     # Variance of the mean: between trials, plus between seeds, less the noise that both contain.
-    variance = float(np.var(trial_means, ddof=1)) / count
-    parts, freedom = [variance], [count - 1.0]
+    variance = float(np.var(trial_means, ddof=1)) / trial_count
+    variances, part_degrees = [variance], [trial_count - 1.0]
     rng, resampled = np.random.default_rng(seed), np.zeros(draws)
-    trials = rng.multinomial(count, np.full(count, 1 / count), draws) / count
+    trials = (
+        rng.multinomial(trial_count, np.full(trial_count, 1 / trial_count), draws) / trial_count
+    )
     for sign, group in zip(signs, groups, strict=True):
-        n = len(group)
-        between = float(np.var(group.mean(1), ddof=1)) / n
+        seed_count = len(group)
+        seed_variance = float(np.var(group.mean(1), ddof=1)) / seed_count
         residual = group - group.mean(1, keepdims=True) - group.mean(0) + group.mean()
-        noise = float((residual**2).sum()) / ((n - 1) * (count - 1)) / (n * count)
-        variance += between - noise
-        parts, freedom = [*parts, between, noise], [*freedom, n - 1.0, (n - 1.0) * (count - 1.0)]
-        seeds = rng.multinomial(n, np.full(n, 1 / n), draws) / n
+        noise_variance = (
+            float((residual**2).sum())
+            / ((seed_count - 1) * (trial_count - 1))
+            / (seed_count * trial_count)
+        )
+        variance += seed_variance - noise_variance
+        variances, part_degrees = (
+            [*variances, seed_variance, noise_variance],
+            [*part_degrees, seed_count - 1.0, (seed_count - 1.0) * (trial_count - 1.0)],
+        )
+        seeds = rng.multinomial(seed_count, np.full(seed_count, 1 / seed_count), draws) / seed_count
         resampled += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
-    largest = max(variance, max(parts))
-    spread = float(resampled.std())
-    if not largest or not spread:
+    largest = max(variance, max(variances))
+    resampled_sd = float(resampled.std())
+    if not largest or not resampled_sd:
         return Interval(float(value), float(value), float(value))
-    degrees = largest**2 / sum(part**2 / df for part, df in zip(parts, freedom, strict=True))
+    degrees = largest**2 / sum(
+        part**2 / df for part, df in zip(variances, part_degrees, strict=True)
+    )
     quantile = float(student.ppf(0.975, max(1.0, degrees)))
-    factor = sqrt(largest) * quantile / (NORMAL_QUANTILE * spread)
+    factor = sqrt(largest) * quantile / (NORMAL_QUANTILE * resampled_sd)
     low, high = np.quantile(resampled, [0.025, 0.975])
     return Interval(
         float(value), float(value + factor * (low - value)), float(value + factor * (high - value))

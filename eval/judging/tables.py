@@ -23,7 +23,7 @@ from eval.worlds.trial import ENDINGS, TrialResult
 from tracks.common.grid import Grid, markdown, table_of
 
 PRINTED_TRIALS = 10
-"""Number of trials of a cell in the tables of the papers."""
+"""Number of trials of a cell in the published tables with which results are compared."""
 NOTE = (
     "Success: rate with its 95 % Wilson interval. v_max, v_mean, lap: median over the cell's "
     "trials (lap: over its finished ones) with its 95 % bootstrap interval; v_max is each trial's "
@@ -42,23 +42,23 @@ class Tally(NamedTuple):
     trials: int
     success: Interval
     gates_passed: float
-    """Mean number of gates."""
+    """Mean number of passed gates."""
     v_max: Interval
-    """Median over trials [m/s]."""
+    """Largest speed of a trial, median over trials [m/s]."""
     v_mean: Interval
-    """Median over trials [m/s]."""
+    """Mean speed of a trial, median over trials [m/s]."""
     lap_s: Interval
     """Median lap time over finished trials [s]; NaN where there is none."""
     ended_by: dict[str, int]
-    """Number of trials by ending."""
+    """Ending -> number of trials with it."""
     late: int = 0
     """Number of timeouts because the policy's output was late or missing."""
     v_max_of_ten: float | None = None
-    """Expected largest v_max of ten random trials; None with fewer trials [m/s]."""
+    """Expected largest v_max of ten random trials [m/s]; None with fewer trials."""
 
 
 class Pairing(NamedTuple):
-    """The differences between a policy and the first policy on the same trials."""
+    """The differences between a policy and the first policy (`against`) on the same trials."""
 
     policy: str
     against: str
@@ -68,7 +68,7 @@ class Pairing(NamedTuple):
     success: Interval
     """Difference of success rates."""
     p_value: float
-    """Exact McNemar test, two-sided."""
+    """Two-sided p-value of the exact McNemar test."""
     v_mean: Interval
     """Median difference of mean speeds [m/s]."""
 

@@ -17,9 +17,9 @@ from tracks.geometry.scene import Array
 HEADING_RATE = 6.0
 """Rate of the first-order blend of the heading [1/s]."""
 LEAST_FORCE = 0.1
-"""Below this wanted specific force, its direction is undefined and the tilt is held [m/s^2]."""
+"""Wanted specific force [m/s^2] below which its direction is undefined, and the tilt is held."""
 SMALL = 1e-6
-"""Length of a vector's part below which its direction counts as undefined."""
+"""Length of a vector (or projection) below which its direction counts as undefined."""
 
 
 class AttitudeLoop(Protocol):
@@ -50,7 +50,7 @@ def action_to_force(action_b: Array, rot_w: Array) -> Array:
 def attitude_command(
     controller: AttitudeLoop, force_w: Array, rot_w: Array, heading_w: Array
 ) -> Command:
-    """Return the command (thrust and body rates) that turns body z to a force, body x to a heading.
+    """Return the thrust and body rates that turn body z to a force, and body x to a heading.
 
     If the force is near zero, the tilt is held; if the heading is along the force, the heading is
     held. A body that is upside down rolls about its x axis.
@@ -75,7 +75,7 @@ def attitude_command(
 
 
 def blend_heading(heading_w: Array, to_gate_w: Array, dt: float) -> Array:
-    """Return the heading after it turned towards the gate for a time (first order, 6 1/s).
+    """Return the heading after it turned towards the gate for a time, at `HEADING_RATE`.
 
     The blend acts on the angle, so it also works for a gate directly behind. A gate directly above
     or below does not change the heading.
@@ -83,7 +83,7 @@ def blend_heading(heading_w: Array, to_gate_w: Array, dt: float) -> Array:
     Args:
         heading_w: (..., 3) current heading, a horizontal unit vector.
         to_gate_w: (..., 3) vector from the body to the gate, of any length > 0 [m].
-        dt: the time [s].
+        dt: duration of the turn [s].
     """
     xp = heading_w.__array_namespace__()
     hx, hy = heading_w[..., 0], heading_w[..., 1]

@@ -32,10 +32,10 @@ class Autopilot:
     dt: float
     """Length of a physics step [s]."""
     attitude_every: int
-    """Physics steps for which a command of the attitude loop is held."""
+    """Number of physics steps for which a command of the attitude loop is held."""
     action: ActionSpec = field(default_factory=ActionSpec)
-    """The policy's output: an acceleration is the input of the attitude loop, thrust and body rates
-    of the rate loop; motor commands bypass both."""
+    """The policy's kind of action. An acceleration is the input of the attitude loop; thrust and
+    body rates are the input of the rate loop; motor commands bypass both."""
     speed_max: float = 0.0
     """Largest commanded speed of a rotor [rad/s]."""
 
@@ -62,7 +62,7 @@ def make_autopilot(vehicle: Vehicle, action: ActionSpec | None = None) -> Autopi
 def start_autopilot(
     autopilot: Autopilot, motion: Motion, noise: Array | None = None
 ) -> AutopilotState:
-    """Return the state of N vehicles that hovered until now, with the heading of body x.
+    """Return the state of N vehicles that hovered until now, with headings along their x axes.
 
     Args:
         autopilot: from `make_autopilot`.

@@ -3,8 +3,9 @@
 A log gives commands at the times of its rows, and the rate loop runs at another frequency. So steps
 end where commands change, and are otherwise as long as accuracy allows. The body moves by the
 explicit midpoint rule (order 2; Hairer, Norsett & Wanner 1993, Sec. II.1), with aerodynamic forces
-at half a step predicted from the previous step. The rotors' first-order lag is integrated exactly.
-For flights that MuJoCo's Euler integrator simulated, the body moves by that integrator's rule.
+at half a step predicted from the previous step. The rotors' first-order response to commands (lag)
+is integrated exactly. For flights that MuJoCo's Euler integrator simulated, the body moves by that
+integrator's rule. A plant holds the constants of a quadrotor with its effects.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ SHORTEST_S = 1e-9
 
 
 class Steps(NamedTuple):
-    """T steps of flights; (T, ...) each."""
+    """The lengths and loop updates of T steps, arrays (T, ...)."""
 
     length_s: Array
     """Length of the step [s]; a step of zero length does not move the body."""
@@ -59,13 +60,13 @@ class Carry(NamedTuple):
     """State of a quadrotor between steps, in addition to its motion."""
 
     rotor_speed: Array
-    """(..., 4) [rad/s]."""
+    """(..., 4) rotor speeds [rad/s]."""
     wanted_speed: Array
     """(..., 4) rotor speeds that the rate loop's last update commanded [rad/s]."""
     turn_b: Array
     """(..., 3) angular acceleration of the last step [rad/s^2]."""
     air: Wrench
-    """(..., 3) force and torque of the last step, less those of the rotors in still air."""
+    """(..., 3) aerodynamic part of the last step's wrench: total minus rotors in still air."""
     loop: Any = ()
     """State of a firmware's rate loop."""
     since_s: Any = 0.0
@@ -76,11 +77,11 @@ class Flight(NamedTuple):
     """T simulated steps."""
 
     motion: Motion
-    """(T + 1, ...): the start and the state after each step."""
+    """(T + 1, ...) states: at the start, and after each step."""
     rotor_speed: Array
-    """(T + 1, ..., 4) [rad/s]."""
+    """(T + 1, ..., 4) rotor speeds at the same times [rad/s]."""
     acc_b: Array
-    """(T, ..., 3) specific force at the end of each step; with Euler, during it [m/s^2]."""
+    """(T, ..., 3) specific force [m/s^2] at the end of each step, or during it (`euler`)."""
 
 
 def fly(
@@ -96,28 +97,29 @@ def fly(
     """Simulate T steps from `motion` in JAX, and return the states after them.
 
     Args:
-        plant: its `dt` and `delay_weight` are not used: the inputs' commands are already delayed.
+        plant: the quadrotor. Its `dt` and `delay_weight` are not used, because the inputs' commands
+            are delayed already.
         motion: (...) rigid-body state at the start.
         steps: lengths of the T steps, and where the rate loop updates.
         inputs: (T, ...) inputs of the steps; a command is read where the loop updates.
-        rotor_speed: (..., 4) at the start [rad/s].
-        start_s: (...,) time since the start of the flight [s].
+        rotor_speed: (..., 4) rotor speeds at the start [rad/s].
+        start_s: (...,) time of the first step since the start of the flight [s].
         integrator: one of `INTEGRATORS`.
         feedback: computes a push (an additional acceleration) that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
 
-    still = jnp.zeros_like(motion.vel_w)
-    none = Wrench(still, still)
+    no_motion = jnp.zeros_like(motion.vel_w)
+    no_wrench = Wrench(no_motion, no_motion)
     memory = loops.start(plant.loop, rotor_speed.shape[:-1], jnp)
-    start = Carry(rotor_speed, rotor_speed, still, none, memory)
+    start = Carry(rotor_speed, rotor_speed, no_motion, no_wrench, memory)
     if plant.loop is not None:
         start = start._replace(since_s=jnp.zeros(rotor_speed.shape[:-1]))
     # Aerodynamic forces at the start, so that the first step is as accurate as the others.
-    first = jax.tree.map(lambda series: series[0], inputs)._replace(push_b=None)
+    first_inputs = jax.tree.map(lambda series: series[0], inputs)._replace(push_b=None)
     rotors = steady(rotor_speed)
-    total = _wrench(plant, motion, rotors, first, start_s)
+    total = _wrench(plant, motion, rotors, first_inputs, start_s)
     start = start._replace(air=_difference(total, _still(plant, rotors)))
 
     def one_step(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
@@ -129,9 +131,9 @@ def fly(
         carry = (now, motion, time_s + span.length_s, memory)
         return carry, (motion, now.rotor_speed, acc_b)
 
-    begin = (start, motion, start_s, None if feedback is None else feedback.start)
+    first_carry = (start, motion, start_s, None if feedback is None else feedback.start)
     rows = (jnp.arange(len(steps.length_s)), steps, inputs)
-    _, (motions, speeds, acc_b) = jax.lax.scan(one_step, begin, rows)
+    _, (motions, speeds, acc_b) = jax.lax.scan(one_step, first_carry, rows)
     motions, speeds = prepend_start((motion, rotor_speed), (motions, speeds))
     return Flight(motions, speeds, acc_b)
 
@@ -158,7 +160,10 @@ def update_loop(plant: Plant, carry: Carry, span: Steps, command: Command, rate_
 def _update_firmware_loop(
     plant: Plant, carry: Carry, span: Steps, command: Command, rate_b: Array
 ) -> Carry:
-    """Return `carry` after an update of a firmware's loop; merged updates count as one long one."""
+    """Return `carry` after an update of a firmware's loop.
+
+    Merged updates count as one update after a longer time.
+    """
     import jax
 
     xp = rate_b.__array_namespace__()
@@ -177,7 +182,7 @@ def _update_firmware_loop(
 
 
 def turn_rotors(plant: Plant, carry: Carry, span: Steps) -> tuple[Carry, RotorStep]:
-    """Return `carry` after the step `span` of the rotors towards their commands, and that step."""
+    """Return `carry` after the rotors' step `span` towards their commands, and the rotors' step."""
     xp = span.length_s.__array_namespace__()
     length_s = xp.maximum(span.length_s, SHORTEST_S)
     rotors = follow(carry.rotor_speed, carry.wanted_speed, plant.constants.time_constant, length_s)
@@ -197,7 +202,7 @@ def step(
 
     The arguments are those of `fly`, for one step; `time_s` is the time at its start.
     """
-    before, wanted = carry.rotor_speed, None
+    speed_before, wanted = carry.rotor_speed, None
     length = span.length_s[..., None]
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
@@ -210,12 +215,13 @@ def step(
     rotor_acc = None
     if uses_rotor_acc(plant):
         lag = plant.constants.time_constant
-        rotor_acc = acceleration(before, rotors, wanted, lag, length)
+        rotor_acc = acceleration(speed_before, rotors, wanted, lag, length)
     if integrator == "euler":
         total = _wrench(plant, motion, rotors, inputs, time_s, rotor_acc)
         acc_w, turn_b = accelerations(plant, motion, total)
         carry = carry._replace(turn_b=turn_b)
         return carry, euler_move(motion, acc_w, turn_b, length), total.force_b / mass_of(plant)
+    # Midpoint rule: the state at half a step, from predicted forces, gives the forces of the step.
     thrust = _still(plant, rotors)
     half, air = 0.5 * length, carry.air
     predicted = Wrench(thrust.force_b + air.force_b, thrust.torque_b + air.torque_b)

@@ -1,7 +1,8 @@
 """Force and torque on the quadrotor's body: of rotors, wind and all effects of the vehicle.
 
-The functions take numpy and JAX arrays of any leading batch shape. The steppers call them once a
-step (`eval.quadrotor.stepper`, `eval.quadrotor.continuous`).
+The functions take numpy and JAX arrays of any leading batch shape. A plant holds the constants of a
+quadrotor with its effects. The steppers (`eval.quadrotor.stepper`, `eval.quadrotor.continuous`)
+call these functions at every step.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ def with_push(plant: Plant, wrench: Wrench, push_b: Array | None) -> Wrench:
 
 
 def mass_of(plant: Plant) -> Array:
-    """Return the true mass (..., 1) to divide vectors (..., 3) by; a plain number for one plant.
+    """Return the true mass as (..., 1), a divisor of vectors (..., 3); for one plant, a scalar.
 
-    XLA rounds a division by a number differently from one by an array with one element.
+    XLA rounds a division by a scalar differently from a division by an array with one element.
     """
     mass = plant.constants.mass
     return mass[..., None] if mass.ndim else mass
@@ -104,7 +105,7 @@ def still_thrust(plant: Plant, rotors: RotorStep) -> Array:
 def rotor_wrench(plant: Plant, rotors: RotorStep, thrust: Array) -> Wrench:
     """Return the rotors' force and torque on the body for thrusts (..., 4) [N].
 
-    `rotors` gives the speeds, which determine the torque about z.
+    The torque about z comes from the speeds in `rotors`, not from `thrust`.
     """
     constants, arm = plant.constants, plant.constants.rotor_position_b
     force_b = thrust.sum(axis=-1)[..., None] * constants.thrust_axis_b

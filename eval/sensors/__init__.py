@@ -1,8 +1,8 @@
 """The catalogue of sensor models: errors of state estimates, gate positions, depth images and IMU.
 
-A model turns a drone's true view (pose, next gates, depth image) into the view that its policy
-gets. The trainer and the judge, which flies policies in simulation and scores them, apply models
-with the functions here.
+A model turns a drone's true view (pose, velocity, next gates, depth image) into the view that its
+policy gets. The trainer and the judge, which flies policies in simulation and scores them, apply
+models with the functions here.
 
 To add a model, write its `Sensor` and list it here. Another package adds one with an entry point of
 the group `diffracing_suite.sensors`. A program adds one for its own process with
@@ -64,7 +64,7 @@ _BUILT_IN = (
     imu.SENSOR,
     gate_filter.SENSOR,
 )
-"""The models in their order of application: each gets the output of those before it."""
+"""The models in their order of application: each gets the output of the models before it."""
 SENSORS: Registry[Sensor] = Registry(
     "sensor model",
     "diffracing_suite.sensors",
@@ -90,7 +90,7 @@ def scale_model(name: str, values: Any, magnitude: Any) -> Any:
 
     Args:
         name: name of the model.
-        values: the model's NamedTuple of numbers.
+        values: the model's parameters, a NamedTuple of numbers.
         magnitude: factor of the errors, a number or an array (N,) for N drones. 0: no errors;
             1: the given values.
     """
@@ -144,7 +144,7 @@ def sense(
 
     Args:
         models: models that change a view; see `view_models`.
-        memory: state of each model, from `start` or the observation before.
+        memory: state of each model, from `start` or from the previous observation.
         truth: the true views of N drones.
         draws: the random numbers of this observation, by model.
         dt_s: time between observations [s].

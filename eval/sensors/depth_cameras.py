@@ -19,7 +19,7 @@ EDGE = 1.25
 
 
 class Stereo(NamedTuple):
-    """Parameters of `stereo`; units in `STEREO`."""
+    """Parameters of `stereo`; units in `STEREO`, letters as in its `equation`."""
 
     noise: Array
     """n: standard deviation of the disparity (shift between the two images)."""
@@ -34,13 +34,13 @@ class Stereo(NamedTuple):
     edge_holes: Array
     """Share of pixels at the far side of an edge that are holes."""
     thin_holes: Array
-    """Share of pixels on thin objects that show what is behind."""
+    """Share of pixels on thin objects that show the background instead."""
     smear: Array
     """Share of pixels at the far side of an edge that show the near side."""
     focal: Array
     """f: focal length of the stereo camera."""
     baseline: Array
-    """b: distance between its two lenses."""
+    """b: distance between the two lenses of the stereo camera."""
 
 
 def stereo_start(values: Stereo, moment: Moment) -> Array:
@@ -49,13 +49,14 @@ def stereo_start(values: Stereo, moment: Moment) -> Array:
 
 
 def stereo_sense(values: Stereo, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with the depth image of a stereo camera."""
+    """Return the view with the depth image of a stereo camera, and the offset in `memory`."""
     depth_m, grain, chance = seen.depth_m, moment.draws.grain, moment.draws.chance
     xp, range_m = depth_m.__array_namespace__(), moment.camera.range_m
     left, right = neighbour(depth_m, -1), neighbour(depth_m, 1)
     nearer, further = xp.minimum(left, right), xp.maximum(left, right)
     edge = EDGE * nearer < depth_m
     thin = EDGE * depth_m < xp.minimum(left, right)
+    # At edges and thin objects, stereo matching finds a neighbour's depth or nothing.
     smeared = edge & (chance[..., 0, :, :] < over_image(values.smear))
     hole = edge & (chance[..., 1, :, :] < over_image(values.edge_holes)) & ~smeared
     missed = thin & (chance[..., 2, :, :] < over_image(values.thin_holes))
@@ -90,11 +91,11 @@ def in_disparity(
     disparity = focal_baseline / xp.maximum(depth_m, NEAREST_M)
     disparity = disparity + over_image(values.noise) * grain + over_image(offset)
     step = over_image(values.step)
-    stepped = step * xp.rint(disparity / xp.where(step > 0.0, step, 1.0))
-    disparity = xp.where(step > 0.0, stepped, disparity)
-    least = xp.maximum(over_image(values.least), focal_baseline / camera.range_m)
-    measured_m = focal_baseline / xp.maximum(disparity, least)
-    return xp.where(disparity < least, camera.range_m, measured_m)
+    rounded = step * xp.rint(disparity / xp.where(step > 0.0, step, 1.0))
+    disparity = xp.where(step > 0.0, rounded, disparity)
+    least_disparity = xp.maximum(over_image(values.least), focal_baseline / camera.range_m)
+    measured_m = focal_baseline / xp.maximum(disparity, least_disparity)
+    return xp.where(disparity < least_disparity, camera.range_m, measured_m)
 
 
 STEREO = Sensor(
@@ -131,13 +132,13 @@ LIGHT = 299_792_458.0
 
 
 class TimeOfFlight(NamedTuple):
-    """Parameters of `tof`."""
+    """Parameters of `tof`; units in `TOF`, letters as in its `equation`."""
 
     noise: Array
-    """s: standard deviation, as a share of the depth."""
+    """s: standard deviation of the noise, as a share of the depth."""
     bias: Array
-    """b: standard deviation of a trial's error by multipath, as a share of the depth; never below
-    0."""
+    """b: size of a trial's constant error by multipath (light that is reflected twice), as a share
+    of the depth. The error is the absolute value of a normal number with this deviation."""
     mixing: Array
     """Share of pixels at an edge that mix near and far depths."""
     wrapped: Array
@@ -154,14 +155,14 @@ def tof_start(values: TimeOfFlight, moment: Moment) -> Array:
 def tof_sense(
     values: TimeOfFlight, memory: Array, seen: View, moment: Moment
 ) -> tuple[View, Array]:
-    """Return the view with the depth image of a time-of-flight camera."""
+    """Return the view with the depth image of a time-of-flight camera, and the bias in `memory`."""
     depth_m, draws, range_m = seen.depth_m, moment.draws, moment.camera.range_m
     xp, chance = depth_m.__array_namespace__(), draws.chance
     neighbours = [neighbour(depth_m, side) for side in (-1, 1)]
     nearer = xp.minimum(*neighbours)
     mixed = (EDGE * nearer < depth_m) & (chance[..., 0, :, :] < over_image(values.mixing))
-    share = chance[..., 1, :, :]
-    measured_m = xp.where(mixed, share * nearer + (1.0 - share) * depth_m, depth_m)
+    mix_share = chance[..., 1, :, :]
+    measured_m = xp.where(mixed, mix_share * nearer + (1.0 - mix_share) * depth_m, depth_m)
     noise = over_image(values.noise) * draws.grain[..., 0, :, :]
     measured_m = measured_m * (1.0 + over_image(memory) + noise)
     # Depths are ambiguous by half a wavelength of the modulation.

@@ -40,7 +40,7 @@ def blank_model_draws(
 
 
 def draw(into: Draws, row: int, generator: np.random.Generator) -> None:
-    """Draw the random numbers of drone `row`, in place."""
+    """Draw the random numbers of drone `row`, in place: see `Draws` for the distributions."""
     fills = {
         "normal": generator.standard_normal,
         "uniform": generator.random,

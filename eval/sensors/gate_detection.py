@@ -1,11 +1,11 @@
 """Sensor model `gate_detection`: a detector measures the poses of the next two gates.
 
-The pose is from four corners by PnP (perspective-n-point). Its standard deviations are the first
-order ones of a square of half side a, seen frontally at range r, from corners with noise of s
-pixels at a focal length of f pixels: across the view s r / (sqrt(2) f), along it
-s r^2 / (sqrt(8) f a), tilt s r^2 / (2 f a^2). While a gate is out of view or not detected, the last
-estimate in the estimator's world frame is used. Before the first detection, it is the position in
-the map.
+The detector computes a gate's pose from its four corners by PnP (perspective-n-point). The standard
+deviations are those of first order for a square of half side a at range r, seen frontally. Its
+corners have a noise of s pixels at a focal length of f pixels. The standard deviations are
+s r / (sqrt(2) f) across the view, s r^2 / (sqrt(8) f a) along the view, and s r^2 / (2 f a^2) for
+the tilt. While a gate is out of view or not detected, its last estimate in the estimator's world
+frame is used. Before the first detection, its position in the map is used.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ ACROSS = 640
 
 
 class GateDetection(NamedTuple):
-    """Parameters of `gate_detection`."""
+    """Parameters of `gate_detection`; units in `SENSOR`, letters as in the module's docstring."""
 
     pixels: Array
     """s: standard deviation of a corner in an image of 640 pixels across."""
     missed: Array
     """Share of the observations in which a gate in view is not detected."""
     length: Array
-    """Mean duration of such a gap."""
+    """Mean duration of a gap without detections."""
     half_side: Array
     """a: half of the gate's side, as the detector assumes it."""
     known_tilt: Array
@@ -62,7 +62,7 @@ def start(values: GateDetection, moment: Moment) -> dict[str, Any]:
 def sense(
     values: GateDetection, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the gates at their estimated poses, relative to the drone."""
+    """Return the view with the gates at their estimated poses, and the model's new state."""
     xp, truth, draws = seen.pos_w.__array_namespace__(), moment.truth, moment.draws
     map_w = xp.stack([seen.gate_w, seen.second_w], axis=-2)
     axes_w = xp.stack([seen.axis_w, seen.second_axis_w], axis=-2)
@@ -75,6 +75,7 @@ def sense(
     held = xp.where(passed, next_held, memory["held"])  # whether a gate has an estimate
     stored_w = xp.where(column(held), stored_w, map_w)
 
+    # Detect gates in view, and measure their positions with the errors of PnP.
     gates_b = to_local(truth.rot_w[..., None, :, :], true_w - truth.pos_w[..., None, :])
     share, gap_s = column(values.missed), column(values.length)
     missed = markov_step(memory["missed"], draws.uniform, share, gap_s, moment.dt_s)
@@ -86,6 +87,7 @@ def sense(
     along_ray = column((ray_b * normal[..., :3]).sum(-1)) * ray_b
     error_b = column(across) * (normal[..., :3] - along_ray) + column(along) * along_ray
     measured_w = seen.pos_w[..., None, :] + to_world(seen.rot_w[..., None, :, :], gates_b + error_b)
+    # Filter the measured positions; without a detection, keep the stored ones.
     weight = -xp.expm1(-moment.dt_s / xp.maximum(values.smoothing, 1e-9))
     weight = xp.where(held, column(weight), 1.0)
     filtered_w = stored_w + column(weight) * (measured_w - stored_w)
@@ -114,10 +116,10 @@ def spreads(values: GateDetection, range_m: Array, camera: Camera) -> tuple[Arra
     """
     xp = range_m.__array_namespace__()
     focal_px = ACROSS / 2 / math.tan(math.radians(camera.fov_deg[0]) / 2)
-    angle, known = column(values.pixels) / focal_px, column(values.known_tilt)
+    angle, known_tilt = column(values.pixels) / focal_px, column(values.known_tilt)
     half_side = xp.maximum(column(values.half_side), 1e-3)
     tilt = angle * range_m**2 / (2.0 * half_side**2)
-    tilt = tilt * known / xp.sqrt(tilt**2 + known**2 + 1e-12)
+    tilt = tilt * known_tilt / xp.sqrt(tilt**2 + known_tilt**2 + 1e-12)
     return angle * range_m / math.sqrt(2), angle * range_m**2 / (math.sqrt(8) * half_side), tilt
 
 
@@ -127,8 +129,8 @@ def in_view(point_b: Array, camera: Camera) -> Array:
     up = np.array([-forward[2], 0.0, forward[0]])
     ahead = point_b[..., 0] * forward[0] + point_b[..., 2] * forward[2]
     above = point_b[..., 0] * up[0] + point_b[..., 2] * up[2]
-    wide, high = (math.tan(math.radians(angle) / 2) for angle in camera.fov_deg)
-    inside = (abs(point_b[..., 1]) < wide * ahead) & (abs(above) < high * ahead)
+    half_width, half_height = (math.tan(math.radians(angle) / 2) for angle in camera.fov_deg)
+    inside = (abs(point_b[..., 1]) < half_width * ahead) & (abs(above) < half_height * ahead)
     return inside & (ahead > NEAREST_M)
 
 

@@ -25,7 +25,7 @@ class GateFilter(NamedTuple):
     rate: Array
     """Frames per second [Hz]."""
     dropout: Array
-    """Share of the frames without a detection [1]."""
+    """Share of the frames without a detection."""
     dropout_length: Array
     """Mean duration of a dropout [s]."""
     delay: Array
@@ -35,13 +35,13 @@ class GateFilter(NamedTuple):
     position: Array
     """Standard deviation of the position error at the start, for each axis."""
     velocity: Array
-    """The same of the velocity."""
+    """Standard deviation of the velocity error at the start, for each axis."""
     attitude: Array
-    """The same of the attitude."""
+    """Standard deviation of the attitude error at the start, for each axis."""
     acc_bias: Array
-    """The same of the accelerometer's bias, as the filter assumes it."""
+    """Standard deviation of the accelerometer's bias that the filter assumes, for each axis."""
     gyro_bias: Array
-    """The same of the gyroscope's bias, as the filter assumes it."""
+    """Standard deviation of the gyroscope's bias that the filter assumes, for each axis."""
     acc_noise: Array
     """Noise density of the accelerometer that the filter assumes."""
     gyro_noise: Array

@@ -12,11 +12,14 @@ from eval.sensors.interface import Array, Moment, Needs, Parameter, Sensor, View
 from tracks.geometry.rotation import to_world
 
 GATES = 32
-"""Number of different gate errors; a longer course repeats them."""
+"""Number of different gate errors; a track with more gates repeats them."""
 
 
 class GateMap(NamedTuple):
-    """Parameters of `gate_map`, all standard deviations over trials; units in `SENSOR`."""
+    """Parameters of `gate_map`, all standard deviations over trials.
+
+    Units are in `SENSOR`, letters as in its `equation`.
+    """
 
     shift: Array
     """t: standard deviation of the shift of all gates, for each axis."""
@@ -27,7 +30,7 @@ class GateMap(NamedTuple):
     moved: Array
     """m_i: standard deviation of each gate's own displacement, for each axis."""
     turned: Array
-    """Standard deviation of each gate's own rotation about the vertical."""
+    """Standard deviation of each gate's own rotation about the vertical axis."""
 
 
 def start(values: GateMap, moment: Moment) -> dict[str, Any]:
@@ -50,10 +53,10 @@ def sense(
     """Return the view with both gates at their poses in the map."""
     number = moment.truth.gate_number % GATES
     # After the last gate, the view repeats it as the second gate.
-    last = (moment.truth.second_w == moment.truth.gate_w).all(-1)
-    second = (number + (~last).astype(number.dtype)) % GATES
+    no_second_gate = (moment.truth.second_w == moment.truth.gate_w).all(-1)
+    second_number = (number + (~no_second_gate).astype(number.dtype)) % GATES
     gate_w, axis_w = _in_map(memory, seen.gate_w, seen.axis_w, number)
-    second_w, second_axis_w = _in_map(memory, seen.second_w, seen.second_axis_w, second)
+    second_w, second_axis_w = _in_map(memory, seen.second_w, seen.second_axis_w, second_number)
     seen = seen._replace(
         gate_w=gate_w, axis_w=axis_w, second_w=second_w, second_axis_w=second_axis_w
     )

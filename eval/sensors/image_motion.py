@@ -1,8 +1,8 @@
 """Sensor model `image_motion`: blur over the exposure time, and rolling shutter.
 
-At the policy's low resolution, a rotation of the camera shifts all pixels of an image equally: by
-the body rate times the time, divided by a pixel's angle. The rate is the mean since the observation
-before.
+At the policy's low resolution, a rotation of the camera shifts all pixels of an image equally. The
+shift is the body rate times the time, divided by a pixel's angle. The rate is the mean rate since
+the previous observation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from eval.sensors.interface import (
 
 
 class ImageMotion(NamedTuple):
-    """Parameters of `image_motion`."""
+    """Parameters of `image_motion`; units in `SENSOR`."""
 
     exposure: Array
     """Exposure time of a row."""
@@ -38,16 +38,18 @@ def start(values: ImageMotion, moment: Moment) -> Array:
 
 
 def sense(values: ImageMotion, memory: Array, seen: View, moment: Moment) -> tuple[View, Array]:
-    """Return the view with a blurred and sheared image."""
+    """Return the view with a blurred and sheared image, and the attitude of this observation."""
     camera, depth_m = moment.camera, seen.depth_m
     xp = depth_m.__array_namespace__()
     rate_b = rotation_since(moment.truth.rot_w, memory) / moment.dt_s
-    wide, high = (2.0 * math.tan(math.radians(angle) / 2) for angle in camera.fov_deg)
+    tangents_wide, tangents_high = (
+        2.0 * math.tan(math.radians(angle) / 2) for angle in camera.fov_deg
+    )
     # A yaw to the left moves the image to the right, a pitch down (about y) moves it up.
-    right_px_per_s = over_image(rate_b[..., 2]) * camera.width / wide
-    down_px_per_s = -over_image(rate_b[..., 1]) * camera.height / high
+    right_px_per_s = over_image(rate_b[..., 2]) * camera.width / tangents_wide
+    down_px_per_s = -over_image(rate_b[..., 1]) * camera.height / tangents_high
     row_s = over_image(values.readout) * (np.arange(camera.height)[:, None] / camera.height - 0.5)
-    # The mean of inverse depth at the start and the end of the exposure.
+    # Blur: the mean of the inverse depths at the start and the end of the exposure.
     inverse: Any = 0.0
     for fraction in (-0.5, 0.5):
         time_s = row_s + fraction * over_image(values.exposure)
@@ -64,11 +66,11 @@ def shift(image: Array, pixels: Array, axis: int) -> Array:
     xp, count = image.__array_namespace__(), image.shape[axis]
     index = np.arange(count) if axis == -1 else np.arange(count)[:, None]
     source = (index - pixels).clip(0.0, count - 1.0) + 0.0 * image
-    low = xp.floor(source)
-    share, first = source - low, low.astype(int)
+    pixel = xp.floor(source)
+    fraction, first = source - pixel, pixel.astype(int)
     second = (first + 1).clip(0, count - 1)
     low_value, high_value = (xp.take_along_axis(image, k, axis=axis) for k in (first, second))
-    return (1.0 - share) * low_value + share * high_value
+    return (1.0 - fraction) * low_value + fraction * high_value
 
 
 SENSOR = Sensor(

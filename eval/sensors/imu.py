@@ -15,32 +15,32 @@ UNLIMITED = 1e6
 
 
 class Imu(NamedTuple):
-    """Parameters of `imu`; units in `SENSOR`."""
+    """Parameters of `imu`; units in `SENSOR`, letters as in its `equation`."""
 
     gyro_noise: Array
     """s_w: noise density of the gyroscope."""
     gyro_bias: Array
-    """b_w: standard deviation of its bias at the start."""
+    """b_w: standard deviation of the gyroscope's bias at the start."""
     gyro_walk: Array
-    """Random walk of that bias."""
+    """Random walk of the gyroscope's bias."""
     gyro_limit: Array
-    """Largest measurable rate."""
+    """Largest measurable body rate."""
     acc_noise: Array
     """s_a: noise density of the accelerometer."""
     acc_bias: Array
-    """b_a: standard deviation of its bias at the start."""
+    """b_a: standard deviation of the accelerometer's bias at the start."""
     acc_walk: Array
-    """Random walk of that bias."""
+    """Random walk of the accelerometer's bias."""
     acc_limit: Array
     """Largest measurable specific force."""
     acc_per_thrust: Array
-    """k: standard deviation of an error in proportion to the thrust."""
+    """k: standard deviation over trials of an accelerometer error in proportion to the thrust."""
     vibration: Array
-    """v: noise of the accelerometer in proportion to the thrust."""
+    """v: standard deviation of an accelerometer noise in proportion to the thrust."""
 
 
 def start(values: Imu, moment: Moment) -> dict[str, Any]:
-    """Return the trial's biases, and its error of the accelerometer per thrust, each (..., 3)."""
+    """Return the trial's biases and accelerometer error per thrust, each (..., 3), by name."""
     draws = moment.draws.normal
     return {
         "gyro": column(values.gyro_bias) * draws[..., :3],
@@ -56,15 +56,15 @@ def measure(
     normal = draws.normal
     xp = normal.__array_namespace__()
     root_dt = dt_s**0.5
-    gyro = memory["gyro"] + column(values.gyro_walk) * root_dt * normal[..., 6:9]
-    acc = memory["acc"] + column(values.acc_walk) * root_dt * normal[..., 9:12]
+    gyro_bias = memory["gyro"] + column(values.gyro_walk) * root_dt * normal[..., 6:9]
+    acc_bias = memory["acc"] + column(values.acc_walk) * root_dt * normal[..., 9:12]
     thrust = column(abs(truth.acc_b[..., 2]))
-    rate_b = truth.rate_b + gyro + column(values.gyro_noise) / root_dt * normal[..., :3]
+    rate_b = truth.rate_b + gyro_bias + column(values.gyro_noise) / root_dt * normal[..., :3]
     acc_sd = column(values.acc_noise) / root_dt + column(values.vibration) * thrust
-    acc_b = truth.acc_b + acc + memory["per_thrust"] * thrust + acc_sd * normal[..., 3:6]
+    acc_b = truth.acc_b + acc_bias + memory["per_thrust"] * thrust + acc_sd * normal[..., 3:6]
     limits = column(values.gyro_limit), column(values.acc_limit)
     rate_b, acc_b = (xp.clip(v, -m, m) for v, m in zip((rate_b, acc_b), limits, strict=True))
-    return Inertial(rate_b, acc_b), memory | {"gyro": gyro, "acc": acc}
+    return Inertial(rate_b, acc_b), memory | {"gyro": gyro_bias, "acc": acc_bias}
 
 
 SENSOR = Sensor(

@@ -22,33 +22,33 @@ Values = Any
 Memory = Any
 """The state of a model between observations: arrays (..., K), or tuples and dicts of them."""
 STAGES = ("state", "gates", "depth", "imu")
-"""What a model changes: estimated state, gates, depth image, inertial sensor."""
+"""Stages, named after what a model changes: estimated state, gates, depth image, inertial unit."""
 
 
 class Needs(NamedTuple):
-    """Numbers of random draws of a model."""
+    """How many random numbers a model needs, of each distribution."""
 
     normal: int = 0
-    """Standard normal numbers."""
+    """Number of standard normal numbers."""
     uniform: int = 0
-    """Uniform numbers from 0 to 1."""
+    """Number of uniform numbers from 0 to 1."""
     grain: int = 0
-    """Images of standard normal numbers, one number a pixel."""
+    """Number of images of standard normal numbers, with one number a pixel."""
     chance: int = 0
-    """Images of uniform numbers from 0 to 1, one number a pixel."""
+    """Number of images of uniform numbers from 0 to 1, with one number a pixel."""
 
 
 class Draws(NamedTuple):
     """Random numbers of a model; K is the count in the field of `Needs` with the same name."""
 
     normal: Array
-    """(..., K) standard normal."""
+    """(..., K) standard normal numbers."""
     uniform: Array
-    """(..., K) uniform from 0 to 1."""
+    """(..., K) uniform numbers from 0 to 1."""
     grain: Array
-    """(..., K, H, W) standard normal, for each pixel."""
+    """(..., K, H, W) standard normal numbers, one for each pixel."""
     chance: Array
-    """(..., K, H, W) uniform from 0 to 1, for each pixel."""
+    """(..., K, H, W) uniform numbers from 0 to 1, one for each pixel."""
 
 
 class Moment(NamedTuple):
@@ -59,7 +59,7 @@ class Moment(NamedTuple):
     draws: Draws
     """Random numbers of this observation; for `start`, of the trial."""
     dt_s: Any
-    """Time since the observation before [s]."""
+    """Time since the previous observation [s]."""
     camera: Camera
     """The policy's camera."""
 
@@ -72,7 +72,7 @@ class Ages(NamedTuple):
     image_s: float = 0.0
     """Mean age of the image [s]."""
     jitter: float = 0.0
-    """Largest relative deviation of an age from its mean, uniformly distributed [1]."""
+    """Largest relative deviation of an age from its mean; deviations are uniformly distributed."""
 
 
 class Inertial(NamedTuple):
@@ -97,7 +97,7 @@ class Sensor:
     equation: str
     """The observation as a function of the truth."""
     source: str
-    """Publications of the equation and the usual sizes."""
+    """Publications from which the equation and the usual sizes of the errors are."""
     values: type
     """NamedTuple class with a field for each parameter, in order."""
     parameters: tuple[Parameter, ...]
@@ -111,9 +111,9 @@ class Sensor:
     start: Callable[[Values, Moment], Memory] | None = None
     """Returns the model's state at the first observation, from the trial's draws."""
     sense: Callable[[Values, Memory, View, Moment], tuple[View, Memory]] | None = None
-    """Takes the view after the models before it; returns the changed view, and the new state."""
+    """Takes the view that earlier models have changed; returns the changed view and new state."""
     ages: Callable[[Values], Ages] | None = None
-    """For a delay: the ages of the observation."""
+    """For a delay: returns the ages of the observation."""
     estimate: Callable[[Values], Any] | None = None
     """For a state estimator: returns its `eval.sensors.filter.kalman.FilterSettings`."""
     measure: Callable[[Values, Memory, Inertial, Draws, Any], tuple[Inertial, Memory]] | None = None
@@ -143,13 +143,13 @@ def markov_step(on: Array, chance: Array, share: Array, length_s: Array, dt_s: A
     """Return whether an intermittent fault is present at the next observation, bool (...,).
 
     The fault is a two-state Markov chain: in the long run it is present in `share` of the
-    observations and lasts `length_s` on average. Observations are independent where `length_s` is
-    shorter than independent observations give.
+    observations and lasts `length_s` on average. For a short `length_s` the observations are
+    independent: a fault then lasts as long as chance makes it last.
 
     Args:
-        on: (...,) bool, whether the fault was present at the observation before.
+        on: (...,) bool, whether the fault was present at the previous observation.
         chance: (...,) uniform draws from 0 to 1.
-        share: share of the observations with the fault, below 1 [1].
+        share: share of the observations with the fault, below 1.
         length_s: mean duration of the fault [s].
         dt_s: time between observations [s].
     """
@@ -170,7 +170,7 @@ def noise_factor(decay: Array) -> Array:
 
 
 def length(vector: Array) -> Array:
-    """Return the norm (...,) of vectors, with a finite slope at zero and an error below 1e-6."""
+    """Return the norm (...,) of vectors, differentiable at zero, with an error below 1e-6."""
     xp = vector.__array_namespace__()
     return xp.sqrt((vector**2).sum(-1) + 1e-12)
 
@@ -178,8 +178,8 @@ def length(vector: Array) -> Array:
 def rotation_since(rot_w: Array, before_w: Array) -> Array:
     """Return the rotation of a body since `before_w`, as a vector in its axes (..., 3) [rad].
 
-    The vector is the axis times the sine of the angle, within 1 % of the rotation vector below
-    0.25 rad.
+    The vector is the axis times the sine of the angle. Below 0.25 rad it is within 1 % of the
+    rotation vector.
 
     Args:
         rot_w: (..., 3, 3) attitude now, body to world.

@@ -23,16 +23,16 @@ from eval.sensors.interface import (
 
 
 class StateLoss(NamedTuple):
-    """Parameters of `state_loss`."""
+    """Parameters of `state_loss`; units in `STATE_LOSS`."""
 
     share: Array
-    """Share of the observations without track."""
+    """Share of the observations in which the estimator has lost track."""
     length: Array
-    """Mean duration of a loss."""
+    """Mean duration of a loss of track."""
     acceleration: Array
-    """a: standard deviation of the acceleration with which the estimate runs away."""
+    """a: standard deviation of the acceleration with which the estimate leaves the true path."""
     jump: Array
-    """Standard deviation of the position's jump at the end, for each axis."""
+    """Standard deviation of the position's jump at the end of a loss, for each axis."""
 
 
 def state_loss_start(values: StateLoss, moment: Moment) -> dict[str, Any]:
@@ -45,7 +45,10 @@ def state_loss_start(values: StateLoss, moment: Moment) -> dict[str, Any]:
 def state_loss_sense(
     values: StateLoss, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the estimator's state; each loss of track leaves a jump."""
+    """Return the view with the estimator's state, and the model's new state.
+
+    Each loss of track leaves a jump of the position.
+    """
     xp, draws, dt_s = seen.pos_w.__array_namespace__(), moment.draws, moment.dt_s
     lost = markov_step(memory["lost"], draws.uniform[..., 0], values.share, values.length, dt_s)
     lost_before, lost_now = column(memory["lost"]), column(lost)
@@ -110,10 +113,10 @@ def wrong_gate_sense(
 ) -> tuple[View, Array]:
     """Return the view with the second gate in place of the first one during the fault."""
     xp, chance = seen.pos_w.__array_namespace__(), moment.draws.uniform[..., 0]
-    wrong = markov_step(memory, chance, values.share, values.length, moment.dt_s)
-    gate_w = xp.where(column(wrong), seen.second_w, seen.gate_w)
-    axis_w = xp.where(column(wrong), seen.second_axis_w, seen.axis_w)
-    return seen._replace(gate_w=gate_w, axis_w=axis_w), wrong
+    is_wrong = markov_step(memory, chance, values.share, values.length, moment.dt_s)
+    gate_w = xp.where(column(is_wrong), seen.second_w, seen.gate_w)
+    axis_w = xp.where(column(is_wrong), seen.second_axis_w, seen.axis_w)
+    return seen._replace(gate_w=gate_w, axis_w=axis_w), is_wrong
 
 
 WRONG_GATE = _fault(

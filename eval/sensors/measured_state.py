@@ -23,26 +23,29 @@ from eval.sensors.interface import (
 from tracks.geometry.rotation import exp_rot, to_world
 
 GROUPS = {"position": ("m", 10.0), "velocity": ("m/s", 10.0), "attitude": ("rad", 0.5)}
-"""Part of the state -> unit of its errors, and the largest standard deviation."""
+"""Part of the state -> unit of its errors, and the largest allowed standard deviation."""
 AXES = tuple(f"{group}_{axis}" for group in GROUPS for axis in "xyz")
 """Names of the nine errors, in the order of all arrays (..., 9) here."""
 LASTS_S = 0.5
-"""Default correlation time [s]."""
+"""Default of the long correlation time [s]."""
 
 
 class Axis(NamedTuple):
-    """Parameters of the error along one axis, named `position_x`, `position_x_bias`, ..."""
+    """Parameters of the error along one axis, named `position_x`, `position_x_bias`, ...
+
+    The noise has two parts: a fast one with a short, and a slow one with a long correlation time.
+    """
 
     noise: Array
-    """Standard deviation of the varying error."""
+    """Standard deviation of the noise (both parts together), in the unit of the axis."""
     bias: Array
-    """Standard deviation of the constant error of a trial."""
+    """Standard deviation over trials of the constant error, in the unit of the axis."""
     fast: Array
-    """Share of the noise's variance with the short correlation time [1]."""
+    """Share of the noise's variance that the fast part has."""
     fast_lasts: Array
-    """Short correlation time; 0: independent at every observation [s]."""
+    """Correlation time of the fast part [s]; 0: independent at every observation."""
     lasts: Array
-    """Correlation time of the remaining variance [s]."""
+    """Correlation time of the slow part [s]."""
 
 
 def _keys(axis: str) -> tuple[str, ...]:
@@ -63,7 +66,10 @@ def axes_of(values: Any) -> Axis:
 
 
 def start(values: Any, moment: Moment) -> dict[str, Any]:
-    """Return unit errors and biases (..., 9), zero drift (..., 3) and the position at the start."""
+    """Return the state at the start, by name.
+
+    It holds noises and biases of unit variance (..., 9), and drift and position (..., 3).
+    """
     draws, pos_w = moment.draws.normal, moment.truth.pos_w
     return {
         "slow": draws[..., :9],
@@ -77,12 +83,12 @@ def start(values: Any, moment: Moment) -> dict[str, Any]:
 def sense(
     values: Any, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with an estimated position, velocity and attitude."""
+    """Return the view with an estimated position, velocity and attitude, and the new state."""
     xp, axes, draws = seen.pos_w.__array_namespace__(), axes_of(values), moment.draws.normal
     slow = _next_error(memory["slow"], axes.lasts, draws[..., :9], moment.dt_s)
     fast = _next_error(memory["fast"], axes.fast_lasts, draws[..., 9:18], moment.dt_s)
-    unit = xp.sqrt(1.0 - axes.fast) * slow + xp.sqrt(axes.fast) * fast
-    error = axes.noise * unit + axes.bias * memory["bias"]
+    unit_noise = xp.sqrt(1.0 - axes.fast) * slow + xp.sqrt(axes.fast) * fast
+    error = axes.noise * unit_noise + axes.bias * memory["bias"]
     flown_m = length(moment.truth.pos_w - memory["pos_w"])
     drift_w = memory["drift_w"] + column(values.position_drift * xp.sqrt(flown_m)) * draws[..., 18:]
     scaled_w = column(1.0 + values.velocity_scale) * seen.vel_w
@@ -91,8 +97,8 @@ def sense(
         vel_w=scaled_w + to_world(seen.rot_w, error[..., 3:6]),
         rot_w=product(seen.rot_w, exp_rot(error[..., 6:])),
     )
-    now = {"slow": slow, "fast": fast, "drift_w": drift_w, "pos_w": moment.truth.pos_w}
-    return seen, memory | now
+    changed_state = {"slow": slow, "fast": fast, "drift_w": drift_w, "pos_w": moment.truth.pos_w}
+    return seen, memory | changed_state
 
 
 def _next_error(error: Array, correlation_s: Array, draws: Array, dt_s: Any) -> Array:
@@ -105,13 +111,13 @@ def _next_error(error: Array, correlation_s: Array, draws: Array, dt_s: Any) -> 
 def _parameters() -> tuple[Parameter, ...]:
     """Return the parameters of all axes, and the two that belong to no axis."""
     of_axes = []
-    for group, (unit, most) in GROUPS.items():
+    for group, (unit, largest) in GROUPS.items():
         usual = {"position": (0.01, 0.1), "velocity": (0.05, 0.3), "attitude": (0.005, 0.03)}[group]
         for axis in "xyz":
             noise, bias, fast, fast_lasts, lasts = _keys(f"{group}_{axis}")
             of_axes += [
-                Parameter(noise, unit, 0.0, 0.0, most, usual),
-                Parameter(bias, unit, 0.0, 0.0, most, usual),
+                Parameter(noise, unit, 0.0, 0.0, largest, usual),
+                Parameter(bias, unit, 0.0, 0.0, largest, usual),
                 Parameter(fast, "1", 0.0, 0.0, 1.0, (0.05, 0.5), required=False),
                 Parameter(fast_lasts, "s", 0.0, 0.0, 1000.0, (0.01, 0.1), required=False),
                 Parameter(lasts, "s", LASTS_S, 0.0, 1000.0, (0.1, 2.0), required=False),

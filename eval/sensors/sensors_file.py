@@ -21,8 +21,11 @@ from tracks.common.names import printable
 from tracks.common.toml_table import Table, load_shipped, shipped_names, to_toml
 
 SCHEMA = 1
+"""Version of the file format."""
 PRESETS = Path(__file__).resolve().parent / "presets"
+"""Folder of the sensors files that come with the suite."""
 NO_AGES = Ages()
+"""Ages of an observation without delay."""
 
 
 class SensorsFileError(ValueError):
@@ -103,7 +106,8 @@ def load_sensors(source: str | os.PathLike[str]) -> SensorSet:
     """Return the sensors of a file, or shipped ones by their name.
 
     Args:
-        source: a path (it ends in .toml, has a folder or exists) or a shipped name.
+        source: a path, or a shipped name. A text counts as a path if it ends in .toml, has a folder
+            or is an existing file.
 
     Raises:
         SensorsFileError: for an unusable file.
@@ -171,7 +175,7 @@ def save_sensors(sensors: SensorSet, path: str | os.PathLike[str], comment: str 
         comment: lines for the head of the file.
 
     Raises:
-        ValueError: for sensors that could not be read back.
+        ValueError: for sensors that `load_sensors` would reject.
     """
     table = sensors_table(sensors)
     parse_sensors(table)

@@ -27,11 +27,12 @@ from eval.sensors.interface import (
 from tracks.geometry.rotation import cross, exp_rot, to_world
 
 SMALL = 1e-3
-"""Distances [m] and angles [rad] below this add no drift, which keeps the root's slope finite."""
+"""Distances [m] and angles [rad] well below this add hardly any drift. So the slope of the square
+root stays finite."""
 
 
 class StateDrift(NamedTuple):
-    """Parameters of `state_drift`; units in `STATE_DRIFT`."""
+    """Parameters of `state_drift`; units in `STATE_DRIFT`, letters as in its `equation`."""
 
     position: Array
     """s_p: drift of the position, for each axis, over the root of the distance."""
@@ -46,7 +47,7 @@ class StateDrift(NamedTuple):
 
 
 def state_drift_start(values: StateDrift, moment: Moment) -> dict[str, Any]:
-    """Return the errors from the distance flown before the trial, and the pose at the start."""
+    """Return the errors by the distance flown before the trial, and the pose at the start."""
     xp, draws = moment.draws.normal.__array_namespace__(), moment.draws.normal
     root_flown = xp.sqrt(values.flown)
     return {
@@ -61,7 +62,7 @@ def state_drift_start(values: StateDrift, moment: Moment) -> dict[str, Any]:
 def state_drift_sense(
     values: StateDrift, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with the state that dead reckoning estimates."""
+    """Return the view with the state that dead reckoning estimates, and the model's new state."""
     truth, draws = moment.truth, moment.draws.normal
     step_w = truth.pos_w - memory["pos_w"]
     root_path = root(length(step_w))
@@ -76,12 +77,12 @@ def state_drift_sense(
         vel_w=scale * to_world(yaw_rot, seen.vel_w),
         rot_w=product(yaw_rot, seen.rot_w),
     )
-    now = {"yaw": yaw, "error_w": error_w, "pos_w": truth.pos_w, "rot_w": truth.rot_w}
-    return seen, memory | now
+    changed_state = {"yaw": yaw, "error_w": error_w, "pos_w": truth.pos_w, "rot_w": truth.rot_w}
+    return seen, memory | changed_state
 
 
 def root(size: Array) -> Array:
-    """Return the square root of sizes (...,), with a finite slope below `SMALL`."""
+    """Return the square root of sizes (...,), modified near zero so that its slope is finite."""
     xp = size.__array_namespace__()
     return size / xp.sqrt(size + SMALL)
 
@@ -112,7 +113,7 @@ STATE_DRIFT = Sensor(
 
 
 class StateNoise(NamedTuple):
-    """Parameters of `state_noise`, standard deviations along each axis; units in `STATE_NOISE`."""
+    """Parameters of `state_noise`; units in `STATE_NOISE`, letters as in its `equation`."""
 
     position: Array
     """s_p: standard deviation of the position, for each axis."""
@@ -121,15 +122,18 @@ class StateNoise(NamedTuple):
     attitude: Array
     """s_R: standard deviation of the attitude, for each axis."""
     velocity_bias: Array
-    """b_v: standard deviation of a trial's constant error, body axes."""
+    """b_v: standard deviation of a trial's constant error of the velocity, for each body axis."""
     attitude_bias: Array
-    """b_R: standard deviation of a trial's constant error, body axes."""
+    """b_R: standard deviation of a trial's constant error of the attitude, for each body axis."""
     correlation: Array
     """Correlation time of the noise; 0: independent at every observation."""
 
 
 def state_noise_start(values: StateNoise, moment: Moment) -> dict[str, Any]:
-    """Return unit errors (..., 9) of position, velocity and attitude, and biases (..., 6)."""
+    """Return errors and biases of unit variance, by name.
+
+    Errors (..., 9) are of position, velocity and attitude, biases (..., 6) of the latter two.
+    """
     draws = moment.draws.normal
     return {"error": draws[..., :9], "bias": draws[..., 9:]}
 
@@ -137,19 +141,19 @@ def state_noise_start(values: StateNoise, moment: Moment) -> dict[str, Any]:
 def state_noise_sense(
     values: StateNoise, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with an estimated position, velocity and attitude."""
+    """Return the view with an estimated position, velocity and attitude, and the new state."""
     xp = seen.pos_w.__array_namespace__()
     decay = xp.exp(-moment.dt_s / xp.maximum(values.correlation, 1e-9))
     error = column(decay) * memory["error"] + column(noise_factor(decay)) * moment.draws.normal
     bias = memory["bias"]
-    rotation_b = column(values.attitude) * error[..., 6:]
-    rotation_b = rotation_b + column(values.attitude_bias) * bias[..., 3:]
+    attitude_error_b = column(values.attitude) * error[..., 6:]
+    attitude_error_b = attitude_error_b + column(values.attitude_bias) * bias[..., 3:]
     bias_b = column(values.velocity_bias) * bias[..., :3]
     vel_error_w = column(values.velocity) * error[..., 3:6] + to_world(seen.rot_w, bias_b)
     seen = seen._replace(
         pos_w=seen.pos_w + column(values.position) * error[..., :3],
         vel_w=seen.vel_w + vel_error_w,
-        rot_w=product(seen.rot_w, exp_rot(rotation_b)),
+        rot_w=product(seen.rot_w, exp_rot(attitude_error_b)),
     )
     return seen, {"error": error, "bias": bias}
 
@@ -184,13 +188,13 @@ class DragTilt(NamedTuple):
     """Parameters of `drag_tilt`; units in `DRAG_TILT`."""
 
     drag: Array
-    """Deceleration over speed of the drag that the estimator neglects."""
+    """Drag that the estimator neglects, as deceleration per speed."""
     lasts: Array
-    """Correlation time: how fast the estimator corrects its tilt."""
+    """Time constant with which the estimator's tilt follows the apparent vertical."""
 
 
 def drag_tilt_start(values: DragTilt, moment: Moment) -> dict[str, Any]:
-    """Return the tilt error per unit of drag (..., 3) in steady flight, world axes [s]."""
+    """Return the tilt error per unit of drag (..., 3) in steady flight [rad s], world axes."""
     del values
     return {"lean_w": _lean(moment.truth)}
 
@@ -198,15 +202,16 @@ def drag_tilt_start(values: DragTilt, moment: Moment) -> dict[str, Any]:
 def drag_tilt_sense(
     values: DragTilt, memory: dict[str, Any], seen: View, moment: Moment
 ) -> tuple[View, dict[str, Any]]:
-    """Return the view with an attitude from which the drag's deceleration is missing."""
+    """Return the view with an attitude that is tilted by the neglected drag, and the new state."""
     xp = seen.pos_w.__array_namespace__()
-    kept = column(xp.exp(-moment.dt_s / xp.maximum(values.lasts, 1e-9)))
-    lean_w = kept * memory["lean_w"] + (1.0 - kept) * _lean(moment.truth)
+    decay = column(xp.exp(-moment.dt_s / xp.maximum(values.lasts, 1e-9)))
+    lean_w = decay * memory["lean_w"] + (1.0 - decay) * _lean(moment.truth)
     turn_w = exp_rot(column(values.drag) * lean_w)
     return seen._replace(rot_w=product(turn_w, seen.rot_w)), {"lean_w": lean_w}
 
 
 def _lean(truth: View) -> Array:
+    """Return the tilt error per unit of drag (..., 3) that the current velocity would cause."""
     return cross(truth.vel_w, truth.rot_w[..., 2]) / GRAVITY
 
 

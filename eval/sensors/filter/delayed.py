@@ -46,11 +46,11 @@ def step(
         noise: noise of the IMU.
     """
     xp = gyro_b.__array_namespace__()
-    new = xp.concatenate([gyro_b, acc_b, dt[:, None]], axis=-1)[:, None]
-    queue = xp.concatenate([filters.buffer, new], axis=1)
-    first = queue[:, 0]
-    state = predict(filters.state, first[:, :3], first[:, 3:6], first[:, 6], noise)
-    return select(flew, Delayed(state, queue[:, 1:]), filters)
+    new_sample = xp.concatenate([gyro_b, acc_b, dt[:, None]], axis=-1)[:, None]
+    buffer_and_new = xp.concatenate([filters.buffer, new_sample], axis=1)
+    oldest = buffer_and_new[:, 0]
+    state = predict(filters.state, oldest[:, :3], oldest[:, 3:6], oldest[:, 6], noise)
+    return select(flew, Delayed(state, buffer_and_new[:, 1:]), filters)
 
 
 def current_state(filters: Delayed) -> FilterState:

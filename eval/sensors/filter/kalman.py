@@ -25,7 +25,7 @@ from tracks.geometry.rotation import cross, exp_rot, to_local, to_world
 from tracks.geometry.scene import Array
 
 GRAVITY = 9.81
-"""[m/s^2]."""
+"""Gravity [m/s^2]."""
 SIZE = 15
 """Size of the error state: position, velocity, attitude, accelerometer bias, gyro bias."""
 
@@ -44,7 +44,7 @@ class ImuNoise(NamedTuple):
 
 
 class FilterSettings(NamedTuple):
-    """Settings of a state estimator in the loop: of the filter and of the gate detections."""
+    """Settings of a state estimator that feeds a policy: of the filter and of gate detections."""
 
     corner_sigma: float
     """Noise of a corner in the image, along each axis, standard deviation [pixel]."""
@@ -53,7 +53,7 @@ class FilterSettings(NamedTuple):
     frame_hz: float
     """Frames per second [Hz]."""
     dropout: float
-    """Share of the frames without a gate detection [1]."""
+    """Share of the frames without a gate detection."""
     dropout_s: float
     """Mean duration of a gap without detections [s]."""
     delay_s: float
@@ -87,7 +87,7 @@ class Corners(NamedTuple):
     """Gate corners in the image of a camera at the body's origin, K for each drone."""
 
     image: Array
-    """(N, K, 2) image coordinates (left, up), tangents of the angles to the optical axis [1]."""
+    """(N, K, 2) image coordinates (left, up): tangents of the angles to the optical axis."""
     corner_w: Array
     """(N, K, 3) positions in the map [m]."""
     seen: Array
@@ -104,20 +104,22 @@ def start(pos_w: Array, vel_w: Array, rot_w: Array, sigma: Array) -> FilterState
         sigma: (15,) or (N, 15) standard deviations of the error, in SI units.
     """
     xp = pos_w.__array_namespace__()
-    still, variance = xp.zeros_like(pos_w), xp.zeros((pos_w.shape[0], SIZE)) + sigma**2
-    return FilterState(pos_w, vel_w, rot_w, still, still, variance[..., None] * xp.eye(SIZE))
+    zero_bias, variance = xp.zeros_like(pos_w), xp.zeros((pos_w.shape[0], SIZE)) + sigma**2
+    return FilterState(
+        pos_w, vel_w, rot_w, zero_bias, zero_bias, variance[..., None] * xp.eye(SIZE)
+    )
 
 
 def move(state: FilterState, gyro_b: Array, acc_b: Array, dt: Array) -> FilterState:
     """Return the nominal state after `dt`, with the covariance unchanged; see `predict`."""
     xp = gyro_b.__array_namespace__()
-    step = dt[:, None]
-    rotation_b = (gyro_b - state.gyro_bias_b) * step
+    step_s = dt[:, None]
+    rotation_b = (gyro_b - state.gyro_bias_b) * step_s
     middle_w = xp.matmul(state.rot_w, exp_rot(0.5 * rotation_b))
     acc_w = to_world(middle_w, acc_b - state.acc_bias_b) - xp.asarray([0.0, 0.0, GRAVITY])
-    vel_w = state.vel_w + step * acc_w
+    vel_w = state.vel_w + step_s * acc_w
     return state._replace(
-        pos_w=state.pos_w + 0.5 * step * (state.vel_w + vel_w),
+        pos_w=state.pos_w + 0.5 * step_s * (state.vel_w + vel_w),
         vel_w=vel_w,
         rot_w=xp.matmul(state.rot_w, exp_rot(rotation_b)),
     )
@@ -136,29 +138,31 @@ def predict(
         noise: noise of the IMU.
     """
     xp = gyro_b.__array_namespace__()
-    step = dt[:, None, None]
-    zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
+    step_s = dt[:, None, None]
+    zeros, identity = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
     acc_by_angle = xp.matmul(state.rot_w, _skew(acc_b - state.acc_bias_b))
     angle_by_angle = exp_rot(-(gyro_b - state.gyro_bias_b) * dt[:, None])
     transition = _blocks(
         [
-            [one, one * step, zero, zero, zero],
-            [zero, one, -acc_by_angle * step, -state.rot_w * step, zero],
-            [zero, zero, angle_by_angle, zero, -one * step],
-            [zero, zero, zero, one, zero],
-            [zero, zero, zero, zero, one],
+            [identity, identity * step_s, zeros, zeros, zeros],
+            [zeros, identity, -acc_by_angle * step_s, -state.rot_w * step_s, zeros],
+            [zeros, zeros, angle_by_angle, zeros, -identity * step_s],
+            [zeros, zeros, zeros, identity, zeros],
+            [zeros, zeros, zeros, zeros, identity],
         ]
     )
     # Process noise of dp, dv, dtheta, da and dw.
     densities = xp.stack([0.0 * dt + part for part in (0.0, noise.acc, noise.gyro, *noise[2:])], -1)
-    added = xp.repeat(densities**2 * dt[:, None], 3, axis=-1)
+    process_noise = xp.repeat(densities**2 * dt[:, None], 3, axis=-1)
     covariance = xp.matmul(xp.matmul(transition, state.covariance), xp.matrix_transpose(transition))
-    covariance = covariance + added[..., None] * xp.eye(SIZE)
+    covariance = covariance + process_noise[..., None] * xp.eye(SIZE)
     return move(state, gyro_b, acc_b, dt)._replace(covariance=covariance)
 
 
 def project(pos_w: Array, rot_w: Array, camera_b: Array, corner_w: Array) -> tuple[Array, Array]:
-    """Return the corners' image coordinates (left, up) (N, K, 2) [1] and depths (N, K) [m].
+    """Return the corners' image coordinates (left, up) (N, K, 2), and depths (N, K) [m].
+
+    Image coordinates are tangents of the angles to the optical axis.
 
     Args:
         pos_w: (N, 3) position [m].
@@ -179,7 +183,7 @@ def update_gate(
     Args:
         state: the state at the time of the image.
         observation: the detected corners.
-        variance: (N, K) variance of each coordinate in `Corners.image` [1], or one for all.
+        variance: (N, K) variance of each coordinate in `Corners.image`, or one for all.
         camera_b: (3, 3) camera axes (forward, left, up) as rows in body axes.
     """
     xp = state.pos_w.__array_namespace__()
@@ -202,12 +206,14 @@ def update_gate(
     gradient = xp.matmul(transposed, residual.reshape(*rows.shape[:-1], 1))
     # With A the information, g the gradient and U the unit columns of dp and dtheta:
     # P' = P - P U (I + A U^T P U)^-1 A U^T P,  dx = P U (I + A U^T P U)^-1 g.
-    before = state.covariance
-    p_u = xp.concatenate([before[..., 0:3], before[..., 6:9]], axis=-1)  # (N, 15, 6)
+    covariance_before = state.covariance
+    p_u = xp.concatenate(
+        [covariance_before[..., 0:3], covariance_before[..., 6:9]], axis=-1
+    )  # (N, 15, 6)
     u_p_u = xp.concatenate([p_u[..., 0:3, :], p_u[..., 6:9, :]], axis=-2)
     solved = xp.linalg.solve(xp.eye(6) + xp.matmul(information, u_p_u), xp.concatenate(
         [xp.matmul(information, xp.matrix_transpose(p_u)), gradient], axis=-1))  # fmt: skip
-    covariance = before - xp.matmul(p_u, solved[..., :-1])
+    covariance = covariance_before - xp.matmul(p_u, solved[..., :-1])
     error = xp.matmul(p_u, solved[..., -1:])[..., 0]
     return _corrected(state, error, covariance)
 
@@ -216,10 +222,10 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
     """Return the state corrected by the error (N, 15), with the covariance after the reset."""
     xp = error.__array_namespace__()
     rotation_b = error[:, 6:9]
-    zero, one = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
-    reset_angle = one - 0.5 * _skew(rotation_b)
+    zeros, identity = xp.zeros_like(state.rot_w), xp.zeros_like(state.rot_w) + xp.eye(3)
+    reset_angle = identity - 0.5 * _skew(rotation_b)
     reset = _blocks([
-        [reset_angle if row == col == 2 else one if row == col else zero for col in range(5)]
+        [reset_angle if row == col == 2 else identity if row == col else zeros for col in range(5)]
         for row in range(5)
     ])  # fmt: skip
     covariance = xp.matmul(xp.matmul(reset, covariance), xp.matrix_transpose(reset))
@@ -234,9 +240,10 @@ def _corrected(state: FilterState, error: Array, covariance: Array) -> FilterSta
 
 
 def error_of(state: FilterState, truth: FilterState) -> Array:
-    """Return the error of the state, (N, 15); the truth's covariance is not used.
+    """Return the error of the state (N, 15): truth minus estimate, in the order of the error state.
 
-    The attitude error is the axis times the sine of the angle, in body axes.
+    The attitude error is the axis times the sine of the angle, in body axes. The covariance in
+    `truth` is not used.
     """
     xp = state.pos_w.__array_namespace__()
     relative = xp.matmul(xp.matrix_transpose(state.rot_w), truth.rot_w)
