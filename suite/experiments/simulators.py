@@ -74,8 +74,8 @@ def conditions(config: Config) -> list[Condition]:
         if name in (BASE, REFERENCE):
             others = ", ".join(known for known in WORLDS if known not in (BASE, REFERENCE))
             raise ValueError(
-                f"--simulator {name}: all simulators are compared with {BASE}, which flies as "
-                f"{name}; give one of {others}"
+                f"--simulator {name}: the page compares with {BASE}, whose dynamics are those of "
+                f"{REFERENCE}; give one of {others}"
             )
         if hasattr(simulator, "nearest"):
             entries.append(Condition(control_label(name), 1.0, "", simulator.nearest(vehicle)))

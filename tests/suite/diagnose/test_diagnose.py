@@ -209,7 +209,7 @@ def test_what_drives_the_model_must_be_in_every_log():
     with pytest.raises(ValueError, match="motors"):
         diagnose([fly(LAGGED, 0, duration_s=2.0)], LAGGED, by="rollouts", drive="motors")
     log = replace(fly(LAGGED, 0, duration_s=2.0), thrust_cmd=None, rate_cmd_b=None)
-    with pytest.raises(ValueError, match="sort"):
+    with pytest.raises(ValueError, match="diagnose each kind alone"):
         diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED, by="rollouts")
 
 

@@ -34,7 +34,7 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
 
 def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(command, "_made", lambda config, console: asked.append(config) or {})
+    monkeypatch.setattr(command, "_make_page", lambda config, console: asked.append(config) or {})
     _, config = parse("reproduce", ["all", "--out", str(tmp_path)])
     assert list(command.run(config, Console())["seconds"]) == list(published.PUBLISHED)
     assert [type(c.experiment).__module__.rpartition(".")[2] for c in asked] == list(

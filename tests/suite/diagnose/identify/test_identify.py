@@ -74,7 +74,7 @@ def coverage(root):
 @pytest.fixture(scope="module")
 def fleet(coverage):
     """A vehicle of drawn numbers, and its flights."""
-    return coverage.flown(0, 1)
+    return coverage.fly_fleet(0, 1)
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet):
 
 @pytest.mark.slow
 def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(coverage):
-    found = coverage.found(40, 0, list(coverage.CASES), "")
+    found = coverage.measure(40, 0, list(coverage.CASES), "")
     assert len(found) > 40
     for (case, key), rows in found.items():
         held = sum(abs(pull) < 1.0 for _, pull, _ in rows)
