@@ -24,21 +24,23 @@ from suite.train.overrides import check_owned, in_every_phase
 from tracks.common.grid import Grid, table
 
 PROGRESS = (0.4, 0.8, 1.6, 3.2)
-"""lambda_p, the weight of the progress term L_p. The paper has the field only at the first weight;
-here each weight, and the recipe's, is trained with and without it, so that only the field differs
-in a pair."""
+"""Values of lambda_p, the weight of the progress term L_p. The paper trains with the field only at
+the first of these weights. Here each of them, and the weight of the recipe, is trained with and
+without the field, so that the two trainings of a pair differ in the field only."""
 NORMALISED = (1.6, 3.2, 6.4)
-"""lambda_p of L_p^norm, progress by direction alone, without the field."""
+"""Values of lambda_p, trained without the field, for the term L_p^norm. It rewards the direction of
+flight alone."""
 KINDS = {
     "field": "with the field, L_p",
     "progress": "without, L_p",
     "normalised": "without, L_p^norm",
 }
-"""Kinds of settings, the first words of their keys, with their labels."""
+"""Kind of a setting -> its label in tables. The key of a setting is its kind and its weight, such
+as "field 0.4"."""
 RATES = ("success_cross", "collision_free")
-"""Numbers of `validation.mean_scores` that are rates."""
+"""Measures of `validation.mean_scores` that are shares of the trials."""
 SPREADS = ("success_cross", "collision_free", "v_max", "v_max_most", "gates")
-"""Numbers of `validation.mean_scores` in ablation.json."""
+"""Measures of `validation.mean_scores` that ablation.json has."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,10 @@ class Config(options.FourGateOptions):
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; missing trainings and flights are made first."""
+    """Return the contents of the page; missing trainings and flights are made first."""
     from suite.experiments.pages.charts import bars_chart
 
+    # The first argument is 0: only the finished policies are measured.
     compared = settings(config)
     unseen = training.UnseenWorlds(0, config.trials, config.seed, config.seconds)
     study = training.Study(compared, config.training_seeds, unseen)
@@ -121,26 +124,34 @@ def settings(config: Config) -> list[training.Setting]:
         return training.Setting(f"{kind} {weight:g}", KINDS[kind], recipe)
 
     weights = sorted({float(f"{weight:g}") for weight in (*PROGRESS, base.loss.progress)})
-    found = [setting("field", w) for w in weights]
-    found += [setting("progress", w, field_gain=0.0) for w in weights]
-    found += [
+    all_settings = [setting("field", w) for w in weights]
+    all_settings += [setting("progress", w, field_gain=0.0) for w in weights]
+    all_settings += [
         setting("normalised", w, progress=0.0, progress_norm=w, field_gain=0.0) for w in NORMALISED
     ]
-    return list(options.select({each.key: each for each in found}, config.only, "setting").values())
+    return list(
+        options.select({each.key: each for each in all_settings}, config.only, "setting").values()
+    )
 
 
 def weight(row: Summary) -> float:
-    """Return lambda_p of the setting's progress term."""
+    """Return lambda_p, the weight of the progress term of the setting."""
     return row.recipe.loss.progress or row.recipe.loss.progress_norm
 
 
 def pooled(row: Summary, name: str, trials: int) -> Interval:
-    """Return the Wilson interval of a rate over the trials of all seeds, `trials` of each."""
+    """Return the Wilson interval of a rate over the trials of all training seeds together.
+
+    Args:
+        row: the setting.
+        name: measure of `RATES`.
+        trials: number of trials of each seed.
+    """
     return wilson(sum(round(trials * x) for x in row.values(name)), trials * len(row.trainings))
 
 
 def _comparison_grid(rows: Sequence[Summary], trials: int) -> Grid:
-    """Return our numbers next to the printed ones, a row per setting."""
+    """Return a table of our results and those that the paper prints, a row per setting."""
     source, paper_rows = paper.ablation()
     headers = ["setting", "lambda_p", "success cross [%]", "pooled [%]", "paper [%]",
                "collision-free rate [%]", "pooled [%]", "paper [%]",

@@ -1,7 +1,8 @@
 """The page `faults`: how many injected faults are named in simulated and real logs.
 
-A fault is an error of interface or log: a unit, sign, scale, order, delay or rate. `suite check`
-and `suite import` should report it by name, and report nothing in logs without a fault.
+A fault is an error of an interface or a log: a wrong unit, sign, scale, order, delay or rate. Each
+case takes a correct log, puts one fault into it, and imports and checks the result. `suite check`
+and `suite import` should report the fault by name, and report nothing in logs without a fault.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ FLIGHT_LOG = "flight log"
 FORMATS = (*WRITERS, FLIGHT_LOG)
 """Formats of the simulated logs."""
 POLICY_HZ = 30.0
-"""Rate of the policy with which the logs are compared [Hz]."""
+"""Decision rate of the policy that the simulated logs are checked against [Hz]."""
 OUTCOMES = ("named", "not identifiable", "refused", "another name", "silent")
-"""Outcomes of a faulty log: its fault is named, or reported as not identifiable; the log is refused
-with a reason; only another fault is named; or it is imported without a finding."""
+"""Outcomes of a faulty log. Its fault is named, or reported as not identifiable. Or the import
+refuses the log with a reason. Or only another fault is named. Or nothing is reported."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +71,17 @@ class Case:
     """One log to check."""
 
     kind: str
-    """A key of `KINDS`, the injected fault; "" for none."""
+    """The injected fault, a key of `KINDS`; "" for none."""
     format: str
     """One of `FORMATS`, or "real"."""
     path: Path
     """The log of the flight without a fault."""
     number: int
-    """Number of the flight, the seed of its noise."""
+    """Number of the flight; it is a part of the seed of its noise."""
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return the tables; missing flights and checks are made first."""
+    """Return the contents of the page; missing flights and checks are made first."""
     vehicle = load_vehicle(config.vehicle)
     inputs = [config.vehicle, config.seed, git_commit(), code_digest("eval")]
     folder = workspace.cache / f"faults-{digest(inputs)}"
@@ -145,7 +146,10 @@ def _fly(config: Config, vehicle: Vehicle, folder: Path, console: Console) -> li
 
 
 def _simulated_cases(config: Config, flights: Sequence[Path]) -> Iterator[Case]:
-    """Yield `config.flights` cases per kind, in the formats that have the fault's signals."""
+    """Yield `config.flights` cases per kind of fault.
+
+    The formats alternate, among those that have the signals that the fault changes.
+    """
     for number, (name, kind) in enumerate(KINDS.items()):
         formats = [f for f in FORMATS if kind.fits(_signals_of(f))]
         for k in range(config.flights):
@@ -155,13 +159,26 @@ def _simulated_cases(config: Config, flights: Sequence[Path]) -> Iterator[Case]:
 
 def _signals_of(format: str) -> set[str]:
     """Return the signals that a simulated log of this format has."""
-    common = {"time", "pos", "quat", "rate", "acc", "motor", "cmd_rate", "throttle", "voltage"}
-    further = {"betaflight": set(), FLIGHT_LOG: {"vel", "baro", "cmd_thrust"}}
-    return common | further.get(format, {"vel"})
+    shared_signals = {
+        "time",
+        "pos",
+        "quat",
+        "rate",
+        "acc",
+        "motor",
+        "cmd_rate",
+        "throttle",
+        "voltage",
+    }
+    further_signals = {"betaflight": set(), FLIGHT_LOG: {"vel", "baro", "cmd_thrust"}}
+    return shared_signals | further_signals.get(format, {"vel"})
 
 
 def _real_cases(real: Sequence[Path], count: int) -> Iterator[Case]:
-    """Yield `count` cases per kind, from all sets of real logs that have the fault's signals."""
+    """Yield `count` cases per kind of fault, from the sets of real logs.
+
+    The sets alternate, among those that have the signals that the fault changes. A set is a folder.
+    """
     sets: dict[Path, list[Path]] = {}
     for path in real:
         sets.setdefault(path.parent, []).append(path)
@@ -175,13 +192,13 @@ def _real_cases(real: Sequence[Path], count: int) -> Iterator[Case]:
 
 
 Answer = list[dict[str, Any]] | str
-"""Records of findings, or the reason of a refusal."""
+"""Findings in the log of a case, one dictionary each, or the reason why the import refused it."""
 
 
 def _check_cases(
     cases: Sequence[Case], config: Config, folder: Path, console: Console, workspace: Workspace
 ) -> dict[Case, Answer]:
-    """Return the findings of every case; those of an interrupted run are reused."""
+    """Return the answer to every case; those of an interrupted run are read from its file."""
     path = folder / f"checked-{code_digest('suite/experiments/injected', 'eval/importers')}.jsonl"
     keys = {f"{c.kind}|{c.format}|{c.path.parent.name}/{c.path.name}": c for c in cases}
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
@@ -201,7 +218,10 @@ def _check_cases(
 
 
 def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
-    """Inject the fault of a case, and yield the findings in the log."""
+    """Inject the fault of a case, import and check the faulty log, and yield the answer.
+
+    It is a generator because `run_pieces` expects one; it yields once.
+    """
     kind = KINDS.get(case.kind, Kind(()))
     rng = np.random.default_rng([seed, case.number, len(case.kind)])
     if case.format == "real":
@@ -226,7 +246,11 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
 def _findings(
     case: Case, signals: dict[str, np.ndarray], vehicle: Vehicle, context: CheckContext
 ) -> list[Finding]:
-    """Return the findings of import and check in signals, as a log of the case's format."""
+    """Return the findings in a log with `signals`.
+
+    A case in the format of another program is written to a file and imported, which also gives
+    findings. Other cases become a flight log without a file.
+    """
     if case.format in WRITERS:
         with tempfile.TemporaryDirectory() as folder:
             written = WRITERS[case.format](Path(folder), signals, vehicle.full_thrust)
@@ -237,7 +261,7 @@ def _findings(
 
 
 def _import_real(path: Path) -> tuple[FlightLog, Vehicle]:
-    """Return an imported real log, and the vehicle that it is compared with."""
+    """Return a real log after its import, and the vehicle that it is compared with."""
     name = path.parent.name if path.parent.name in ("nanobench", "crazyswarm2") else "crazypad"
     vehicle = load_vehicle("crazyflie21")
     options = ImportOptions(map=Path(name), partial=True, vehicle=vehicle)
@@ -264,7 +288,7 @@ def _outcome(case: Case, answer: Answer) -> str:
 
 
 def _kinds_grid(answers: Iterable[tuple[Case, Answer]]) -> Grid:
-    """Return the number of logs by outcome, a row per kind of fault."""
+    """Return a table with the number of logs by outcome, a row per kind of fault."""
     count = Counter((case.kind, _outcome(case, answer)) for case, answer in answers)
     rows = [
         [("(race) " if KINDS[kind].race else "") + kind, " or ".join(KINDS[kind].names)]
@@ -279,7 +303,7 @@ def _kinds_grid(answers: Iterable[tuple[Case, Answer]]) -> Grid:
 
 
 def _clean_grid(answers: Iterable[tuple[Case, Answer]]) -> Grid:
-    """Return the false alarms in logs without a fault, a row per format."""
+    """Return a table with the false alarms in logs without a fault, a row per format."""
     logs, false_alarms, names = Counter[str](), Counter[str](), Counter[tuple[str, str]]()
     for case, answer in answers:
         reported = _reported_faults(answer)

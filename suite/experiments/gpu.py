@@ -51,12 +51,13 @@ from tracks.families import JUDGED
 from tracks.input.ranges import Range, Seed, Trials
 
 LEVELS = (0, 3, 6, 9)
-"""Levels of the trained policy's trials, and of the comparison with the CPU."""
+"""Levels of all judged trials: those of the trained policy and those of the comparison with the
+CPU."""
 SAMPLED, COUNTED = 128, 8
-"""Number of different worlds in a speed measurement, which are repeated to its size; and number of
-worlds whose operations are counted."""
+"""Number of different worlds in a measurement of the speed, in which further worlds are copies of
+these; and number of worlds in the program whose operations are counted."""
 CPU_MOST = 256
-"""Largest number of worlds on a CPU: more take hours."""
+"""Largest number of worlds that may be measured on a CPU: more take hours."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Config:
 
 
 class Row(NamedTuple):
-    """The trainer's speed for a number of worlds."""
+    """Speed of the training for one model and one number of worlds."""
 
     model: str
     """A key of MODELS."""
@@ -96,7 +97,7 @@ class Row(NamedTuple):
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables, a chart and numbers.
+    """Return the contents of the page, after all measurements.
 
     Raises:
         ValueError: if --train-worlds is not one of --worlds, and for too many worlds on a CPU.
@@ -114,7 +115,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     device, vehicle = jax.devices()[0], load_vehicle("reference")
     best = multiplying_rate(config.matrix)
     console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
-    # Another process flies on the CPU at the same time.
+    # Another process flies the trials on the CPU while this one measures the accelerator.
     with worker_pool(1) as cpu_process:
         cpu_results = cpu_process.submit(fly_on_cpu, config, vehicle)
         programs = compile_programs(config, vehicle, console)
@@ -174,13 +175,13 @@ class Update(NamedTuple):
     """A compiled gradient step with its worlds."""
 
     phase: TrainConfig
-    """Its settings."""
+    """Settings of the training phase that the step belongs to."""
     call: Callable[[], Any]
-    """Makes the step."""
+    """Function that makes the step."""
 
 
 class Compiled(NamedTuple):
-    """The compiled programs."""
+    """The compiled programs, and the results of running them once."""
 
     updates: Mapping[tuple[str, int], Update]
     """Gradient steps by model and number of worlds."""
@@ -191,9 +192,10 @@ class Compiled(NamedTuple):
 
 
 def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Compiled:
-    """Run every program once, all at the same time, since compiling takes most of the time.
+    """Run every program once, so that it is compiled before its time is measured.
 
-    The programs of the short training are among them, so it does not compile them again.
+    All compile at the same time, since compiling takes most of the time. The programs of the short
+    training are among them, so that training does not compile them again.
     """
     measured = {
         (model, worlds): last_phase(config, model, worlds)
@@ -205,9 +207,9 @@ def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Comp
     with ThreadPoolExecutor(len(measured) + len(phases) + len(config.worlds)) as pool:
         judged = [pool.submit(_fly_timed, config, vehicle, worlds) for worlds in config.worlds]
         results = pool.submit(_fly_paired, config, vehicle, "mjx")
-        others = [pool.submit(_compile_update, phase) for phase in phases[:-1]]
+        earlier_phases = [pool.submit(_compile_update, phase) for phase in phases[:-1]]
         updates = dict(zip(measured, pool.map(_compile_update, measured.values()), strict=True))
-        for future in (*judged, *others):
+        for future in (*judged, *earlier_phases):
             future.result()
         programs = Compiled(updates, results.result(), time.perf_counter() - started)
     console.say(f"every program compiled: {programs.seconds:.0f} s")
@@ -215,7 +217,7 @@ def compile_programs(config: Config, vehicle: Vehicle, console: Console) -> Comp
 
 
 def _compile_update(phase: TrainConfig) -> Update:
-    """Return a gradient step of a phase, after one call."""
+    """Return a gradient step of a phase; one call of it is made, which compiles it."""
     update, worlds = make_update(phase), repeated_worlds(phase)
     state = jax.device_put(start_state(phase), jax.devices()[0])
     jax.block_until_ready(update(state, worlds))
@@ -223,7 +225,10 @@ def _compile_update(phase: TrainConfig) -> Update:
 
 
 def repeated_worlds(config: TrainConfig) -> Worlds:
-    """Return the worlds of the first iteration; up to SAMPLED are different, the others copies."""
+    """Return the worlds of the first iteration.
+
+    At most SAMPLED of them are different, because drawing worlds is slow. The others are copies.
+    """
     batch = config.episode.batch
     few = replace(config, episode=replace(config.episode, batch=min(batch, SAMPLED)))
     worlds = sample_worlds(few, 0)
@@ -234,7 +239,7 @@ def repeated_worlds(config: TrainConfig) -> Worlds:
 def trainer_speeds(
     config: Config, updates: Mapping[tuple[str, int], Update], console: Console
 ) -> list[Row]:
-    """Return the speed of each gradient step, few worlds first."""
+    """Return the speed of each gradient step, in the order of the number of worlds."""
     operations = {model: _operations_per_world(config, model) for model in MODELS}
     rows = []
     for (model, worlds), update in sorted(updates.items(), key=lambda entry: entry[0][1]):
@@ -245,7 +250,7 @@ def trainer_speeds(
 
 
 def _operations_per_world(config: Config, model: str) -> float:
-    """Return the operations of the gradient for one world."""
+    """Return the floating-point operations of the gradient for one world."""
     phase = last_phase(config, model, COUNTED)
     gradient = make_gradient(phase)
     arguments = (start_state(phase).params, repeated_worlds(phase), jax.random.key(0))
@@ -253,7 +258,7 @@ def _operations_per_world(config: Config, model: str) -> float:
 
 
 def judge_speed(config: Config, vehicle: Vehicle, worlds: int, console: Console) -> dict[str, Any]:
-    """Return the speed of mjx with `worlds` trials at once; the making of their tracks counts."""
+    """Return the speed of mjx with `worlds` trials at once; the time includes making the tracks."""
     started = time.perf_counter()
     results = _fly_timed(config, vehicle, worlds)
     seconds = time.perf_counter() - started
@@ -275,13 +280,13 @@ def _fly_timed(config: Config, vehicle: Vehicle, worlds: int) -> list[TrialResul
 
 
 def _trials(count: int, seed: int) -> list[TrialSpec]:
-    """Return trials over the three tracks and LEVELS in turn."""
+    """Return `count` trials, over the three tracks and LEVELS in turn; seeds begin at `seed`."""
     cells = [(track, level) for track in JUDGED for level in LEVELS]
     return [TrialSpec(*cells[k % len(cells)], seed + k // len(cells)) for k in range(count)]
 
 
 def _fly_paired(config: Config, vehicle: Vehicle, simulator: str) -> list[TrialResult]:
-    """Fly the trials of the comparison with the CPU."""
+    """Fly the shipped policy on the trials of the comparison between accelerator and CPU."""
     options = JudgeOptions(slots=min(config.worlds), workers=1)
     trials = _trials(config.paired_trials, config.seed)
     return fly(load_policy(default_policy()), trials, vehicle, simulator, options)
@@ -317,17 +322,18 @@ def short_training(
     """Train by the recipe gpu for about `config.seconds`, and judge the policy.
 
     Args:
-        config: of the experiment.
-        vehicle: of the judged trials.
-        step_s: time of a gradient step of the last phase, from which the number of steps follows
-            [s].
-        workspace: cache; an earlier run is removed, since the time is a result.
+        config: options of the experiment.
+        vehicle: vehicle of the judged trials.
+        step_s: time of a gradient step of the last phase [s]; it determines the number of steps.
+        workspace: cache; an earlier run is removed, since the time of the training is a result.
         console: shows progress.
     """
     base = recipe(config, config.train_worlds)
+    # Phases differ in the decisions of a gradient step, and its time is proportional to them. With
+    # 1000 iterations in all, each phase counts with its share.
     phases = phase_configs(with_iterations(base, 1000))
-    mean_steps = sum(p.optimizer.iterations * p.episode.steps for p in phases) / 1000
-    iterations = max(len(phases), round(config.seconds / step_s * _steps(config) / mean_steps))
+    mean_decisions = sum(p.optimizer.iterations * p.episode.steps for p in phases) / 1000
+    iterations = max(len(phases), round(config.seconds / step_s * _steps(config) / mean_decisions))
     folder = workspace.cache / "gpu"
     shutil.rmtree(folder, ignore_errors=True)
     started = time.perf_counter()

@@ -1,7 +1,8 @@
-"""The page `perception`: success and speed of policies through sensor models.
+"""The page `perception`: success rate and speed of policies that get the data of sensor models.
 
-A preset is a shipped sensors file with several models, such as `vio`. The magnitude is a factor on
-the errors of its file. All policies fly the same trials (a track, a level of difficulty, a seed).
+A sensor model simulates one kind of error in what a policy sees. A preset is a shipped sensors file
+with several models, such as `vio`. A magnitude multiplies the errors: 0 is a perfect sensor, 1 the
+usual size. All policies fly the same trials (a track, a level of difficulty, a seed).
 """
 
 from __future__ import annotations
@@ -62,16 +63,26 @@ class Config(options.JudgingOptions):
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; trials that are not in the cache are flown first."""
+    """Return the contents of the page; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import sweeps_chart
 
+    # 1. Every preset at its usual size, on all tracks and levels.
     vehicle, presets, models = load_vehicle(config.vehicle), *select_sensor_sets(config.only)
     policies = judging.named_policies(config.policy)
-    trials, growing = judging.judged_trials(config), replace(config, trials=config.growing_trials)
+    trials, sweep_config = (
+        judging.judged_trials(config),
+        replace(config, trials=config.growing_trials),
+    )
     base = Condition("perfect", 0.0, "", vehicle)
-    usual = [Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()]
-    results, _ = disturbed.fly_conditions([base, *usual], {}, policies, trials, workspace, console)
-    sweep_trials = judging.judged_trials(growing, [3])
+    preset_conditions = [
+        Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()
+    ]
+    results, _ = disturbed.fly_conditions(
+        [base, *preset_conditions], {}, policies, trials, workspace, console
+    )
+
+    # 2. Presets and single models at several magnitudes, on level 3.
+    sweep_trials = judging.judged_trials(sweep_config, [3])
 
     def fly_sweeps(
         sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
@@ -89,7 +100,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         **judging.policy_facts(policies),
         "presets": f"three tracks, levels {config.difficulty}, seeds "
         f"{options.judged_seeds(config)}: {len(trials)} trials per preset, the same in all",
-        "magnitudes": f"three tracks, level 3, seeds {options.judged_seeds(growing)}: "
+        "magnitudes": f"three tracks, level 3, seeds {options.judged_seeds(sweep_config)}: "
         f"{len(sweep_trials)} trials per magnitude",
         "vehicle": config.vehicle,
     }
@@ -112,17 +123,19 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
 
 def select_sensor_sets(only: Sequence[str]) -> tuple[dict[str, SensorSet], dict[str, SensorSet]]:
-    """Return the presets, and the single models at their usual size: those in `only`, or all.
+    """Return the presets, and the single sensor models at their usual size.
+
+    With names in `only`, both parts have these entries alone.
 
     Raises:
         ValueError: for an unknown name.
     """
     presets = {name: load_sensors(name) for name in shipped_sensors() if name != "perfect"}
-    usual = {**presets["tof-depth"].models, **presets["all"].models}
+    all_models = {**presets["tof-depth"].models, **presets["all"].models}
     models = {
-        name: SensorSet(name, MappingProxyType({name: usual[name]}))
+        name: SensorSet(name, MappingProxyType({name: all_models[name]}))
         for name, sensor in SENSORS.items()
-        if name in usual and not sensor.measure
+        if name in all_models and not sensor.measure
     }
     names = options.select({**presets, **models}, only, "preset or sensor model")
     return (
@@ -143,15 +156,16 @@ def magnitude_sweeps(sets: Mapping[str, SensorSet], magnitudes: Sequence[float])
     ]
 
 
-def _speed(entry: ConditionResult, policy: str) -> float:
-    """Return the median of the trials' mean speeds [m/s]."""
+def _median_speed(entry: ConditionResult, policy: str) -> float:
+    """Return the median, over the trials of a policy, of the mean speed [m/s]."""
     return float(np.median([row.v_mean for row in entry.results[policy]]))
 
 
 def preset_grid(results: Sequence[ConditionResult]) -> Grid:
-    """Return success by level and over all, its change from perfect sensors, and speed.
+    """Return a table with a row for each preset and policy.
 
-    There is a row for each preset and policy.
+    It has the success rate at each level and over all levels, the change of the success rate
+    against perfect sensors, and the speed.
     """
     base, rows = results[0], []
     levels = list(dict.fromkeys(trial.difficulty for trial in next(iter(base.results.values()))))
@@ -162,7 +176,7 @@ def preset_grid(results: Sequence[ConditionResult]) -> Grid:
                 success = [trial.success for trial in trials if trial.difficulty == level]
                 row.append(percent(wilson(sum(success), len(success))))
             change = paired_success(entry.won(name), base.won(name))
-            speed, base_speed = _speed(entry, name), _speed(base, name)
+            speed, base_speed = _median_speed(entry, name), _median_speed(base, name)
             is_perfect = entry.condition.sensors == PERFECT
             row += [percent(entry.success(name)), "" if is_perfect else difference_cell(change)]
             row.append(f"{speed:.2f} ({speed / base_speed - 1:+.1%})")
@@ -172,14 +186,17 @@ def preset_grid(results: Sequence[ConditionResult]) -> Grid:
 
 
 def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
-    """Return the differences of the other policies to the first under each preset."""
+    """Return a table with the differences of the other policies to the first under each preset.
+
+    The list is empty if there is one policy only.
+    """
     first, *others = results[0].results
     rows = []
     for entry in results:
         cells = []
         for name in others:
             change = difference_cell(paired_success(entry.won(name), entry.won(first)))
-            speed_change = _speed(entry, name) / _speed(entry, first) - 1
+            speed_change = _median_speed(entry, name) / _median_speed(entry, first) - 1
             cells.append(Cell(f"{change.text}, {speed_change:+.1%}", change.tone))
         rows.append([entry.condition.name, *cells])
     title = f"Success in points and median v_mean against {first}, on the same trials"
@@ -187,11 +204,16 @@ def gain_grids(results: Sequence[ConditionResult]) -> list[Grid]:
 
 
 def magnitude_grid(sweeps: Mapping[Sweep, Sequence[ConditionResult]]) -> Grid:
-    """Return success and speed at every magnitude, a row for each set and policy."""
+    """Return a table of success rate and speed at every magnitude.
+
+    It has a row for each policy with each preset or model.
+    """
     rows = []
     for sweep, points in sweeps.items():
         for name in points[0].results:
-            cells = (f"{percent(p.success(name))}, {_speed(p, name):.2f} m/s" for p in points)
+            cells = (
+                f"{percent(p.success(name))}, {_median_speed(p, name):.2f} m/s" for p in points
+            )
             rows.append([sweep.name, name, *cells])
     magnitudes = next(iter(sweeps)).sizes
     headers = ["sensors", "policy", *(f"x {size:g}" for size in magnitudes)]

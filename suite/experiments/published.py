@@ -1,4 +1,4 @@
-"""The published pages of docs/results: their options, making all of them, and finding old ones."""
+"""The published pages of docs/results: their options, and how to make all and find outdated ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     ),
     "faults": (),
 }
-"""Page -> its options, in the order in which `suite reproduce all` makes them."""
+"""Page -> its options. `suite reproduce all` makes the pages in this order."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,11 @@ class Status:
 
 
 def make_all(make: Callable[[str, tuple[str, ...]], Any], console: Console) -> dict[str, Any]:
-    """Make each published page by make(name, options), and print how long each took."""
+    """Make each published page by make(name, options), and print how long each took.
+
+    Returns:
+        `seconds`: page -> time that it took [s].
+    """
     seconds: dict[str, float] = {}
     for name, options in PUBLISHED.items():
         console.say(f"{len(seconds) + 1} of {len(PUBLISHED)}: {name}")
@@ -60,10 +64,11 @@ def make_all(make: Callable[[str, tuple[str, ...]], Any], console: Console) -> d
 
 
 def page_states(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return `commit`, which made the page, and `newer` for every published page in `folder`.
+    """Return the state of every published page in `folder`, by name.
 
-    `newer` has "policy" if a shipped policy has other weights than the one that flew, and "code" if
-    the code that flies (tracks, policies, eval) has changed; it is None if there is no page.
+    A state has `commit`, which made the page, and `newer`, a list of what has changed since. It has
+    "policy" if a shipped policy now has other weights, and "code" if the code that flies (tracks,
+    policies, eval) is different. `newer` is None if there is no page.
     """
     return {name: _page_state(folder / f"{name}.json") for name in PUBLISHED}
 
@@ -75,8 +80,10 @@ def _page_state(path: Path) -> dict[str, Any]:
     page = json.loads(path.read_text(encoding="utf-8"))
     policies = re.findall(r"([\w-]+), SHA-256 ([0-9a-f]{16})", json.dumps(page["made_by"]))
     names = shipped.names()
-    is_old = (name not in names or policy_digest(name)[:16] != digest for name, digest in policies)
-    newer = ["policy"] if any(is_old) else []
+    weights_differ = (
+        name not in names or policy_digest(name)[:16] != digest for name, digest in policies
+    )
+    newer = ["policy"] if any(weights_differ) else []
     newer += ["code"] if page.get("code_sha256") != code_digest(*FLIES) else []
     return {"commit": page["git_commit"] or "", "newer": newer}
 

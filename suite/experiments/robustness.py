@@ -1,7 +1,8 @@
 """The page `robustness`: success of policies under physical effects and growing disturbances.
 
 An effect is one physical cause of a mismatch, such as drag or wind. A condition is a vehicle with
-an effect, or with other sensors; all policies fly the same trials under every condition.
+an effect, or with other sensors. A sweep is a series of conditions in which one disturbance grows.
+All policies fly the same trials under every condition.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ class Config(options.JudgingOptions):
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; trials that are not in the cache are flown first."""
+    """Return the contents of the page; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import effects_chart, sweeps_chart
 
     vehicle, policies = load_vehicle(config.vehicle), judging.named_policies(config.policy)
     singles, sweeps = disturbed.select_conditions(vehicle, config.only)
     base, trials = Condition("undisturbed", 0.0, "", vehicle), judging.judged_trials(config)
-    effects, grown = disturbed.fly_conditions(
+    effects, sweep_results = disturbed.fly_conditions(
         [base, *singles], sweeps, policies, trials, workspace, console
     )
     facts = {
@@ -57,12 +58,15 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             Picture(effects_chart(effects), "Success under each effect; dashed: undisturbed"),
             condition_grid(effects, effects[0], ("effect", "size in this row")),
         ]
-    if grown:
+    if sweep_results:
         parts["Growing disturbances"] = [
-            Picture(sweeps_chart(grown), "Success against the size of each disturbance"),
-            *(condition_grid(points, effects[0], (s.axis,), s.name) for s, points in grown.items()),
+            Picture(sweeps_chart(sweep_results), "Success against the size of each disturbance"),
+            *(
+                condition_grid(points, effects[0], (s.axis,), s.name)
+                for s, points in sweep_results.items()
+            ),
         ]
-    results = [*effects, *(point for points in grown.values() for point in points)]
+    results = [*effects, *(point for points in sweep_results.values() for point in points)]
     numbers = [disturbed.tested_numbers(entry, effects[0]) for entry in results]
     return PageContents(facts, parts, {"conditions": numbers})
 
@@ -70,13 +74,15 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 def condition_grid(
     entries: Sequence[ConditionResult], base: ConditionResult, first: Sequence[str], title: str = ""
 ) -> Grid:
-    """Return success and change under each of `entries`, a row each.
+    """Return a table of the success rates under each of `entries`, and their changes from `base`.
+
+    Every entry has a row. With several policies, further columns compare the others with the first.
 
     Args:
-        entries: results under conditions; the other policies are compared with the first.
+        entries: results under the conditions.
         base: results under the undisturbed condition.
         first: headers of the first columns: the size, or the name and the size.
-        title: of the table.
+        title: title of the table.
     """
     headers, names = list(first), list(base.results)
     for name in names:
@@ -87,6 +93,7 @@ def condition_grid(
     rows = []
     for entry in entries:
         condition = entry.condition
+        # With one header in `first` the row begins with the size, with two with name and size.
         row: list[str | Cell] = [*(condition.name, condition.size_text)[-len(first) :]]
         is_base = (
             condition.vehicle is undisturbed.vehicle and condition.sensors == undisturbed.sensors

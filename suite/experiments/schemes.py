@@ -1,7 +1,8 @@
-"""The page `schemes`: the paper's comparison of PPO, our method, and ours without the field.
+"""The page `schemes`: the paper's comparison of three schemes (ways of training a policy).
 
-The field is the Attractive Vector Field, which guides the drone through gates. The schemes are
-trained in the same dynamics, and measured during the training on tracks that no training uses.
+They are PPO, our method, and our method without the field (the Attractive Vector Field, which
+guides the drone through gates). All are trained in the same dynamics. During the training they are
+measured on tracks that no training uses.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ from tracks.common.grid import Grid, table
 from tracks.input.ranges import Iterations, Range, Trials
 
 PROJECTION, PROJECTION_DECAY = 3.0, 0.5
-"""lambda_proj and beta_3 of L_proj, the paper's substitute for the field."""
+"""lambda_proj and beta_3: weight and decay of L_proj, the paper's substitute for the field."""
 FIGURE = ("reward", "v_max", "collision_free", "gates")
-"""Numbers of the chart, those of the paper's figure."""
+"""Measures of `validation.mean_scores` in the chart; the paper's figure has the same ones."""
 MEASURED = ("reward", "success_cross", "collision_free", "v_max", "gates")
-"""Numbers of `validation.mean_scores` in the table and in schemes.json."""
+"""Measures of `validation.mean_scores` in the table and in schemes.json."""
 GATE_COUNTS = (1, 2, 3)
-"""Mean gates per trial, of four: the table has the time at which each is first reached."""
+"""Numbers of passed gates, of the four of a track. A table has the time at which the mean over the
+trials first reaches each of them."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Config(options.FourGateOptions):
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; missing trainings are made first."""
+    """Return the contents of the page; missing trainings are made first."""
     from suite.experiments.pages.charts import curves_chart
 
     compared = schemes(config)
@@ -75,6 +77,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     }
     measured = [row for row in rows if row.at]
     chart = [Picture(curves_chart(measured, FIGURE), "Learning curves over steps and over time")]
+    # Without a measured scheme the page has no chart: the slice below is then empty.
     parts = {
         "Learning curves": [
             *chart[: len(measured)],
@@ -113,8 +116,8 @@ def schemes(config: Config) -> list[training.Setting]:
     check_owned(config.set, {"loss.progress": "give --progress", **owned})
     base = options.four_gate_recipe(config)
     ours = in_every_phase(base, "loss", progress=config.progress, progress_norm=0.0, projection=0.0)
-    substitute = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
-    without_field = in_every_phase(ours, "loss", field_gain=0.0, **substitute)
+    field_substitute = {"projection": PROJECTION, "projection_decay": PROJECTION_DECAY}
+    without_field = in_every_phase(ours, "loss", field_gain=0.0, **field_substitute)
     ppo = ppo_like(ours, config.ppo_iterations or ours.optimizer.iterations)
     known = [
         training.Setting("ppo", "PPO", ppo),
@@ -131,13 +134,20 @@ def schemes(config: Config) -> list[training.Setting]:
 
 
 def first_times(row: Summary, gates: float) -> list[tuple[float, float]]:
-    """Return steps and time [s] at which each seed first passes `gates`; seeds that do not lack."""
-    firsts = [next((p for p in points if p["gates"] >= gates), None) for points in row.trainings]
-    return [(point["steps"], point["time"]) for point in firsts if point is not None]
+    """Return when the trainings first pass `gates` gates in the mean.
+
+    Returns:
+        (environment steps, time [s]) of each training that reaches this number; the others have no
+        entry.
+    """
+    first_points = [
+        next((p for p in points if p["gates"] >= gates), None) for points in row.trainings
+    ]
+    return [(point["steps"], point["time"]) for point in first_points if point is not None]
 
 
 def _end_grid(rows: Sequence[Summary]) -> Grid:
-    """Return the numbers at the end of the trainings, a row per scheme."""
+    """Return a table of the measures at the end of the trainings, a row per scheme."""
     headers = ["scheme", *(METRICS[name].title for name in MEASURED), "diverged"]
     lines = [
         [row.label, *(row.text(name) for name in MEASURED), f"{row.diverged} of {row.seeds}"]
@@ -147,7 +157,10 @@ def _end_grid(rows: Sequence[Summary]) -> Grid:
 
 
 def _time_grid(rows: Sequence[Summary], compile_s: Mapping[str, float]) -> Grid:
-    """Return the steps and times until `GATE_COUNTS` are reached, a row per scheme."""
+    """Return a table of the steps and times until `GATE_COUNTS` are reached, a row per scheme.
+
+    Each entry is the median over the training seeds that reach the number.
+    """
     headers = ["scheme", *(f"{gates} gates" if gates > 1 else "1 gate" for gates in GATE_COUNTS),
                "whole budget", "compilation"]  # fmt: skip
     lines = []

@@ -31,11 +31,11 @@ from tracks.input.ranges import Trials
 BASE = "mujoco"
 """The simulator that the others are compared with."""
 ROUNDING = "mjx"
-"""This simulator differs from `BASE` in single precision, in contacts by signed distance, and in
-images from analytic rays."""
+"""The simulator that differs from `BASE` in numerics only: single precision, contacts by signed
+distance, and images from analytic rays."""
 REASONS = ("rounding", "air", "rest")
 """Why the success of a trial changes. `rounding`: it also changes in mjx. `air`: it also changes in
-mujoco with that simulator's aerodynamics. `rest`: for another reason."""
+mujoco with that simulator's aerodynamics (the control). `rest`: for another reason."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ def conditions(config: Config) -> list[Condition]:
                 f"--simulator {name}: the page compares with {BASE}, whose dynamics are those of "
                 f"{REFERENCE}; give one of {others}"
             )
+        # A simulator with other aerodynamics offers the vehicle that is nearest to them in mujoco.
         if hasattr(simulator, "nearest"):
             entries.append(Condition(control_label(name), 1.0, "", simulator.nearest(vehicle)))
         entries.append(Condition(name, 1.0, "", vehicle, simulator=name))
@@ -84,7 +85,7 @@ def conditions(config: Config) -> list[Condition]:
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; trials that are not in the cache are flown first."""
+    """Return the contents of the page; trials that are not in the cache are flown first."""
     simulators = conditions(config)
     policies = judging.named_policies(config.policy or tuple(shipped.names()))
     trials = judging.judged_trials(config)
@@ -120,14 +121,17 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
 
 def _numbers(entry: ConditionResult, base: ConditionResult, policy: str) -> dict[str, Any]:
-    """Return one policy's results in a simulator, and their difference to those in mujoco."""
+    """Return a policy's results in a simulator (`entry`), and their differences to mujoco (`base`).
+
+    Laps and speeds are compared over the trials that succeed in both.
+    """
     rows, base_rows = entry.results[policy], base.results[policy]
     pairs = list(zip(rows, base_rows, strict=True))
 
     def median_difference(field: str) -> float | None:
-        """Return the median absolute difference of a field over trials that succeed in both."""
-        both = [(a, b) for a, b in pairs if a.success and b.success]
-        values = [abs(getattr(a, field) - getattr(b, field)) for a, b in both]
+        """Return the median absolute difference of a field; None if no trial succeeds in both."""
+        succeeded = [(a, b) for a, b in pairs if a.success and b.success]
+        values = [abs(getattr(a, field) - getattr(b, field)) for a, b in succeeded]
         return float(np.median(values)) if values else None
 
     return {
@@ -141,7 +145,10 @@ def _numbers(entry: ConditionResult, base: ConditionResult, policy: str) -> dict
 
 
 def _success_grid(results: Sequence[ConditionResult]) -> Grid:
-    """Return success and its difference to mujoco, a row per policy and simulator."""
+    """Return a table of the success rate and its difference to mujoco.
+
+    It has a row per policy and simulator.
+    """
     headers = ["policy", "simulator", "success", "minus mujoco", "p", "same ending"]
     headers += ["lap time difference [s]", "mean speed difference [m/s]"]
     rows = []
@@ -164,18 +171,19 @@ def _success_grid(results: Sequence[ConditionResult]) -> Grid:
 def changed_trials(results: Sequence[ConditionResult]) -> list[dict[str, Any]]:
     """Return the trials whose success in a simulator differs from that in mujoco.
 
-    Each has the endings by simulator, and `why`, one of `REASONS`; that is None in mjx and in
-    controls.
+    Each entry has `policy`, `column` (the simulator), `trial`, `endings` (how the trial ended, by
+    simulator) and `why`, one of `REASONS`. `why` is None for mjx and the controls, which only serve
+    to find the reasons.
     """
     by_name = {entry.condition.name: entry for entry in results}
-    base, *others = results
+    base, *other_entries = results
     changed = []
     for policy, rows in base.results.items():
-        for entry in others:
+        for entry in other_entries:
             simulator = entry.condition.simulator
-            for number, first in enumerate(rows):
+            for number, base_result in enumerate(rows):
                 result = entry.results[policy][number]
-                if result.success == first.success:
+                if result.success == base_result.success:
                     continue
                 # Whether the two controls change the success of this trial as well.
                 rounding, air = (
@@ -200,7 +208,7 @@ def changed_trials(results: Sequence[ConditionResult]) -> list[dict[str, Any]]:
 
 
 def _changes_grid(changed: Sequence[Mapping[str, Any]], results: Sequence[ConditionResult]) -> Grid:
-    """Return the changed trials that have a reason, a row each."""
+    """Return a table of the changed trials that have a reason, a row each."""
     names = [entry.condition.name for entry in results]
     lines = [
         [c["policy"], c["trial"].track, str(c["trial"].difficulty), str(c["trial"].seed)]

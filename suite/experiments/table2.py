@@ -1,6 +1,7 @@
-"""The page `table2`: a policy on three tracks at all ten levels, next to the paper's table.
+"""The page `table2`: a policy on three tracks at all ten levels, and the paper's table.
 
-A cell is the trials of one track and level of difficulty; a trial is one judged flight.
+A cell is all trials of one track and level of difficulty. A trial is one judged flight. "Printed"
+numbers are those of the paper.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from tracks.families import JUDGED
 from tracks.input.ranges import Seed, Trials
 
 OURS = "ours"
-"""Label of the policy next to the printed rows."""
+"""Label of the judged policy in the tables, which also have the paper's methods."""
 COLUMNS = [
     header
     for track in JUDGED
     for header in (f"{track} SR", "v_max [m/s]", "largest of 10 [m/s]", "v_mean [m/s]", "lap [s]")
 ]
-"""Columns of every track."""
+"""Columns of the table: five for each track. SR is the success rate."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Config:
 
 
 def document(config: Config, workspace: Workspace, console: Console) -> PageContents:
-    """Return tables and numbers; trials that are not in the cache are flown first."""
+    """Return the contents of the page; trials that are not in the cache are flown first."""
     from suite.experiments.pages.charts import level_chart
 
     policy = config.policy or default_policy()
@@ -86,7 +87,11 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
 
 
 def paper_grid(cells: Sequence[Tally]) -> Grid:
-    """Return our rows and the printed ones, a row per method and level, tracks as columns."""
+    """Return a table of our results and the printed ones.
+
+    It has a row per method and level, and the columns of each track next to each other. The paper
+    prints no largest of ten, mean speed and lap.
+    """
     printed = sim_to_sim()
     lines = [[OURS, str(level), *_our_numbers(cells, level)] for level in printed.levels]
     for method, name in printed.methods.items():
@@ -100,7 +105,7 @@ def paper_grid(cells: Sequence[Tally]) -> Grid:
 
 
 def _our_numbers(cells: Sequence[Tally], level: int) -> list[str]:
-    """Return our numbers at a level, track by track."""
+    """Return the texts of our row at a level, in the order of COLUMNS."""
     by_track, texts = {cell.track: cell for cell in cells if cell.difficulty == level}, []
     for cell in (by_track[track] for track in JUDGED):
         lap = "-" if math.isnan(cell.lap_s.value) else f"{cell.lap_s.value:.1f}"
