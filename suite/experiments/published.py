@@ -1,4 +1,4 @@
-"""The published pages of docs/results: their options, and how to make all and find outdated ones."""
+"""The published pages of docs/results: their options, making all, and finding outdated ones."""
 
 from __future__ import annotations
 

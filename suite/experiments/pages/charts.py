@@ -1,4 +1,4 @@
-"""Draw the charts of the result pages, each as a PNG file's bytes."""
+"""Draw the charts of the result pages. Every function returns the bytes of a PNG file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ def _percent_axis(axes: Axes, low: float, vertical: bool = True) -> None:
 
 
 def level_chart(cells: Sequence[Tally]) -> bytes:
-    """Return success (above) and v_max (below) by level, a column per track, with the paper's."""
+    """Return a chart of the success rate (above) and v_max (below) by level, a column per track.
+
+    Diamonds are the values of the paper, moved a little to the right.
+    """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     rows = figure.subplots(2, len(JUDGED), sharex=True, sharey="row")
     lowest, filled = 100.0, {"ms": 4, "lw": 1.2, "color": LINES[0]}
@@ -60,25 +63,28 @@ def level_chart(cells: Sequence[Tally]) -> bytes:
 
 
 def effects_chart(entries: Sequence[ConditionResult]) -> bytes:
-    """Return success under each effect, the lowest on top; the first entry is undisturbed."""
-    first, *others = entries
-    names = list(first.results)
+    """Return a chart of the success rate under each effect, the lowest on top.
+
+    The first of `entries` is the undisturbed condition: the lowest row, and dashed lines.
+    """
+    undisturbed, *others = entries
+    names = list(undisturbed.results)
     others.sort(key=lambda entry: max(entry.success(name).value for name in names), reverse=True)
-    shown = [*others, first]
-    figure = Figure(figsize=(8.6, 1.4 + 0.24 * len(shown)), layout="constrained")
+    ordered = [*others, undisturbed]
+    figure = Figure(figsize=(8.6, 1.4 + 0.24 * len(ordered)), layout="constrained")
     axes = figure.subplots()
-    y = np.arange(len(shown))
+    y = np.arange(len(ordered))
     for number, name in enumerate(names):
         colour, offset = LINES[number % len(LINES)], 0.22 * (number - (len(names) - 1) / 2)
-        rates = [entry.success(name) for entry in shown]
+        rates = [entry.success(name) for entry in ordered]
         value, low, high = 100 * np.array(rates).T
         bars = np.maximum([value - low, high - value], 0)
-        label = f"{name}, {len(first.results[name])} trials per row; dashed: undisturbed"
+        label = f"{name}, {len(undisturbed.results[name])} trials per row; dashed: undisturbed"
         style = {"fmt": "o", "ms": 4, "lw": 1.4, "color": colour, "label": label}
         axes.errorbar(value, y - offset, xerr=bars, **style)
-        axes.axvline(100 * first.success(name).value, color=colour, lw=1, ls="--", alpha=0.6)
-    axes.set_yticks(y, [f"{e.condition.name}  {e.condition.size_text}".strip() for e in shown])
-    _percent_axis(axes, min(100 * e.success(n).low for e in shown for n in names), vertical=False)
+        axes.axvline(100 * undisturbed.success(name).value, color=colour, lw=1, ls="--", alpha=0.6)
+    axes.set_yticks(y, [f"{e.condition.name}  {e.condition.size_text}".strip() for e in ordered])
+    _percent_axis(axes, min(100 * e.success(n).low for e in ordered for n in names), vertical=False)
     axes.set_xlabel("success [%]", fontsize=9)
     titled(axes, "Success under one effect at a time, with 95 % Wilson intervals")
     axes.tick_params(axis="y", labelsize=7)
@@ -87,12 +93,13 @@ def effects_chart(entries: Sequence[ConditionResult]) -> bytes:
 
 
 def sweeps_chart(grown: Mapping[Sweep, Sequence[ConditionResult]]) -> bytes:
-    """Return success against the size of each disturbance, a panel each.
+    """Return a chart of the success rate against the size of each disturbance, a panel each.
 
-    Dots are at the measured sizes; those of several policies are next to each other.
+    Dots are at the measured sizes. With several policies they are moved a little sideways.
     """
     results = next(iter(grown.values()))[0].results
     names = list(results)
+    # Divisions rounded up: at most four panels in a row, and rows of about equal length.
     rows = -(-len(grown) // 4)
     columns = -(-len(grown) // rows)
     figure = Figure(figsize=(10.4, 0.5 + 2.5 * rows), layout="constrained")
@@ -117,7 +124,7 @@ def sweeps_chart(grown: Mapping[Sweep, Sequence[ConditionResult]]) -> bytes:
 
 
 def short_name(policy: str) -> str:
-    """Return a policy's label for a legend; that of a checkpoint RUN/policy is the run's name."""
+    """Return a policy's label for a legend. For a checkpoint RUN/policy it is the name of RUN."""
     path = PurePath(policy)
     return path.parent.name if path.name == "policy" and path.parent.name else policy
 
@@ -128,13 +135,15 @@ def bars_chart(
     kinds: Mapping[str, str],
     sample: str,
 ) -> bytes:
-    """Return means over training seeds as bars, least and most as dots, the paper's as diamonds.
+    """Return a chart of means over training seeds as bars, with the least and most as dots.
+
+    Diamonds are the values of the paper.
 
     Args:
-        rows: numbers by key: a kind and its weight, such as "field 0.4".
-        printed: the paper's numbers, of some keys.
+        rows: measures of each setting. Its key is its kind and its weight, such as "field 0.4".
+        printed: values of the paper, for some of the keys.
         kinds: label of each kind, in the order of the colours.
-        sample: the seeds and trials, for the legend.
+        sample: number of seeds and trials as text, for the legend.
     """
     figure = Figure(figsize=(10.4, 5.2), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
@@ -161,9 +170,9 @@ def bars_chart(
 
 
 def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
-    """Return numbers over steps (above) and over time (below), a column per number.
+    """Return a chart of measures over steps (above) and over time (below), a column per measure.
 
-    Bands are the range over training seeds.
+    A line is the mean over the training seeds of a scheme, a band the range from least to most.
     """
     figure = Figure(figsize=(12.5, 5.6), layout="constrained")
     upper, lower = figure.subplots(2, len(names), sharey="col")
@@ -171,9 +180,9 @@ def curves_chart(rows: Sequence[Summary], names: Sequence[str]) -> bytes:
         scale = METRICS[name].scale
         for axes, key, label in ((upper[column], "steps", "environment steps [thousands]"),
                                  (lower[column], "time", "training [s]")):  # fmt: skip
-            unit = 1e3 if key == "steps" else 1.0
+            divisor = 1e3 if key == "steps" else 1.0
             for colour, row in zip(LINES, rows, strict=False):
-                x = [point[key].mean / unit for point in row.at]
+                x = [point[key].mean / divisor for point in row.at]
                 mean, least, most = scale * np.array([point[name] for point in row.at]).T
                 axes.fill_between(x, least, most, color=colour, alpha=0.15, lw=0)
                 axes.plot(

@@ -31,9 +31,9 @@ class PageContents(NamedTuple):
     """The results of an experiment."""
 
     facts: Mapping[str, str]
-    """Conditions by name: policies, recipe, trials, seeds."""
+    """How the results were made, by name: policies, recipe, trials, seeds."""
     parts: Mapping[str, Sequence[Grid | Picture]]
-    """Tables and charts, by heading."""
+    """Heading -> tables and charts below it."""
     numbers: Mapping[str, Any]
     """Contents of NAME.json, without configuration and provenance."""
 
@@ -57,9 +57,9 @@ def write_document(
     The page is written last, after everything that it shows.
 
     Args:
-        workspace: folder of the files.
-        name: of the experiment.
-        config: of the experiment; its `seed` goes into the stamp.
+        workspace: has the folder of the files.
+        name: name of the experiment.
+        config: options of the experiment; its `seed` goes into the stamp (version, time, seed).
         contents: the results.
         console: prints the names of the written files.
 
@@ -72,10 +72,11 @@ def write_document(
     """
     header, page = stamp(SCHEMA, config.seed), workspace.out / f"{name}.md"
     facts = {**contents.facts, **_provenance(header)}
-    old = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
-    before, after = _split_page(old, page)
+    old_page = page.read_text(encoding="utf-8") if page.is_file() else _new_page(name)
+    before, after = _split_page(old_page, page)
     header["code_sha256"] = code_digest(*FLIES)
     answer = {**header, "made_by": facts, "config": config, **contents.numbers}
+    # Text of the page, and the charts as files; the first chart has no number in its name.
     figures: list[str] = []
     blocks = ["\n".join(f"- {key}: {value}" for key, value in facts.items())]
     for title, parts in contents.parts.items():
@@ -86,8 +87,8 @@ def write_document(
                 continue
             file = f"{name}.png" if not figures else f"{name}-{len(figures) + 1}.png"
             figures.append(file)
-            with replacing_file(workspace.out / file) as new:
-                new.write_bytes(part.png)
+            with replacing_file(workspace.out / file) as new_file:
+                new_file.write_bytes(part.png)
             blocks.append(f"![{part.caption}]({file})")
     write_json(workspace.out / f"{name}.json", answer)
     write_text(page, "\n\n".join([before + BEGIN, *blocks, END]) + after)
@@ -96,12 +97,17 @@ def write_document(
 
 
 def _new_page(name: str) -> str:
+    """Return the text of a page that does not exist yet: title, summary, empty generated part."""
     summary = EXPERIMENTS.get(name, name)
     return f"# {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n{BEGIN}\n{END}\n"
 
 
 def _split_page(text: str, path: Path) -> tuple[str, str]:
-    """Return the text before and after the generated part of a page."""
+    """Return the hand-written text before and after the generated part of a page.
+
+    Raises:
+        ValueError: if one of the two comments is missing.
+    """
     before, begin, remainder = text.partition(BEGIN)
     _, end, after = remainder.partition(END)
     if not begin or not end:

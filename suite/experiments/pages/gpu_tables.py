@@ -14,11 +14,11 @@ from tracks.common.grid import Grid, table_of
 MODELS = {"quadrotor": "quadrotors", "point": "point masses"}
 """Dynamics of the training: key -> name in tables."""
 Numbers = Mapping[str, Any]
-"""Numbers of a row, by name."""
+"""Measured values of one row of a table, by name."""
 
 
 def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
-    """Return the trainer's speed, a row per model and number of worlds.
+    """Return a table of the speed of training, a row per model and number of worlds.
 
     Args:
         rows: model, worlds, seconds and operations of a gradient step.
@@ -40,7 +40,7 @@ def trainer_grid(rows: Sequence[Numbers], steps: int, best: float) -> Grid:
 
 
 def judge_grid(rows: Sequence[Numbers]) -> Grid:
-    """Return the judge's speed, a row per number of trials at once."""
+    """Return a table of the speed of the judge, a row per number of trials at once."""
     return table_of(
         rows,
         ("trials at once", lambda row: f"{row['worlds']}"),
@@ -51,7 +51,10 @@ def judge_grid(rows: Sequence[Numbers]) -> Grid:
 
 
 def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
-    """Return how many trials have the same result on CPU and accelerator, a row per simulator."""
+    """Return a table of the trials with the same result on CPU and accelerator.
+
+    It has a row per simulator on the CPU.
+    """
 
     def difference(row: Numbers) -> str:
         return "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * x for x in row["difference"]))
@@ -67,7 +70,7 @@ def pairs_grid(pairs: Mapping[str, Numbers]) -> Grid:
 
 
 def training_grid(short: Numbers) -> Grid:
-    """Return the results of the short training in one row."""
+    """Return a table of one row with the results of the short training."""
     return table_of(
         [short],
         ("worlds", lambda row: f"{row['worlds']}"),

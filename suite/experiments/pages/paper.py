@@ -15,23 +15,24 @@ from eval.judging.tables import Tally, percent
 from tracks.common.grid import Grid, table
 
 SURE = 0.90
-"""Goal for the lower end of our Wilson interval if the printed success rate is 1."""
+"""Goal for the lower end of the Wilson interval of our success rate, in a cell in which the paper
+prints a success rate of 1. No measured rate can be better than 1, so the interval is compared."""
 FLOORS = {0: 0.99, 3: 0.98, 6: 0.97, 9: 0.95}
-"""Goal for the success rate of the shipped policy, by level."""
+"""Level -> second goal for the success rate: a fixed lower limit, whatever the paper prints."""
 
 
 class Printed(NamedTuple):
-    """One method on one track at one level, as printed."""
+    """Printed result of one method in one cell."""
 
     method: str
-    """Its key in paper.toml."""
+    """Key of the method in paper.toml."""
     track: str
     level: int
     won: int
     """Number of successful trials."""
     trials: int
     v_max: float
-    """[m/s]; the paper does not say over what it is the maximum."""
+    """Largest speed [m/s]; the paper does not say whether of one trial or of all."""
 
 
 class SimToSim(NamedTuple):
@@ -41,7 +42,7 @@ class SimToSim(NamedTuple):
     """Citation of the table."""
     levels: tuple[int, ...]
     methods: dict[str, str]
-    """Names of the methods by key, in the order of the table."""
+    """Key of each method -> its printed name, in the order of the table."""
     cells: tuple[Printed, ...]
 
     def at(self, track: str, level: int) -> list[Printed]:
@@ -50,24 +51,28 @@ class SimToSim(NamedTuple):
 
 
 class Ablated(NamedTuple):
-    """One setting of the ablation, as printed."""
+    """Printed result of one setting of the ablation."""
 
     success_cross: float
     """Share of trials with all four gates and no collision."""
     collision_free: float
     """Share of trials without a collision."""
     v_max: float
-    """[m/s]; the paper does not say over what it is the maximum."""
+    """Largest speed [m/s]; the paper does not say whether of one trial or of all."""
 
 
 def _read_table(name: str) -> dict[str, Any]:
+    """Return one of the tables of paper.toml."""
     path = Path(__file__).with_name("paper.toml")
     return tomllib.loads(path.read_text(encoding="utf-8"))[name]
 
 
 @functools.cache
 def ablation() -> tuple[str, dict[str, Ablated]]:
-    """Return the source and the rows of the table "Performance Comparison with and without AVF"."""
+    """Return the table "Performance Comparison with and without AVF": its citation, and its rows.
+
+    The key of a row is a key of the settings on the page `ablation`, such as "field 0.4".
+    """
     printed = _read_table("ablation")
     return printed["source"], {key: Ablated(**row) for key, row in printed["rows"].items()}
 
@@ -89,45 +94,48 @@ def sim_to_sim() -> SimToSim:
 
 
 class Goal(NamedTuple):
-    """The goals of one cell; a miss is the distance to a goal, 0 if it is met."""
+    """The three goals of one cell, and the distances to them; a distance is 0 if the goal is met."""
 
     track: str
     level: int
     success: float
-    """Goal: the best printed success rate; for 1 the interval must begin at `SURE` or above."""
+    """First goal: the best printed success rate. If that is 1, the interval of our success rate
+    must begin at `SURE` or above instead."""
     success_miss: float
-    """Distance to that goal."""
+    """Distance of our success rate, or of the lower end of its interval, to the first goal."""
     floor: float
-    """Goal: the entry of `FLOORS`."""
+    """Second goal: the success rate that `FLOORS` demands at this level."""
     floor_miss: float
-    """Distance to that goal."""
+    """Distance of our success rate to the second goal."""
     v_max: float
-    """Goal: the largest printed v_max [m/s]."""
+    """Third goal: the largest printed v_max [m/s]."""
     v_max_miss: float
-    """Distance of the median over trials to that goal [m/s]."""
+    """Distance of our median v_max over trials to the third goal [m/s]."""
     of_ten_miss: float | None = None
-    """Distance of the mean largest v_max of ten trials to that goal; None for fewer trials
-    [m/s]."""
+    """Distance of the mean of our largest v_max of ten trials to the third goal [m/s]; None with
+    fewer than ten trials."""
 
 
 def goals(cells: Sequence[Tally]) -> list[Goal]:
-    """Return the goals of every cell that the paper prints."""
+    """Return the goals of those of `cells` that the paper prints, and the distances to them."""
     printed = sim_to_sim()
     cell_goals = []
     for cell in cells:
-        others = printed.at(cell.track, cell.difficulty)
-        if not others:
+        printed_cells = printed.at(cell.track, cell.difficulty)
+        if not printed_cells:
             continue
         success, v_max_of_ten = cell.success, cell.v_max_of_ten
-        rate = max(other.won / other.trials for other in others)
-        v_max = max(other.v_max for other in others)
+        best_rate = max(other.won / other.trials for other in printed_cells)
+        v_max = max(other.v_max for other in printed_cells)
         floor = FLOORS[cell.difficulty]
         cell_goals.append(
             Goal(
                 cell.track,
                 cell.difficulty,
-                success=rate,
-                success_miss=max(0.0, SURE - success.low if rate == 1 else rate - success.value),
+                success=best_rate,
+                success_miss=max(
+                    0.0, SURE - success.low if best_rate == 1 else best_rate - success.value
+                ),
                 floor=floor,
                 floor_miss=max(0.0, floor - success.value),
                 v_max=v_max,
@@ -139,7 +147,7 @@ def goals(cells: Sequence[Tally]) -> list[Goal]:
 
 
 def goal_grid(cells: Sequence[Tally]) -> Grid:
-    """Return a table of the cells of one policy and their goals."""
+    """Return a table of the printed cells: the results of our policy, and the goals."""
     by_key = {(cell.track, cell.difficulty): cell for cell in cells}
     headers = ["track", "level", "success", "best of the others", "missed by", "floor",
                "missed by", "v_max [m/s]", "largest of the others", "missed by"]  # fmt: skip
@@ -162,4 +170,5 @@ def goal_grid(cells: Sequence[Tally]) -> Grid:
 
 
 def _miss_text(miss: float, unit: str, digits: int = 1) -> str:
+    """Return the distance to a goal as text, "met" for 0."""
     return f"{miss:.{digits}f} {unit}" if miss else "met"

@@ -1,4 +1,7 @@
-"""The cache of experiments: names of results, made by a SHA-256 of their inputs and code."""
+"""The cache of experiments: a result has a name made from the SHA-256 of its inputs and code.
+
+A change of an input or of the code gives another name, so outdated results are never reused.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,11 @@ from tracks.common.names import added_entries
 from tracks.common.work import Workers
 
 ROOT = Path(__file__).resolve().parents[3]
-"""Folder of the four packages."""
+"""Folder of the project, which has the four packages."""
 NO_RESULT = ("view", "importers", "faults", "envs")
-"""Folders whose code cannot change a flight."""
+"""Names of the folders within packages whose code cannot change a flight."""
 FLIES = ("tracks", "policies", "eval")
-"""The packages whose code affects a flight."""
+"""Packages whose code can change a flight."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,8 @@ class Workspace:
     cache: Path
     """Folder of results that all experiments reuse."""
     workers: Workers | None = None
-    """Processes or a cluster; None trains one after the other, and flies in processes."""
+    """Number of processes, or a cluster. None: trainings run one after the other, and flights in as
+    many processes as help."""
 
     @property
     def at_once(self) -> str:
@@ -46,7 +50,7 @@ def digest(value: Any) -> str:
 
 @functools.cache
 def code_digest(*folders: str) -> str:
-    """Return a digest (16 hex digits) of the code in `folders`.
+    """Return a digest (16 hex digits) of the code in `folders`, without that of `NO_RESULT`.
 
     Args:
         folders: folders of the project, such as "tracks" or "suite/train".
@@ -62,7 +66,10 @@ def code_digest(*folders: str) -> str:
 
 @functools.cache
 def engines() -> dict[str, str | None]:
-    """Return further inputs of a result: processor, versions and plugins."""
+    """Return what else affects a result: the processor, versions of packages, and the plugins.
+
+    A plugin is an installed Python package that adds effects, tracks or simulators.
+    """
     versions = package_versions()
     names = ("numpy", "scipy", "jax", "jaxlib", "optax", "mujoco", "mujoco-mjx", "torch")
     return {

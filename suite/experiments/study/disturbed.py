@@ -1,7 +1,7 @@
 """Fly policies under conditions, such as a vehicle with an additional effect or with sensor errors.
 
 An effect is one physical cause of a mismatch, such as drag. A sweep is a series of conditions in
-which one disturbance grows.
+which one disturbance grows. A single condition ("single") belongs to no sweep.
 """
 
 from __future__ import annotations
@@ -38,18 +38,20 @@ class ConditionResult(NamedTuple):
         return wilson(int(self.won(policy).sum()), len(self.results[policy]))
 
     def won(self, policy: str) -> np.ndarray:
-        """Return whether each trial succeeded, (n,) bool."""
+        """Return whether each trial of a policy succeeded, (n,) bool."""
         return np.array([row.success for row in self.results[policy]])
 
 
 SweepResults = dict[Sweep, list[ConditionResult]]
-"""The results under the conditions of each sweep, the undisturbed first."""
+"""Sweep -> results under its conditions; the undisturbed condition is the first."""
 
 
 def select_conditions(
     vehicle: Vehicle, only: Sequence[str]
 ) -> tuple[list[Condition], dict[Sweep, list[Condition]]]:
-    """Return the effects and the sweeps of `vehicle` that are in `only`, all if it is empty.
+    """Return the conditions with one effect each, and the conditions of each sweep.
+
+    With names in `only`, both parts have these effects and sweeps alone.
 
     Raises:
         ValueError: for an unknown name.
@@ -71,13 +73,13 @@ def fly_conditions(
     workspace: Workspace,
     console: Console,
 ) -> tuple[list[ConditionResult], SweepResults]:
-    """Return all conditions with the results of every policy under them.
+    """Return the results of every policy under the single conditions, and under those of the sweeps.
 
     Args:
         singles: conditions that belong to no sweep.
-        by_sweep: conditions by sweep.
-        policies: names or paths, by label.
-        trials: each policy flies all of them under every condition.
+        by_sweep: conditions of each sweep.
+        policies: label -> name or path of a policy.
+        trials: trials; each policy flies all of them under every condition.
         workspace: cache of flights, and workers.
         console: shows progress.
     """
@@ -94,14 +96,17 @@ def fly_conditions(
         ConditionResult(condition, {name: rows[number, name] for name in policies})
         for number, condition in enumerate(conditions)
     ]
-    of_sweeps = iter(results[len(singles) :])
+    sweep_results = iter(results[len(singles) :])
     return results[: len(singles)], {
-        sweep: [next(of_sweeps) for _ in points] for sweep, points in by_sweep.items()
+        sweep: [next(sweep_results) for _ in points] for sweep, points in by_sweep.items()
     }
 
 
 def tested_numbers(entry: ConditionResult, base: ConditionResult) -> dict[str, Any]:
-    """Return the results under one condition for JSON, over all trials and by track."""
+    """Return the results under one condition for JSON, over all trials and by track.
+
+    `change` is the difference of the success rate to that under `base`, the undisturbed condition.
+    """
     numbers: dict[str, Any] = {
         "name": entry.condition.name,
         "size": entry.condition.size,

@@ -63,7 +63,7 @@ class FourGateOptions:
 
 
 def select(known: Mapping[str, T], only: Sequence[str], kind: str) -> dict[str, T]:
-    """Return the entries of `known` whose names are in `only`, all if it is empty.
+    """Return the entries of `known` whose names are in `only`, or all entries if `only` is empty.
 
     Raises:
         ValueError: for an unknown name; the message calls an entry `kind`.
@@ -75,10 +75,10 @@ def select(known: Mapping[str, T], only: Sequence[str], kind: str) -> dict[str, 
 
 
 def check(config: Any) -> None:
-    """Refuse option values of an experiment that are out of range.
+    """Refuse the options of an experiment if a value is not allowed.
 
     Raises:
-        ValueError: naming the option and what is allowed.
+        ValueError: with the option and what is allowed.
     """
     check_ranges(config, options=True)
     values = vars(config)
@@ -99,7 +99,8 @@ def four_gate_recipe(config: FourGateOptions) -> TrainConfig:
     """Return the recipe that `config` selects, on tracks of four gates.
 
     Raises:
-        ValueError: for an unknown recipe or change, or one without the field, which is compared.
+        ValueError: for an unknown recipe or change, and for a recipe without the vector field,
+            since the experiments compare training with the field and without it.
     """
     from suite.train.overrides import check_phases, with_changes
     from suite.train.recipes import named_recipe, with_iterations
@@ -120,5 +121,5 @@ def recipe_fact(config: FourGateOptions) -> str:
 
 
 def judged_seeds(config: Any) -> str:
-    """Return the first and the last seed of the judged trials."""
+    """Return the first and the last seed of the judged trials as text."""
     return f"{config.seed} to {config.seed + config.trials - 1}"

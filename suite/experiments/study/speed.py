@@ -16,7 +16,10 @@ REPEATS = 4
 
 
 def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Return the shortest time of several calls of a compiled program, results awaited [s]."""
+    """Return the shortest time of several calls of a compiled program [s].
+
+    The time of a call ends when its results are computed.
+    """
     times_s = []
     for _ in range(repeats):
         started = time.perf_counter()
@@ -28,20 +31,22 @@ def best_time(call: Callable[[], Any], repeats: int = REPEATS) -> float:
 def count_operations(function: Callable[..., Any], *args: Any) -> float:
     """Return the approximate number of floating-point operations of a call.
 
-    Matrix products and convolutions count a multiplication and an addition per term, any other
-    operation one per element of its result. A loop counts once per pass, and once if its length is
-    unknown. (XLA's own count takes one pass of every loop.)
+    A matrix product or a convolution counts a multiplication and an addition per term. Any other
+    operation counts one per element of its result. The body of a loop counts once per pass, or once
+    if the number of passes is unknown. (XLA's own count always takes one pass.)
     """
     return _operations(jax.make_jaxpr(function)(*args).jaxpr)
 
 
 def _operations(jaxpr: Any) -> float:
+    """Return the operations of a jaxpr, JAX's list of the primitive operations of a function."""
     return sum(_equation_operations(equation) for equation in jaxpr.eqns)
 
 
 def _equation_operations(equation: Any) -> float:
     """Return the operations of one primitive, with those of the functions that it calls."""
     name, params = equation.primitive.name, equation.params
+    # Functions inside the primitive, such as the body of a loop; a closed jaxpr wraps a jaxpr.
     inner = [
         getattr(item, "jaxpr", item)
         for value in params.values()
@@ -50,7 +55,7 @@ def _equation_operations(equation: Any) -> float:
     ]
     if inner:
         operations = [_operations(jaxpr) for jaxpr in inner]
-        if name == "cond":
+        if name == "cond":  # one of the branches runs; the longest is assumed
             return max(operations)
         return params.get("length", 1) * sum(operations)
     size = sum(math.prod(out.aval.shape) for out in equation.outvars)
@@ -67,7 +72,11 @@ def _equation_operations(equation: Any) -> float:
 def multiplying_rate(size: int) -> float:
     """Return the operations per second of a product of float32 matrices in full precision [1/s].
 
-    It is approximately the best speed of the device without rounding to fewer bits.
+    Args:
+        size: number of rows and columns of the matrices.
+
+    Returns:
+        Approximately the best speed of the device without rounding to fewer bits.
     """
     matrix = jax.random.normal(jax.random.key(0), (size, size))
     with jax.default_matmul_precision("highest"):
@@ -77,9 +86,13 @@ def multiplying_rate(size: int) -> float:
 
 
 def peak_memory() -> int | None:
-    """Return the peak memory of the default device, or on a CPU of this process [bytes]."""
+    """Return the peak memory of the accelerator, or of this process if there is only a CPU [bytes].
+
+    None: the accelerator does not report it.
+    """
     if jax.default_backend() == "cpu":
-        unit = 1 if sys.platform == "darwin" else 1024
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+        # The operating systems differ: macOS counts bytes, Linux kibibytes.
+        bytes_per_count = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * bytes_per_count
     statistics = jax.devices()[0].memory_stats() or {}
     return statistics.get("peak_bytes_in_use")

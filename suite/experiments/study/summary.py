@@ -1,4 +1,4 @@
-"""Summarise the trainings of each setting over its seeds: mean, least and most of every number."""
+"""Summarise the trainings of each setting over its seeds: mean, least and most of every measure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from suite.experiments.study.training import Setting, TrainingResult
 
 
 class Spread(NamedTuple):
-    """A number over training seeds."""
+    """The values of one measure, such as `v_max`, over the training seeds."""
 
     mean: float
     least: float
@@ -25,15 +25,16 @@ class Summary(NamedTuple):
     key: str
     """Name of the setting."""
     label: str
-    """Its label in tables."""
+    """Label of the setting in tables."""
     recipe: Any
-    """Its settings, a `TrainConfig` or a `PpoConfig`."""
+    """The trained configuration, a `TrainConfig` or a `PpoConfig`."""
     seeds: int
     """Number of trainings, including diverged ones."""
     trainings: list[list[dict[str, float]]]
-    """The measurements of every training that did not diverge."""
+    """Measurements of every training that did not diverge, in the order of time; a measurement
+    is a dictionary of measures."""
     at: list[dict[str, Spread]]
-    """The spread over seeds at each measurement; empty if all diverged."""
+    """The spread of every measure over the seeds, at each measurement; empty if all diverged."""
 
     @property
     def diverged(self) -> int:
@@ -41,11 +42,11 @@ class Summary(NamedTuple):
         return self.seeds - len(self.trainings)
 
     def values(self, name: str) -> list[float]:
-        """Return a number of each training at its end, without diverged ones."""
+        """Return a measure at the end of each training, without diverged ones."""
         return [points[-1][name] for points in self.trainings]
 
     def text(self, name: str) -> str:
-        """Return a number at the end as text for a table: mean over seeds [least, most]."""
+        """Return a measure at the end as text for a table: mean over seeds [least, most]."""
         if not self.at:
             return "diverged"
         _, scale, digits = METRICS[name]
@@ -57,15 +58,16 @@ def summaries(settings: Sequence[Setting], runs: Sequence[TrainingResult]) -> li
     """Return the summary of every setting, in order."""
     result = []
     for key, label, recipe in settings:
-        of_setting = [run for run in runs if run.setting == key]
-        trainings = [run.points for run in of_setting if not run.diverged]
+        setting_runs = [run for run in runs if run.setting == key]
+        trainings = [run.points for run in setting_runs if not run.diverged]
         at = [
             {name: _spread([point[name] for point in seeds]) for name in seeds[0]}
             for seeds in zip(*trainings, strict=True)
         ]
-        result.append(Summary(key, label, recipe, len(of_setting), trainings, at))
+        result.append(Summary(key, label, recipe, len(setting_runs), trainings, at))
     return result
 
 
 def _spread(values: Sequence[float]) -> Spread:
+    """Return mean, least and most of `values`."""
     return Spread(float(np.mean(values)), min(values), max(values))

@@ -1,9 +1,8 @@
-"""Measure a policy's success in the trainer's dynamics, on worlds that no training uses.
+"""Measure the success of a policy in the dynamics of the training, on worlds that no training uses.
 
-A world is one simulated scene and drone.
-
-Flight, collisions and passed gates are computed by the trainer's code (`suite/train/rollout.py`): a
-collision is a distance below `BODY_RADIUS_M` at one of `PATH_SAMPLES` points of a step's path.
+A world is one simulated scene and drone. The code of the training (`suite/train/rollout.py`)
+computes the flight, the collisions and the passed gates. A collision is a distance to an obstacle
+below `BODY_RADIUS_M`, at one of `PATH_SAMPLES` points on the path of a step.
 """
 
 from __future__ import annotations
@@ -23,22 +22,22 @@ from suite.train.step import BODY_RADIUS_M
 from suite.train.worlds import Worlds, sample_worlds
 
 Measure = Callable[[network.Params], dict[str, float]]
-"""(parameters of a policy) -> numbers, as `suite.train.training_loop.Watch` calls it."""
+"""Parameters of a policy -> measures by name; `suite.train.training_loop.Watch` calls it."""
 
 
 class Scores(NamedTuple):
-    """Results of each trial, (B,) each, until its end: a collision or the last gate."""
+    """Results of B trials. A trial ends with a collision or the last gate, or after its time."""
 
     gates: jax.Array
-    """Number of passed gates."""
+    """(B,) number of passed gates."""
     collided: jax.Array
-    """Bool."""
+    """(B,) bool: the trial ended with a collision."""
     crossed: jax.Array
-    """Bool: all gates passed, without a collision before."""
+    """(B,) bool: all gates passed, without a collision before."""
     v_max: jax.Array
-    """Largest speed [m/s]."""
+    """(B,) largest speed [m/s]."""
     reward: jax.Array
-    """Sum over the trial; zero without a reward."""
+    """(B,) sum of the rewards of the steps; zero if no reward is computed."""
 
 
 def score_trials(
@@ -48,16 +47,17 @@ def score_trials(
     gates: int,
     reward: jax.Array | float = 0.0,
 ) -> Scores:
-    """Return the trials' scores.
+    """Return the scores of B trials from the records of their T steps.
 
     A step with both a collision and a passed gate counts as a collision: their order is unknown.
 
     Args:
-        passed: (T, B) bool, a gate was passed in the step.
-        clearance: (T, B) smallest signed distance of the body's centre in the step [m].
-        speed: (T, B) at the step's end [m/s].
+        passed: (T, B) bool, whether a gate was passed in the step.
+        clearance: (T, B) smallest distance from the centre of the body to an obstacle in the step,
+            negative inside an obstacle [m].
+        speed: (T, B) speed at the end of the step [m/s].
         gates: number of gates of a trial.
-        reward: (T, B) of the step.
+        reward: (T, B) reward of the step.
     """
     collision = clearance < BODY_RADIUS_M
     passed = passed & ~collision
@@ -77,8 +77,8 @@ def score_trials(
 def validation_worlds(config: TrainConfig, trials: int, seed: int, seconds: float) -> TrainConfig:
     """Return `config` with the worlds of a validation: all start at rest and fly at full speed.
 
-    Tracks, obstacles and the spread of the dynamics are those of the training. The field of view is
-    the camera's, without its spread.
+    Tracks, obstacles and the randomisation of the dynamics are those of the training. The field of
+    view is that of the camera, without randomisation.
     """
     episode = replace(
         config.episode,
@@ -98,8 +98,8 @@ def make_flight(
     """Return fly(params, worlds) -> scores, compiled on its first call.
 
     Args:
-        config: from `validation_worlds`; its seed determines the noise of the images.
-        reward: (worlds, before, after, target) -> (B,), of a step.
+        config: a configuration from `validation_worlds`; its seed determines the image noise.
+        reward: function (worlds, state before, state after, target) -> reward of a step, (B,).
     """
     rollout, episode = make_rollout(config, reward), config.episode
 
@@ -116,13 +116,14 @@ def make_flight(
 
 
 def mean_scores(scores: Scores) -> dict[str, float]:
-    """Return the results over all trials.
+    """Return the measures of all trials together, by name.
 
-    They are `success_cross` (all gates passed without a collision), `collision_free` (no collision,
-    whatever gates were passed), `v_max` (median of the trials' largest speeds) and `v_max_most`
-    (the largest of them) [m/s], and the means of `gates` and `reward`.
+    They are the shares of trials `success_cross` (all gates passed without a collision) and
+    `collision_free` (no collision, whatever gates were passed); `v_max` (median over the trials of
+    the largest speed) and `v_max_most` (largest speed of all trials) [m/s]; and the means of
+    `gates` and `reward`.
     """
-    numbers = {
+    measures = {
         "success_cross": scores.crossed.mean(),
         "collision_free": 1.0 - scores.collided.mean(),
         "v_max": jnp.median(scores.v_max),
@@ -130,20 +131,20 @@ def mean_scores(scores: Scores) -> dict[str, float]:
         "gates": scores.gates.mean(),
         "reward": scores.reward.mean(),
     }
-    return {name: float(value) for name, value in numbers.items()}
+    return {name: float(value) for name, value in measures.items()}
 
 
 def make_validation(
     config: TrainConfig, trials: int, seed: int, seconds: float, reward: Note | None = None
 ) -> Measure:
-    """Return measure(params) -> numbers of `mean_scores`, on the same worlds at every call.
+    """Return measure(params) -> measures of `mean_scores`, on the same worlds at every call.
 
     Args:
-        config: of the training, whose dynamics are flown.
+        config: configuration of the training, whose dynamics are flown.
         trials: number of worlds.
-        seed: of the worlds; not a training seed.
+        seed: seed of the worlds; no training uses it.
         seconds: length of a trial, from a standing start [s].
-        reward: (worlds, before, after, target) -> (B,), of a step.
+        reward: function (worlds, state before, state after, target) -> reward of a step, (B,).
     """
     config = validation_worlds(config, trials, seed, seconds)
     fly, worlds = make_flight(config, reward), sample_worlds(config, 0)
