@@ -1,4 +1,4 @@
-"""Flights without a fault, into which faults are injected: simulated ones with noise, real logs."""
+"""Flights without a fault, into which faults are injected: noisy simulated ones, and real logs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle
 
 TRUE_EFFECTS = {"com_offset": EFFECTS["com_offset"].values((0.006, -0.003, 0.0))}
-"""Effects of the flown vehicle that the nominal one lacks."""
+"""Effects of the vehicle that flies (an offset of the centre of mass [m]); the nominal vehicle,
+with which the logs are compared, lacks them."""
 NOISE = {"pos": 0.002, "vel": 0.02, "quat": 0.001, "rate": 0.03, "acc": 0.3, "motor": 3.0,
          "voltage": 0.05, "baro": 0.05}  # fmt: skip
-"""Standard deviation of the white noise of each signal [its unit]."""
+"""Signal -> standard deviation of its white noise, in SI units."""
 LOGS = ("nanobench/*.csv", "crazyswarm2/log*", "crazypad/*/*log*")
 """Patterns of the real logs' files."""
 
@@ -31,11 +32,12 @@ def flight_signals(
 
     Args:
         log: the flight.
-        vehicle: its vehicle, for the throttle.
+        vehicle: its vehicle; its full thrust gives the throttle.
         rng: draws the noise.
 
     Returns:
-        signal -> (T, C) in SI units and our frames; `time` is (T,) [s].
+        Signal -> (T, C) values at T times in C components, in SI units and the suite's frames.
+        `time` is (T,) [s].
     """
     assert log.thrust_cmd is not None and log.rate_cmd_b is not None and log.rotor_speed is not None
     acc_w = velocity_from_position(log.time_s, log.vel_w)  # the derivative of any signal
@@ -62,8 +64,12 @@ def flight_signals(
 def as_log(signals: Mapping[str, np.ndarray], name: str) -> FlightLog:
     """Return signals as a flight log, with extra columns `throttle` and `baro`.
 
+    Args:
+        signals: as from `flight_signals`; a log without pose or rates becomes a partial log.
+        name: name of the log.
+
     Raises:
-        FlightLogError: if they break a rule of flight logs.
+        FlightLogError: if the signals break a rule of flight logs.
     """
     columns = {"time": signals["time"]}
     for group, names in GROUPS.items():

@@ -1,7 +1,8 @@
-"""The catalogue of injected faults: each changes a flight or its vehicle file.
+"""The catalogue of injected faults: each changes the signals of a flight or its vehicle file.
 
-A fault is an error of interface or log, such as a wrong unit or sign. Most are a reading, an
-expression that converts a signal (`eval.logs.faults.reading`), which corrupts a correct signal.
+A fault is an error of an interface or a log, such as a wrong unit or sign. Most faults are made by
+a reading: an expression such as "rate=x,-y,z" that converts a signal, here a correct one into a
+wrong one (`eval.logs.faults.reading`). "race" marks faults that ended flights in a vision race.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from eval.logs.faults.reading import parse_readings, read_rows
 from eval.vehicles.vehicle import Vehicle
 
 Signals = dict[str, np.ndarray]
-"""Signal -> (T, C), `time` -> (T,), in SI units and our frames."""
+"""Signal -> (T, C) values at T times in C components, in SI units and the suite's frames; `time` is
+(T,) [s]."""
 DEG = float(180.0 / np.pi)
 """Degrees in a radian."""
 RPM = float(60.0 / (2.0 * np.pi))
@@ -31,22 +33,24 @@ class Kind:
     names: tuple[str, ...]
     """Names in `eval.logs.faults.catalogue`, one of which must be reported."""
     readings: tuple[str, ...] = ()
-    """Readings that corrupt the flight."""
+    """Readings that corrupt the signals."""
     change: Callable[[Signals, Vehicle], Signals] | None = None
-    """A change that no reading describes."""
+    """Change of the signals that no reading can describe."""
     vehicle: Callable[[Vehicle], Vehicle] | None = None
-    """A change of the vehicle file."""
+    """Change of the vehicle file."""
     fov: float = 1.0
-    """The policy's field of view, as a factor of the vehicle's."""
+    """Field of view of the policy, as a factor of that of the vehicle."""
     race: bool = False
     """Whether it ended flights of teams in a vision race of 2026."""
     needs: tuple[str, ...] = ()
-    """Signals that `change` reads, and those without which the fault is not identifiable."""
+    """Signals that `change` reads, and signals without which the fault is not identifiable."""
     accepts_pwm: bool = False
-    """Whether motor commands (`pwm`) replace rotor speeds (`motor`) in a log without these."""
+    """Whether motor commands (`pwm`) may stand in for rotor speeds (`motor`), if a log has only
+    the commands."""
 
     def fits(self, signals: set[str]) -> bool:
         """Return whether the fault can be injected into a log with these signals."""
+        # A reading that starts with "from-" turns a signal by the attitude.
         attitude = {"quat"} if any("from-" in text for text in self.readings) else set()
         needed = {*self.needs, *attitude, *(text.partition("=")[0] for text in self.readings)}
         use_pwm = self.accepts_pwm and "pwm" in signals
@@ -67,11 +71,13 @@ def inject(kind: Kind, signals: Mapping[str, np.ndarray], vehicle: Vehicle) -> S
 
 
 def _remove_gravity(signals: Signals, _: Vehicle) -> Signals:
-    down = rotate(conjugate(signals["quat"]), np.array([0.0, 0.0, GRAVITY]))
-    return {**signals, "acc": signals["acc"] - down}
+    """Log the acceleration without gravity, which an accelerometer at rest shows as +9.81 upwards."""
+    gravity_b = rotate(conjugate(signals["quat"]), np.array([0.0, 0.0, GRAVITY]))
+    return {**signals, "acc": signals["acc"] - gravity_b}
 
 
 def _add_throttle_bias(signals: Signals, _: Vehicle) -> Signals:
+    """Add a vertical accelerometer error that grows with the square of the throttle."""
     bias = -0.46 * GRAVITY * signals["throttle"] ** 2
     return {**signals, "acc": signals["acc"] + bias * [0.0, 0.0, 1.0]}
 
@@ -87,46 +93,49 @@ def _linear_stick_map(signals: Signals, _: Vehicle) -> Signals:
 
 
 def _stop_motor_3(signals: Signals, _: Vehicle) -> Signals:
+    """Log a speed of 0 for the third motor."""
     return {**signals, "motor": signals["motor"] * [1.0, 1.0, 0.0, 1.0]}
 
 
 def _thrust_in_newtons(signals: Signals, vehicle: Vehicle) -> Signals:
+    """Log the thrust command in newtons, instead of per mass [m/s^2]."""
     return {**signals, "cmd_thrust": vehicle.mass * signals["cmd_thrust"]}
 
 
 def _log_commands_early(signals: Signals, _: Vehicle) -> Signals:
     """Log commands 150 ms before they act."""
     count = round(0.15 / float(np.median(np.diff(signals["time"]))))
-    moved = {n: np.roll(signals[n], -count, axis=0) for n in ("cmd_rate", "throttle", "cmd_thrust")}
-    return {**signals, **moved}
+    early = {n: np.roll(signals[n], -count, axis=0) for n in ("cmd_rate", "throttle", "cmd_thrust")}
+    return {**signals, **early}
 
 
 def _hold_commands(signals: Signals, _: Vehicle) -> Signals:
     """Update commands at two thirds of the policy's rate: 20 instead of 30 Hz."""
     step = float(np.median(np.diff(signals["time"])))
-    first = np.floor(signals["time"] * 20.0 + 1e-6) / 20.0
-    index = np.clip(np.round((first - signals["time"][0]) / step).astype(int), 0, None)
+    # Time of the last update before each row, and the row at that time.
+    update_s = np.floor(signals["time"] * 20.0 + 1e-6) / 20.0
+    index = np.clip(np.round((update_s - signals["time"][0]) / step).astype(int), 0, None)
     return {**signals, **{n: signals[n][index] for n in ("cmd_rate", "throttle", "cmd_thrust")}}
 
 
 def _delay_pose(signals: Signals, _: Vehicle) -> Signals:
-    """Log the pose 60 ms late."""
+    """Log position, velocity and attitude 60 ms late; the last rows of the flight are lost."""
     count = round(0.06 / float(np.median(np.diff(signals["time"]))))
     others = {n: v[count:] for n, v in signals.items() if n not in ("pos", "vel", "quat")}
     return {**others, **{n: signals[n][:-count] for n in ("pos", "vel", "quat")}}
 
 
 def _speed_up_pose_clock(signals: Signals, _: Vehicle) -> Signals:
-    """Stamp the pose by a clock that runs 0.5 % fast."""
+    """Stamp position, velocity and attitude by a clock that runs 0.5 % fast."""
     time_s = signals["time"]
     true_s = time_s - 0.005 * (time_s - time_s.mean())
-    moved = {
+    stretched = {
         n: np.stack([np.interp(true_s, time_s, c) for c in signals[n].T], axis=1)
         for n in ("pos", "vel", "quat")
         if n in signals
     }
-    moved["quat"] /= np.linalg.norm(moved["quat"], axis=1, keepdims=True)
-    return {**signals, **moved}
+    stretched["quat"] /= np.linalg.norm(stretched["quat"], axis=1, keepdims=True)
+    return {**signals, **stretched}
 
 
 def _drop_barometer(signals: Signals, _: Vehicle) -> Signals:
@@ -143,16 +152,19 @@ def _drop_barometer(signals: Signals, _: Vehicle) -> Signals:
 
 
 def _with_rotors(vehicle: Vehicle, **changes: object) -> Vehicle:
+    """Return `vehicle` with other values for fields of its rotors."""
     return replace(vehicle, rotors=replace(vehicle.rotors, **changes))
 
 
 def _arms_in_mm(vehicle: Vehicle) -> Vehicle:
+    """Return `vehicle` with rotor positions in millimetres, which a reader takes for metres."""
     hubs = tuple(tuple(1000.0 * c for c in hub) for hub in vehicle.rotors.position)
     return _with_rotors(vehicle, position=hubs)
 
 
 LINEAR, SQUARE = 0.62, 1.78
-"""Coefficients of the firmware's curve of rates over stick deflection, relative to the largest."""
+"""Coefficients of the firmware's curve: body rate = LINEAR stick + SQUARE stick^2, where rate and
+stick are relative to typical large values (the 98 % quantile of the rate)."""
 ALL_FRD = tuple(f"{name}=x,-y,-z" for name in ("rate", "acc", "cmd_rate"))
 """Readings that convert all body signals to forward-right-down axes."""
 KINDS: dict[str, Kind] = {
@@ -270,4 +282,4 @@ KINDS: dict[str, Kind] = {
         needs=("motor", "pos", "quat"),
     ),
 }
-"""Kind -> its change and the names under which it must be reported."""
+"""Name of each kind of fault -> the fault."""

@@ -1,7 +1,8 @@
 """Write flights in the log formats of PX4, Betaflight with motion capture, Crazyflie, and a table.
 
 Each writer follows the public description of its format (docs.px4.io, blackbox_decode, Bitcraze's
-micro SD card deck). Its input is signals in SI units and our frames, all at the same times.
+micro SD card deck). Its input is signals in SI units and the suite's frames, all at the same times.
+It converts them to the units, frames and motor order of the other program.
 """
 
 from __future__ import annotations
@@ -18,24 +19,27 @@ from eval.importers.frames import QUAT_HALF_TURN
 from eval.importers.options import ImportOptions
 
 FLIP = np.array([1.0, -1.0, -1.0])
-"""Half turn about x: our axes to north-east-down or forward-right-down, or back."""
+"""Factors of a half turn about x. It converts the suite's world axes to north-east-down (PX4), and
+its body axes to forward-right-down, or back."""
 DEG, RPM = float(180.0 / np.pi), float(60.0 / (2.0 * np.pi))
 """Degrees in a radian, and revolutions per minute in a radian per second."""
 Signals = Mapping[str, np.ndarray]
-"""Signal -> (T, C), `time` -> (T,), in SI units and our frames."""
+"""Signal -> (T, C) values at T times in C components, in SI units and the suite's frames; `time` is
+(T,) [s]."""
 
 
 class Written(NamedTuple):
     """A written log."""
 
     path: Path
-    """Its file."""
+    """File of the log."""
     options: ImportOptions
-    """Options of its import."""
+    """Options with which the log must be imported."""
 
 
 def write_ulog(folder: Path, signals: Signals, full_thrust: float) -> Written:
-    """Write PX4's ULog: north-east-down, forward-right-down, ESCs in PX4's order."""
+    """Write a ULog of PX4: north-east-down, forward-right-down, motors in PX4's order."""
+    # Time in microseconds; the start of the log is not 0 in real logs either.
     stamp = np.round(signals["time"] * 1e6).astype(np.int64) + 5_000_000
     motors = signals["motor"][:, [0, 2, 3, 1]] * RPM
     thrust = np.concatenate([np.zeros((len(stamp), 2)), -signals["throttle"]], axis=1)
@@ -54,6 +58,8 @@ def write_ulog(folder: Path, signals: Signals, full_thrust: float) -> Written:
         "esc_status": ([("esc_report[4]", "esc")], motors),
         "battery_status": ([("float", "voltage_v")], signals["voltage"]),
     }
+    # Messages of a ULog: B flags, F definition of a format, P parameter (here the positions of the
+    # motors), A announcement of a topic, D one row of a topic.
     data = b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 112574307) + _message("B", bytes(40))
     data += _message("F", b"esc_report:float esc_rpm;")
     for k, (x, y) in enumerate([(0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1)]):
@@ -66,8 +72,8 @@ def write_ulog(folder: Path, signals: Signals, full_thrust: float) -> Written:
     for number, name in enumerate(topics):
         data += _message("A", struct.pack("<BH", 0, number) + name.encode())
     for number, (_, value) in enumerate(topics.values()):
-        cells = value.astype("<f4")
-        for when, row in zip(stamp, cells, strict=True):
+        values = value.astype("<f4")
+        for when, row in zip(stamp, values, strict=True):
             data += _message("D", struct.pack("<HQ", number, max(int(when), 1)) + row.tobytes())
     path = folder / "log.ulg"
     path.write_bytes(data)
@@ -94,6 +100,8 @@ def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
     for k in range(4):
         columns[f"rpm.m{k + 1}(f)"] = signals["motor"][:, k] * RPM
     columns["pm.vbat(f)"] = signals["voltage"][:, 0]
+    # Header with one event type (number 7) and the names of its columns; then the rows; then a
+    # checksum.
     data = b"\xbc" + struct.pack("<HHH", 2, 1, 7) + b"fixedFrequency\0"
     data += struct.pack("<H", len(columns)) + b"".join(n.encode() + b"\0" for n in columns)
     table = np.column_stack(list(columns.values())).astype("<f4")
@@ -106,7 +114,10 @@ def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
 
 
 def write_blackbox(folder: Path, signals: Signals, full_thrust: float) -> Written:
-    """Write a CSV of `blackbox_decode`, and the pose by motion capture next to it."""
+    """Write a CSV as `blackbox_decode` makes it, and a second file with the pose of motion capture.
+
+    The clock of the pose is 3 s ahead; the other log starts at 52 s.
+    """
     columns = {"loopIteration": np.arange(len(signals["time"]), dtype=float)}
     columns["time (us)"] = np.round(signals["time"] * 1e6) + 52e6
     for k in range(3):
@@ -131,7 +142,7 @@ motors = [[1, -1], [-1, 1], [1, 1], [-1, -1]]
 [time]
 column = "t"
 """
-"""Beginning of the table's mapping file."""
+"""Beginning of the mapping file, which describes frames, units and columns of the table."""
 
 
 def write_table(folder: Path, signals: Signals, full_thrust: float) -> Written:
@@ -162,6 +173,7 @@ def write_table(folder: Path, signals: Signals, full_thrust: float) -> Written:
 
 
 def _csv(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
+    """Write columns to a CSV file and return its path."""
     table = np.column_stack(list(columns.values()))
     np.savetxt(path, table, "%.9g", ",", header=",".join(columns), comments="", encoding="utf-8")
     return path

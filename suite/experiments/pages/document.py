@@ -59,7 +59,7 @@ def write_document(
     Args:
         workspace: has the folder of the files.
         name: name of the experiment.
-        config: options of the experiment; its `seed` goes into the stamp (version, time, seed).
+        config: options of the experiment; its `seed` goes into the stamp (version, commit, seed).
         contents: the results.
         console: prints the names of the written files.
 

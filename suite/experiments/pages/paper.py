@@ -94,7 +94,7 @@ def sim_to_sim() -> SimToSim:
 
 
 class Goal(NamedTuple):
-    """The three goals of one cell, and the distances to them; a distance is 0 if the goal is met."""
+    """The three goals of one cell, and the distances to them, which are 0 if a goal is met."""
 
     track: str
     level: int

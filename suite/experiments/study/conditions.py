@@ -1,7 +1,8 @@
 """The conditions of the page `robustness`: single effects at their usual size, and sweeps.
 
-An effect is one physical cause of a mismatch, such as drag. A sweep is a series of conditions in
-which one disturbance grows.
+An effect is one physical cause of a mismatch, such as drag. Its neutral value is the one that
+changes nothing, such as a drag of 0. A sweep is a series of conditions in which one disturbance
+grows.
 """
 
 from __future__ import annotations
@@ -21,21 +22,22 @@ from eval.sensors.sensors_file import PERFECT, SensorSet, sensor_set
 from eval.vehicles.vehicle import Vehicle
 
 STATE_UNIT = {"position": 0.03, "velocity": 0.1, "attitude": math.radians(1.0)}
-"""Errors at size 1 in the sweep of the state estimate."""
+"""Errors of the estimated state at size 1 of its sweep: position [m], velocity [m/s], attitude
+[rad]."""
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
-"""Effects that grow in the sweep of drag, if the vehicle has them."""
+"""Effects whose coefficients grow in the sweep of drag, if the vehicle has them."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A vehicle, sensors and a simulator other than those of the result tables."""
+    """A vehicle, sensors and a simulator with which policies fly; usually one of them is changed."""
 
     name: str
     """Name of the effect or the sweep."""
     size: float
-    """Size, in the unit of the sweep or the effect."""
+    """Size of the disturbance, in the unit of the sweep or the effect."""
     size_text: str
-    """Size as text, with its unit."""
+    """Size of the disturbance as text, with its unit."""
     vehicle: Vehicle
     sensors: SensorSet = PERFECT
     simulator: str = "mujoco"
@@ -43,23 +45,24 @@ class Condition:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A disturbance of growing size; its first point is the undisturbed vehicle."""
+    """A disturbance of growing size; the first size is that of the undisturbed vehicle."""
 
     name: str
     """Title of the chart."""
     axis: str
     """The quantity that grows, with its unit."""
     sizes: Sequence[float]
-    """Its values in increasing order; the first is that of the undisturbed vehicle."""
+    """Values of the quantity in increasing order; the first is that of the undisturbed vehicle."""
     make: Callable[[Vehicle, float], tuple[Vehicle, SensorSet]]
-    """Returns vehicle and sensors for a size."""
+    """Function (undisturbed vehicle, size) -> vehicle and sensors with this size."""
 
 
 def effect_conditions(vehicle: Vehicle) -> list[Condition]:
-    """Return `vehicle` with each effect that changes a flight, at the upper end of its usual size.
+    """Return a condition for each effect that changes a flight, at the upper end of its usual size.
 
-    If the vehicle has a larger value, that is kept. The size is limited to physical values: a
-    vehicle of 27 g cannot lose 0.2 kg. The effect's other parameters do not change.
+    An effect that has two usual signs gives two conditions. If the vehicle already has a larger
+    value, it keeps that. The size is limited to physical values: a vehicle of 27 g cannot lose
+    0.2 kg. Only the first parameter of an effect changes.
     """
     conditions = []
     for effect in EFFECTS.values():
@@ -72,17 +75,27 @@ def effect_conditions(vehicle: Vehicle) -> list[Condition]:
 def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     """Return `vehicle` with one effect, up (+1) or down (-1) from its neutral value."""
     parameter = effect.parameters[0]
-    values = _values(vehicle, effect.name)
+    values = _values_of(vehicle, effect.name)
+    # `typical` is the usual range of the difference from neutral. With `whole` it is the range of
+    # the value itself, which then counts from 0.
     size = parameter.typical[1]
     zero = np.asarray(getattr(neutral(effect, vehicle), parameter.name), float)
     zero = np.zeros_like(zero) if parameter.whole else zero
     direction = np.asarray(parameter.direction) if parameter.direction else np.ones(zero.shape)
-    new = zero + sign * size * direction
-    new = np.clip(new, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle))
-    old = np.asarray(getattr(values, parameter.name), float)
-    new = np.where(np.abs(old - zero) > np.abs(new - zero), old, new)
-    value = _plain(new)
-    number = "(" + ", ".join(f"{v:.3g}" for v in new) + ")" if new.ndim else f"{value:.3g}"
+    values_after = zero + sign * size * direction
+    values_after = np.clip(
+        values_after, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
+    )
+    values_before = np.asarray(getattr(values, parameter.name), float)
+    values_after = np.where(
+        np.abs(values_before - zero) > np.abs(values_after - zero), values_before, values_after
+    )
+    value = _plain(values_after)
+    number = (
+        "(" + ", ".join(f"{v:.3g}" for v in values_after) + ")"
+        if values_after.ndim
+        else f"{value:.3g}"
+    )
     unit = "" if parameter.unit == "1" else parameter.unit
     size_text = f"{parameter.name} {number} {unit}".strip()
     changed = with_effect(vehicle, effect.name, values._replace(**{parameter.name: value}))
@@ -99,7 +112,7 @@ def _plain(value: np.ndarray | np.floating) -> float | tuple[float, ...]:
     return tuple(map(float, np.atleast_1d(value))) if value.ndim else float(value)
 
 
-def _values(vehicle: Vehicle, name: str) -> Any:
+def _values_of(vehicle: Vehicle, name: str) -> Any:
     """Return the vehicle's values of the effect `name`, or neutral ones."""
     return vehicle.effects.get(name, neutral(EFFECTS[name], vehicle))
 
@@ -126,11 +139,13 @@ def _set_effect(
 
 
 def _add_mass(vehicle: Vehicle, percent: float) -> tuple[Vehicle, SensorSet]:
+    """Return `vehicle` with its mass above the nominal one by `percent`, and perfect sensors."""
     values = EFFECTS["mass_offset"].values(offset=percent / 100 * vehicle.mass)
     return with_effect(vehicle, "mass_offset", values), PERFECT
 
 
 def _scale_drag(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
+    """Return `vehicle` with all its drag coefficients times `factor`, and perfect sensors."""
     for name in _drags(vehicle):
         values = vehicle.effects[name]
         coefficient = _plain(factor * np.asarray(values.coefficient, float))
@@ -139,7 +154,7 @@ def _scale_drag(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
 
 
 def _drags(vehicle: Vehicle) -> list[str]:
-    """Return the kinds of drag that `vehicle` has."""
+    """Return the names of the drag effects that `vehicle` has."""
     return [
         name
         for name in DRAGS
@@ -170,29 +185,33 @@ def _set_sensor(
 
 
 def _add_state_noise(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSet]:
+    """Return `vehicle`, and sensors with `factor` times the errors of STATE_UNIT."""
     errors = {name: factor * size for name, size in STATE_UNIT.items()}
     return vehicle, sensor_set({"state_noise": {**errors, "correlation": 0.5}})
 
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
     """Return all sweeps, each starting from `vehicle`."""
-    lag = 1e3 * _values(vehicle, "motor_lag").time_constant
-    delay = 1e3 * _values(vehicle, "command_delay").delay
-    added_mass = 100 * _values(vehicle, "mass_offset").offset / vehicle.mass
-    wind = float(np.linalg.norm(_values(vehicle, "constant_wind").velocity))
+    motor_lag_ms = 1e3 * _values_of(vehicle, "motor_lag").time_constant
+    command_delay_ms = 1e3 * _values_of(vehicle, "command_delay").delay
+    added_mass_percent = 100 * _values_of(vehicle, "mass_offset").offset / vehicle.mass
+    wind_speed = float(np.linalg.norm(_values_of(vehicle, "constant_wind").velocity))
 
     def sizes(first: float, *others: float) -> tuple[float, ...]:
-        """Return the vehicle's size and larger ones; above the last of `others`, multiples."""
+        """Return the sizes of a sweep that starts at the vehicle's own value `first`.
+
+        They are `first` and those of `others` that are larger, or multiples of `first` if none is.
+        """
         return (first, *([size for size in others if size > first] or (1.5 * first, 2 * first)))
 
     return [
-        Sweep("motor lag", "rotor time constant [ms]", sizes(lag, 50, 80, 120, 180),
+        Sweep("motor lag", "rotor time constant [ms]", sizes(motor_lag_ms, 50, 80, 120, 180),
               _set_effect("motor_lag", "time_constant", 1e-3)),
-        Sweep("latency", "command delay [ms]", sizes(delay, 50, 80, 120, 180),
+        Sweep("latency", "command delay [ms]", sizes(command_delay_ms, 50, 80, 120, 180),
               _set_effect("command_delay", "delay", 1e-3)),
-        Sweep("mass", "mass above nominal [%]", sizes(added_mass, 10, 20, 40, 60), _add_mass),
+        Sweep("mass", "mass above nominal [%]", sizes(added_mass_percent, 10, 20, 40, 60), _add_mass),
         _drag_sweep(vehicle),
-        Sweep("wind", "constant wind [m/s]", sizes(wind, 2, 4, 6, 8),
+        Sweep("wind", "constant wind [m/s]", sizes(wind_speed, 2, 4, 6, 8),
               _set_effect("constant_wind", "velocity", CONSTANT_WIND.parameters[0].direction)),
         Sweep("depth noise", "standard deviation of inverse depth [1/m]", (0, 0.01, 0.03, 0.1, 0.3),
               _set_sensor("stereo", 1, "noise", focal=1.0, baseline=1.0)),

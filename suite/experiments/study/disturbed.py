@@ -73,7 +73,7 @@ def fly_conditions(
     workspace: Workspace,
     console: Console,
 ) -> tuple[list[ConditionResult], SweepResults]:
-    """Return the results of every policy under the single conditions, and under those of the sweeps.
+    """Return the results of every policy under the single conditions, and those under the sweeps.
 
     Args:
         singles: conditions that belong to no sweep.

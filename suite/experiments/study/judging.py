@@ -1,8 +1,10 @@
 """Judge trials with a permanent cache of results: each flight is flown only once.
 
-A trial is one flight: a track, a level of difficulty and a seed. A journal in the cache is named by
-the SHA-256 of all that determines an outcome: policy, vehicle, the judge's code, the engines. Each
-result is written there as its trial ends. All pages share the journals.
+A trial is one flight: a track, a level of difficulty and a seed. The results of a setup (policy,
+vehicle, sensors, simulator) are in one file of the cache, its journal. The name of a journal is the
+SHA-256 of everything else that determines an outcome: the setup, the code of the judge and the
+versions of the packages. A result is written as soon as its trial ends. All pages share the
+journals.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ class Setup:
     policy: str
     """A shipped policy's name, a checkpoint's folder, or a policy file."""
     vehicle: Vehicle
-    """The vehicle that it flies."""
+    """The vehicle that the policy flies."""
     sensors: SensorSet = PERFECT
     """Errors in what the policy sees."""
     simulator: str = "mujoco"
@@ -65,26 +67,27 @@ class TrialRequest:
 def fly_trials(
     requests: Mapping[Key, TrialRequest], workspace: Workspace, console: Console, title: str
 ) -> dict[Key, list[TrialResult]]:
-    """Return the results of every request; those not in the cache are flown first.
+    """Return the results of every request; trials that are not in the cache are flown first.
 
     After an interrupt, finished trials stay in the cache.
 
     Args:
-        requests: several may have the same setup.
-        workspace: folder of the journals, and the workers; without workers as many processes of
-            this machine as shorten the work.
+        requests: trials of setups, by any key. Several requests may have the same setup.
+        workspace: folder of the journals, and the workers. Without workers, as many processes of
+            this machine are started as shorten the work.
         console: shows progress.
         title: label of the progress.
 
     Raises:
         ValueError: for a policy that cannot be loaded, before the first flight.
     """
+    # 1. Find the journal of each request. Requests with the same setup share one.
     policies = {request.setup.policy for request in requests.values()}
     digests = {policy: policy_digest(policy) for policy in policies}
     inputs = {key: _inputs(request.setup, digests) for key, request in requests.items()}
     names = {key: digest(entry) for key, entry in inputs.items()}
     setups = {names[key]: request.setup for key, request in requests.items()}
-    # Dictionaries as sets that keep their order.
+    # Trials of each journal: dictionaries as sets that keep their order.
     requested: dict[str, dict[TrialSpec, None]] = {name: {} for name in setups}
     for key, request in requests.items():
         requested[names[key]].update(dict.fromkeys(request.trials))
@@ -93,29 +96,31 @@ def fly_trials(
             name: stack.enter_context(Journal(workspace.cache / "trials" / f"{name}.jsonl", entry))
             for name, entry in {names[key]: entry for key, entry in inputs.items()}.items()
         }
+        # 2. Read which trials are done, and fly the others in pieces of work.
         missing = [journals[name].missing(list(trials)) for name, trials in requested.items()]
         remaining, total = sum(map(len, missing)), sum(map(len, requested.values()))
         if remaining < total:
             console.note(f"{title}: {total - remaining} of {total} trials were flown before")
         if remaining:
-            worthwhile = max(1, remaining // TRIALS_A_PROCESS)
-            workers = workspace.workers or min(usable_cores(), worthwhile)
+            useful_processes = max(1, remaining // TRIALS_A_PROCESS)
+            workers = workspace.workers or min(usable_cores(), useful_processes)
             costs = [relative_cost(setup.simulator) for setup in setups.values()]
             cost = sum(c * len(trials) for c, trials in zip(costs, missing, strict=True))
             announce(console, f"{title}: {remaining} trials", flying_estimate(cost, workers))
-            numbers, all_journals = count(total - remaining + 1), list(journals.values())
+            trial_numbers, all_journals = count(total - remaining + 1), list(journals.values())
             with console.progress(title, total) as update:
 
                 def keep(piece: int, answer: tuple[int, TrialResult]) -> None:
-                    number, result = answer
-                    all_journals[number].append(result)
+                    journal_number, result = answer
+                    all_journals[journal_number].append(result)
                     # A sweep has more journals than a process may have open files.
-                    all_journals[number].close()
-                    update(next(numbers))
+                    all_journals[journal_number].close()
+                    update(next(trial_numbers))
 
                 loaders = _loaders(policies, workers)
                 pieces = _pieces(list(setups.values()), missing, worker_count(workers))
                 run_pieces(partial(_fly_piece, loaders), pieces, workers, keep)
+    # 3. Collect the results of each request.
     return {
         key: [journals[names[key]].done[trial] for trial in request.trials]
         for key, request in requests.items()
@@ -123,10 +128,11 @@ def fly_trials(
 
 
 def policy_name(policy: str) -> str:
-    """Return the name of a policy that a page may fly.
+    """Return the name of a policy.
 
     Raises:
-        PolicyError: if it cannot be loaded, or loading it can run code from its file.
+        PolicyError: if the policy cannot be loaded, or if loading it can run code from its file,
+            because a page never flies such a policy.
     """
     try:
         return load_policy(policy).name
@@ -138,25 +144,28 @@ def policy_name(policy: str) -> str:
 
 
 def named_policies(sources: Sequence[str]) -> dict[str, str]:
-    """Return label -> source of the policies, or of the shipped default without any."""
+    """Return label -> source (name or path) of the policies.
+
+    Without any source it is the default policy that the suite ships.
+    """
     sources = sources or (default_policy(),)
     labels = policy_labels(sources, [policy_name(source) for source in sources])
     return dict(zip(labels, sources, strict=True))
 
 
 def policy_facts(policies: Mapping[str, str]) -> dict[str, str]:
-    """Return name and digest of each policy, for the facts of a page."""
+    """Return the source and the digest of each policy as text, for the facts of a page."""
     return {name: f"{path}, SHA-256 {policy_digest(path)[:16]}" for name, path in policies.items()}
 
 
 def judged_trials(config: Any, levels: Sequence[int] | None = None) -> list[TrialSpec]:
-    """Return an experiment's judged trials, at `levels` or those of its --difficulty."""
+    """Return the judged trials of an experiment, at `levels` or else those of its --difficulty."""
     levels = parse_levels(config.difficulty) if levels is None else levels
     return trial_list(JUDGED, levels, config.trials, config.seed)
 
 
 def _inputs(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
-    """Return all inputs of an outcome except the trial."""
+    """Return everything except the trial that determines the outcome of a flight."""
     return {
         "policy_sha256": digests[setup.policy],
         "vehicle": setup.vehicle,
@@ -168,20 +177,24 @@ def _inputs(setup: Setup, digests: Mapping[str, str]) -> dict[str, Any]:
 
 
 Loaders = dict[str, Callable[[], Policy]]
-"""Function that loads each policy in the process that flies it."""
+"""Policy -> function that loads it, called in the process that flies it."""
 
 
 class Share(NamedTuple):
     """Trials of one setup in a piece of work."""
 
     number: int
-    """Number of the setup."""
+    """Number of the setup in the order of all setups."""
     setup: Setup
     trials: Sequence[TrialSpec]
 
 
 def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
-    """Return functions that load policies: by name on this machine, by content on others."""
+    """Return functions that load policies.
+
+    Processes of this machine load them by name. Other machines lack the files, so they get the
+    content.
+    """
     if isinstance(workers, int):
         return {name: partial(load_policy, name) for name in policies}
     return {name: PolicyContent.of(name) for name in policies}
@@ -190,15 +203,18 @@ def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:
 def _pieces(
     setups: Sequence[Setup], missing: Sequence[Sequence[TrialSpec]], processes: int
 ) -> list[list[Share]]:
-    """Cut the trials of all setups into pieces of about equal size for `processes`."""
+    """Cut the trials of all setups into pieces of about equal size for `processes`.
+
+    A piece may have trials of several setups, and a setup with many trials is in several pieces.
+    """
     total = sum(map(len, missing))
-    most = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
+    piece_limit = total if processes == 1 else min(MOST_A_PIECE, math.ceil(total / processes))
     pieces: list[list[Share]] = [[]]
     size = 0
     for number, (setup, trials) in enumerate(zip(setups, missing, strict=True)):
-        count = math.ceil(len(trials) / most) if trials else 0
-        for share in (trials[k::count] for k in range(count)):
-            if size and size + len(share) > most:
+        share_count = math.ceil(len(trials) / piece_limit) if trials else 0
+        for share in (trials[k::share_count] for k in range(share_count)):
+            if size and size + len(share) > piece_limit:
                 pieces.append([])
                 size = 0
             pieces[-1].append(Share(number, setup, share))
@@ -207,7 +223,10 @@ def _pieces(
 
 
 def _fly_piece(loaders: Loaders, piece: Sequence[Share]) -> Iterator[tuple[int, TrialResult]]:
-    """Fly a piece and yield (number of the setup, result); each policy is loaded once."""
+    """Fly a piece and yield (number of the setup, result) of each trial.
+
+    Each policy is loaded once.
+    """
     loaded: dict[str, Policy] = {}
     for number, setup, trials in piece:
         if setup.policy not in loaded:

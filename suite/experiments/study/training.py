@@ -1,7 +1,7 @@
 """Train several settings from several seeds, and measure the policies; finished ones are reused.
 
-A training's folder is named by the hash of its configuration. Newer code does not repeat it, so
-pages name the commit of each training.
+The folder of a training is named by the hash of its configuration. A change of the code does not
+change this hash, so it does not repeat a training. Therefore pages name the commit of each one.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 
 
 class Setting(NamedTuple):
-    """A setting that is trained from every seed."""
+    """One of the compared configurations, which is trained from every seed."""
 
     key: str
-    """Its name."""
+    """Name of the setting."""
     label: str
-    """Its label in tables."""
+    """Label of the setting in tables."""
     recipe: Any
-    """A `TrainConfig` or a `PpoConfig`; its seed is replaced."""
+    """The configuration, a `TrainConfig` or a `PpoConfig`; each training replaces its seed."""
 
 
 class UnseenWorlds(NamedTuple):
     """Measurement of policies in worlds (scenes with a drone) that no training uses."""
 
     measurements: int
-    """Approximate number during a training; 0 measures only the finished policy."""
+    """Approximate number of measurements during a training; 0 measures only the finished policy."""
     trials: int
     """Number of worlds."""
     seed: int
@@ -57,36 +57,38 @@ class TrainingResult(NamedTuple):
     """One training of a setting."""
 
     setting: str
-    """The setting's key."""
+    """Key of the setting."""
     seed: int
     policy: str
-    """The checkpoint's folder; of a diverged training the last finite checkpoint."""
+    """Folder of the checkpoint. A diverged training has the last checkpoint with finite weights."""
     seconds: float
     """Time of the gradient steps that do not compile [s]."""
     compile_s: float
     """Extra time of the gradient steps that compile [s]."""
     commit: str
-    """Commits of the code that trained it; several if it was resumed."""
+    """Commit of the code that trained it; several commits if the training was resumed."""
     diverged: str
-    """The message if it diverged, else ""."""
+    """The error message if the training diverged, else ""."""
     points: list[dict[str, float]]
-    """Measurements in unseen worlds. Those during the training have `steps`, the environment steps
-    before, and `time`, the seconds of training before, without measurements and compilation."""
+    """Measurements in unseen worlds, each a dictionary of measures. One that was made during the
+    training also has `steps` and `time`: the environment steps until then, and the time of training
+    until then, without measurements and compilation [s]."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """Settings, training seeds and measurement."""
+    """What is trained and measured: every setting from every training seed."""
 
     settings: Sequence[Setting]
     seeds: Sequence[int]
     unseen: UnseenWorlds
-    """The measurement, in the dynamics of the training."""
+    """How the policies are measured, in the dynamics of the training."""
     by_seed: bool = False
-    """Whether the settings alternate, so that all have the same load of the machine."""
+    """Whether all settings are trained from the first seed, then from the second, and so on. Times
+    can then be compared, because a changing load of the machine affects all settings alike."""
 
     def pieces(self) -> list[tuple[str, Any]]:
-        """Return key and configuration of every training, in the order of the work."""
+        """Return (key of the setting, configuration) of every training, in the order of the work."""
         if self.by_seed:
             return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.settings]
         return [(r.key, replace(r.recipe, seed=s)) for r in self.settings for s in self.seeds]
@@ -95,7 +97,7 @@ class Study:
 def train_all(study: Study, workspace: Workspace, console: Console) -> list[TrainingResult]:
     """Return every training of `study`; missing ones are trained or resumed first.
 
-    If one diverges, the others continue.
+    If a training diverges, the others continue.
 
     Args:
         study: settings and seeds.
@@ -110,6 +112,7 @@ def train_all(study: Study, workspace: Workspace, console: Console) -> list[Trai
     if not pieces:
         return []
     estimates = [ppo_estimate(c) if isinstance(c, PpoConfig) else estimate(c) for _, c in pieces]
+    # Memory for as many trainings as run at once on this machine.
     memory = max(each.memory_bytes for each in estimates)
     memory *= workspace.workers if isinstance(workspace.workers, int) else 1
     total = Estimate(sum(each.seconds for each in estimates), memory)
@@ -117,12 +120,13 @@ def train_all(study: Study, workspace: Workspace, console: Console) -> list[Trai
     jobs = [Job(piece, workspace.cache / _training_folder(piece, study.unseen)) for piece in pieces]
     do = functools.partial(train_setting, unseen=study.unseen)
     results = do_jobs(do, jobs, workspace.workers, console, "training")
-    return [_read(job, *result) for job, result in zip(jobs, results, strict=True)]
+    return [_finished_training(job, *result) for job, result in zip(jobs, results, strict=True)]
 
 
 def _training_folder(piece: tuple[str, Any], unseen: UnseenWorlds) -> Path:
     """Return the folder of a training within the cache."""
     key, config = piece
+    # Measurements during a training are in its folder, so they are a part of the folder's name.
     if unseen.measurements:
         return Path("schemes", digest([key, config, unseen]))
     return Path("trainings", digest(config))
@@ -134,8 +138,8 @@ def train_setting(
     """Train one of `Study.pieces` in the job's folder unless it is finished, and measure it.
 
     Returns:
-        `TrainingResult.diverged`, and the measurement of the finished policy if only that is
-        measured.
+        The error message if it diverged, else ""; and the measurement of the finished policy, as a
+        list of one entry. The list is empty if the policy was measured during the training.
     """
     from suite.experiments.study.validation import make_validation
     from suite.train.overrides import phase_configs
@@ -155,7 +159,7 @@ def train_setting(
     except WorkFailed as failure:
         console.note(f"{key}, seed {config.seed}: {failure}")
         return str(failure), []
-    if watch:
+    if watch:  # the measurements are in the folder
         return "", []
     last = phase_configs(config)[-1]
     params = load_start_params(str(folder / "policy"), last.spec)
@@ -167,8 +171,11 @@ def train_setting(
     return "", [scores]
 
 
-def _read(job: Job, diverged: str, at_end: list[dict[str, float]]) -> TrainingResult:
-    """Return a training from its folder; `at_end` is the measurement of the finished policy."""
+def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) -> TrainingResult:
+    """Return a training from its folder.
+
+    `at_end` has the measurement of the finished policy, or is empty if the folder has measurements.
+    """
     (key, config), policy = job.task, job.folder / "policy"
     points, compile_s = read_measurements(job.folder, config.episode.batch * config.episode.steps)
     rows = curve.read(job.folder)
@@ -185,7 +192,7 @@ def _read(job: Job, diverged: str, at_end: list[dict[str, float]]) -> TrainingRe
 
 
 def reward_recorder(config: TrainConfig) -> Note:
-    """Return a function that records the paper's reward at every step of a rollout."""
+    """Return a function that computes the paper's reward at every step of a rollout, to record it."""
     from suite.train.ppo.reward import make_reward
 
     reward = make_reward(config)
@@ -193,13 +200,13 @@ def reward_recorder(config: TrainConfig) -> Note:
 
 
 def read_measurements(folder: Path, frames: int) -> tuple[list[dict[str, float]], float]:
-    """Return a run's measurements with their steps and time, and the time of compilation [s].
+    """Return the measurements of a run, each with its `steps` and `time`, and the compile time [s].
 
-    Iterations that compile, the first and those after a stop, count with the median time of the
-    others.
+    Some iterations compile ("cold": the first one, and the first after a stop). They count with the
+    median time of the others.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         frames: environment steps in an iteration.
     """
     rows = curve.read(folder)
@@ -215,9 +222,9 @@ def read_measurements(folder: Path, frames: int) -> tuple[list[dict[str, float]]
 
 
 def training_commit(policy: Path) -> str:
-    """Return the commit that trained `policy` (RUN/policy), or "unknown".
+    """Return the commit of the code that trained `policy` (RUN/policy), or "unknown".
 
-    A training that was interrupted and resumed may have several commits; all are returned.
+    A training that was interrupted and resumed may have several commits; the text has all of them.
     """
     path = policy.parent / "run.json"
     try:
