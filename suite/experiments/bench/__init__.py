@@ -1,4 +1,7 @@
-"""Benchmarks: the speed of core parts of the suite against plain implementations, in one run."""
+"""Benchmarks: the speed of core parts of the suite against plain implementations.
+
+Both sides of a benchmark run in turn in one process, so that they have the same machine.
+"""
 
 from __future__ import annotations
 

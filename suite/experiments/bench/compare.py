@@ -12,19 +12,19 @@ from typing import Any
 from tracks.common.grid import Grid
 
 BUSY_SHARE = 0.15
-"""Share of the processor that other processes may use without a warning [1]."""
+"""Share of the processor that other processes may use without a warning, from 0 to 1."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured rate (more is better) or a time."""
+    """A measured rate (more is better) or a time (less is better)."""
 
     value: float
-    """The figure, in `unit`."""
+    """The rate or time, in `unit`."""
     unit: str
-    """Such as "gradient steps/s"."""
+    """Unit of the value, such as "gradient steps/s"."""
     less_is_better: bool = False
-    """Whether it is a time, not a rate."""
+    """Whether the figure is a time, not a rate."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Comparison:
     """The result of a benchmark."""
 
     name: str
-    """The benchmark's name."""
+    """Name of the benchmark."""
     ours: Figure
-    """Our implementation."""
+    """Speed of the suite."""
     baseline: Figure
-    """The plain implementation of the same, on the same inputs."""
+    """Speed of the plain implementation of the same computation, on the same inputs."""
     warnings: tuple[str, ...] = ()
     """Reasons not to trust the figures; empty on a machine without other load."""
     details: dict[str, Any] = field(default_factory=dict)
@@ -59,8 +59,11 @@ def in_turn(
 ) -> dict[str, list[float]]:
     """Return the seconds of each call in every round, after one call each to warm up.
 
+    The calls take turns, so that a changing load of the machine affects all of them alike.
+
     Args:
-        calls: by name; each must finish its work before it returns (`jax.block_until_ready`).
+        calls: functions to time, by name. Each must finish its work before it returns
+            (`jax.block_until_ready`).
         rounds: number of rounds; in each of them every call is made once.
         clock: returns the time [s].
         most_s: no round begins after this time, except the first [s].
@@ -89,10 +92,10 @@ def compare_times(
     """Return the comparison of two implementations by the medians of their times.
 
     Args:
-        name: of the benchmark.
-        times_s: times from `in_turn`, ours first [s].
-        work: work of one call, in units of the figure times seconds.
-        unit: of the figures.
+        name: name of the benchmark.
+        times_s: times from `in_turn`, those of the suite first [s].
+        work: work of one call. Divided by a time [s] it gives a figure in `unit`.
+        unit: unit of the figures.
         details: further results.
     """
     ours, baseline = (

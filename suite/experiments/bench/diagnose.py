@@ -1,8 +1,8 @@
 """The benchmark `diagnose`: the fit of the diagnosis against `mujoco.sysid` on the same data.
 
-Both fit six numbers (mass, centre of mass, inertia) to the same windows of five flights of 10 s,
-from the same initial values, in turn. Only the fit is timed, after logs are read and programs are
-compiled.
+Both fit six parameters (of mass, centre of mass and inertia) to the same windows (short parts) of
+five flights of 10 s, from the same initial values. They run in turn. Only the fit is timed, not the
+reading of logs and the compiling of programs before it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from suite.experiments.bench.compare import Comparison, compare_times, in_turn
 from suite.experiments.bench.rigid_body import Task, make_task
 
 SEED = 20_001
-"""Seed of the truth, the flights and their noise; no blind case and no tuning used it."""
+"""Seed of the true parameters, the flights and their noise. No blind case and no tuning of the
+suite used it."""
 ROUNDS = 3
 """Number of timed fits of each side."""
 
 
 def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Comparison:
-    """Time both refits in turn and compare their estimates.
+    """Time both fits in turn and compare their estimates.
 
     Args:
-        seed: of the truth, the flights and their noise.
+        seed: seed of the true parameters, the flights and their noise.
         duration_s: length of each of the five flights [s].
         rounds: number of timed fits of each side, after one call to warm up.
 
@@ -43,11 +44,12 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
     if not sysid_baseline.is_installed():
         raise WorkFailed("mujoco.sysid lacks some of its packages: pip install 'mujoco[sysid]'")
     task = make_task(seed, duration_s)
+    # Measured rotor speeds are the input of the simulation, as for the baseline.
     model = RolloutModel(
         task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
     )
-    begin = start_estimate(model, task.windows)
-    residual = model.residual(begin.theta, begin.free, task.windows)
+    start = start_estimate(model, task.windows)
+    residual = model.residual(start.theta, start.free, task.windows)
     problem = sysid_baseline.prepare(task, noise_of(residual, task.windows))
     answers: dict[str, tuple[np.ndarray, NormalEquations]] = {}
 
@@ -68,11 +70,14 @@ def run(seed: int = SEED, duration_s: float = 10.0, rounds: int = ROUNDS) -> Com
 
 
 def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]:
-    """Return the fitted numbers (K,) and their normal equations, as the diagnosis fits them.
+    """Fit the K parameters as the diagnosis does.
 
-    It estimates the noise, linearises with respect to the numbers and the start of every window,
-    and makes Gauss-Newton steps on the part of the windows in which the model is accurate. It
-    repeats this while that part grows.
+    It estimates the noise, linearises the simulation with respect to the parameters and the start
+    of every window, and makes Gauss-Newton steps. They use the part of the windows in which the
+    linearisation is trusted. All this is repeated as long as that part grows.
+
+    Returns:
+        The fitted parameters (K,), and the normal equations of the last step.
     """
     indices, state = list(task.indices), start_estimate(model, task.windows)
     used_values = 0
@@ -89,14 +94,14 @@ def refit(model: RolloutModel, task: Task) -> tuple[np.ndarray, NormalEquations]
 def _agreement(
     task: Task, answers: Mapping[str, tuple[np.ndarray, NormalEquations]]
 ) -> dict[str, Any]:
-    """Return each side's numbers, and their difference over the joint 95 % half-width.
+    """Return the parameters that each side fitted, and how far they are apart.
 
-    The half-widths of both sides come from the disagreement between windows; the joint one is their
-    root sum of squares.
+    The difference of the sides is divided by their joint 95 % half-width. The half-width of a side
+    comes from the scatter between the windows. The joint one is the root sum of squares of both.
     """
     widths = {side: intervals95(equations).half_width for side, (_, equations) in answers.items()}
-    first, second = (values for values, _ in answers.values())
-    difference = np.abs(first - second) / np.hypot(*widths.values())
+    our_values, their_values = (values for values, _ in answers.values())
+    difference = np.abs(our_values - their_values) / np.hypot(*widths.values())
     rows = {}
     for k, name in enumerate(task.names):
         rows[name] = {

@@ -1,10 +1,10 @@
 """The benchmark `judge`: trials per second of the judge, against depth images by `mj_multiRay`.
 
-The judge is the simulator that scores policies. The shipped policy flies the same trials twice,
-level 9 of every track family, in one process. The suite casts the rays of all images together
-(`tracks/geometry/tiles.py`). The baseline casts those of one camera after the other with
-`mj_multiRay`, and flies 64 trials at once. Both are timed by the processor time of the process,
-which depends little on other work on the machine.
+The judge is the simulator that scores policies. The shipped policy flies the same trials on both
+sides, level 9 of every track family, in one process. The suite casts the rays of all images
+together (`tracks/geometry/tiles.py`). The baseline casts the rays of one camera after the other
+with MuJoCo's `mj_multiRay`, and flies 64 trials at once. Both are timed by the processor time of
+the process, which depends little on other work on the machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BASELINE = "mujoco, its own rays"
 
 
 class OwnRays(MujocoWorld):
-    """The simulator `mujoco` with images cast by MuJoCo's rays."""
+    """The simulator `mujoco` with depth images from MuJoCo's own ray casting."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -55,7 +55,7 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
     """Time both in turn, and count the trials that end in the same way.
 
     Args:
-        policy: name or folder; the shipped one by default.
+        policy: name or folder of a policy; the shipped one by default.
         trials: number of trials per call.
         time_limit_s: longest trial [s].
     """

@@ -17,20 +17,21 @@ from suite.experiments.bench.compare import Comparison, Figure
 from tracks.common.grid import Grid, table
 
 M7_HZ, M7_CYCLES = 480e6, {"C float32": 3.0, "C int8": 2.0}
-"""A Cortex-M7: clock, and cycles of a multiply-add in plain C with the weights in fast memory (two
-loads, the product, a share of the loop) [1]. Assumed, not measured."""
+"""Processor Cortex-M7: clock [Hz], and clock cycles of a multiply-add in plain C with the weights
+in fast memory (two loads, the product, a share of the loop). Assumed, not measured."""
 A76_HZ, A76_CYCLES = 2.4e9, {"C float32": 0.5, "C int8": 0.5}
-"""A Cortex-A76: a quarter of the peak of two units of four lanes [1]. Assumed, not measured."""
+"""Processor Cortex-A76: clock [Hz], and clock cycles of a multiply-add, at a quarter of the peak
+speed of two units of four lanes. Assumed, not measured."""
 ROUNDS = 20
 """Number of timed blocks of each engine."""
 
 
 def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
-    """Time single steps in turn.
+    """Time single steps of every engine (C export, ONNX Runtime, torch) in turn.
 
     Args:
-        policy: name or folder; the shipped one by default.
-        rounds: blocks of 100 steps of each engine.
+        policy: name or folder of a policy; the shipped one by default.
+        rounds: number of blocks of 100 steps of each engine.
 
     Raises:
         WorkFailed: without a C compiler.
@@ -58,7 +59,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
             times = time_in_turn(steps, rounds)
     finally:
         torch.set_num_threads(threads)
-    count = multiply_adds(checkpoint.spec)
+    multiply_add_count = multiply_adds(checkpoint.spec)
     weight_bytes = sum(x.nbytes for x in checkpoint.params.values())
     rows: dict[str, dict[str, Any]] = {}
     for engine, timing in times.items():
@@ -66,7 +67,7 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
             "median_us": 1e6 * timing.median_s,
             "p99_us": 1e6 * timing.p99_s,
             "max_us": 1e6 * timing.max_s,
-            "multiply_adds": count,
+            "multiply_adds": multiply_add_count,
             "weight_bytes": weight_bytes,
             "working_bytes": None,
         }
@@ -74,8 +75,10 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
             quantised = layers[engine]
             row["weight_bytes"] = constant_bytes(checkpoint, quantised)
             row["working_bytes"] = memory_bytes(checkpoint.spec, quantised is not None)
-            row["estimate_cortex_m7_480mhz_ms"] = 1e3 * count * M7_CYCLES[engine] / M7_HZ
-            row["estimate_a76_2400mhz_ms"] = 1e3 * count * A76_CYCLES[engine] / A76_HZ
+            row["estimate_cortex_m7_480mhz_ms"] = (
+                1e3 * multiply_add_count * M7_CYCLES[engine] / M7_HZ
+            )
+            row["estimate_a76_2400mhz_ms"] = 1e3 * multiply_add_count * A76_CYCLES[engine] / A76_HZ
         rows[engine] = row
     ours, baseline = (
         Figure(rows[engine]["median_us"], "us/step, median", less_is_better=True)
@@ -85,7 +88,10 @@ def run(policy: str = "", rounds: int = ROUNDS) -> Comparison:
 
 
 def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the steps of both C exports, and their quantised layers, by engine."""
+    """Return a function that makes one step, and the quantised layers, of each C export by engine.
+
+    The layers of the float32 export are None.
+    """
     from policies.formats.c.c_file import load_c
     from policies.formats.c.project import c_project, random_observations
     from suite.judging.deploy.latency import c_step
@@ -103,7 +109,7 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
 
 
 def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
-    """Return the measured times and the estimates for two processors, a row per engine."""
+    """Return a table of the measured times and the estimates for two processors, a row per engine."""
     headers = (
         "engine", "median [us]", "p99 [us]", "longest [us]", "multiply-adds", "weights [B]",
         "working memory [B]", "Cortex-M7 480 MHz [ms], estimate", "A76 2.4 GHz [ms], estimate",

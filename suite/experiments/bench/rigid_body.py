@@ -1,8 +1,8 @@
 """The data of the benchmark `diagnose`: windows of simulated flights of a vehicle to identify.
 
-A window is a short part of a flight. Measured rotor speeds are the input of both models, since a
-MuJoCo model has no rate loop. Mass, centre of mass and inertia are fitted, which `mujoco.sysid` is
-made for.
+A window is a short part of a flight. Both sides simulate it with the measured rotor speeds as
+input, since a MuJoCo model has no rate loop. They fit mass, centre of mass and inertia, the
+parameters that `mujoco.sysid` is made for.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from suite.diagnose.data.windows import FlightWindows, cut
 from suite.diagnose.estimate.parameters import ParameterSpace, make_space
 
 REFITTED = ("mass_offset", "com_offset", "inertia_scale")
-"""Effects whose numbers are fitted; six of these are identifiable."""
+"""Effects whose parameters are fitted; six of these parameters are identifiable."""
 
 
 @dataclass(frozen=True)
@@ -28,24 +28,24 @@ class Task:
     """Windows, and the parameters that are fitted to them."""
 
     nominal: Vehicle
-    """The vehicle with the initial values of both sides."""
+    """The nominal vehicle; its parameters are the initial values of both sides."""
     space: ParameterSpace
-    """The catalogue's parameters for that vehicle."""
+    """All parameters of the catalogue of effects for that vehicle."""
     indices: tuple[int, ...]
-    """Indices of the K fitted numbers in `space`."""
+    """Indices of the K fitted parameters in `space`."""
     truth: np.ndarray
-    """(K,) true values of the flown vehicle."""
+    """(K,) values of these parameters for the vehicle that flew."""
     windows: FlightWindows
-    """Windows of 1 s, driven by measured rotor speeds."""
+    """Windows of 1 s, with measured rotor speeds as the input."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Each number as "effect.parameter component"."""
+        """Name of each fitted parameter, as "effect.parameter component"."""
         entries = [self.space.entries[i] for i in self.indices]
         return tuple(f"{e.effect}.{e.parameter} {e.component or 0}" for e in entries)
 
     def array(self, field: str) -> np.ndarray:
-        """Return a field of the fitted numbers' entries, (K,)."""
+        """Return a field of `ParameterSpace.entries` for the fitted parameters, (K,)."""
         return self.space.array(field)[list(self.indices)]
 
 
@@ -53,7 +53,7 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
     """Return windows of five MuJoCo flights of a vehicle with other mass and inertia.
 
     Args:
-        seed: of the truth, the flights and the noise.
+        seed: seed of the true parameters, the flights and the noise.
         duration_s: length of each flight [s].
     """
     from eval.flights.follow import FlightFailed
@@ -85,13 +85,14 @@ def make_task(seed: int, duration_s: float = 10.0) -> Task:
 
 
 def _draw_effects(nominal: Vehicle, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the effects' values: every number off by its usual size, up or down at random."""
+    """Draw the values of the effects: every parameter differs by its usual size, up or down."""
     neutral, values = all_values(nominal), dict[str, Any]()
     for name in REFITTED:
         fields = {}
         for parameter in EFFECTS[name].parameters:
             size = max(parameter.size, 1)
             shift = rng.uniform(*parameter.typical, size) * rng.choice((-1.0, 1.0), size)
+            # Components that no flight can identify do not change.
             shift[list(parameter.unseen)] = 0.0
             value = np.atleast_1d(np.asarray(getattr(neutral[name], parameter.name), float)) + shift
             fields[parameter.name] = tuple(value.tolist()) if parameter.size else float(value[0])

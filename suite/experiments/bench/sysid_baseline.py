@@ -1,10 +1,10 @@
 """The baseline of the benchmark `diagnose`: fit mass, centre of mass and inertia by `mujoco.sysid`.
 
-It takes finite differences of rollouts in MuJoCo's C engine. The controls of the model are the
-rotors' thrusts. Bounds and typical sizes of the parameters are those of the suite's catalogue of
-effects. Residuals are divided by the measurement noise, so both sides minimise the same error. A
-window (a short part of a flight) starts in its measured state: `mujoco.sysid` does not estimate
-initial states.
+It takes finite differences of rollouts (simulated windows) in MuJoCo's C engine. A window is a
+short part of a flight; its rollout starts in the measured state, because `mujoco.sysid` does not
+estimate initial states. The inputs of the model are the thrusts of the rotors. Bounds and typical
+sizes of the parameters are those of the suite's catalogue of effects. Residuals are divided by the
+measurement noise, so both sides minimise the same error.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from suite.diagnose.estimate.block import NormalEquations
 from suite.experiments.bench.rigid_body import Task
 
 STATE_SIZE = 13
-"""Numbers in the state of a free body: position 3, quaternion 4, velocity 3, rates 3."""
+"""Size of the state of a free body: position 3, quaternion 4, velocity 3, body rates 3."""
 FILL_S = 1e-3
-"""Time between empty rows [s]."""
+"""Time between the empty rows that fill up a short window [s]."""
 
 
 class Problem(NamedTuple):
-    """The data that are prepared once, outside the timing."""
+    """The inputs of `mujoco.sysid`, prepared before the timed fits."""
 
     task: Task
     """Windows and parameters."""
     params: Any
-    """`mujoco.sysid.ParameterDict` at the nominal values."""
+    """The parameters with their nominal values, a `mujoco.sysid.ParameterDict`."""
     residual: Any
-    """(x, params) -> residuals over their noise."""
+    """Function (values, params) -> residuals divided by their noise."""
 
 
 def is_installed() -> bool:
@@ -107,7 +107,11 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
 
 
 def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
-    """Return the fitted numbers (K,) and their normal equations, one for each window."""
+    """Fit the K parameters by `mujoco.sysid`.
+
+    Returns:
+        The fitted parameters (K,), and the normal equations at these values, one for each window.
+    """
     import mujoco.sysid as sysid
 
     # `verbose=False` silences `sysid.optimize`, not the optimiser that it calls.
@@ -129,7 +133,7 @@ def refit(problem: Problem) -> tuple[np.ndarray, NormalEquations]:
 
 
 def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
-    """Return a copy of the compiled model with the values (K,) of the fitted numbers."""
+    """Return a copy of the compiled model `base` with the values (K,) of the fitted parameters."""
     theta = task.space.array("start")
     theta[list(task.indices)] = values
     effects = task.space.effects(theta)
@@ -145,7 +149,7 @@ def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
 
 
 def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
-    """Return the measured state at the start of window `w`, as `mujoco.sysid` reads it."""
+    """Return the measured state at the start of window `w`, in the form that `mujoco.sysid` reads."""
     import mujoco.sysid as sysid
 
     quat = np.empty(4)
@@ -157,7 +161,7 @@ def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
 
 
 def _thrusts(task: Task, w: int, dt: float) -> Any:
-    """Return the rotors' thrusts in window `w` [N], from the measured speeds."""
+    """Return the thrusts of the rotors in window `w` [N], from the measured rotor speeds."""
     import mujoco.sysid as sysid
 
     constants = make_plant(task.nominal, dt).constants
@@ -177,17 +181,20 @@ def _measurements(task: Task, w: int) -> Any:
         mujoco.mju_mat2Quat(quat, np.asarray(rot_w).ravel())
     rows = [windows.row_pos_w[w], quats, windows.row_vel_w[w], windows.row_rate_b[w]]
     values = np.concatenate(rows, axis=1)
-    seen = np.asarray(windows.valid[w])[:, :12]
-    # Three angles are four numbers of a quaternion.
-    values[~seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
+    is_seen = np.asarray(windows.valid[w])[:, :12]
+    # `seen` has 12 columns and `values` 13: the three angles are a quaternion of four numbers.
+    values[~is_seen[:, [0, 1, 2, 3, 3, 3, 3, 6, 7, 8, 9, 10, 11]]] = np.nan
     # A window with fewer rows is filled with empty rows, whose times must still increase.
-    times, is_empty = np.array(windows.row_s[w]), ~seen.any(axis=1)
+    times, is_empty = np.array(windows.row_s[w]), ~is_seen.any(axis=1)
     times[is_empty] = times.max() + FILL_S * np.arange(1, is_empty.sum() + 1)
     return sysid.TimeSeries(times, values)
 
 
 def _difference(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return simulated - measured (N, 12), the attitude as a small rotation in body axes."""
+    """Return simulated minus measured states (N, 12).
+
+    The difference of the attitude is a small rotation in body axes [rad].
+    """
     rotation_b = np.full((len(measured), 3), np.nan)
     is_measured = np.isfinite(measured[:, 3:7]).all(axis=1)
     reference, attitude = (

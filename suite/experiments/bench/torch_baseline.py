@@ -1,8 +1,9 @@
 """The baseline of the benchmark `train`: the training method as a plain torch-eager loop.
 
-Network, point mass, losses, field, delays and noise are those of `suite.train` with the recipe
-`paper`. The encoder is inside the loop over steps, and the backward pass goes through the loop.
-Settings that the recipe does not use are not implemented.
+Network, point mass, losses, vector field, delays and noise are those of `suite.train` with the
+recipe `paper`. The encoder of the images runs inside the loop over steps, and the backward pass
+goes through this loop. Settings that the recipe does not use are not implemented. In the shapes, B
+is the number of worlds.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from tracks.geometry.camera import pixel_rays_b
 from tracks.geometry.scene import Gates
 
 SIZES = ("camera", "hidden_size", "channels")
-"""Settings that may differ from the recipe: sizes of the network and the image."""
+"""Settings that may differ from those of the recipe: sizes of the network and of the image."""
 
 
 class TorchState(NamedTuple):
-    """State of the point mass as tensors; shapes and units are `point_mass.PointMassState`'s."""
+    """State of the point mass as tensors; `point_mass.PointMassState` has shapes and units."""
 
     pos_w: Tensor
     vel_w: Tensor
@@ -51,16 +52,20 @@ def to_torch(tree: Any) -> Any:
 
 
 def _norm(vector: Tensor) -> Tensor:
+    """Return the lengths of vectors; the small addend keeps the gradient of a zero vector finite."""
     return ((vector * vector).sum(-1) + 1e-12).sqrt()
 
 
 def faded(x: Tensor, factor: Tensor) -> Tensor:
-    """Return x, with its gradient multiplied by factor."""
+    """Return `x` unchanged, but with its gradient multiplied by `factor`."""
     return x * factor + (x * (1 - factor)).detach()
 
 
 def attitude(thrust_w: Tensor, heading_w: Tensor) -> Tensor:
-    """Return body to world (B, 3, 3); see `suite.train.dynamics.point_mass.attitude`."""
+    """Return the attitude of the body, a rotation from body to world axes (B, 3, 3).
+
+    See `suite.train.dynamics.point_mass.attitude`.
+    """
     force = thrust_w + torch.tensor([0.0, 0.0, GRAVITY])
     size = force.norm(dim=-1, keepdim=True)
     up = torch.where(size > 1e-3, force / size.clamp(min=1e-3), torch.tensor([0.0, 0.0, 1.0]))
@@ -76,18 +81,21 @@ def step(
     target_w: Tensor,
     config: TrainConfig,
 ) -> TorchState:
-    """Advance one policy period; see `suite.train.dynamics.point_mass.step`."""
+    """Advance by one policy period; see `suite.train.dynamics.point_mass.step`."""
     dt = constants.time_step[:, None]
+    # Delay and lag of the thrust: interpolate between the last commands, then filter.
     history = torch.cat([to_world(body.rot_w, action)[:, None], body.commands_w], 1)
-    share = (1.0 - (constants.delay[:, None] - torch.arange(3.0)).abs()).clamp(min=0)
+    weights = (1.0 - (constants.delay[:, None] - torch.arange(3.0)).abs()).clamp(min=0)
     keep = (-constants.lag[:, None] * dt).exp()
-    thrust = (share[..., None] * history).sum(1) * (1 - keep) + body.thrust_w * keep
-    air_b = to_local(body.rot_w, body.vel_w - constants.wind_w)
-    acc = thrust - to_world(body.rot_w, constants.drag * air_b)
+    thrust = (weights[..., None] * history).sum(1) * (1 - keep) + body.thrust_w * keep
+    # Acceleration with drag; position and velocity, whose gradients decay.
+    airspeed_b = to_local(body.rot_w, body.vel_w - constants.wind_w)
+    acc = thrust - to_world(body.rot_w, constants.drag * airspeed_b)
     fade = (-config.loss.gradient_decay * dt).exp()
     pos, vel = faded(body.pos_w, fade), faded(body.vel_w, fade)
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
+    # The heading turns slowly towards the target; no gradient goes through the attitude.
     with torch.no_grad():
         towards = (target_w - pos) * torch.tensor([1.0, 1.0, 0.0])
         towards = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-3)
@@ -103,7 +111,7 @@ class Baseline:
     """A policy in torch, its optimiser and the loss of a batch of worlds."""
 
     def __init__(self, config: TrainConfig, params: Mapping[str, Any]) -> None:
-        """Take over the parameters of `policies.networks.network`.
+        """Make the network, with the parameters `params` of `policies.networks.network`.
 
         Raises:
             ValueError: for quadrotors, and for a setting of the loss or the observation that
@@ -157,6 +165,7 @@ class Baseline:
             vel_b, gate_b = (to_local(body.rot_w, v) for v in (body.vel_w, target_w - body.pos_w))
             state = torch.cat([vel_b, body.rot_w[:, 2], gate_b, action], -1)
             states = [*(states or [state] * physics.state_delay), state]
+            # Both lists are queues: the policy sees a delayed state and a delayed image.
             action, hidden = self.network(states.pop(0), images.pop(0), hidden)
             before, body = body, step(body, constants, action, target_w, config)
             passed = torch_scene.crossed(gate, before.pos_w, body.pos_w)
@@ -173,7 +182,10 @@ class Baseline:
         )  # fmt: skip
 
     def target_gate(self, gates: Gates, target: Tensor) -> tuple[Gates, Tensor]:
-        """Return each world's current gate and the point to fly to (B, 3)."""
+        """Return the current gate of each world, and the point to fly to (B, 3).
+
+        After the last gate it is a point beyond that gate.
+        """
         count = gates.center_w.shape[1]
         rows = torch.arange(len(target))
         gate = Gates(*(array[rows, target.clamp(max=count - 1)] for array in gates))
@@ -199,31 +211,39 @@ class Baseline:
         gate: Gates,
         target_w: Tensor,
     ) -> Tensor:
-        """Return the loss of a step (B,)."""
+        """Return the loss of a step (B,), from the states before and after it."""
         config = self.config.loss
+        # Collisions: distances at points on the path of the step. The gradient of a distance is the
+        # direction away from the obstacle.
         share = (torch.arange(PATH_SAMPLES) + 1.0) / PATH_SAMPLES
         path = before.pos_w[:, None] + share[:, None] * (body.pos_w - before.pos_w)[:, None]
         distance, away = torch_scene.nearest_obstacle(worlds.scene, path.detach())
-        gap = distance + ((path - path.detach()) * away).sum(-1) - config.safety_radius_m
-        barrier = torch.nn.functional.softplus(BARRIER_SLOPE * gap, threshold=1e3)
+        margin_m = distance + ((path - path.detach()) * away).sum(-1) - config.safety_radius_m
+        barrier = torch.nn.functional.softplus(BARRIER_SLOPE * margin_m, threshold=1e3)
         closing = (-(away * body.vel_w.detach()[:, None]).sum(-1)).clamp(min=0)
-        collide = closing * (1.0 - gap).clamp(min=0) ** 2
+        collide = closing * (1.0 - margin_m).clamp(min=0) ** 2
         loss = config.clearance * BARRIER_HEIGHT * barrier.mean(-1)
         loss = loss + config.collide * collide.mean(-1)
 
+        # Smoothness.
         jerk = (body.acc_w - before.acc_w) / worlds.constants.time_step[:, None]
         loss = loss + config.acceleration * (body.acc_w**2).sum(-1)
         loss = loss + config.jerk * (jerk**2).sum(-1)
 
+        # Progress: speed towards the target.
         to_gate = target_w - body.pos_w
         loss = loss - config.progress * (body.vel_w * to_gate).sum(-1) / _norm(to_gate)
 
+        # Vector field: its gradient with respect to the position is the pull.
         pull = self.pull(gate, body.pos_w.detach(), body.vel_w.detach())
         guidance = (pull * (body.pos_w - body.pos_w.detach())).sum(-1)
         return loss - config.field_gain * guidance
 
     def pull(self, gate: Gates, pos_w: Tensor, vel_w: Tensor) -> Tensor:
-        """Return the field's pull u_A (B, 3), 1 across the centre of a gate of 1 m."""
+        """Return the pull u_A of the vector field (B, 3).
+
+        Its size is 1 in the centre of a gate of 1 m, for a flight across the field.
+        """
         field = torch_scene.magnetic_field(gate, pos_w)
         size = field.norm(dim=-1)
         aligned = (vel_w * field).sum(-1) / (vel_w.norm(dim=-1) * size + 1e-5)

@@ -2,8 +2,8 @@
 
 Both sides make whole gradient steps (rollout, gradient, AdamW) on the same worlds of 64 solids with
 the recipe `paper`: batch 64, 150 steps, 24x32 images, two threads. A world is one simulated scene
-and drone. The time of a step through the quadrotor, randomised as in the recipe `race`, is reported
-as a multiple of the point mass's.
+and drone, which is a point mass in this recipe. A gradient step with a quadrotor instead,
+randomised as in the recipe `race`, is timed too; its time is reported as a multiple.
 """
 
 from __future__ import annotations
@@ -28,26 +28,28 @@ SOLIDS = Counts(boxes=44, cylinders=8, capsules=6, spheres=6)
 BATCH, STEPS, THREADS = 64, 150, 2
 """Worlds, policy periods of a rollout, and threads of both sides."""
 UNTRUSTED_BELOW = 2000.0
-"""Two cores without other load make at least this many steps per second with the baseline [1/s]."""
+"""Environment steps per second that the baseline reaches at least on two cores without other load;
+fewer mean that the machine is too busy for a comparison [1/s]."""
 ROUNDS = 4
 """Number of timed rounds."""
 OURS, BASELINE, QUADROTOR = "ours", "baseline", "quadrotor"
 """Names of the timed programs."""
 ENOUGH_S = 100.0
-"""No further round begins after this time, in which two cores without other load make all rounds
+"""No further round begins after this time. Two cores without other load finish all rounds earlier
 [s]."""
 
 
 def bench_config(batch: int = BATCH, steps: int = STEPS) -> TrainConfig:
-    """Return the recipe `paper` with the benchmark's batch and horizon."""
+    """Return the recipe `paper` with another number of worlds (`batch`) and of steps."""
     base = named_recipe("paper")
     return replace(base, episode=replace(base.episode, batch=batch, steps=steps))
 
 
 def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
-    """Return worlds of the training distribution with exactly SOLIDS solids each, none parked.
+    """Return worlds as in a training, but with exactly SOLIDS solids each.
 
-    Solids that a track lacks are placed at random 1.5 to 4 m from its gates.
+    In a training, solids that a track lacks are "parked" far below the ground. Here they are placed
+    at random 1.5 to 4 m from its gates, so that every world costs the same.
     """
     worlds = sample_worlds(config, seed)
     rng = np.random.default_rng(seed)
@@ -60,19 +62,22 @@ def bench_worlds(config: TrainConfig, seed: int = 0) -> Worlds:
         )
     }
     for solids in kinds.values():
-        missing = solids.center_w[..., 2] < PARKED_Z / 2
-        solids.center_w[missing] = _near_gates(scene.gates, missing, rng)
+        is_parked = solids.center_w[..., 2] < PARKED_Z / 2
+        solids.center_w[is_parked] = _near_gates(scene.gates, is_parked, rng)
         for name, low, high in (("half_size", 0.05, 0.25), ("radius", 0.1, 0.3)):
             if hasattr(solids, name):
                 array = getattr(solids, name)
-                array[missing] = rng.uniform(low, high, array[missing].shape)
+                array[is_parked] = rng.uniform(low, high, array[is_parked].shape)
         if hasattr(solids, "half_length"):
-            solids.half_length[missing] = rng.uniform(0.1, 0.8, missing.sum())
+            solids.half_length[is_parked] = rng.uniform(0.1, 0.8, is_parked.sum())
     return worlds._replace(scene=scene._replace(**kinds, triangles=scene.triangles[:, :0]))
 
 
 def _near_gates(gates: Gates, missing: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a point (N, 3) near a gate of its world for each missing solid [m]."""
+    """Return a random point near a gate for each of the N missing solids, (N, 3) [m].
+
+    `missing` is (worlds, solids) bool.
+    """
     world, _ = np.nonzero(missing)
     count = len(world)
     center = gates.center_w[world, rng.integers(0, gates.center_w.shape[1], count)]
@@ -138,7 +143,7 @@ def _two_cores() -> Iterator[None]:
 
 
 def _compare(batch: int, steps: int, rounds: int) -> Comparison:
-    """Return the comparison; the best time of each side counts."""
+    """Return the comparison; the shortest time of each side counts."""
     point = bench_config(batch, steps)
     quadrotor = replace(point, quadrotor=named_recipe("race").quadrotor)
     worlds = bench_worlds(point)

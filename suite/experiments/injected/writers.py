@@ -116,7 +116,7 @@ def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
 def write_blackbox(folder: Path, signals: Signals, full_thrust: float) -> Written:
     """Write a CSV as `blackbox_decode` makes it, and a second file with the pose of motion capture.
 
-    The clock of the pose is 3 s ahead; the other log starts at 52 s.
+    The two files have different clocks, as in a real recording.
     """
     columns = {"loopIteration": np.arange(len(signals["time"]), dtype=float)}
     columns["time (us)"] = np.round(signals["time"] * 1e6) + 52e6

@@ -30,7 +30,7 @@ DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
 
 @dataclass(frozen=True)
 class Condition:
-    """A vehicle, sensors and a simulator with which policies fly; usually one of them is changed."""
+    """A vehicle, sensors and a simulator with which policies fly; usually one of them differs."""
 
     name: str
     """Name of the effect or the sweep."""
@@ -82,19 +82,15 @@ def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     zero = np.asarray(getattr(neutral(effect, vehicle), parameter.name), float)
     zero = np.zeros_like(zero) if parameter.whole else zero
     direction = np.asarray(parameter.direction) if parameter.direction else np.ones(zero.shape)
-    values_after = zero + sign * size * direction
-    values_after = np.clip(
-        values_after, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
+    new_array = zero + sign * size * direction
+    new_array = np.clip(
+        new_array, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
     )
-    values_before = np.asarray(getattr(values, parameter.name), float)
-    values_after = np.where(
-        np.abs(values_before - zero) > np.abs(values_after - zero), values_before, values_after
-    )
-    value = _plain(values_after)
+    old_array = np.asarray(getattr(values, parameter.name), float)
+    new_array = np.where(np.abs(old_array - zero) > np.abs(new_array - zero), old_array, new_array)
+    value = _plain(new_array)
     number = (
-        "(" + ", ".join(f"{v:.3g}" for v in values_after) + ")"
-        if values_after.ndim
-        else f"{value:.3g}"
+        "(" + ", ".join(f"{v:.3g}" for v in new_array) + ")" if new_array.ndim else f"{value:.3g}"
     )
     unit = "" if parameter.unit == "1" else parameter.unit
     size_text = f"{parameter.name} {number} {unit}".strip()
@@ -192,9 +188,9 @@ def _add_state_noise(vehicle: Vehicle, factor: float) -> tuple[Vehicle, SensorSe
 
 def sweeps(vehicle: Vehicle) -> list[Sweep]:
     """Return all sweeps, each starting from `vehicle`."""
-    motor_lag_ms = 1e3 * _values_of(vehicle, "motor_lag").time_constant
-    command_delay_ms = 1e3 * _values_of(vehicle, "command_delay").delay
-    added_mass_percent = 100 * _values_of(vehicle, "mass_offset").offset / vehicle.mass
+    lag_ms = 1e3 * _values_of(vehicle, "motor_lag").time_constant
+    delay_ms = 1e3 * _values_of(vehicle, "command_delay").delay
+    added_percent = 100 * _values_of(vehicle, "mass_offset").offset / vehicle.mass
     wind_speed = float(np.linalg.norm(_values_of(vehicle, "constant_wind").velocity))
 
     def sizes(first: float, *others: float) -> tuple[float, ...]:
@@ -205,11 +201,11 @@ def sweeps(vehicle: Vehicle) -> list[Sweep]:
         return (first, *([size for size in others if size > first] or (1.5 * first, 2 * first)))
 
     return [
-        Sweep("motor lag", "rotor time constant [ms]", sizes(motor_lag_ms, 50, 80, 120, 180),
+        Sweep("motor lag", "rotor time constant [ms]", sizes(lag_ms, 50, 80, 120, 180),
               _set_effect("motor_lag", "time_constant", 1e-3)),
-        Sweep("latency", "command delay [ms]", sizes(command_delay_ms, 50, 80, 120, 180),
+        Sweep("latency", "command delay [ms]", sizes(delay_ms, 50, 80, 120, 180),
               _set_effect("command_delay", "delay", 1e-3)),
-        Sweep("mass", "mass above nominal [%]", sizes(added_mass_percent, 10, 20, 40, 60), _add_mass),
+        Sweep("mass", "mass above nominal [%]", sizes(added_percent, 10, 20, 40, 60), _add_mass),
         _drag_sweep(vehicle),
         Sweep("wind", "constant wind [m/s]", sizes(wind_speed, 2, 4, 6, 8),
               _set_effect("constant_wind", "velocity", CONSTANT_WIND.parameters[0].direction)),

@@ -88,7 +88,7 @@ class Study:
     can then be compared, because a changing load of the machine affects all settings alike."""
 
     def pieces(self) -> list[tuple[str, Any]]:
-        """Return (key of the setting, configuration) of every training, in the order of the work."""
+        """Return (key of the setting, configuration) of every training, in the order of work."""
         if self.by_seed:
             return [(r.key, replace(r.recipe, seed=s)) for s in self.seeds for r in self.settings]
         return [(r.key, replace(r.recipe, seed=s)) for r in self.settings for s in self.seeds]
@@ -192,7 +192,7 @@ def _finished_training(job: Job, diverged: str, at_end: list[dict[str, float]]) 
 
 
 def reward_recorder(config: TrainConfig) -> Note:
-    """Return a function that computes the paper's reward at every step of a rollout, to record it."""
+    """Return a function that gives the paper's reward of each step, for the record of a rollout."""
     from suite.train.ppo.reward import make_reward
 
     reward = make_reward(config)
