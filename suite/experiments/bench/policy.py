@@ -109,7 +109,7 @@ def _c_steps(name: str, checkpoint: Any, folder: Path) -> tuple[dict[str, Any], 
 
 
 def _grid(rows: dict[str, dict[str, Any]]) -> Grid:
-    """Return a table of the measured times and the estimates for two processors, a row per engine."""
+    """Return a table of the measured times, and estimates for two processors, a row per engine."""
     headers = (
         "engine", "median [us]", "p99 [us]", "longest [us]", "multiply-adds", "weights [B]",
         "working memory [B]", "Cortex-M7 480 MHz [ms], estimate", "A76 2.4 GHz [ms], estimate",

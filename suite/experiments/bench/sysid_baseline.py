@@ -149,7 +149,7 @@ def _with_parameters(base: Any, task: Task, values: np.ndarray) -> Any:
 
 
 def _start_state(model: Any, windows: Any, w: int) -> np.ndarray:
-    """Return the measured state at the start of window `w`, in the form that `mujoco.sysid` reads."""
+    """Return the measured state at the start of window `w`, in the form of `mujoco.sysid`."""
     import mujoco.sysid as sysid
 
     quat = np.empty(4)

@@ -52,7 +52,7 @@ def to_torch(tree: Any) -> Any:
 
 
 def _norm(vector: Tensor) -> Tensor:
-    """Return the lengths of vectors; the small addend keeps the gradient of a zero vector finite."""
+    """Return the lengths of vectors; a small addend keeps the gradient of a zero vector finite."""
     return ((vector * vector).sum(-1) + 1e-12).sqrt()
 
 

@@ -71,7 +71,7 @@ def inject(kind: Kind, signals: Mapping[str, np.ndarray], vehicle: Vehicle) -> S
 
 
 def _remove_gravity(signals: Signals, _: Vehicle) -> Signals:
-    """Log the acceleration without gravity, which an accelerometer at rest shows as 9.81 upwards."""
+    """Log the acceleration without gravity; an accelerometer at rest shows it as 9.81 upwards."""
     gravity_b = rotate(conjugate(signals["quat"]), np.array([0.0, 0.0, GRAVITY]))
     return {**signals, "acc": signals["acc"] - gravity_b}
 
