@@ -1,4 +1,5 @@
 """Fitting a Delta Action Model to recorded flights (Su et al. 2026, Sec. III-D).
 
-It is a network that adds a correction to the action, so that simulated flights match measured ones.
+The model is a network that adds a correction to each action of a policy, so that simulated flights
+match measured ones.
 """

@@ -1,9 +1,12 @@
 """Fit a Delta Action Model by gradients through the dynamics that it corrects.
 
 The model is a network that adds a correction to the action, so that simulated flights match
-measured ones. No fit uses the held-out flights, on which the errors are measured. The model is
-compared with the trainer's point mass, and with one whose lag, drag and delay are fitted to the
-same flights: a network is only useful if it is better than plain system identification.
+measured ones. A fit replays windows (short parts of measured flights) in simulation and makes the
+difference small. No fit uses the held-out flights, on which the errors are measured.
+
+The model is compared with the trainer's point mass, and with a point mass whose parameters are
+fitted to the same flights. These are its lag (rate at which the acceleration follows the command),
+drag and delay. A network is only useful if it is better than this plain system identification.
 """
 
 from __future__ import annotations
@@ -26,9 +29,10 @@ from suite.train.config import PointMassConfig
 from tracks.input.ranges import Iterations, Range, Seed
 
 IDENTIFY_RATE = 3e-2
-"""Least learning rate of lag, drag and delay, which change more than a network's weights."""
+"""Least learning rate for lag, drag and delay, which change more than a network's weights."""
 CURVE_WINDOWS = 512
-"""Approximate number of fitted windows, evenly selected, for the curve's fit error."""
+"""Approximate number of fitted windows, evenly selected, from which the learning curve's fit error
+is computed."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,10 @@ class FitConfig:
     rate: Annotated[float, Range(0.0, 10.0)] = 5e-3
     """Peak learning rate, with cosine decay to zero."""
     velocity_weight: Annotated[float, Range(0.0, 1e6)] = 0.3
-    """Weight of the velocity's error next to the position's [s]."""
+    """Weight of the velocity error in the loss; the position error has weight 1 [s]."""
     blank_share: Annotated[float, Range(0.0, 1.0)] = 0.5
-    """Share of a batch's windows in which the network starts without memory, as in worlds of the
-    trainer that start between two gates."""
+    """Share of a batch's windows in which the network starts with an empty memory, as in simulated
+    flights of the trainer that start between two gates."""
     size_weight: Annotated[float, Range(0.0, 1e6)] = 1e-3
     """Weight of the correction's size, which keeps it small [s^2]."""
     seed: Seed = 0
@@ -59,12 +63,12 @@ class FitConfig:
 
 
 class ReplayErrors(NamedTuple):
-    """Mean distance between replay and record at the end of a window, over windows."""
+    """Differences of the replayed and the measured state at a window's end, means over windows."""
 
     position_m: float
-    """[m]."""
+    """Distance of the positions [m]."""
     velocity_m_s: float
-    """[m/s]."""
+    """Size of the velocities' difference [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,12 @@ class DeltaFit:
     params: dict[str, np.ndarray]
     """Parameters of the Delta Action network."""
     without: ReplayErrors
-    """Held-out errors of the dynamics alone."""
+    """Errors of the dynamics without the network, on held-out flights."""
     with_delta: ReplayErrors
-    """Held-out errors with the network."""
+    """Errors of the dynamics with the network, on held-out flights."""
     curve: list[dict[str, float]]
-    """Rows of iteration, fit error and held-out error [m]."""
+    """Learning curve. Each row has the iteration and the position errors on fitted and on held-out
+    windows [m]."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +97,15 @@ class PointMassFit(DeltaFit):
 
 
 Replay = Callable[[Any, Any], tuple[jax.Array, jax.Array, jax.Array]]
-"""(windows, network or None) -> pos_w, vel_w (N, T, 3) after each step, corrections (N, T, 3)."""
+"""(windows, network or None) -> pos_w [m] and vel_w [m/s] after each step, and the corrections of
+the actions [m/s^2], (N, T, 3) each. The network is given by its parameters."""
 
 
 def window_errors(replay: Replay, windows: Any, delta: Any) -> tuple[jax.Array, jax.Array]:
-    """Return position [m] and velocity [m/s] errors at the end of every window, (N,) each."""
+    """Return the position [m] and velocity [m/s] errors at the end of every window, (N,) each.
+
+    `delta` are the network's parameters; None replays without a network.
+    """
     pos, vel, _ = replay(windows, delta)
     return (
         jnp.linalg.norm(pos[:, -1] - windows.pos_w[:, -1], axis=1),
@@ -105,10 +114,15 @@ def window_errors(replay: Replay, windows: Any, delta: Any) -> tuple[jax.Array, 
 
 
 def _loss(config: FitConfig, replay: Replay, windows: Any, delta: Any) -> jax.Array:
-    """Return the mean distance between replay and record, plus the weighted correction [m]."""
+    """Return the loss [m]: the mean error over all steps, plus a penalty on large corrections.
+
+    The error is that of the position, plus the weighted one of the velocity. The penalty is the
+    weighted mean of the corrections' squared lengths.
+    """
     pos, vel, correction = replay(windows, delta)
 
     def mean_norm(vector: jax.Array) -> jax.Array:
+        # The small number keeps the gradient finite at zero.
         return jnp.sqrt((vector * vector).sum(-1) + 1e-8).mean()
 
     error = mean_norm(pos - windows.pos_w[:, 1:])
@@ -158,6 +172,7 @@ def identify(
 ) -> PointMassModel:
     """Return the point mass whose lag, drag and delay replay `windows` best."""
     nominal = nominal_model(physics)
+    # The logarithm keeps the lag positive.
     start = (jnp.log(nominal.lag), nominal.drag, nominal.delay)
 
     def as_model(variables: Any) -> PointMassModel:
@@ -167,6 +182,7 @@ def identify(
     def loss(variables: Any, batch: PointMassWindows) -> jax.Array:
         return _loss(config, partial(replay_point_mass, as_model(variables)), batch, None)
 
+    # A few parameters need fewer steps than a network.
     iterations = max(1, config.iterations // 3)
     faster = replace(config, rate=max(config.rate, IDENTIFY_RATE))
     best = _descend(faster, loss, start, windows, iterations, lambda *_: None)
@@ -190,10 +206,11 @@ def fit_network(
         show: called with (iteration, text) during the fit.
     """
     errors = jax.jit(partial(window_errors, replay))
+    # Division that rounds up: at most CURVE_WINDOWS windows are selected.
     stride = -(-len(fit_windows.pos_w) // CURVE_WINDOWS)
     curve_windows = jax.tree.map(itemgetter(slice(None, None, stride)), fit_windows)
     curve: list[dict[str, float]] = []
-    period = max(1, config.iterations // 50)
+    period = max(1, config.iterations // 50)  # about 50 rows
 
     def add_to_curve(iteration: int, params: delta_network.Params) -> None:
         if iteration % period and iteration + 1 < config.iterations:
@@ -210,7 +227,8 @@ def fit_network(
     start = delta_network.init(jax.random.key(config.seed))
 
     def loss(params: delta_network.Params, batch: Any) -> jax.Array:
-        # Batches are in random order, so the first windows are a random selection.
+        # Some windows start without memory. Batches are in random order, so the first windows of a
+        # batch are a random selection.
         burn_in = without_memory(batch.burn_in, config.blank_share)
         return _loss(config, replay, batch._replace(burn_in=burn_in), params)
 
@@ -224,6 +242,7 @@ def fit_network(
 
 
 def _means(errors: tuple[jax.Array, jax.Array]) -> ReplayErrors:
+    """Return the means over windows of what `window_errors` returns."""
     return ReplayErrors(*(float(error.mean()) for error in errors))
 
 
@@ -238,7 +257,7 @@ def fit_point_mass(
 
     Args:
         config: the fit.
-        physics: the trainer's point mass; the middle of its ranges is corrected.
+        physics: the trainer's point mass. The network corrects the middle of its ranges.
         fit_windows: windows of the flights of the fit.
         held_out: windows of held-out flights.
         show: called with (iteration, text) during the fit.
@@ -248,5 +267,7 @@ def fit_point_mass(
     identified = identify(config, physics, fit_windows)
     errors = jax.jit(partial(window_errors, partial(replay_point_mass, identified)))
     return PointMassFit(
-        **vars(network), identified=identified, identified_errors=_means(errors(held_out, None))
+        **vars(network),
+        identified=identified,
+        identified_errors=_means(errors(held_out, None)),
     )

@@ -1,9 +1,10 @@
 """Replay recorded actions in the trainer's quadrotor, with or without a Delta Action Model.
 
-The model is a network that corrects the actions. A window is a part of a flight; it starts from the
-measured state, with rotor speeds and commands that are still delayed. Each row of the log is one
-step of the attitude loop. The commanded yaw rate is the recorded one, because an action does not
-set the heading.
+The model is a network that corrects the actions. A window is a short part of a measured flight. Its
+replay starts from the measured state; this includes the rotor speeds and the commands that are
+delayed and still to act. Each row of the log is one step of the attitude loop. The commanded yaw
+rate is the recorded one, because an action does not set the heading. The plant is the model of
+mixer, rotors and effects of the vehicle, for steps of a given delay_steps.
 """
 
 from __future__ import annotations
@@ -43,28 +44,29 @@ LEAST_PHYSICS_HZ = 250.0
 
 
 class QuadrotorWindows(NamedTuple):
-    """N windows of T rows; row 0 is where the replay starts, at a decision."""
+    """N windows of T rows of the log; the replay starts at row 0, at a decision of the policy."""
 
     pos_w: np.ndarray
-    """(N, T + 1, 3) measured [m]."""
+    """(N, T + 1, 3) measured positions [m]."""
     vel_w: np.ndarray
-    """(N, T + 1, 3) measured [m/s]."""
+    """(N, T + 1, 3) measured velocities [m/s]."""
     rot_w: np.ndarray
-    """(N, 3, 3) measured at the start, body to world."""
+    """(N, 3, 3) measured attitude at the window's start, body to world."""
     rate_b: np.ndarray
-    """(N, 3) measured at the start [rad/s]."""
+    """(N, 3) measured body rates at the window's start [rad/s]."""
     rotor_speed: np.ndarray
-    """(N, 4) measured at the start [rad/s]; NaN if not measured."""
+    """(N, 4) measured rotor speeds at the window's start; NaN if not measured [rad/s]."""
     past: np.ndarray
-    """(N, L, 4) thrust and rates commanded in the L physics steps before it, newest first."""
+    """(N, L, 4) commanded thrust and body rates in the L physics steps before the window, newest
+    first [m/s^2, rad/s]."""
     start_s: np.ndarray
-    """(N,) since the flight's start [s]."""
+    """(N,) start of the window, from the start of the flight [s]."""
     action_b: np.ndarray
-    """(N, T, 3) the action that holds in each row [m/s^2]."""
+    """(N, T, 3) the policy's action that holds in each row [m/s^2]."""
     decides: np.ndarray
-    """(N, T) 1 where a new action begins."""
+    """(N, T) 1 in rows in which the policy decided on a new action, else 0."""
     yaw_rate: np.ndarray
-    """(N, T) commanded about body z [rad/s]."""
+    """(N, T) commanded rate about body z [rad/s]."""
     burn_in: BurnIn
     """Inputs of the network before each window."""
 
@@ -87,14 +89,14 @@ def cut_quadrotor_windows(
     stride_s: float,
     row_s: float | None = None,
 ) -> tuple[QuadrotorWindows, Substeps]:
-    """Return windows of all flights, and the physics steps of a row.
+    """Return windows of all flights, and the physics steps of one row.
 
-    A window is left out if a value is missing or a row is not `row_s` long.
+    A window is left out if a value is missing or a row is not `row_s` long (within 20 %).
 
     Args:
         logs: the flights.
         config: the vehicle and its physics rate.
-        duration_s: length of a window [s].
+        duration_s: delay_steps of a window [s].
         stride_s: approximate time between the starts of windows [s].
         row_s: time between rows [s]; by default `row_period` of these logs.
 
@@ -111,11 +113,11 @@ def cut_quadrotor_windows(
     row_s = row_period(logs) if row_s is None else row_s
     substeps = row_substeps(config, row_s)
     plant = plant_of(config, {}, substeps.dt, varies=False)
-    length = plant.delay_weight.shape[-1]
+    delay_steps = plant.delay_weight.shape[-1]
     windows = [
         window
         for log in logs
-        for window in _flight_windows(log, substeps, length, row_s, duration_s, stride_s)
+        for window in _flight_windows(log, substeps, delay_steps, row_s, duration_s, stride_s)
     ]
     refuse_no_windows(windows, logs, duration_s)
     return stack_windows(windows), substeps
@@ -124,31 +126,34 @@ def cut_quadrotor_windows(
 def _flight_windows(
     log: FlightLog,
     substeps: Substeps,
-    length: int,
+    delay_steps: int,
     row_s: float,
     duration_s: float,
     stride_s: float,
 ) -> list[QuadrotorWindows]:
-    """Return the windows of one flight; `length` is the longest delay in physics steps."""
+    """Return the windows of one flight; `delay_steps` is the longest delay in physics steps."""
     action, decides = log_decisions(log)
     assert log.rate_cmd_b is not None and log.thrust_cmd is not None
     rows, time_s, rot_w = round(duration_s / row_s), log.time_s, log.rot_w
     commands = np.concatenate([log.thrust_cmd[:, None], log.rate_cmd_b], axis=1)
-    ages_s = substeps.dt * (np.arange(length) + 0.5)
+    # Middle of each physics step before a window, as time before its start.
+    ages_s = substeps.dt * (np.arange(delay_steps) + 0.5)
     speed = np.full((len(time_s), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
     decision_rows = np.flatnonzero(decides & log.whole)
     if len(decision_rows) < 2:
         return []
     burn_in_count = round(BURN_IN_S / decision_period(time_s[decision_rows], row_s))
-    rows_before = int(np.ceil(length * substeps.dt / row_s - 1e-9))
+    rows_before = int(np.ceil(delay_steps * substeps.dt / row_s - 1e-9))
     windows, next_s = [], time_s[0]
     for number, first in enumerate(decision_rows.tolist()):
         if time_s[first] < next_s or first < rows_before or first + rows >= len(time_s):
             continue
         used = slice(first - rows_before, first + rows + 1)
+        # `log.whole` marks the rows with a complete state and command.
         is_steady = np.abs(np.diff(time_s[used]) - row_s) < 0.2 * row_s
         if not (log.whole[used].all() and is_steady.all()):
             continue
+        # The next window starts at the first decision from this time on.
         next_s = time_s[first] + stride_s
         span = slice(first, first + rows + 1)
         delayed_rows = np.searchsorted(time_s, time_s[first] - ages_s, side="right") - 1
@@ -183,7 +188,9 @@ def replay_quadrotor(
     windows: QuadrotorWindows,
     delta: delta_network.Params | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return pos_w, vel_w (N, T, 3) after every row, and the corrections (N, T, 3).
+    """Return pos_w [m] and vel_w [m/s] after every row, and the corrections of the actions [m/s^2].
+
+    Each is (N, T, 3).
 
     Args:
         config: the vehicle; its randomisation is not used.
@@ -193,6 +200,7 @@ def replay_quadrotor(
     """
     plant = plant_of(config, {}, substeps.dt, varies=False)
     count = windows.pos_w.shape[0]
+    # Rotor speeds that are not measured start as in hover.
     hover = hover_state(plant, (count,), jnp)
     speed = jnp.asarray(windows.rotor_speed)
     state = hover._replace(
@@ -206,7 +214,7 @@ def replay_quadrotor(
         acc_w=zero,
         rot_w=jnp.asarray(windows.rot_w),
         rate_b=jnp.asarray(windows.rate_b),
-        heading_w=zero.at[:, 0].set(1.0),
+        heading_w=zero.at[:, 0].set(1.0),  # any: the recorded yaw rate replaces the heading
         plant=state,
         time_s=jnp.asarray(windows.start_s),
     )
@@ -215,6 +223,7 @@ def replay_quadrotor(
     def step(carry: Any, row: tuple[jax.Array, ...]) -> tuple[Any, tuple[jax.Array, ...]]:
         body, hidden, correction = carry
         action, decides, yaw_rate = row
+        # The correction changes at decisions only and holds until the next one, like the action.
         if delta is not None:
             vel_b = to_local(body.rot_w, body.vel_w)
             new_correction, new_hidden = delta_network.step(

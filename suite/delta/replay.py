@@ -1,7 +1,8 @@
 """Replay recorded actions in the trainer's point mass, with or without a Delta Action Model.
 
-The model is a network that corrects the actions. Its checkpoint describes the dynamics that it
-corrects, and `check_corrects` compares them with those of a training.
+The model is a network that corrects the actions. It is valid only for the dynamics that it was
+fitted to. Its checkpoint describes them (key `plant`), and `check_corrects` compares this
+description with the dynamics of a training.
 """
 
 from __future__ import annotations
@@ -46,10 +47,12 @@ def nominal_model(config: PointMassConfig) -> PointMassModel:
 def replay_point_mass(
     model: PointMassModel, windows: PointMassWindows, delta: delta_network.Params | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return pos_w, vel_w (N, T, 3) after every decision, and the corrections (N, T, 3).
+    """Simulate the windows; return positions and velocities after every decision, and corrections.
 
-    The state is the simulated one in all steps (Su et al. 2026, Eq. delta_action_loss). Only the
-    heading, which the point mass does not determine, is the recorded one.
+    They are pos_w [m], vel_w [m/s] and the corrections in body axes [m/s^2], (N, T, 3) each. A
+    window is a short part of a measured flight. The measured state is used only at its start
+    (Su et al. 2026, Eq. delta_action_loss). Only the heading, which the point mass does not
+    determine, is the measured one in all steps.
 
     Args:
         model: parameters of the point mass.
@@ -58,6 +61,7 @@ def replay_point_mass(
     """
     count = windows.action_b.shape[0]
     rot_w = jnp.asarray(windows.rot_w)
+    # The acceleration by thrust and gravity is the measured one plus the drag's share.
     vel_b = to_local(rot_w, windows.vel_w[:, 0])
     thrust_w = windows.acc_w + to_world(rot_w, model.drag * vel_b)
     body = point_mass.PointMassState(
@@ -87,6 +91,7 @@ def replay_point_mass(
             delay=jnp.broadcast_to(model.delay, count),
         )
         body = point_mass.step(body, constants, action + correction, body.pos_w, 0.0)
+        # The step turned the heading to a gate; the measured one replaces it.
         body = body._replace(
             heading_w=heading,
             rot_w=point_mass.attitude(jax.lax.stop_gradient(body.thrust_w), heading),
@@ -105,13 +110,14 @@ def replay_point_mass(
 
 
 POINT, QUAD = "point", "quad"
-"""Names of the two models in `suite train --model`."""
+"""Names of the point mass and the quadrotor in `suite train --model`."""
 
 
 def describe_dynamics(dynamics: PointMassConfig | QuadrotorConfig) -> dict[str, Any]:
-    """Return the description of the corrected dynamics for a checkpoint.
+    """Return the description of the corrected dynamics for a checkpoint: `model` and `plant`.
 
-    It has the middle of the point mass's ranges, or the vehicle file without its name.
+    `plant` has the parameters of the model: the middle of the point mass's ranges, or the contents
+    of the vehicle file. The vehicle's name is empty, because it does not change the dynamics.
     """
     if isinstance(dynamics, PointMassConfig):
         return {"model": POINT, "plant": plain(nominal_model(dynamics))}
@@ -127,14 +133,15 @@ def check_corrects(
     """Refuse a Delta Action Model of other dynamics than the training's.
 
     Args:
-        fit: the model's description from its checkpoint. Without a model it counts as that of a
-            point mass, and without a rate it is valid for any.
-        dynamics: of the training.
-        rate_hz: decisions of the trained policy [Hz]; the network makes one step per decision.
+        fit: the description in the checkpoint. Without the key `model` it counts as that of a point
+            mass. Without `rate_hz` the network is valid for any rate.
+        dynamics: the dynamics of the training.
+        rate_hz: rate of the trained policy's decisions [Hz]; the network makes one step per
+            decision.
         checkpoint: the model's folder, for the message.
 
     Raises:
-        ValueError: if they differ.
+        ValueError: if model, rate or parameters differ.
     """
     training = describe_dynamics(dynamics)
     model = fit.get("model", POINT)

@@ -32,7 +32,8 @@ from suite.train.config import PointMassConfig, QuadrotorConfig
 from tracks.common.files import plain, write_json, write_text
 
 PLANT_STEPS_S, POINT_STEPS_S = 4e5, 1.5e5
-"""Steps a second of the quadrotor and of the point mass in a fit, for the estimate."""
+"""Simulated steps a second of the quadrotor and of the point mass in a fit, from which the duration
+of a fit is estimated."""
 MODEL_NAMES = {
     "point_mass": "point mass as trained in",
     "without": "quadrotor of the vehicle file",
@@ -40,11 +41,11 @@ MODEL_NAMES = {
     "delta_action": "with Delta Action Model",
 }
 """Key in delta.json -> name of a model that replays the held-out flights. The uncorrected dynamics
-are first, the Delta Action Model is last."""
+are first: `point_mass` or, for a quadrotor, `without`. The Delta Action Model is last."""
 
 
 def fitting_estimate(config: FitConfig, steps: float, through_quadrotor: bool) -> Estimate:
-    """Return the approximate time and memory of a fit with `steps` steps in each window."""
+    """Return the approximate time and memory of a fit with `steps` simulated steps a window."""
     total = config.iterations * config.batch * steps
     if through_quadrotor:
         return Estimate(40 + total / PLANT_STEPS_S, 1.5e9)
@@ -93,6 +94,7 @@ def long_enough(logs: Sequence[FlightLog], horizon_s: float) -> tuple[list[Fligh
 
     If fewer than two are long enough, all are returned; cutting them then raises the error.
     """
+    # A window begins after the first two decisions.
     needed_s = horizon_s + 2.0 / decision_rate(logs)
     long = [log for log in logs if log.duration_s >= needed_s]
     if len(long) < 2:
@@ -124,12 +126,14 @@ def fit_delta(
         ValueError: for invalid logs.
     """
     refuse_other_run(out, config)
+    # Read the flights, and hold some of them out.
     logs, warnings = read_flights(flight_files(paths))
     logs, short = long_enough(logs, config.horizon_s)
     for warning in [*warnings, *short]:
         console.note(f"warning: {warning}")
     groups = split(logs, config.held_out, config.seed)
     description = describe_dynamics(dynamics)
+    # Cut both groups into windows, and select the fit through the given dynamics.
     run_fit: Callable[[Any, Any, Callable[[int, str], None]], DeltaFit]
     fit_windows: Any
     held_out: Any
@@ -151,11 +155,13 @@ def fit_delta(
         )
         title, steps = "fitting the Delta Action Model", 1
         run_fit = partial(fit_point_mass, config, dynamics)
+    # Fit, with progress. `steps` becomes the number of simulated steps in a window.
     rate_hz = decision_rate(logs)
     steps *= fit_windows.action_b.shape[1]
     announce(console, title, fitting_estimate(config, steps, description["model"] == QUAD))
     with console.progress("fitting", config.iterations) as show:
         result = run_fit(fit_windows, held_out, show)
+    # Write the record, the checkpoint and the tables.
     summary = {
         "model": description["model"],
         "horizon_s": config.horizon_s,

@@ -1,9 +1,10 @@
 """Cut recorded flights into windows that start at a policy's decision, for replay in simulation.
 
-A Delta Action Model, a recurrent network that corrects actions, is fitted to them. In fine-tuning
-it runs for seconds, so it is also fitted from states with memory: before a window it runs over the
-measurements since the flight's start, up to a few seconds (burn-in). Some windows start without
-memory, like the trainer's flights that start between two gates.
+A window is a short part of a flight. A Delta Action Model, a recurrent network that corrects
+actions, is fitted to windows. In fine-tuning it runs for seconds, so its memory is not empty in
+most steps. Therefore it first runs over the measurements before a window, up to a few seconds
+(burn-in). Some windows start without memory, like the trainer's flights that start between two
+gates.
 """
 
 from __future__ import annotations
@@ -24,38 +25,39 @@ T = TypeVar("T")
 RATE_SHARE = 0.05
 """Largest relative difference of decision rates that count as equal."""
 HISTORY = 2
-"""Decisions before a window whose delayed commands may still act in it."""
+"""Number of decisions before a window whose commands may still act in it, because of the delay."""
 
 
 class PointMassWindows(NamedTuple):
-    """N windows of T decisions; row 0 is where the replay starts."""
+    """N windows of T decisions; the replay starts at row 0."""
 
     pos_w: np.ndarray
-    """(N, T + 1, 3) measured [m]."""
+    """(N, T + 1, 3) measured positions [m]."""
     vel_w: np.ndarray
-    """(N, T + 1, 3) measured [m/s]."""
+    """(N, T + 1, 3) measured velocities [m/s]."""
     acc_w: np.ndarray
-    """(N, 3) measured at the start [m/s^2]."""
+    """(N, 3) measured acceleration at the window's start [m/s^2]."""
     rot_w: np.ndarray
-    """(N, 3, 3) measured at the start, body to world."""
+    """(N, 3, 3) measured attitude at the window's start, body to world."""
     heading_w: np.ndarray
-    """(N, T + 1, 3) heading, horizontal unit vectors."""
+    """(N, T + 1, 3) measured heading, horizontal unit vectors."""
     action_b: np.ndarray
-    """(N, T, 3) the actions flown [m/s^2]."""
+    """(N, T, 3) the policy's actions in the flight [m/s^2]."""
     commands_w: np.ndarray
-    """(N, HISTORY, 3) commands before the window in world axes, latest first [m/s^2]."""
+    """(N, HISTORY, 3) actions before the window in world axes, latest first [m/s^2]."""
     time_step: np.ndarray
-    """(N, T) time between decisions [s]."""
+    """(N, T) time between a decision and the next one [s]."""
     burn_in: BurnIn
     """Inputs of the network before each window."""
 
 
 def _heading(rot_w: np.ndarray) -> np.ndarray:
-    """Return the heading (..., 3) with which `point_mass.attitude` gives the same body x.
+    """Return the heading (..., 3) from which `point_mass.attitude` computes the same attitude.
 
-    It is horizontal and perpendicular to body y; the projection of body x differs from it if the
-    body is rolled.
+    It is horizontal and perpendicular to body y. If the body is rolled, it differs from the
+    horizontal projection of body x.
     """
+    # Columns of R: the axes y and z of the body, in world axes.
     left, up = rot_w[..., 1], rot_w[..., 2]
     forward = np.stack([left[..., 1], -left[..., 0], np.zeros_like(left[..., 0])], axis=-1)
     forward = np.where(up[..., 2:] < 0, -forward, forward)
@@ -66,8 +68,8 @@ def _heading(rot_w: np.ndarray) -> np.ndarray:
 def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -> PointMassWindows:
     """Return windows of `duration_s`, about one per `stride_s` of every flight.
 
-    A window with a missing value is left out. The acceleration at the start is the mean over the
-    row's period, from the measured velocity.
+    A window with a missing value is left out. The acceleration at the start is the change of the
+    measured velocity from the first row to the next, divided by the time between them.
 
     Raises:
         ValueError: if a log has no actions, or all flights are shorter than a window.
@@ -135,8 +137,8 @@ def log_decisions(log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
 def decision_period(time_s: np.ndarray, row_s: float) -> float:
     """Return the time between a policy's decisions [s], NaN for fewer than two decisions.
 
-    It is a mean, because decisions are at a log's rows: with rows every 10 ms and 15 Hz, periods
-    are 60 or 70 ms. Gaps in the record are left out.
+    It is a mean, because decisions are marked at a log's rows: with rows every 10 ms and 15
+    decisions a second, periods are 60 or 70 ms. Periods with a lost decision do not count.
 
     Args:
         time_s: (T,) times of the rows with a decision [s].
@@ -177,12 +179,12 @@ def decision_rate(logs: Sequence[FlightLog]) -> float:
 
 
 def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.ndarray:
-    """Return (T,) bool: whether a gap is between consecutive decisions, without a lost one.
+    """Return (T,) bool: whether no decision was lost between two recorded ones.
 
     Args:
         gaps_s: (T,) times between recorded decisions [s].
-        period_s: time between decisions [s].
-        row_s: time between rows, by which a recorded decision may be late [s].
+        period_s: usual time between decisions [s].
+        row_s: time between rows; a decision may be marked this much late [s].
     """
     return gaps_s < 1.5 * period_s + row_s
 
@@ -190,6 +192,7 @@ def are_consecutive(gaps_s: np.ndarray, period_s: float, row_s: float) -> np.nda
 def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[PointMassWindows]:
     """Return the windows of one flight."""
     action, decides = log_decisions(log)
+    # Rows with a decision, with all values, and with a next row for the acceleration.
     rows = np.flatnonzero(decides & log.whole)
     rows = rows[rows + 1 < len(log.time_s)]
     time, rot = log.time_s[rows], quat_to_rot(log.quat_wxyz[rows])
@@ -207,6 +210,7 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
     for first in range(HISTORY, len(rows) - steps, stride):
         span = slice(first, first + steps + 1)
         gaps = np.diff(time[first - HISTORY : first + steps + 1])
+        # A window with a lost decision, also in its history, is left out.
         if not are_consecutive(gaps, period, row_s).all() or not np.isfinite(acc[first]).all():
             continue
         windows.append(
@@ -230,25 +234,27 @@ BURN_IN_S = 3.0
 
 
 class BurnIn(NamedTuple):
-    """The network's inputs at W decisions before each of N windows."""
+    """The network's inputs at the W decisions before each of N windows."""
 
     inputs: Array
-    """(N, W, 9) velocity in body axes [m/s], third row of R, action [m/s^2]; oldest first."""
+    """(N, W, 9) velocity in body axes [m/s], world z in body axes, action [m/s^2]; the oldest
+    decision is the first."""
     seen: Array
-    """(N, W) 1 for a decision of the flight, 0 before its start."""
+    """(N, W) 1 where the network gets the inputs; 0 before the flight's start, and in a window that
+    starts without memory."""
 
 
 def burn_in_before(
     rot_w: np.ndarray, vel_w: np.ndarray, action_b: np.ndarray, first: int, count: int
 ) -> BurnIn:
-    """Return inputs (W, 9) and seen (W,) of the decisions before number `first` of a flight.
+    """Return the burn-in of one window: `inputs` (W, 9) and `seen` (W,).
 
     Args:
-        rot_w: (T, 3, 3) measured at the flight's decisions.
-        vel_w: (T, 3) [m/s].
-        action_b: (T, 3) [m/s^2].
-        first: the decision at which the window starts.
-        count: W.
+        rot_w: (T, 3, 3) measured attitude at all decisions of the flight.
+        vel_w: (T, 3) measured velocity at them [m/s].
+        action_b: (T, 3) the policy's actions [m/s^2].
+        first: index of the decision at which the window starts.
+        count: number W of decisions before it; those before the flight's start have zeros.
     """
     inputs, seen = np.zeros((count, 9)), np.zeros(count)
     start = max(0, first - count)
@@ -261,7 +267,7 @@ def burn_in_before(
 
 
 def without_memory(burn_in: BurnIn, share: float) -> BurnIn:
-    """Return burn-ins without inputs for the first `share` (0 to 1) of the windows."""
+    """Return the burn-ins, with those of the first `share` (0 to 1) of the windows removed."""
     count = len(burn_in.seen)
     has_memory = (jnp.arange(count) >= round(share * count))[:, None]
     return burn_in._replace(seen=jnp.where(has_memory, jnp.asarray(burn_in.seen), 0.0))

@@ -1,8 +1,10 @@
 """Compute the gradient of a rollout in two passes, because the image encoder costs the most time.
 
-First the rollout (a flight of all simulated drones of a batch) is differentiated with a frozen
-encoder. A zero shift added to each embedding gives the gradient of the loss with respect to the
-embeddings. Then these gradients are back-propagated through the encoder, for all images at once.
+The image encoder is the part of the policy that turns an image into a vector, its embedding. A
+rollout is a flight of all simulated drones of a batch. The first pass differentiates the rollout
+with a frozen encoder. It adds a shift of zero to each embedding; the gradient with respect to this
+shift is that with respect to the embedding. The second pass back-propagates these gradients, the
+cotangents, through the encoder, for many images at once.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ from suite.train.rollout import StepRecord, make_rollout
 from suite.train.worlds import Worlds
 
 CHUNK = 320
-"""Images encoded at a time in the backward pass: few enough for the processor's cache."""
+"""Largest number of images encoded at a time in the second pass; they fit into the processor's
+cache."""
 
 
-def _chunk(count: int) -> int:
+def _chunk_size(count: int) -> int:
     """Return the largest divisor of count that is at most CHUNK."""
     return max(size for size in range(1, min(count, CHUNK) + 1) if count % size == 0)
 
@@ -36,9 +39,9 @@ def encoder_gradient(
         images: (N, height, width).
         cotangents: (N, hidden) gradient of the loss with respect to the embeddings.
     """
-    size = _chunk(images.shape[0])
+    size = _chunk_size(images.shape[0])
 
-    def body(
+    def add_chunk(
         total: network.Params, part: tuple[jax.Array, jax.Array]
     ) -> tuple[network.Params, None]:
         image, cotangent = part
@@ -50,7 +53,7 @@ def encoder_gradient(
         images.reshape(-1, size, *images.shape[1:]),
         cotangents.reshape(-1, size, cotangents.shape[-1]),
     )
-    return jax.lax.scan(body, zero, split)[0]
+    return jax.lax.scan(add_chunk, zero, split)[0]
 
 
 def sampled_encoder_gradient(
@@ -62,8 +65,8 @@ def sampled_encoder_gradient(
 ) -> network.Params:
     """Return the encoder's gradient from the images of every `stride`-th step, times `stride`.
 
-    Neighbouring images are similar: a sample of them saves most of the cost. The random first step
-    and the factor make the expected gradient that of all images.
+    Neighbouring images are similar, so a sample of them saves most of the cost. The random first
+    step and the factor `stride` make the expected gradient equal to that of all images.
 
     Args:
         params: the policy's parameters.
@@ -87,8 +90,9 @@ def make_gradient(
 ) -> Callable[..., tuple[network.Params, jax.Array, StepRecord]]:
     """Return gradient(params, worlds, key, delta) -> (gradient, loss, records).
 
-    It computes on one device. `delta` holds the parameters of the Delta Action Model, a network
-    that corrects the actions so that simulated flights match measured ones; None without one.
+    It computes on one device. `delta` are the parameters of a Delta Action Model, a network that
+    corrects the actions so that simulated flights match measured ones; None: no correction.
+    `records` are the numbers of every step (`StepRecord`).
     """
     stride, steps = config.episode.image_stride, config.episode.steps
     rollout, width = make_rollout(config), config.spec.hidden_size

@@ -1,8 +1,10 @@
 """The training loss of one step, as a table of terms (Su et al. 2026, Sec. III-C).
 
 Each term is a function that returns a loss (B,), one per world (a simulated scene and drone) of the
-batch. A new term needs that function, a line in `LOSSES` and its weight in `LossConfig`. The gap of
-a step is the distance to the nearest solid, minus the safety radius.
+batch. A new term needs that function, a line in `LOSSES` and its weight in `LossConfig`. The names
+L_..., beta and u_A are those of the paper. In this file the gap is not the glossary's: it is the
+distance of a point to the nearest solid, minus the safety radius. The (attractive) field pulls the
+gradient towards the gate. The goal of the progress term is the gate or a point before it.
 """
 
 from __future__ import annotations
@@ -19,16 +21,17 @@ from suite.train.step import Step, norm
 from tracks.geometry.field import CURRENT, attractive_field, magnetic_field
 
 BARRIER_HEIGHT, BARRIER_SLOPE = 2.0, -32.0
-"""beta_1 [1] and beta_2 [1/m] of L_clearance, as the paper prints them."""
+"""beta_1 (dimensionless) and beta_2 [1/m] of L_clearance, as the paper prints them."""
 FIELD_DECAY = 0.3
-"""lambda_A, how slowly u_A falls with distance, as the paper prints it [1]."""
+"""lambda_A of the field u_A, as the paper prints it: a larger one makes u_A fall more slowly with
+the distance."""
 TILT_FREE_DEG = 65.0
-"""Tilt up to which L_tilt is 0: fast turns need about this much [deg]."""
+"""Tilt up to which L_tilt is 0, because fast turns need about this much [deg]."""
 UNIT_FIELD = 11.313708498984761
-"""Size of the magnetic field over the current, |B| / C_I, at the centre of a square gate of 1 m:
-8 sqrt(2) [1/m]."""
+"""Size of the magnetic field divided by the current, |B| / C_I, at the centre of a square gate of
+1 m: 8 sqrt(2) [1/m]."""
 MAX_PULL = 5.0
-"""Limit of the field's pull, relative to that at the centre of a 1 m gate [1]."""
+"""Largest allowed size of the field, relative to that at the centre of a 1 m gate."""
 
 
 Term = Callable[[LossConfig, Step], jax.Array]
@@ -36,34 +39,38 @@ Term = Callable[[LossConfig, Step], jax.Array]
 
 
 def barrier(step: Step) -> jax.Array:
-    """Return ln(1 + e^{beta_2 gap}) at the points of the path, (B, S) [1]."""
+    """Return ln(1 + e^{beta_2 gap}), (B, S), at S points of the path that is flown in the step."""
     return jax.nn.softplus(BARRIER_SLOPE * step.gap)
 
 
 def clearance(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_clearance, the mean over the path [1]."""
+    """Return L_clearance, which keeps the drone away from solids: the mean over the path."""
     return (BARRIER_HEIGHT * barrier(step)).mean(1)
 
 
 def collide(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_collide, the mean over the path [m^3/s]."""
+    """Return L_collide, which penalises flight towards near solids: the mean over the path [m^3/s].
+
+    The velocity has no gradient: the term moves the path away from the solid.
+    """
     fixed_vel = jax.lax.stop_gradient(step.vel_w)
     closing_speed = jnp.maximum(-(step.away_w * fixed_vel[:, None]).sum(-1), 0.0)
     return (closing_speed * jnp.maximum(1.0 - step.gap, 0.0) ** 2).mean(1)
 
 
 def acceleration(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_a [m^2/s^4]."""
+    """Return L_a, the squared acceleration [m^2/s^4]."""
     return (step.acc_w * step.acc_w).sum(1)
 
 
 def jerk(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_j [m^2/s^6]."""
+    """Return L_j, the squared jerk [m^2/s^6]."""
     return (step.jerk_w * step.jerk_w).sum(1)
 
 
 def tilt(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_tilt: 0 up to a tilt of `TILT_FREE_DEG`, growing to 1 at 90 degrees [1]."""
+    """Return L_tilt: 0 up to a tilt of `TILT_FREE_DEG`, then growing to 1 at 90 degrees."""
+    # `step.up` is the cosine of the tilt.
     free_up = math.cos(math.radians(TILT_FREE_DEG))
     return (jnp.maximum(free_up - step.up, 0.0) / free_up) ** 2
 
@@ -75,9 +82,10 @@ def speed_to_goal(step: Step) -> jax.Array:
 
 
 def progress(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_p, minus the speed towards the goal, up to the commanded speed [m/s].
+    """Return L_p, the negative speed towards the goal [m/s].
 
-    Progress above the commanded speed does not count, and any speed above it costs.
+    For a policy with a commanded speed, progress counts up to that speed only, and a faster flight
+    is penalised. A command of 1 means no limit.
     """
     command = step.speed_command
     if command is None:
@@ -88,22 +96,25 @@ def progress(config: LossConfig, step: Step) -> jax.Array:
 
 
 def progress_norm(_: LossConfig, step: Step) -> jax.Array:
-    """Return L_p^norm, the ablation's progress by direction alone [1]."""
+    """Return L_p^norm, which rewards the direction of flight alone; for an ablation."""
     return -speed_to_goal(step) / (norm(step.vel_w) + 1e-3)
 
 
 def projection(config: LossConfig, step: Step) -> jax.Array:
-    """Return L_proj, which replaces the field: the squared distance to the gate's axis [m^2]."""
-    near = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(norm(step.place_g)))
-    return (step.place_g[:, 1:] ** 2).sum(1) * near
+    """Return L_proj, which can replace the field: the squared distance to the gate's axis [m^2].
+
+    It has a weight that falls with the distance to the gate.
+    """
+    nearness = jnp.exp(-config.projection_decay * jax.lax.stop_gradient(norm(step.place_g)))
+    return (step.place_g[:, 1:] ** 2).sum(1) * nearness
 
 
 def guidance(_: LossConfig, step: Step) -> jax.Array:
-    """Return the term whose position gradient is -u_A / u_A(centre of a 1 m gate); 0 in value.
+    """Return a term of value 0 whose gradient with respect to the position is minus the field u_A.
 
-    u_A is the paper's attractive field: it points along the magnetic field of a current around the
-    gate's opening, and is 0 for a velocity in that direction. It is unbounded at the gate's edges,
-    so it is limited to MAX_PULL.
+    u_A points along the magnetic field of a current around the gate's opening, and is 0 for a
+    velocity in that direction. Its size is 1 at the centre of a 1 m gate. At the gate's edges it
+    would be unbounded, so it is limited to MAX_PULL.
     """
     fixed_pos, fixed_vel = jax.lax.stop_gradient(step.pos_w), jax.lax.stop_gradient(step.vel_w)
     gate = step.gate
@@ -127,7 +138,8 @@ LOSSES: dict[str, tuple[tuple[Term, str], ...]] = {
     ),
     "guidance": ((guidance, "field_gain"),),
 }
-"""Name in the curve -> its terms, each with the name of its weight in `LossConfig`."""
+"""Name in the learning curve -> the terms that are added under this name, each with the name of its
+weight in `LossConfig`."""
 
 
 def weighted(config: LossConfig, step: Step) -> dict[str, jax.Array]:

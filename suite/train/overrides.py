@@ -1,7 +1,9 @@
 """Change settings of a run by name, as in `--set loss.progress=1.2`, also from one phase on.
 
-A phase is a part of a run; it has the settings of the phase before, with its own changes. A user's
-change holds in every phase; `phases.2.loss.progress=2` holds from the second phase on.
+A run is one training; a phase is a part of it that has the settings of the phase before, with
+further changes. A user's change holds in every phase; `phases.2.loss.progress=2` holds from the
+second phase on. The path of a setting is its name with those of the parts that it is in, such as
+`loss.progress`.
 """
 
 from __future__ import annotations
@@ -35,19 +37,19 @@ NEEDS = {
     "episode.race_share": "spec.speed_input",
     "episode.stop_from": "episode.rest_share",
 }
-"""Settings without effect if another setting is 0 or False."""
+"""Setting -> the setting without which it has no effect (while that is 0 or False)."""
 ABSENT = {
     "quadrotor": "quadrotor; take a recipe that trains through quadrotors (suite train: or add "
     "--model quad and --vehicle)",
     "sensors": "sensor models; suite train: add --sensors",
 }
-"""Advice for a part of a run that is None."""
+"""Part of the settings that may be None -> text of the error if one of its settings is changed."""
 PREFIX = "phases."
-"""Prefix of a change that begins with a phase."""
+"""Prefix of a change that begins in a later phase."""
 
 
 def override(config: T, changes: Iterable[str]) -> T:
-    """Return `config` with every change "field.field=value" made, within the fields' ranges.
+    """Return `config` with every change "PATH=VALUE" made; values outside their range are refused.
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
@@ -85,7 +87,7 @@ def is_within(path: str, part: str) -> bool:
 
 
 def _check_model(config: object, keys: list[str], change: str) -> None:
-    """Refuse a setting of the point mass in a run through quadrotors."""
+    """Refuse a setting of the point mass in a run that trains through quadrotors."""
     quadrotor = getattr(config, "quadrotor", None)
     if quadrotor is not None and keys[0] == "physics" and set(keys) & set(POINT_MASS_ONLY):
         raise ValueError(
@@ -95,11 +97,11 @@ def _check_model(config: object, keys: list[str], change: str) -> None:
 
 
 def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = "--set") -> None:
-    """Refuse changes of settings that a command sets itself.
+    """Refuse changes of settings that the command sets itself.
 
     Args:
-        changes: SETTING=VALUE each.
-        owned: advice by path; the path of a part includes all settings below it.
+        changes: the user's changes, each PATH=VALUE.
+        owned: path of a setting, or of a part with all its settings -> advice for the message.
         option: the option with the changes, for the message.
 
     Raises:
@@ -113,7 +115,10 @@ def check_owned(changes: Iterable[str], owned: Mapping[str, str], option: str = 
 
 
 def _with_value(config: T, path: list[str], text: str, change: str) -> T:
-    """Return `config` with the setting at `path` read from `text`; `change` is for messages."""
+    """Return `config` with the value of the setting at `path` read from `text`.
+
+    `change` is the user's text of the change, for messages.
+    """
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise ValueError(f"--set {change}: {shown(path[0])} is below a setting that has no parts")
     name, *rest = path
@@ -128,16 +133,20 @@ def _with_value(config: T, path: list[str], text: str, change: str) -> T:
     if dataclasses.is_dataclass(old):
         parts = ", ".join(field.name for field in dataclasses.fields(old))
         raise ValueError(f"--set {change}: {name!r} has parts, set one of {parts}")
-    kinds = get_args(get_type_hints(type(config))[name])
-    if type(None) in kinds and text == "None":
+    # For a type such as `float | None`: its parts, float and None.
+    allowed_types = get_args(get_type_hints(type(config))[name])
+    if type(None) in allowed_types and text == "None":
         return dataclasses.replace(config, **{name: None})
-    if old is None and kinds[0] in (int, float, str):
-        old = kinds[0]()
+    if old is None and allowed_types[0] in (int, float, str):
+        old = allowed_types[0]()
     return dataclasses.replace(config, **{name: _value(old, text, change)})
 
 
 def _value(old: object, text: str, change: str) -> object:
-    """Return the value that `text` gives for a setting, of the type of its `old` value."""
+    """Return the value in `text` for a setting, which must have the type of the `old` value.
+
+    Whole numbers are allowed for floats, and lists for tuples of the same length.
+    """
     try:
         value = ast.literal_eval(text)
     # The parser fails in different ways on text that is nested a thousand times.
@@ -168,7 +177,7 @@ def phase_ends(config: TrainConfig) -> tuple[int, ...]:
 
 
 def phase_configs(config: TrainConfig) -> tuple[TrainConfig, ...]:
-    """Return the settings of each phase, as a run of that phase alone.
+    """Return the settings of each phase, as if the phase were a whole run.
 
     Raises:
         ValueError: for a change that cannot be made, naming the phase.
@@ -208,7 +217,11 @@ def check_phases(config: TrainConfig) -> None:
 
 
 def _common_settings(config: TrainConfig, run: TrainConfig) -> dict[str, object]:
-    """Return the settings that all phases must share."""
+    """Return the settings that all phases must share, by path.
+
+    The rate and the speed of the policy may change. They are replaced by those of the `run`, so
+    that they are equal in all phases.
+    """
     spec = replace(config.spec, rate_hz=run.spec.rate_hz, speed=run.spec.speed)
     episode = config.episode
     return {"spec": spec, "episode.batch": episode.batch, "episode.shards": episode.shards,
@@ -216,12 +229,12 @@ def _common_settings(config: TrainConfig, run: TrainConfig) -> dict[str, object]
 
 
 def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
-    """Return a run with a user's changes: SETTING=VALUE in every phase, or from one phase on.
+    """Return `config` with a user's changes, which hold in every phase or from one phase on.
 
     Args:
-        config: the run.
-        changes: such as "loss.progress=0.4", or "phases.2.loss.progress=0.4", which holds from the
-            second phase until a later phase changes that setting.
+        config: settings of the run.
+        changes: PATH=VALUE, such as "loss.progress=0.4", for every phase; "phases.2.PATH=VALUE"
+            holds from the second phase until a later phase changes that setting.
 
     Raises:
         ValueError: naming the setting, what is wrong with it and what is allowed.
@@ -245,18 +258,18 @@ def with_changes(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
 
 
 def in_every_phase(config: TrainConfig, part: str, **values: Any) -> TrainConfig:
-    """Return a run in which settings of a part, such as "loss", have these values in all phases."""
+    """Return `config` with these `values` in all phases, of settings in a part such as "loss"."""
     config = _without_phase_changes(config, {f"{part}.{name}" for name in values})
     return replace(config, **{part: replace(getattr(config, part), **values)})
 
 
 def without_quadrotor(config: TrainConfig) -> TrainConfig:
-    """Return a run through the point mass instead of quadrotors."""
+    """Return `config` with training through the point mass instead of quadrotors."""
     return replace(_without_phase_changes(config, {"quadrotor"}), quadrotor=None)
 
 
 def _without_phase_changes(config: TrainConfig, paths: Iterable[str]) -> TrainConfig:
-    """Return a run whose phases do not change the settings at or below `paths`."""
+    """Return `config` without the phases' changes of the settings (or parts) at `paths`."""
     removed = tuple(paths)
 
     def is_kept(change: str) -> bool:

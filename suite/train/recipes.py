@@ -1,7 +1,8 @@
-"""Recipes: the settings of a training under a name, for `suite train --recipe NAME`.
+"""Recipes: named sets of all settings of a training, for `suite train --recipe NAME`.
 
-Below the recipes are functions that return a recipe with another vehicle, rate or sensors. The
-judge, which the docstrings mention, is the independent simulator that scores the policies.
+The functions after the recipes return a recipe with another vehicle, rate or sensors. The judge,
+which the docstrings mention, is the independent simulator that scores the policies. The paper is
+Su et al. 2026. The meaning of each setting is in `config.py`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from tracks.geometry.camera import Camera
 
 
 def race_paper() -> TrainConfig:
-    """Return the recipe of `race-paper`: the paper's 12 numbers, through the point mass alone."""
+    """Return the recipe of `race-paper`: the paper's state of 12 numbers, a point mass."""
     return TrainConfig()
 
 
@@ -39,12 +40,12 @@ def race() -> TrainConfig:
     """Return the recipe of `race`, the default policy: three phases from random weights.
 
     The first phase learns safe flight at 15 decisions a second, where a gradient step costs least.
-    The second learns speed: a higher weight of progress, lower ones of acceleration and jerk. The
-    third has 30 decisions a second, a higher weight of tilt, since tipping over ends a judged
-    trial, and delays of up to 80 ms. Quadrotors vary widely around `racer5`, which no result table
-    uses.
+    The second phase learns speed: the weight of progress is higher, those of acceleration and jerk
+    are lower. The third phase has 30 decisions a second and delays of up to 80 ms. Its weight of
+    tilt is higher, since tipping over ends a trial of the judge. The quadrotors vary widely around
+    the vehicle `racer5`, which no result table uses.
     """
-    fast = (
+    second_phase = (
         "loss.progress=2.2",
         "loss.acceleration=2e-3",
         "loss.jerk=1e-4",
@@ -52,7 +53,7 @@ def race() -> TrainConfig:
         "episode.race_share=0.8",
         "optimizer.rate=1e-3",
     )
-    often = (
+    third_phase = (
         "spec.rate_hz=30.0",
         "episode.steps=180",
         "episode.image_stride=6",
@@ -95,18 +96,19 @@ def race() -> TrainConfig:
             image_stride=3,
         ),
         optimizer=OptimizerConfig(iterations=4500),
-        phases=(Phase(13 / 45), Phase(11 / 45, fast), Phase(21 / 45, often)),
+        # 1300, 1100 and 2100 gradient steps.
+        phases=(Phase(13 / 45), Phase(11 / 45, second_phase), Phase(21 / 45, third_phase)),
     )
 
 
 def race_small() -> TrainConfig:
-    """Return the recipe of `race-small`: that of `race` for a network of under 100,000 weights."""
+    """Return the recipe of `race-small`: as `race`, for a network of under 100,000 weights."""
     base = race()
     return replace(base, spec=replace(base.spec, channels=(16, 32, 32), hidden_size=96))
 
 
 def paper() -> TrainConfig:
-    """Return the weights of Su et al. 2026 and the simulator of Zhang et al. 2025 as printed.
+    """Return the loss weights of Su et al. 2026 and the point mass of Zhang et al. 2025.
 
     The paper does not say how its attractive field u_A scales with batch and horizon. Here u_A is
     added as written to the gradient of a loss averaged over 64 worlds of 150 steps.
@@ -137,7 +139,7 @@ def paper() -> TrainConfig:
 
 
 def quick() -> TrainConfig:
-    """Return a run of minutes on two cores, through the point mass: it flies, but slowly."""
+    """Return a run of minutes on two cores, through the point mass; its policy is slow."""
     base = race_paper()
     return replace(
         base,
@@ -161,9 +163,9 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
 
 
 def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
-    """Return `config` with decisions at `rate_hz`; rollouts and delays keep their durations.
+    """Return `config` with decisions at `rate_hz`; rollouts and delays last as long as before [s].
 
-    Delays of the point mass are limited to two decisions.
+    The delay of the point mass's commands is limited to two decisions.
     """
     ratio, physics, episode = rate_hz / config.spec.rate_hz, config.physics, config.episode
     stride = max(1, round(ratio * episode.image_stride))
@@ -186,13 +188,13 @@ def at_rate(config: TrainConfig, rate_hz: float) -> TrainConfig:
 
 
 def finetune(config: TrainConfig, share: float = 0.25) -> TrainConfig:
-    """Return the settings of fine-tuning a policy of `config`, also under a Delta Action Model.
+    """Return the settings of fine-tuning a policy that was trained with `config`.
 
-    They are those of the last phase, with a lower learning rate and other tracks.
+    They are those of the last phase, with fewer steps, a lower learning rate and other tracks.
 
     Args:
         config: the settings of the policy's training.
-        share: gradient steps, as a share of the last phase's.
+        share: number of gradient steps, as a share of those of the last phase.
     """
     last = phase_configs(config)[-1]
     optimizer = last.optimizer
@@ -225,13 +227,14 @@ def with_sensors(config: TrainConfig, sensors: str) -> TrainConfig:
 
 
 def with_quadrotor(config: TrainConfig, vehicle: Vehicle) -> TrainConfig:
-    """Return `config`, trained through the quadrotor of `vehicle` with the recipe's randomisation.
+    """Return `config` with training through the quadrotor of `vehicle`; the randomisation stays.
 
-    Spreads of the centre of mass and of the trim scale with the vehicle's size: a small torque for
-    a racer is more than a palm-sized quadrotor can produce.
+    Only the spreads of the centre of mass and of the constant torque (trim) are scaled with the
+    vehicle's size: a torque that is small for a racer is more than a palm-sized quadrotor can
+    produce.
 
     Raises:
-        ValueError: where the policy decides faster than the vehicle's controller runs.
+        ValueError: if the policy decides faster than the vehicle's controller runs.
     """
     check_decides_in_time(config.spec, vehicle)
     quadrotor = config.quadrotor or QuadrotorConfig(vehicle)
@@ -250,18 +253,19 @@ SPREADS = (
     *("mass_std", "lag_spread_s", "drag_spread", "delay_spread_s"),
     *("gain_spread", "thrust_spread", "com_std_m", "trim_std"),
 )
-"""Spreads that `with_usual_spreads` increases."""
+"""Settings of the randomisation that `with_usual_spreads` increases."""
 
 
 def with_usual_spreads(config: TrainConfig) -> TrainConfig:
     """Return `config` with quadrotors that vary by at least the usual errors of a vehicle file.
 
     A policy that is fine-tuned through one exact vehicle loses its robustness: with a hidden offset
-    of the centre of mass its success fell far below that before the fine-tuning.
+    of the centre of mass its success rate fell far below that before the fine-tuning.
     """
     quadrotor = config.quadrotor
     if quadrotor is None:
         return config
+    # Usual spreads for `racer5`, then scaled to the vehicle.
     base = replace(_racer5_with_spreads(), com_std_m=0.008, trim_std=0.03)
     usual = with_quadrotor(replace(config, quadrotor=base), quadrotor.vehicle).quadrotor
     spreads = {name: max(getattr(quadrotor, name), getattr(usual, name)) for name in SPREADS}
@@ -296,16 +300,16 @@ def _inertia(vehicle: Vehicle) -> float:
 
 
 def with_model(config: TrainConfig, model: str | None, vehicle: str | None) -> TrainConfig:
-    """Return `config` with the dynamics of --model and --vehicle.
+    """Return `config` with the dynamics that the options --model and --vehicle choose.
 
     Args:
         config: a recipe.
         model: "point" or "quad"; None: that of the recipe.
-        vehicle: a vehicle file or a shipped name, for "quad" or a recipe through quadrotors.
+        vehicle: a vehicle file or a shipped name, if the model is a quadrotor; None: that of the
+            recipe, if it has one.
 
     Raises:
-        ValueError: for a vehicle without quadrotors, "quad" without a vehicle, or an invalid
-            vehicle.
+        ValueError: for a point mass with a vehicle, "quad" without one, or an invalid vehicle.
     """
     from eval.quadrotor.vehicle_file import load_vehicle, shipped_vehicles
 
@@ -333,7 +337,7 @@ RECIPES = {
     "paper": paper,
     "gpu": gpu,
 }
-"""Name -> function that returns the settings; its docstring is the description."""
+"""Name of a recipe -> function that returns its settings; its docstring describes the recipe."""
 
 
 def named_recipe(name: str) -> TrainConfig:
@@ -348,10 +352,10 @@ def named_recipe(name: str) -> TrainConfig:
 
 
 def race_settings(recipe: str, vehicle: str = "racer5") -> dict[str, Any]:
-    """Return arguments of the environments in `eval.envs` for training like a recipe.
+    """Return arguments of the environments in `eval.envs`, to train another learner like a recipe.
 
-    They are the policy's observation (`spec`) and vehicles (`vehicle`) with the recipe's
-    randomisation, or the default one if it trains through a point mass.
+    They are `spec`, the policy's observation, and `vehicle`, a function that draws vehicles with
+    the recipe's randomisation. A recipe through a point mass gets the default randomisation.
 
     Args:
         recipe: a name of `suite train`.

@@ -1,9 +1,10 @@
 """Roll out the policy through differentiable dynamics, and compute the loss of every step.
 
 A rollout is a flight of B worlds (a world is one simulated scene and drone) over T policy periods.
-Images have no gradient with respect to the state (Zhang et al. 2025), so the image encoder is
-outside the differentiated loop: its embeddings enter as constants plus `embedding_shift`, a zero
-whose gradient is the embeddings' cotangent (see `gradient.py`). Obstacles, gates and their
+The policy's image encoder turns an image into a vector, its embedding. Images have no gradient with
+respect to the state (Zhang et al. 2025). So the encoder is outside the differentiated loop: an
+embedding enters as a constant plus `embedding_shift`, which is zero. The gradient with respect to
+the shift is that with respect to the embedding (see `gradient.py`). Obstacles, gates and their
 attractive field are evaluated without gradient as well.
 """
 
@@ -36,27 +37,27 @@ from tracks.geometry.rotation import exp_rot, to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
-"""Solids of each kind in a training image, the nearest ones. Images of the judge, which scores
-policies in MuJoCo, have all solids."""
+"""Number of solids of each kind in a training image, the nearest ones. Images of the judge, which
+scores policies in MuJoCo, have all solids."""
 
 
 class RolloutCarry(NamedTuple):
-    """State of a world between steps."""
+    """State of the B worlds between steps."""
 
     state: Any
-    """Of the dynamics."""
+    """State of the dynamics."""
     target: jax.Array
-    """(B,) gates passed, counted from the track's first."""
+    """(B,) number of passed gates, counted from the track's first one; the next gate's index."""
     hidden: jax.Array
-    """(B, hidden) of the policy."""
+    """(B, hidden) recurrent state of the policy."""
     action_b: jax.Array
-    """(B, 3) the policy's last action, without correction [m/s^2]."""
+    """(B, 3) the policy's last action, without the correction of a Delta Action network [m/s^2]."""
     embeddings: jax.Array
-    """(B, image_delay, hidden) the delayed images, oldest first."""
+    """(B, image_delay, hidden) embeddings of images that wait for their delay, oldest first."""
     observed: jax.Array
-    """(B, state_delay, state_size) the delayed states, oldest first."""
+    """(B, state_delay, state_size) state vectors that wait for their delay, oldest first."""
     delta_hidden: jax.Array
-    """(B, 32) of the Delta Action network."""
+    """(B, 32) recurrent state of the Delta Action network."""
     alive: jax.Array
     """(B,) 1 while the world counts in the loss: until it crashes, stops or finishes, then 0."""
     sensed: Any = ()
@@ -67,28 +68,28 @@ class StepRecord(NamedTuple):
     """Records of a step, (B, ...) each."""
 
     image: jax.Array
-    """(B, height, width) encoded, with its noise."""
+    """(B, height, width) the image that was encoded, with its noise."""
     terms: dict[str, jax.Array]
-    """Weighted losses by name, zero for worlds that have left the loss."""
+    """Weighted losses by name; zero for worlds that no longer count in the loss."""
     speed: jax.Array
-    """[m/s]."""
+    """Speed at the step's end [m/s]."""
     clearance: jax.Array
     """Smallest signed distance on the step's path [m]."""
     passed: jax.Array
     """Bool: a gate was crossed in this step."""
     pos_w: jax.Array
-    """(B, 3) at the step's end [m]."""
+    """(B, 3) position at the step's end [m]."""
     hidden: jax.Array
-    """(B, hidden) recurrent state after the step."""
+    """(B, hidden) the policy's recurrent state after the step."""
     alive: jax.Array
     """1 where the step counted in the loss, else 0."""
     noted: Any = None
-    """Result of `note`, the function for additional records, if there is one."""
+    """What the optional function for additional records (`Note`) returned; None without one."""
 
 
 Note = Callable[[Worlds, DynamicsState, DynamicsState, jax.Array], Any]
-"""note(worlds, before, after, target) -> arrays (B, ...) to record of a step; `target` is the
-number of gates passed before it."""
+"""note(worlds, before, after, target) -> additional arrays (B, ...) to record of a step. `before`
+and `after` are the states, `target` is the number of gates passed before the step."""
 
 
 def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
@@ -103,33 +104,39 @@ def view_in(worlds: Worlds, state: DynamicsState, target: jax.Array) -> View:
 
 
 def queue(waiting: jax.Array, new: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return (the oldest entry, the queue without it and with `new` at its end)."""
+    """Add `new` to a queue (B, N, ...) of delayed arrays.
+
+    Return its oldest entry, and the queue without that entry and with `new` at its end. If N is 0,
+    there is no delay, and `new` itself is returned.
+    """
     entries = jnp.concatenate([waiting, new[:, None]], axis=1)
     return entries[:, 0], entries[:, 1:]
 
 
 def world_keys(key: jax.Array, worlds: Worlds) -> jax.Array:
-    """Return a key (B,) for each world, independent of the other worlds of the batch."""
+    """Return a random key for each world, (B,), from `key` and the world's number in the batch."""
     return jax.vmap(jax.random.fold_in, (None, 0))(key, worlds.number)
 
 
 class SensorModels(NamedTuple):
     """The sensor models of a training, as pure functions over B worlds.
 
-    A view has all that the policy's observation is computed from: pose, velocity, gates, depth.
+    In this file a view has all from which the policy's observation is computed: pose, velocity,
+    gates and depth image (`policies.observation.View`).
     """
 
     start: Callable[[Worlds, View], Any]
     """(worlds, view at the start) -> memory of the models."""
     measure: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
-    """(worlds, true view, keys (B,), memory) -> (view with errors, memory)."""
+    """(worlds, true view, keys (B,), memory) -> (view with errors, new memory)."""
 
 
 def make_sensor_models(config: TrainConfig) -> SensorModels:
     """Return the sensor models of `config.sensors`, with each world's magnitudes and draws.
 
-    The functions are the judge's. The trainer has states only at decisions: a state in between is
-    interpolated, and an image in between is one of the two neighbours, at random.
+    The functions are those of the judge. The trainer has states only at decisions. If a delay ends
+    between two decisions, the state is interpolated, and the image is one of the two neighbouring
+    ones, at random.
     """
     assert config.sensors is not None
     models, spec, dt_s = config.sensors.seen.models, config.spec, 1.0 / config.spec.rate_hz
@@ -164,7 +171,7 @@ def make_sensor_models(config: TrainConfig) -> SensorModels:
             uniform = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(delay_keys)
             jitter = 1.0 + delay.jitter * (2.0 * uniform[:, :2] - 1.0)
             ages = jnp.stack([delay.state, delay.image], -1) * jitter / dt_s
-            # A random rounding: up as often as the fraction says.
+            # Random rounding: the probability to round up is the fraction.
             delayed = delayed_view(views, ages[:, 0], jnp.floor(ages[:, 1] + uniform[:, 2]))
         view, states = sensors.sense(
             current_models(worlds), states, delayed, draws, dt_s, spec.camera
@@ -176,12 +183,14 @@ def make_sensor_models(config: TrainConfig) -> SensorModels:
 
 
 def delayed_view(views: tuple[View, ...], age: jax.Array, image_age: jax.Array) -> View:
-    """Return the view of an age between decisions; the next gate is that of the nearer decision.
+    """Return the view at an earlier time, which may be between two decisions.
+
+    Pose and velocity are interpolated. The gates are those of the nearer decision.
 
     Args:
-        views: at this decision, the one before, and so on.
-        age: (B,) of the state [policy periods].
-        image_age: (B,) of the image, whole numbers [policy periods].
+        views: views at this decision, at the one before, and so on.
+        age: (B,) age of the state [policy periods].
+        image_age: (B,) age of the image, whole numbers [policy periods].
     """
     view = views[0]
     for number, (later, earlier) in enumerate(pairwise(views)):
@@ -204,14 +213,14 @@ class Observer(NamedTuple):
     start: Callable[[Worlds, DynamicsState], Any]
     """(worlds, state at the start) -> memory of the sensor models; () without models."""
     observe: Callable[..., tuple[Observation, Any]]
-    """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, memory); without
-    sensor models `memory` may be left out."""
+    """(worlds, state, target, last_action_b, keys (B,), memory) -> (observation, new memory).
+    `target` is the number of passed gates; without sensor models `memory` may be left out."""
 
 
 def make_observer(config: TrainConfig) -> Observer:
     """Return the observation in training, with image noise and sensor errors."""
     spec, camera, noise = config.spec, config.spec.camera, config.physics.depth_noise
-    # One ray a pixel, also for a supersampling camera: more rays took time without a gain.
+    # One ray a pixel, also for a supersampling camera: more rays cost time and had no benefit.
     rays = jnp.asarray(pixel_rays_b(camera), jnp.float32)
     models = None if config.sensors is None else make_sensor_models(config)
 
@@ -249,7 +258,10 @@ def make_observer(config: TrainConfig) -> Observer:
 
 
 def observed_at_start(worlds: Worlds, state: DynamicsState, config: TrainConfig) -> jax.Array:
-    """Return the delayed states at the start, (B, state_delay, state_size): copies of the first."""
+    """Return the queue of delayed state vectors at the start, (B, state_delay, state_size).
+
+    All of its entries are the state vector of the start.
+    """
     view = view_in(worlds, state, jnp.asarray(worlds.target))
     no_action = jnp.zeros_like(state.pos_w)
     observed = observe(config.spec, view, no_action, worlds.speed_command).state
@@ -261,10 +273,10 @@ def make_rollout(
 ) -> Callable[..., tuple[jax.Array, StepRecord]]:
     """Return rollout(params, embedding_shift, worlds, key, encode, delta) -> (loss, records).
 
-    `encode(params, image)` gives the embeddings; `embedding_shift` is (T, B, hidden); `delta` is
-    the parameters of a Delta Action network, which corrects the actions so that simulated flights
-    match measured ones, or None. The loss is the mean over steps and worlds; records are
-    (T, B, ...), without gradient.
+    `encode(params, image)` gives the embeddings; `embedding_shift` (T, B, hidden) is zero. `delta`
+    are the parameters of a Delta Action network, which corrects the actions so that simulated
+    flights match measured ones, or None. The loss is the mean over steps and worlds. The records
+    have arrays (T, B, ...), without gradient; `note` adds some.
     """
     weights, physics, width = config.loss, config.physics, config.spec.hidden_size
     observer, dynamics = make_observer(config), make_dynamics(config)
@@ -300,6 +312,7 @@ def make_rollout(
             shift_now, key_now, number = inputs
             before, target = carry.state, carry.target
             keys = world_keys(key_now, worlds)
+            # What the policy observes, with delays, and its action.
             observation, sensed = observer.observe(
                 worlds, before, target, carry.action_b, keys, carry.sensed
             )
@@ -307,6 +320,7 @@ def make_rollout(
             embedding, embeddings = queue(carry.embeddings, embedding)
             state, observed = queue(carry.observed, observation.state)
             action, hidden = network.recur(params, carry.hidden, embedding, state)
+            # The corrected action, the motion and its loss.
             corrected, delta_hidden = action, carry.delta_hidden
             if delta is not None:
                 vel_b = to_local(before.rot_w, before.vel_w)
@@ -318,13 +332,14 @@ def make_rollout(
             after = dynamics.step(before, worlds.constants, corrected, target_w, keys)
             motion = make_step(weights, worlds, before, after, target)
             terms = losses.weighted(weights, motion)
+            # Whether the world counts in the loss of the next step.
             target_after = target + motion.passed
             goes_on = number + 1 < worlds.stop
             if config.episode.finish:
                 goes_on = goes_on & (target_after < worlds.scene.gates.center_w.shape[1])
             intact = motion.clearance > -weights.crash_depth_m
             if weights.tilt > 0.0:
-                intact = intact & (motion.up > 0.0)
+                intact = intact & (motion.up > 0.0)  # a tilt below 90 degrees
             record = StepRecord(
                 image=observation.image,
                 terms={name: term * carry.alive for name, term in terms.items()},

@@ -1,7 +1,8 @@
-"""Train a policy by backpropagation through differentiable dynamics: `train`, and its estimate.
+"""Train a policy by backpropagation through differentiable dynamics, or estimate how long it takes.
 
-`train` describes the run's phases to the loop of `training_loop.py`, which iterates, saves and
-resumes in a folder. Simulated scenes and noise depend only on the seed and the iteration.
+A run is one training; a phase is a part of it with its own settings. `train` describes the phases
+to the loop of `training_loop.py`, which iterates, saves and resumes in a folder. Simulated scenes
+and noise depend only on the seed and the iteration.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from tracks.common.work import usable_cores
 from tracks.common.work.threads import threads
 
 STEPS_PER_CORE_S = 5000.0
-"""Environment steps a second of a processor core, gradient included; for the estimate."""
+"""Environment steps (decisions of one simulated drone) a second of a processor core, gradient
+included; for the estimate."""
 COMPILE_S = 15.0
 """Time to compile, for the estimate [s]."""
 PROGRAM_BYTES, FLOATS_PER_UNIT = 8e8, 24
-"""Memory of the process without a batch [B], and stored numbers per unit of the recurrent state
-and environment step; for the estimate."""
+"""Memory of the process without a batch [byte], and number of stored floats for each unit of the
+recurrent state and each environment step; for the estimate."""
 
 
 def estimate(
@@ -53,11 +55,12 @@ def estimate(
     Args:
         config: the run.
         steps_per_core_s: environment steps of one processor core, gradient included [1/s].
-        compile_s: time to compile [s].
-        passes: number of passes over an iteration's steps.
-        images: number of copies of its images in memory.
+        compile_s: time to compile a phase [s].
+        passes: number of passes over the steps of an iteration.
+        images: number of copies of an iteration's images in memory.
     """
     pixels = config.spec.camera.height * config.spec.camera.width
+    # An accelerator counts as 50 cores, a rough value.
     cores = usable_cores() if jax.default_backend() == "cpu" else 50
     seconds, most_frames = 0.0, 0
     for phase in phase_configs(config):
@@ -66,7 +69,7 @@ def estimate(
         seconds += compile_s + steps / (steps_per_core_s * cores)
         most_frames = max(most_frames, frames)
     floats = most_frames * (images * pixels + FLOATS_PER_UNIT * config.spec.hidden_size)
-    return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)
+    return Estimate(seconds, PROGRAM_BYTES + floats * 4.0)  # 4 bytes a float
 
 
 def load_start_params(policy: str, spec: PolicySpec) -> network.Params:
@@ -77,7 +80,7 @@ def load_start_params(policy: str, spec: PolicySpec) -> network.Params:
         spec: inputs and network of the policy to train.
 
     Raises:
-        ValueError: if it does not exist, or has an input that `spec` lacks.
+        ValueError: if the policy does not exist, or has an input that `spec` lacks.
     """
     from policies.formats.policy_file import load_policy_checkpoint
     from suite.judging.flying import checkpoint_folder
@@ -105,7 +108,7 @@ def train(
         delta: parameters of a Delta Action network, which corrects every action so that simulated
             flights match measured ones; they are not trained.
         watch: measures the policy during the training; only in a single process.
-        mirror: receives the rows of the curve as well.
+        mirror: a function that also receives the rows of the learning curve.
 
     Raises:
         ValueError: for invalid settings, if the folder has a run of another configuration, start or
@@ -114,11 +117,13 @@ def train(
     """
     check_phases(config)
     check_processes(config)
+    # What must be the same to resume a run, and in all processes that train together.
     origin = {"config": plain(config), "from": _digest(params), "delta": _digest(delta)}
     hosts.check_same({"the configuration": origin["config"], "--init-from": origin["from"],
                  "--delta": origin["delta"], "threads": threads() > 1})  # fmt: skip
     configs, ends = phase_configs(config), phase_ends(config)
     begins = (0, *ends[:-1])
+    # The spec before each phase: the rate may change, and the parameters are then converted.
     specs_before = (configs[0].spec, *(phase.spec for phase in configs[:-1]))
     phases = [
         RunPhase(

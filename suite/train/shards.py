@@ -1,9 +1,9 @@
 """Compute the gradient of a batch in shards, in parallel, and sum them in a fixed order.
 
 A shard is a part of a batch of worlds (simulated scenes with a drone). The number of shards is a
-setting of the run and does not depend on the number of cores, devices and processes. All shards are
-computed by the same compiled program, and their gradients are summed in the order of the shards, so
-that the sums have the same bits with any number of cores.
+setting of the run and does not depend on the number of cores, devices and processes. The same
+compiled program computes all shards, and their gradients are summed in the order of the shards.
+Therefore the sums have the same bits with any number of cores.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from tracks.common.work import usable_cores
 
 
 class Shard(NamedTuple):
-    """Results of the worlds of a shard, or of a batch."""
+    """Results of a shard, or of a whole batch."""
 
     gradient: network.Params
     """Gradient of the loss, the mean over worlds."""
     numbers: dict[str, jax.Array]
-    """Numbers of the curve, means over worlds, scalars each."""
+    """Numbers of the learning curve by name: scalars, means over worlds."""
     hidden: jax.Array
-    """(B, hidden) recurrent state of a random step of each world."""
+    """(B, hidden) the policy's recurrent state at a random step of each world."""
 
 
 def flight_numbers(loss: jax.Array, records: StepRecord) -> dict[str, jax.Array]:
-    """Return a shard's numbers of the curve, means over its worlds.
+    """Return a shard's numbers of the learning curve by name, means over its worlds.
 
-    Gates, collisions and speeds are of the steps that count in the loss; `counted` is their share.
-    `memory` is the mean size of the recurrent states: near 1 they are saturated, and the
-    observation has no influence on the action.
+    Gates, collisions and speeds are those of the steps that count in the loss; `counted` is the
+    share of these steps. `memory` is the mean size of the recurrent states. If it is near 1, they
+    are saturated, and the observation has no influence on the action.
     """
     counts = records.alive > 0
     speed = jnp.where(counts, records.speed, 0.0)
@@ -61,22 +61,24 @@ def flight_numbers(loss: jax.Array, records: StepRecord) -> dict[str, jax.Array]
 
 
 def curve_numbers(shard: Shard) -> dict[str, jax.Array]:
-    """Return the numbers of the curve, scalars each, of a whole batch: a row of metrics.jsonl."""
+    """Return a row of the learning curve, metrics.jsonl, from the results of a whole batch."""
     numbers = dict(shard.numbers)
+    # The mean speed over all steps, divided by the share of steps that count: that of those steps.
     numbers["speed"] = numbers["speed"] / jnp.maximum(numbers.pop("counted"), 1e-6)
     squares = sum((leaf * leaf).sum() for leaf in shard.gradient.values())
     return numbers | {"gradient_norm": jnp.sqrt(squares)}
 
 
 def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> jax.Array:
-    """Return the recurrent states (B, hidden) of a random step of each world.
+    """Return the policy's recurrent states (B, hidden) at a random step of each world.
 
-    A world that has left the loss before that step keeps the state `before`.
+    Worlds of the next rollout start with them. A world that no longer counts in the loss at that
+    step keeps the state `before`.
 
     Args:
-        keys: (B,) of the worlds.
-        records: (T, B, ...).
-        before: (B, hidden).
+        keys: (B,) random keys of the worlds.
+        records: (T, B, ...) records of the rollout.
+        before: (B, hidden) the states from the rollout before.
     """
     steps, batch = records.alive.shape
     step = jax.vmap(lambda key: jax.random.randint(key, (), 0, steps))(keys)
@@ -86,7 +88,7 @@ def sample_hidden(keys: jax.Array, records: StepRecord, before: jax.Array) -> ja
 
 
 def check_processes(config: TrainConfig) -> None:
-    """Refuse a number of shards that is no multiple of the number of processes.
+    """Refuse a number of shards that is not a multiple of the number of processes.
 
     Raises:
         ValueError: naming both numbers.
@@ -104,7 +106,8 @@ def make_shards(
 ) -> Callable[[network.Params, jax.Array, jax.Array, Worlds], list[Shard]]:
     """Return shards(params, hidden, iteration, worlds) -> all shards of a batch, in order.
 
-    `worlds` is the whole batch; every process computes its part of the shards.
+    `worlds` is the whole batch; `hidden` (B, hidden) are recurrent states from the last rollout.
+    Every process computes its part of the shards and receives those of the others.
 
     Args:
         config: the run.
@@ -124,6 +127,7 @@ def make_shards(
         params: network.Params, hidden: jax.Array, iteration: jax.Array, worlds: Worlds
     ) -> Shard:
         key = jax.random.fold_in(seed, iteration)
+        # Only worlds that start between two gates have a recurrent state from before.
         before = hidden[worlds.number]
         worlds = worlds._replace(hidden=before * worlds.remembers[:, None])
         gradient, loss, records = gradient_of(params, worlds, key, delta)

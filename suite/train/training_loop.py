@@ -1,9 +1,11 @@
 """Run a training in a folder: iterate, save checkpoints that survive a kill, resume exactly.
 
-The folder has run.json (settings and versions), metrics.jsonl (the curve), validation.jsonl
-(measurements during the training), policy/ (the checkpoint to fly) and state/ (for resuming). An
-iteration depends only on the state and its number, so a resumed run has the same curve as one
-without a stop. Both trainers, differentiable and PPO, use it.
+A run is one training, an iteration is one update of the policy, a phase is a part of a run with its
+own settings. The run's folder has run.json (settings and versions), metrics.jsonl (the learning
+curve, a row per iteration), validation.jsonl (measurements during the training), policy/ (the
+checkpoint to fly) and state/ (for resuming). An iteration depends only on the state and its number,
+so a resumed run has the same curve as one without a stop. Both trainers, the differentiable one and
+PPO, use this module.
 """
 
 from __future__ import annotations
@@ -46,24 +48,26 @@ class Outcome:
     policy: Path
     """The trained policy's checkpoint."""
     iterations: int
-    """Number of gradient steps, also those before a stop."""
+    """Number of iterations of the run, with those before an interruption."""
     last: dict[str, Any]
-    """Means of the curve's numbers over its last tenth."""
+    """Numbers of the learning curve by name, means over its last tenth."""
 
 
 class Watch(NamedTuple):
     """A measurement of the policy during the training; its time does not count as training."""
 
     every: int
-    """Gradient steps between measurements; one is made before the first step and after the last."""
+    """Number of iterations between measurements. The policy is also measured before the first
+    iteration and after the last one."""
     measure: Callable[[network.Params], Mapping[str, float]]
     """(the policy's parameters) -> a row of validation.jsonl."""
 
 
 class RunPhase(NamedTuple):
-    """The functions of one phase of a run, a part of it with its own settings.
+    """The functions of one phase of a run.
 
-    A state has the policy's `params` and the number of the next `iteration`.
+    They work on the trainer's state, which has at least the policy's `params` and the number of
+    finished iterations, `iteration`.
     """
 
     end: int
@@ -71,19 +75,19 @@ class RunPhase(NamedTuple):
     spec: PolicySpec
     """Spec of the policy during the phase."""
     frames: int
-    """Environment steps in one iteration."""
+    """Number of environment steps (decisions, over all simulated drones) in one iteration."""
     worlds: Callable[[int], Worlds]
-    """The fresh worlds of an iteration."""
+    """(iteration) -> its worlds, the simulated scenes and drones."""
     make_update: Callable[[], Callable[[Any, Worlds], tuple[Any, dict[str, jax.Array]]]]
-    """Returns update(state, worlds) -> (state', numbers of the curve); called once."""
+    """Returns update(state, worlds) -> (new state, row of the curve); called once in a phase."""
     note: Callable[[Mapping[str, float]], str]
-    """Returns a short text about a row of the curve."""
+    """(row of the curve) -> a short text about it, for the progress line."""
     begin: Callable[[Any], Any] = lambda state: state
-    """Returns the phase's first state from the last state of the phase before."""
+    """(last state of the phase before) -> the phase's first state."""
 
 
 def flight_note(goal: str, row: Mapping[str, float]) -> str:
-    """Return a row's number `goal`, its gates, collisions and speed as a short text."""
+    """Return a row of the curve as a short text: the number `goal`, gates, collisions and speed."""
     return (
         f"{goal} {row[goal]:.2f}, gates {row['gates']:.2f}, collided {row['collided']:.0%}, "
         f"{row['speed']:.1f} m/s"
@@ -91,28 +95,29 @@ def flight_note(goal: str, row: Mapping[str, float]) -> str:
 
 
 class Run(NamedTuple):
-    """Folder and identity of a run."""
+    """A run: its settings, its folder, and what must be the same to resume it."""
 
     config: Any
-    """The resolved configuration, a dataclass."""
+    """All settings, a dataclass."""
     seed: int
     """Seed of the run, for its record."""
     origin: dict[str, Any]
-    """The inputs, such as "config", that must be the same to resume a folder's run."""
+    """The inputs, such as "config", that must be the same to resume the run of a folder."""
     folder: Path
     """Where the run's files go."""
     estimate: Estimate
     """Time and memory of the whole run."""
     mirror: curve.Mirror | None = None
-    """Receives the rows of the curve as well."""
+    """A function that also receives the rows of the curve."""
 
 
 def train_in_folder(
     phases: Sequence[RunPhase], run: Run, fresh: Any, console: Console, watch: Watch | None = None
 ) -> Outcome:
-    """Run the phases' updates from the folder's state, or from the `fresh` one, to the end.
+    """Run the updates of all phases to the end, from the state saved in the folder.
 
-    The first of several processes reads and writes the folder, and sends its state to the others.
+    Without a saved state they start from `fresh`. If several processes train together, the first
+    one reads and writes the folder, and sends its state to the others.
 
     Raises:
         ValueError: if the folder has another run.
@@ -122,7 +127,7 @@ def train_in_folder(
     if hosts.is_writer():
         refuse_other_run(folder, run.config)
         fresh = _resume(run, fresh)
-    # On the update's device: a state elsewhere would make the second step compile again.
+    # The state must be on the device of the update; otherwise the second iteration compiles again.
     state = jax.device_put(hosts.broadcast_from_first(fresh), jax.local_devices()[0])
     done, total = int(state.iteration), phases[-1].end
     if not hosts.is_writer():
@@ -132,6 +137,7 @@ def train_in_folder(
         if done < total:
             write_run_record(folder, run.config, run.seed, resumed=done > 0)
         state = _iterate(phases, run, state, console, watch)
+    # The outcome, from the last tenth of the curve.
     rows = curve.read(folder)
     if not rows:
         raise ValueError(
@@ -153,11 +159,13 @@ def _iterate(
         _Recorder(run, watch, total) as recorder,
         WorldsAhead() as ahead,
     ):
+        # Something to save if the run is interrupted before the first iteration ends.
         recorder.last = (next(phase for phase in phases if first <= phase.end), state)
         if _is_missing(watch, run.folder, first, total):
             recorder.measure_if_due(state)
         for phase in phases:
             if int(state.iteration) < phase.end:
+                # A run that is resumed within a phase has its converted state already.
                 if int(state.iteration) == beginning:
                     state = phase.begin(state)
                 state = _iterate_phase(phase, state, recorder, show, ahead)
@@ -183,7 +191,7 @@ def _iterate_phase(
         _check_finite(iteration, row, recorder.run.folder)
         seconds = time.monotonic() - started
         speed = phase.frames / seconds
-        # A cold iteration includes compiling.
+        # The time of a cold iteration, the first one, includes compiling.
         clock = {"seconds": round(seconds, 4), "cold": iteration == first}
         row = {"iteration": iteration, **row, "steps_per_s": round(speed), **clock}
         recorder.add(phase, state, row)
@@ -210,8 +218,8 @@ class _Recorder:
 
     def add(self, phase: RunPhase, state: Any, row: dict[str, Any]) -> None:
         """Add the row of an iteration and the state after it."""
-        # The row is added first: after an interrupt between the two, resuming removes the extra
-        # row; a missing row could not be restored.
+        # The row is added before the state. If the run is interrupted between the two, resuming
+        # removes the extra row; a missing row could not be restored.
         self.rows.append(row)
         self.last = (phase, state)
         self.measure_if_due(state)
@@ -220,7 +228,7 @@ class _Recorder:
             self.saved_at = time.monotonic()
 
     def measure_if_due(self, state: Any) -> None:
-        """Measure the policy after this number of steps, if `watch` measures then."""
+        """Measure the policy if `watch` wants a measurement after this number of iterations."""
         done = int(state.iteration)
         if self.watch and _is_due(self.watch, done, self.total):
             self.measurements.append({"iteration": done, **self.watch.measure(state.params)})
@@ -255,12 +263,12 @@ def _lost_process_explained(iteration: int, folder: Path) -> Iterator[None]:
 
 
 def _is_due(watch: Watch, done: int, total: int) -> bool:
-    """Return whether the policy is measured after `done` of `total` steps."""
+    """Return whether the policy is measured after `done` of `total` iterations."""
     return done % watch.every == 0 or done == total
 
 
 def _is_missing(watch: Watch | None, folder: Path, done: int, total: int) -> bool:
-    """Return whether a due measurement is missing because of a stop."""
+    """Return whether a due measurement is missing because the run was interrupted."""
     if watch is None or not _is_due(watch, done, total):
         return False
     rows = curve.read(folder, curve.WATCHED)
@@ -282,7 +290,7 @@ def _save(run: Run, phase: RunPhase, state: Any) -> None:
     training = {**run.origin, "iteration": int(state.iteration), "threads": threads()}
     policy = run.folder / "policy"
     save_policy(policy, state.params, phase.spec, seed=run.seed, training=training)
-    # The state is written last: then the policy and the curve of its steps are on the disk.
+    # The state is written last. If it is on the disk, so are the policy and the curve up to it.
     save_arrays(
         run.folder / "state",
         tree_to_arrays(state),
@@ -293,10 +301,13 @@ def _save(run: Run, phase: RunPhase, state: Any) -> None:
 
 
 def _resume(run: Run, fresh: Any) -> Any:
-    """Return the folder's saved state, or `fresh` if it has none; cut the curve to that state.
+    """Return the state saved in the folder, or `fresh` if there is none.
+
+    Rows of the curve after that state are removed.
 
     Raises:
-        ValueError: if the folder has another run, or sums would round differently from here on.
+        ValueError: if the folder has another run, or the number of threads changed in a way that
+            makes sums round differently.
     """
     origin, folder = run.origin, run.folder
     saved = folder / "state"
@@ -315,6 +326,7 @@ def _resume(run: Run, fresh: Any) -> Any:
             f"it, give another --out (with --init-from {folder / 'policy'} to train its policy "
             "further), or remove the folder to start over"
         )
+    # One thread sums in another order than several threads.
     before, now = stored.get("threads", threads()), threads()
     if (before == 1) != (now == 1):
         raise ValueError(
@@ -324,6 +336,7 @@ def _resume(run: Run, fresh: Any) -> Any:
         )
     arrays = load_arrays(saved, kind="training").arrays
     state = jax.tree.map(jnp.asarray, tree_from_arrays(fresh, arrays, str(saved)))
+    # A measurement after the last finished iteration stays.
     curve.cut(folder, int(state.iteration))
     curve.cut(folder, int(state.iteration) + 1, curve.WATCHED)
     return state

@@ -1,7 +1,7 @@
 """One gradient step of a training: sum the shards' gradients, apply AdamW, report the curve.
 
 A shard is a part of the batch whose gradient is computed separately (`shards.py`). The curve is the
-table of numbers, such as loss and speed, with a row per step.
+learning curve: a table of numbers, such as loss and speed, with a row per gradient step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from suite.train.shards import Shard, batch_mean, curve_numbers, make_shards
 from suite.train.worlds import Worlds
 
 RATE_END, WEIGHT_DECAY = 1e-5, 1e-2
-"""Learning rate at the end of every run, and AdamW's decoupled weight decay."""
+"""Learning rate at the end of every phase, and AdamW's decoupled weight decay."""
 
 
 class TrainState(NamedTuple):
@@ -32,7 +32,8 @@ class TrainState(NamedTuple):
     iteration: jax.Array
     """Number of finished gradient steps, a scalar."""
     hidden: jax.Array
-    """(B, hidden) recurrent states from random steps of the last rollout."""
+    """(B, hidden) the policy's recurrent states at random steps of the last rollout, with which
+    worlds of the next rollout start."""
 
 
 def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTransformation:
@@ -40,7 +41,8 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
     Args:
         config: the optimiser's settings in the run, or in one of its phases.
-        begin: gradient steps of the run before that phase; AdamW's moments are kept.
+        begin: gradient steps of the run before that phase. The schedule starts again at them, while
+            AdamW's moments and its count of steps are kept.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, config.rate, config.warmup, max(config.iterations, config.warmup + 1), RATE_END
@@ -54,7 +56,7 @@ def make_optimizer(config: OptimizerConfig, begin: int = 0) -> optax.GradientTra
 
 
 def start_state(config: TrainConfig, params: network.Params | None = None) -> TrainState:
-    """Return the state before the first iteration, from `params` or, without, random parameters."""
+    """Return the state before the first iteration; `params` None draws random parameters."""
     start = network.init(jax.random.key(config.seed), config.spec) if params is None else params
     hidden = jnp.zeros((config.episode.batch, config.spec.hidden_size))
     return TrainState(
@@ -68,7 +70,9 @@ def start_state(config: TrainConfig, params: network.Params | None = None) -> Tr
 def make_update(
     config: TrainConfig, delta: delta_network.Params | None = None, begin: int = 0
 ) -> Callable[[TrainState, Worlds], tuple[TrainState, dict[str, jax.Array]]]:
-    """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
+    """Return update(state, worlds) -> (state', the curve's row), which makes one gradient step.
+
+    It is compiled on the first call.
 
     Args:
         config: settings of the run, or of one of its phases.

@@ -1,8 +1,8 @@
 """Draw the worlds of one training iteration with numpy: tracks, start states, parameters.
 
-A world is one simulated scene and drone; a batch has B of them. Worlds are a pure function of
-(config, iteration): a resumed run has the same ones, and `WorldsAhead` samples those of later
-iterations while the devices compute.
+A world is one simulated scene and drone; a batch has B worlds. They depend only on the settings and
+the iteration. So a resumed run has the same ones, and `WorldsAhead` samples the worlds of later
+iterations while the devices compute the present one.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ from tracks.geometry.scene import Array, Scene, stack
 from tracks.track import Track, first_gates
 
 START_DRAWS, START_CLEARANCE_M, START_HEIGHT_M = 6, 0.5, 0.4
-"""Tries to draw a start point between gates, the clearance at which the search ends [m], and the
-lowest height of such a point [m]."""
+"""Limits of the search for a start point between gates: the largest number of draws, the clearance
+at which the search ends [m], and the lowest height of the point [m]."""
 
 
 class Sensed(NamedTuple):
     """Random numbers of the sensor models in a batch of worlds, by the models' names."""
 
     magnitude: dict[str, Array]
-    """(B,) factor on the model's errors: 0 is a perfect sensor, 1 the sensors file's values [1]."""
+    """(B,) factor on the model's errors: 0 is a perfect sensor, 1 has the values of the sensors
+    file."""
     trial: dict[str, Draws]
-    """(B, ...) numbers that a model draws once per flight."""
+    """(B, ...) random numbers that a model needs once per flight."""
 
 
 class Worlds(NamedTuple):
@@ -49,13 +50,13 @@ class Worlds(NamedTuple):
 
     scene: Scene
     pos_w: Array
-    """(B, 3) start [m]."""
+    """(B, 3) position at the start [m]."""
     vel_w: Array
-    """(B, 3) [m/s]."""
+    """(B, 3) velocity at the start [m/s]."""
     heading_w: Array
-    """(B, 3) unit, horizontal."""
+    """(B, 3) heading at the start, horizontal unit vectors."""
     target: Array
-    """(B,) index of the first gate to pass."""
+    """(B,) index of the gate that is passed next."""
     constants: dynamics.WorldParams
     """Parameters of the dynamics."""
     hidden: Array
@@ -64,20 +65,24 @@ class Worlds(NamedTuple):
     """(B,) 1 if a world starts between two gates, with a recurrent state from an earlier
     rollout."""
     stop: Array
-    """(B,) step from which a world no longer counts in the loss."""
+    """(B,) number of the step from which a world no longer counts in the loss."""
     number: Array
-    """(B,) number in the batch, which determines a world's noise on any device."""
+    """(B,) number of the world in the batch. Its noise depends on it, and not on the device."""
     fov_scale: Array
-    """(B,) this iteration's scale of the rays across the optical axis."""
+    """(B,) factor on the tangents of the half field of view, the same in all worlds of an
+    iteration."""
     speed_command: Array | None = None
-    """(B,) the commanded speed, 0 to 1, if the policy has that input [1]."""
+    """(B,) the commanded speed, 0 to 1, if the policy has that input; else None."""
     sensed: Sensed | None = None
     """Random numbers of the sensor models, if there are any."""
 
 
 def _clearance(track: Track, point_w: np.ndarray) -> float:
-    """Return a lower bound of the distance to the obstacles other than gate frames [m]."""
-    # The boxes of a scene begin with the bars of the gates' frames.
+    """Return a lower bound of the distance from a point to the obstacles without gate frames [m].
+
+    It is the distance to the spheres around the obstacles.
+    """
+    # The boxes of a scene begin with the bars of the gates' frames, which are left out.
     bars = track.scene.gates.opening_g.shape[0] * track.scene.gates.opening_g.shape[1]
     spheres = dict(bounds(track.scene))
     spheres["boxes"] = Bounds(*(field[bars:] for field in spheres["boxes"]))
@@ -97,8 +102,9 @@ def _draw_free_point(
     Args:
         track: the scene.
         rng: draws the gate.
-        draw_point: (index of the next gate) -> a point (3,) [m].
+        draw_point: (index of the next gate) -> a random point (3,) [m].
     """
+    # Clearance, point and next gate of the best point so far.
     best = (-np.inf, track.start_pos_w, 0)
     for _ in range(START_DRAWS):
         target = int(rng.integers(0, len(track.scene.gates.center_w)))
@@ -115,7 +121,7 @@ def _draw_free_point(
 def _start_between_gates(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position [m], velocity [m/s] and next gate of a drone between two gates."""
+    """Return position [m], velocity [m/s] and next gate (index) of a drone between two gates."""
     center_w = track.scene.gates.center_w
 
     def draw_point(target: int) -> np.ndarray:
@@ -133,7 +139,7 @@ def _start_between_gates(
 def _start_after_a_miss(
     track: Track, speed_limit: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return position [m], velocity [m/s] and next gate of a drone that has missed that gate."""
+    """Return position [m], velocity [m/s] and next gate (index) of a drone that has missed it."""
     gates = track.scene.gates
 
     def draw_point(target: int) -> np.ndarray:
@@ -153,8 +159,8 @@ def _draw_constants(
 ) -> dynamics.WorldParams:
     """Return the parameters of the dynamics, (B, ...), of an iteration.
 
-    Quadrotors have a separate random generator. Point masses are drawn in any case, so that
-    later numbers of `rng` do not depend on the model.
+    Quadrotors have a separate random generator. The parameters of point masses are drawn in any
+    case, so that the later numbers of `rng` are the same for both models.
     """
     physics, batch, period = config.physics, config.episode.batch, 1.0 / config.spec.rate_hz
     stretch = np.clip(1 + physics.time_step_std * rng.standard_normal(batch), 0.5, 1.5)
@@ -169,7 +175,7 @@ def _draw_constants(
     )
     if config.quadrotor is None:
         return point_mass.PointMassParams(*(np.asarray(x, np.float32) for x in point))
-    # Training through the point mass does not load the judge's physics.
+    # Imported here, so that training through the point mass does not load the judge's physics.
     from suite.train.dynamics.quadrotor import QuadrotorParams, draw_effects
 
     quadrotor_rng = np.random.default_rng([config.seed, iteration, 1])
@@ -178,7 +184,10 @@ def _draw_constants(
 
 
 def _draw_speed_commands(config: TrainConfig, iteration: int) -> Array | None:
-    """Return the commanded speed (B,), 0 to 1, from a separate random generator; None without."""
+    """Return the commanded speeds (B,), 0 to 1; None for a policy without this input.
+
+    A separate random generator draws them, so that the other numbers do not depend on the input.
+    """
     if not config.spec.speed_input:
         return None
     rng = np.random.default_rng([config.seed, iteration, 3])
@@ -188,7 +197,10 @@ def _draw_speed_commands(config: TrainConfig, iteration: int) -> Array | None:
 
 
 def _draw_sensors(config: TrainConfig, iteration: int) -> Sensed | None:
-    """Return the sensor models' random numbers, from a separate generator; None without models."""
+    """Return the random numbers of the sensor models; None without models.
+
+    A separate random generator draws them, so that the other numbers do not depend on the models.
+    """
     if config.sensors is None:
         return None
     rng, batch = np.random.default_rng([config.seed, iteration, 4]), config.episode.batch
@@ -207,6 +219,7 @@ def _draw_sensors(config: TrainConfig, iteration: int) -> Sensed | None:
 
 def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
     """Return the B worlds of an iteration."""
+    # The order of the draws below must stay: it determines the tracks of a seed.
     rng = np.random.default_rng([config.seed, iteration])
     episode, batch = config.episode, config.episode.batch
     tracks, starts = [], []
@@ -251,10 +264,11 @@ def sample_worlds(config: TrainConfig, iteration: int) -> Worlds:
 
 
 class WorldsAhead:
-    """Samples worlds in a thread or, for an accelerator, in processes; a context manager.
+    """Samples the worlds of later iterations in the background; a context manager.
 
-    One core samples faster than the other cores train. An accelerator is so fast that all cores
-    sample for it, each the worlds of another iteration.
+    If the training runs on a CPU, one thread samples, because one core samples faster than the
+    other cores train. For an accelerator, which is faster, a process on each further core samples
+    the worlds of another iteration.
     """
 
     def __init__(self) -> None:
@@ -271,12 +285,12 @@ class WorldsAhead:
     def worlds(
         self, sample: Callable[[int], Worlds], first: int, end: int
     ) -> Iterator[tuple[int, Worlds]]:
-        """Yield each iteration from `first` on, to before `end`, with its worlds.
+        """Yield (iteration, its worlds) for the iterations from `first` to `end` - 1.
 
         Args:
-            sample: returns the worlds of an iteration; must be picklable.
-            first: iteration.
-            end: the iteration after the last.
+            sample: (iteration) -> its worlds; must be picklable, to run in a process.
+            first: the first iteration.
+            end: the iteration after the last one.
         """
         numbers = iter(range(first, end))
         pending = deque(self._pool.submit(sample, k) for k in islice(numbers, self._depth))

@@ -17,16 +17,16 @@ from tracks.geometry.scene import Array
 
 
 class DynamicsState(Protocol):
-    """The part of a state that a rollout reads; the dynamics may have more."""
+    """The part of a state that a rollout (simulated flight) reads; models may have more fields."""
 
     @property
     def pos_w(self) -> jax.Array:
-        """(B, 3) [m]."""
+        """(B, 3) position [m]."""
         ...
 
     @property
     def vel_w(self) -> jax.Array:
-        """(B, 3) [m/s]."""
+        """(B, 3) velocity [m/s]."""
         ...
 
     @property
@@ -36,12 +36,12 @@ class DynamicsState(Protocol):
 
     @property
     def rot_w(self) -> jax.Array:
-        """(B, 3, 3) body to world."""
+        """(B, 3, 3) attitude, body to world."""
         ...
 
 
 class WorldParams(Protocol):
-    """Parameters that are drawn once per world."""
+    """Parameters of the dynamics that are drawn once per world; a model may have more fields."""
 
     @property
     def time_step(self) -> Array:
@@ -63,7 +63,7 @@ class Dynamics(NamedTuple):
 def make_dynamics(config: TrainConfig) -> Dynamics:
     """Return the dynamics that `config` trains through."""
     if config.quadrotor is not None:
-        # Training through the point mass does not load the judge's physics.
+        # Imported here, so that training through the point mass does not load the judge's physics.
         from suite.train.dynamics.quadrotor import quadrotor_dynamics
 
         period = 1.0 / config.spec.rate_hz

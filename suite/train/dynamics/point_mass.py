@@ -1,7 +1,8 @@
 """The differentiable point mass with first-order lag (Zhang et al. 2025; Su et al. 2026, III-B).
 
-Only position, velocity and acceleration have gradients; the attitude follows the thrust direction,
-without a gradient.
+Its acceleration approaches the command exponentially, at a rate that is called lag. Only position,
+velocity and acceleration have gradients. The attitude follows the direction of the thrust, without
+a gradient.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ class PointMassParams(NamedTuple):
     drag: Array
     """(B, 3) linear drag in body axes [1/s]."""
     wind_w: Array
-    """(B, 3) [m/s]."""
+    """(B, 3) constant wind [m/s]."""
     time_step: Array
-    """(B,) [s]."""
+    """(B,) length of a step, one period of the policy [s]."""
     delay: Array
     """(B,) delay of a command, 0 to 2 [time steps]."""
 
@@ -36,27 +37,29 @@ class PointMassState(NamedTuple):
     """State of the point mass."""
 
     pos_w: jax.Array
-    """(B, 3) [m]."""
+    """(B, 3) position [m]."""
     vel_w: jax.Array
-    """(B, 3) [m/s]."""
+    """(B, 3) velocity [m/s]."""
     thrust_w: jax.Array
     """(B, 3) net acceleration by thrust and gravity, after the lag and without drag [m/s^2]."""
     acc_w: jax.Array
     """(B, 3) net acceleration [m/s^2]."""
     rot_w: jax.Array
-    """(B, 3, 3) body to world."""
+    """(B, 3, 3) attitude, body to world."""
     heading_w: jax.Array
     """(B, 3) wanted heading, horizontal unit vectors."""
     commands_w: jax.Array
-    """(B, 2, 3) the last commands, latest first [m/s^2]."""
+    """(B, 2, 3) the last two commands, latest first [m/s^2]."""
 
 
 def attitude(thrust_w: jax.Array, heading_w: jax.Array) -> jax.Array:
-    """Return body to world (B, 3, 3): z along the specific force, x towards the heading.
+    """Return the attitude (B, 3, 3), body to world, of bodies with this thrust and heading.
+
+    Body z is along the specific force (acceleration without gravity), body x towards the heading.
 
     Args:
         thrust_w: (B, 3) net acceleration by thrust and gravity [m/s^2].
-        heading_w: (B, 3) unit, horizontal.
+        heading_w: (B, 3) wanted heading, horizontal unit vectors.
     """
     force = thrust_w + jnp.asarray([0.0, 0.0, GRAVITY])
     size = jnp.linalg.norm(force, axis=-1, keepdims=True)
@@ -92,7 +95,8 @@ def step(
 ) -> PointMassState:
     """Return the body one policy period later.
 
-    The command acts `delay` steps later; for a fraction of a step the mean of two commands acts.
+    A command acts `delay` steps after its decision. If the delay is not a whole number of steps,
+    the weighted mean of two commands acts.
 
     Args:
         body: the present state.
@@ -102,12 +106,14 @@ def step(
         gradient_decay: decay rate of the gradients of position and velocity [1/s].
     """
     dt = constants.time_step[:, None]
+    # The delayed command: weights of the last three commands, by their age in steps.
     command = to_world(jax.lax.stop_gradient(body.rot_w), action_b)
     history = jnp.concatenate([command[:, None], body.commands_w], axis=1)
     age = jnp.arange(3.0)
     share = jnp.maximum(0.0, 1.0 - jnp.abs(constants.delay[:, None] - age))
     delayed = (share[..., None] * history).sum(1)
 
+    # First-order lag and drag, then the motion with decayed gradients.
     keep = jnp.exp(-constants.lag[:, None] * dt)
     thrust = delayed * (1 - keep) + body.thrust_w * keep
     rot = jax.lax.stop_gradient(body.rot_w)
@@ -118,6 +124,7 @@ def step(
     pos = pos + vel * dt + 0.5 * body.acc_w * dt * dt
     vel = vel + 0.5 * (body.acc_w + acc) * dt
 
+    # The heading turns towards the gate; it stays if it would have no direction.
     horizontal = jnp.asarray([1.0, 1.0, 0.0])
     to_gate = jax.lax.stop_gradient(target_w - pos) * horizontal
     to_gate = to_gate / jnp.maximum(jnp.linalg.norm(to_gate, axis=-1, keepdims=True), 1e-3)

@@ -1,11 +1,11 @@
 """The differentiable quadrotor of the trainer: B vehicles fly one policy period, with gradients.
 
 The equations are those of the judge, which flies policies in MuJoCo and scores them
-(`eval.quadrotor`: attitude, stepper, rigid body). The attitude loop computes collective thrust and
-body rates from the action at each of its steps; rate loop, mixer, rotors and effects (the physics
-beyond the nominal quadrotor, such as drag) give the motion. A period has a whole number of
-attitude steps and physics steps, so a step is a little shorter or longer than configured. By
-default there are half as many steps as in the judge.
+(`eval.quadrotor`: attitude, stepper, rigid body). At each of its steps the attitude loop computes
+collective thrust and body rates from the action. In the physics steps between them, the plant
+(rate loop, mixer, rotors and effects such as drag) computes the force and torque that move the
+body. A period has a whole number of attitude steps and physics steps, so a step is a little
+shorter or longer than configured. By default there are half as many steps as in the judge.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from suite.train.dynamics.point_mass import attitude, faded
 from tracks.geometry.scene import Array
 
 TRIM_AXES = (1.0, 1.0, 0.2)
-"""Spread of a constant torque about x, y and z, relative to that about x."""
+"""Standard deviations of a constant torque about x, y and z, relative to that about x."""
 
 
 class QuadrotorParams(NamedTuple):
@@ -38,35 +38,36 @@ class QuadrotorParams(NamedTuple):
     time_step: Array
     """(B,) the policy's period [s]."""
     effects: dict[str, Values]
-    """Values (B, ...) of the effects that vary, by name; the others are the vehicle's."""
+    """Values (B, ...) of the effects that vary, by name. The other effects have the values of the
+    vehicle file."""
 
 
 class QuadrotorState(NamedTuple):
     """State of the quadrotor at a decision of the policy."""
 
     pos_w: jax.Array
-    """(B, 3) centre of mass [m]."""
+    """(B, 3) position of the centre of mass [m]."""
     vel_w: jax.Array
-    """(B, 3) [m/s]."""
+    """(B, 3) velocity [m/s]."""
     acc_w: jax.Array
     """(B, 3) mean net acceleration over the last period [m/s^2]."""
     rot_w: jax.Array
-    """(B, 3, 3) body to world."""
+    """(B, 3, 3) attitude, body to world."""
     rate_b: jax.Array
-    """(B, 3) [rad/s]."""
+    """(B, 3) body rates [rad/s]."""
     heading_w: jax.Array
     """(B, 3) wanted heading, horizontal unit vectors."""
     plant: PlantState
-    """(B, ...) rotor speeds and delayed commands."""
+    """(B, ...) rotor speeds and commands that are still delayed."""
     time_s: jax.Array
-    """(B,) since the start [s]."""
+    """(B,) time since the start of the flight [s]."""
 
 
 class Substeps(NamedTuple):
-    """X."""
+    """The steps into which a policy period is divided: attitude steps, each of physics steps."""
 
     attitude: int
-    """Steps of the attitude loop."""
+    """Steps of the attitude loop in a period."""
     physics: int
     """Physics steps in each attitude step."""
     dt: float
@@ -74,7 +75,8 @@ class Substeps(NamedTuple):
 
 
 def whole_steps(steps: float) -> int:
-    """Return the nearest whole number, at least 1; a half, even an inexact one, is rounded down."""
+    """Return the nearest whole number, at least 1; a half is rounded down."""
+    # The small number makes the result independent of rounding errors in `steps`.
     return max(1, round(steps - 1e-6))
 
 
@@ -93,11 +95,11 @@ def truncated_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def draw_effects(
     config: QuadrotorConfig, batch: int, rng: np.random.Generator
 ) -> dict[str, Values]:
-    """Return values (B, ...) of the effects that vary, drawn around the vehicle's own."""
+    """Return values (B, ...) of the effects that vary, by name, drawn around the vehicle file's."""
     vehicle = config.vehicle
 
     def mean(name: str) -> Any:
-        """Return the vehicle's values of an effect, or the ones that do nothing."""
+        """Return the vehicle's values of an effect; if it lacks the effect, neutral values."""
         return as_arrays(vehicle.effects.get(name, neutral(EFFECTS[name], vehicle)))
 
     def uniform(*shape: int) -> np.ndarray:
@@ -108,6 +110,7 @@ def draw_effects(
     drag = mean("linear_drag").coefficient + config.drag_spread * uniform(3)
     delay = mean("command_delay").delay + config.delay_spread_s * uniform()
     wind = rng.standard_normal((batch, 3)) * np.asarray(config.wind_std)
+    # The lowest mass that the effect allows: the vehicle's mass plus the smallest offset.
     lightest = vehicle.mass + bound_value(EFFECTS["mass_offset"].parameters[0].low, vehicle)
 
     def lag(draw: np.ndarray) -> np.ndarray:
@@ -125,7 +128,7 @@ def draw_effects(
         ),
         "rate_gain": (mean("rate_gain").scale * (1 + config.gain_spread * uniform(3)),),
     }
-    # Only if they vary: each varying effect makes the plant's step slower.
+    # The following effects are left out if they do not vary: each one makes a physics step slower.
     if config.thrust_spread:
         scale = 1 + config.thrust_spread * uniform()
         fields["thrust_scale"] = (mean("thrust_scale").scale * scale,)
@@ -143,13 +146,14 @@ def draw_effects(
 
 @dataclass(frozen=True)
 class DrawnVehicle:
-    """A callable that draws one vehicle, as training does for each world."""
+    """A callable that draws a vehicle at random, as training does for each world."""
 
     config: QuadrotorConfig
     """The vehicle and its randomisation."""
 
     def __call__(self, rng: np.random.Generator) -> Vehicle:
         """Return the vehicle with drawn values of its effects."""
+        # A batch of one vehicle; its values become plain numbers.
         drawn = {
             name: type(values)(*(np.asarray(value, float)[0].tolist() for value in values))
             for name, values in draw_effects(self.config, 1, rng).items()
@@ -168,13 +172,14 @@ def longest_delay(config: QuadrotorConfig) -> float:
 def plant_of(
     config: QuadrotorConfig, effects: dict[str, Values], dt: float, varies: bool = True
 ) -> Plant:
-    """Return the plants (mixer, rotors and effects) of B worlds for steps of `dt` [s].
+    """Return the plants (rate loop, mixer, rotors and effects) of B worlds for steps of `dt` [s].
 
     Args:
         config: the vehicle.
-        effects: values (B, ...) in place of the vehicle's own, by name.
+        effects: values (B, ...) by name; they replace those of the vehicle.
         dt: length of a physics step [s].
-        varies: whether the delay is among `effects`.
+        varies: whether the delay of commands is among `effects`. Then the plant stores as many past
+            commands as the longest possible delay needs.
     """
     vehicle_effects: dict[str, Any] = dict(config.vehicle.effects)
     longest = longest_delay(config) if varies else None
@@ -184,7 +189,7 @@ def plant_of(
 def start_state(
     plant: Plant, pos_w: jax.Array, vel_w: jax.Array, heading_w: jax.Array
 ) -> QuadrotorState:
-    """Return upright bodies (B, ...) with hovering rotors at vel_w [m/s]."""
+    """Return upright bodies at pos_w with velocity vel_w; their rotors have the speed of hover."""
     batch = pos_w.shape[:1]
     zero = jnp.zeros_like(pos_w)
     return QuadrotorState(
@@ -213,24 +218,24 @@ def fly_period(
 
     Args:
         vehicle: has the attitude loop's settings.
-        plant: of B worlds, for steps of `steps.dt`.
+        plant: the plants of B worlds, for steps of `steps.dt`.
         steps: attitude and physics steps of the period.
         body: the present state.
         action_b: (B, 3) wanted net acceleration in body axes [m/s^2], held for the period.
         heading: (heading_w (B, 3), pos_w (B, 3)) -> the wanted heading an attitude step later.
         noise: (attitude, physics, B, 3) normal draws for random wind, or None.
-        yaw_rate: (B,) commanded about body z, instead of following the heading [rad/s].
+        yaw_rate: (B,) commanded rate about body z [rad/s]; None: the rate that follows the heading.
     """
     controller, dt = vehicle.controller, steps.dt
 
-    def physics(
+    def physics_step(
         carry: tuple[PlantState, Motion, jax.Array], draws: jax.Array | None, command: Command
     ) -> tuple[tuple[PlantState, Motion, jax.Array], None]:
         state, motion, time_s = carry
         state, motion, _ = step(plant, state, motion, Inputs(command, noise=draws), time_s)
         return (state, motion, time_s + dt), None
 
-    def loop(carry: Any, draws: jax.Array | None) -> tuple[Any, None]:
+    def attitude_step(carry: Any, draws: jax.Array | None) -> tuple[Any, None]:
         heading_w, state, motion, time_s = carry
         heading_w = jax.lax.stop_gradient(heading(heading_w, motion.pos_w))
         force_w = action_to_force(action_b, motion.rot_w)
@@ -238,7 +243,7 @@ def fly_period(
         if yaw_rate is not None:
             command = command._replace(rate_b=command.rate_b.at[:, 2].set(yaw_rate))
         inner, _ = jax.lax.scan(
-            lambda c, d: physics(c, d, command),
+            lambda c, d: physics_step(c, d, command),
             (state, motion, time_s),
             draws,
             length=steps.physics,
@@ -248,7 +253,9 @@ def fly_period(
 
     motion = Motion(body.pos_w, body.rot_w, body.vel_w, body.rate_b)
     start = (body.heading_w, body.plant, motion, body.time_s)
-    (heading_w, state, motion, time_s), _ = jax.lax.scan(loop, start, noise, length=steps.attitude)
+    (heading_w, state, motion, time_s), _ = jax.lax.scan(
+        attitude_step, start, noise, length=steps.attitude
+    )
     return QuadrotorState(
         pos_w=motion.pos_w,
         vel_w=motion.vel_w,
@@ -264,7 +271,7 @@ def fly_period(
 def quadrotor_dynamics(
     config: QuadrotorConfig, period_s: float, gradient_decay: float
 ) -> tuple[Callable[..., QuadrotorState], Callable[..., QuadrotorState]]:
-    """Return start and step as in `suite.train.dynamics.interface.Dynamics`.
+    """Return the functions `start` and `step` of `suite.train.dynamics.interface.Dynamics`.
 
     Args:
         config: the vehicle and its step rates.
@@ -280,8 +287,8 @@ def quadrotor_dynamics(
     ) -> QuadrotorState:
         return start_state(plant_of(config, constants.effects, steps.dt), pos_w, vel_w, heading_w)
 
-    # The steps within a period are computed again in the backward pass: storing them would take
-    # many times the memory of a whole rollout without them.
+    # Checkpointing: the steps within a period are computed again in the backward pass. Storing them
+    # would take many times the memory of all periods of a rollout.
     @jax.checkpoint
     def step(
         body: QuadrotorState,
@@ -294,6 +301,7 @@ def quadrotor_dynamics(
         noise = None
         if uses_noise(plant):
             shape = (steps.attitude, steps.physics, 3)
+            # 3 separates these draws from others with the same key.
             gusts = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, 3), shape))
             noise = jnp.moveaxis(gusts(keys), 0, 2)
 

@@ -1,7 +1,8 @@
 """The critic: an MLP that estimates the value of a state from privileged information.
 
-The critic is asymmetric (Pinto et al. 2018): it is used only in training, so its inputs are the
-true state and the nearest obstacle instead of the image, from which it learns faster.
+The value is the expected return. The critic is used only in training, so its inputs may be the true
+state and the nearest obstacle instead of the image (asymmetric critic, Pinto et al. 2018). From
+them it learns faster.
 """
 
 from __future__ import annotations
@@ -19,24 +20,27 @@ from tracks.geometry.rotation import to_local
 Params = dict[str, jax.Array]
 
 AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
-"""Times at which the critic's inputs have the distance to solids, along the velocity [s]."""
+"""Times from now at which the critic's inputs have the distance to solids, for a flight at constant
+velocity [s]."""
 FEATURES = 29 + 2 * len(AHEAD_S)
 """Number of inputs, without the commanded speed."""
 REACH_M = 2.0
-"""Distances to obstacles are limited to this [m]."""
+"""Largest distance to an obstacle in the inputs; larger ones are limited to it [m]."""
 TOUCH_M = 0.2
-"""Decay length of the input that grows near obstacles [m]."""
+"""Decay length of the inputs that grow near obstacles [m]."""
 
 
 def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Array:
     """Return the critic's inputs (B, F) in worlds that have passed `target` (B,) gates.
 
-    In the frame of the current gate, scaled to about one: position, velocity, acceleration, the
-    next gate, the drone's forward and up axes, the direction away from the nearest obstacle, and
-    the position with a finer scale nearby. Then the distances to solids now and at later times; the
-    time and place at which the gate's plane is reached at constant velocity; the opening's half
-    width; the number of remaining gates; and the commanded speed, if the policy has that input. F
-    is `feature_count`. Gates and obstacles are evaluated without gradient.
+    The first inputs are in the frame of the next gate, scaled to about one: position, velocity,
+    acceleration, the gate after it, the drone's forward and up axes, the direction away from the
+    nearest obstacle, and the position with a finer scale near the gate. Then follow the distances
+    to solids now and at later times, twice (linear, and growing near a solid); the time and place
+    at which the gate's plane is reached at constant velocity; the opening's width; the number of
+    remaining gates (up to 2); and the commanded speed, if the policy has that input.
+
+    F is `feature_count`. Gates and obstacles are evaluated without gradient.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
@@ -96,7 +100,7 @@ def init(key: jax.Array, width: int, count: int = FEATURES) -> Params:
 
 
 def value(params: Params, inputs: jax.Array) -> jax.Array:
-    """Return the values (...), expected returns of states with `features` (..., F)."""
+    """Return the values (...) of states, given their `features` (..., F)."""
     x = jnp.tanh(inputs @ params["weight0"] + params["bias0"])
     x = jnp.tanh(x @ params["weight1"] + params["bias1"])
     return (x @ params["weight2"] + params["bias2"])[..., 0]

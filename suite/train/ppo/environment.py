@@ -26,18 +26,18 @@ from suite.train.step import BODY_RADIUS_M, target_gate
 from suite.train.worlds import Worlds, sample_worlds
 
 ACTION_LIMIT = 20.0
-"""Acceleration of an action of 1 in `JaxRace`, as in `eval.envs` [m/s^2]."""
+"""Acceleration that an action of 1 means in `JaxRace`, as in `eval.envs` [m/s^2]."""
 
 
 class Episode(NamedTuple):
-    """State of episodes between steps, (B, ...)."""
+    """State of the episodes of B worlds between steps."""
 
     state: Any
     """State of the dynamics."""
     target: jax.Array
-    """(B,) gates passed, counted from the track's first."""
+    """(B,) number of passed gates, counted from the track's first one."""
     action_b: jax.Array
-    """(B, 3) the last action [m/s^2]."""
+    """(B, 3) the policy's last action [m/s^2]."""
     images: jax.Array
     """(B, image_delay, height, width) images that wait for their delay, oldest first."""
     observed: jax.Array
@@ -57,12 +57,12 @@ class PeriodResult(NamedTuple):
 
 
 class Race(NamedTuple):
-    """The environment: pure functions over B worlds, with a key (B,) for each world's noise."""
+    """The environment: pure functions over B worlds; `keys` (B,) are random keys of their noise."""
 
     start: Callable[[Worlds], Episode]
-    """worlds -> episodes."""
+    """(worlds) -> the episodes at their start."""
     observe: Callable[[Worlds, Episode, jax.Array], tuple[Observation, Episode]]
-    """(worlds, episodes, keys) -> (observation, episodes'); called once before each step."""
+    """(worlds, episodes, keys) -> (observation, new episodes); called once before each step."""
     fly: Callable[[Worlds, Episode, jax.Array, jax.Array], tuple[Episode, PeriodResult]]
     """(worlds, episodes, action_b (B, 3) [m/s^2], keys) -> (episodes a policy period
     later, results)."""
@@ -118,11 +118,11 @@ class RaceState(NamedTuple):
     """State of a `JaxRace`."""
 
     world: jax.Array
-    """Index in the pool of worlds."""
+    """Index of the world in the pool."""
     episode: Episode
     """State of the episode, as a batch of one."""
     steps: jax.Array
-    """Policy periods flown."""
+    """Number of policy periods since the start."""
 
 
 @dataclass(frozen=True)
@@ -136,23 +136,23 @@ class JaxRace:
             keys, state, action, worlds
         )
 
-    Tracks are drawn before, as a pool of worlds (gymnax's `params`); `reset` selects one of them.
-    Observations have the delays and the noise of `config`. The components of an action are -1 to 1,
-    see `contract`. The motion is differentiable in the action. An episode ends by a collision, by a
-    tilt beyond 90 degrees, with the last gate or at the time limit.
+    Tracks are drawn beforehand, as a pool of worlds (gymnax's `params`); `reset` selects one of
+    them at random. Observations have the delays and the noise of `config`. The components of an
+    action are -1 to 1, see `contract`. The motion is differentiable in the action. An episode ends
+    at a collision, at a tilt beyond 90 degrees, after the last gate or at the time limit.
     """
 
     config: TrainConfig
-    """Observation, dynamics, randomisation and tracks; of the loss only the safety radius r_q is
-    used."""
+    """Settings of the observation, dynamics, randomisation and tracks; of those of the loss only
+    the safety radius r_q is used."""
     time_limit_s: float = 20.0
     """Longest episode [s]."""
     reward_scale: float = 0.01
-    """Rewards are those of `suite.train.ppo.reward` times this [1]."""
+    """Factor on the rewards of `suite.train.ppo.reward`."""
 
     @property
     def spec(self) -> PolicySpec:
-        """Observation of the policy, and actions of -1 to 1."""
+        """The policy's spec: the observation of `config`, and actions of -1 to 1."""
         action = ActionSpec("acceleration", (ACTION_LIMIT,), (0.0,), clip=1.0)
         return replace(self.config.spec, action=action)
 
@@ -166,7 +166,8 @@ class JaxRace:
 
     @functools.cached_property
     def _race(self) -> Race:
-        # Without this, arrays made during a learner's compilation could not be used outside of it.
+        # The first call may be in a function that a learner compiles. Without this line the arrays
+        # made here would exist in that compilation only.
         with jax.ensure_compile_time_eval():
             return make_race(self.config)
 
@@ -193,11 +194,14 @@ class JaxRace:
         the `gates` passed, counted from the track's first, and `collided`, `tipped`, `finished`
         and `truncated` (the time limit).
         """
+        # Fly one period.
         wind, pick, noise = jax.random.split(key, 3)
         world = _batch_of_one(worlds, state.world)
         output = jnp.clip(action, -1.0, 1.0)
         keys = world_keys(wind, world)
         episode, result = self._race.fly(world, state.episode, ACTION_LIMIT * output[None], keys)
+        # Whether the episode is over, and its reward. A tilt beyond 90 degrees costs as much as a
+        # collision.
         steps = state.steps + 1
         gates = episode.target[0]
         tipped = episode.state.rot_w[0, 2, 2] < 0.0
@@ -210,6 +214,7 @@ class JaxRace:
             "gates": gates, "collided": collided, "tipped": tipped, "finished": finished,
             "truncated": truncated,
         }  # fmt: skip
+        # At its end, start the next episode in a random world of the pool.
         done = over | truncated
         index = jax.random.randint(pick, (), 0, worlds.pos_w.shape[0])
         index = jnp.where(done, index, state.world)

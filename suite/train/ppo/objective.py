@@ -18,22 +18,22 @@ class Actor(NamedTuple):
     params: network.Params
     """The policy's parameters."""
     log_deviation: jax.Array
-    """(3,) logarithm of the exploration's standard deviation on each axis [m/s^2]."""
+    """(3,) logarithm of the standard deviation [m/s^2] of the exploration on each axis."""
 
 
 class Sequences(NamedTuple):
-    """The objective's inputs from a rollout: (T, B, ...), except the start."""
+    """The inputs of the objective from a rollout of T steps in B worlds."""
 
     state: jax.Array
-    """(T, B, state_size)."""
+    """(T, B, state_size) state vectors of the observations."""
     action_b: jax.Array
-    """(T, B, 3)."""
+    """(T, B, 3) actions with exploration [m/s^2]."""
     log_prob: jax.Array
-    """Of the actions, under the policy that flew."""
+    """(T, B) logarithm of the actions' probability density under the policy that flew."""
     done: jax.Array
-    """Bool: the episode ended with the step."""
+    """(T, B) bool: the episode ended with the step."""
     advantage: jax.Array
-    """Normalised."""
+    """(T, B) advantage of the action over the mean one, normalised over the rollout."""
     start: jax.Array
     """(1, B, hidden) recurrent state at the start of every episode of a world."""
 
@@ -43,12 +43,13 @@ def advantages(
 ) -> jax.Array:
     """Return the generalised advantage estimates (T, B) (Schulman et al. 2016, Eq. 16).
 
-    The return after the rollout's end is the critic's value; that after a collision is zero.
+    The return after the rollout's end is the value that the critic estimates. The return after a
+    collision is zero.
 
     Args:
-        reward: (T, B).
-        value: (T + 1, B) of the states before each step, and after the last.
-        done: (T, B) bool, the episode ended with the step.
+        reward: (T, B) reward of each step.
+        value: (T + 1, B) the critic's values of the states before each step and after the last one.
+        done: (T, B) bool: the episode ended with the step.
         discount: gamma.
         trace: lambda.
     """
@@ -66,7 +67,10 @@ def advantages(
 
 
 def action_means(params: network.Params, embeddings: jax.Array, sequences: Sequences) -> jax.Array:
-    """Return the policy's actions (T, B, 3) along its episodes, from embeddings (T, B, hidden)."""
+    """Return the policy's actions (T, B, 3) without exploration, from embeddings (T, B, hidden).
+
+    The recurrent state is set back to that of the start after the end of an episode.
+    """
     start = sequences.start[0]
 
     def step(
@@ -87,7 +91,7 @@ def clipped_loss(
     Args:
         config: has the clip limit and the weight of the entropy.
         actor: the policy and its exploration, with gradient.
-        embeddings: (T, B, hidden) of the images, with gradient.
+        embeddings: (T, B, hidden) embeddings of the images, with gradient.
         sequences: states, actions and advantages of the rollout.
     """
     mean = action_means(actor.params, embeddings, sequences)

@@ -1,8 +1,10 @@
 """The reward of one step, for any policy's rollout (Su et al. 2026, Table "Reward Function").
 
 It compares all training schemes on one scale, so its weights are constants and do not depend on
-those of the training. Values that the table does not give are the differentiable trainer's: beta_2,
-the points of a step's path and the safety radius r_q (`LossConfig.safety_radius_m`).
+those of the training. Some values are not in the table, and are those of the differentiable
+trainer: beta_2, the points of a step's path and the safety radius r_q
+(`LossConfig.safety_radius_m`). Below, d is the distance to the nearest solid, v^c the speed towards
+it, a_k the acceleration in step k and dt the policy's period.
 """
 
 from __future__ import annotations
@@ -20,19 +22,19 @@ from suite.train.step import make_step
 from suite.train.worlds import Worlds
 
 COLLISION = -30.0
-"""lambda_1, of a step that comes closer to a solid than r_q [1]."""
+"""lambda_1, reward of a step that comes closer to a solid than r_q."""
 BARRIER = -6.0
-"""lambda_2, of ln(1 + e^{beta_2 (|d| - r_q)}) [1]."""
+"""lambda_2, weight of ln(1 + e^{beta_2 (|d| - r_q)})."""
 CLOSING = -3.0
-"""lambda_3, of v^c max(1 - |d| + r_q, 0)^2 [s/m^3]."""
+"""lambda_3, weight of v^c max(1 - |d| + r_q, 0)^2 [s/m^3]."""
 ACCELERATION = -1e-2
-"""lambda_4, of |a|^2 [s^4/m^2]."""
+"""lambda_4, weight of |a|^2 [s^4/m^2]."""
 JERK = -1e-3
-"""lambda_5, of |(a_k - a_{k-1}) / dt|^2 [s^6/m^2]."""
+"""lambda_5, weight of |(a_k - a_{k-1}) / dt|^2 [s^6/m^2]."""
 PASS = 110.0
-"""lambda_6, of a step that passes the gate [1]."""
+"""lambda_6, reward of a step that passes the gate."""
 PROGRESS = 0.4
-"""lambda_7, of the speed towards the gate [s/m]."""
+"""lambda_7, weight of the speed towards the gate [s/m]."""
 
 
 class RewardTerms(NamedTuple):
@@ -54,10 +56,11 @@ def make_reward(
 ) -> Callable[..., tuple[RewardTerms, jax.Array, jax.Array]]:
     """Return reward(worlds, before, after, target) -> (terms, clearance, passed), (B,) each.
 
-    It returns for the step from `before` to `after` of worlds that have passed `target` (B,) gates:
-    the weighted terms, the smallest signed distance to a solid [m], and whether a gate was passed.
-    As in the judge, a gate is passed by crossing its opening (not within r_th of its centre). The
-    progress of such a step is towards the next gate.
+    The step is that from the state `before` to the state `after` of worlds that have passed
+    `target` (B,) gates. `terms` are the weighted terms, `clearance` is the smallest signed distance
+    to a solid [m], and `passed` is whether a gate was passed. As in the judge, a gate is passed by
+    crossing its opening; in the paper it is passed within a distance r_th of its centre. In a step
+    that passes a gate, progress is measured towards the gate after it.
 
     Args:
         config: its `loss` has the safety radius r_q.

@@ -30,9 +30,9 @@ class Record(NamedTuple):
     action_b: jax.Array
     """(B, 3) action with exploration [m/s^2]."""
     log_prob: jax.Array
-    """Logarithm of the density of that action."""
+    """Logarithm of the probability density of that action."""
     critic_inputs: jax.Array
-    """(B, F) the critic's inputs before the step."""
+    """(B, F) inputs of the critic, from the state before the step."""
     reward: RewardTerms
     """Reward of the step."""
     done: jax.Array
@@ -42,16 +42,16 @@ class Record(NamedTuple):
     passed: jax.Array
     """Bool: a gate was passed."""
     speed: jax.Array
-    """[m/s]."""
+    """Speed at the step's end [m/s]."""
 
 
 def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array) -> jax.Array:
-    """Return the log density (...) of actions (..., 3) around mean (..., 3).
+    """Return the logarithm of the probability density (...) of actions of a normal distribution.
 
     Args:
-        mean: (..., 3) [m/s^2].
+        mean: (..., 3) mean of the distribution, the policy's output [m/s^2].
         log_deviation: (3,) logarithm of the standard deviation, the same in every state.
-        action: (..., 3) [m/s^2].
+        action: (..., 3) the actions [m/s^2].
     """
     standardised = (action - mean) * jnp.exp(-log_deviation)
     return -(0.5 * standardised * standardised + log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(-1)
@@ -60,8 +60,9 @@ def log_probability(mean: jax.Array, log_deviation: jax.Array, action: jax.Array
 def make_rollout(config: TrainConfig) -> Callable[..., tuple[Record, jax.Array]]:
     """Return rollout(params, log_deviation, worlds, key) -> (records (T, B, ...), inputs (B, F)).
 
-    An episode ends when the drone touches a solid; its world is then reset to its start, with the
-    same recurrent state. `inputs` are the critic's inputs after the last step.
+    An episode ends when the drone touches a solid. Its world is then reset to its start, and the
+    policy's recurrent state to that of the start. `inputs` are the critic's inputs from the states
+    after the last step.
     """
     race = make_race(config)
 

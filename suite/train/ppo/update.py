@@ -1,8 +1,9 @@
-"""Train a policy with PPO: an iteration is a rollout, its advantages, and passes of both networks.
+"""Train a policy with PPO (proximal policy optimisation), the baseline of the suite's own training.
 
-The two networks are the policy (actor) and the critic. A minibatch has whole worlds (simulated
-scenes with a drone), with backpropagation through their whole rollouts. As in the differentiable
-trainer, the images of a minibatch are encoded at once, outside the loop over steps.
+An iteration flies a rollout, computes its advantages, and makes several passes over it that train
+two networks: the policy (actor) and the critic. A minibatch has whole worlds (simulated scenes with
+a drone), with backpropagation through their whole rollouts. As in the differentiable trainer, the
+images of a minibatch are encoded at once, outside the loop over steps.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from suite.train.worlds import Worlds, sample_worlds
 from tracks.common.files import plain
 
 STEPS_PER_CORE_S = 8000.0
-"""Environment steps a second of a processor core, in a rollout or a learning pass; a guess."""
+"""Environment steps a second of a processor core, in a rollout or a learning pass; a rough value
+for the estimate."""
 COMPILE_S = 20.0
 """Time to compile, for the estimate [s]."""
 
@@ -73,7 +75,7 @@ def make_optimizers(
 def start_state(config: PpoConfig) -> PpoState:
     """Return the state before the first iteration; the policy starts as in the trainer."""
     params = network.init(jax.random.key(config.seed), config.spec)
-    # With an explicit type: a weak type would compile the second iteration again.
+    # The explicit type is needed: with a weak type the second iteration would compile again.
     actor = Actor(params, jnp.full(3, math.log(config.deviation), jnp.float32))
     critic_key = jax.random.fold_in(jax.random.key(config.seed), 1)
     critic_params = critic.init(critic_key, config.critic_size, critic.feature_count(config.spec))
@@ -97,13 +99,13 @@ def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
 def actor_gradient(
     config: PpoConfig, actor: Actor, images: jax.Array, sequences: Sequences, key: jax.Array
 ) -> tuple[Actor, dict[str, jax.Array]]:
-    """Return the gradient of the clipped loss and numbers of the curve.
+    """Return the gradient of the clipped loss, and numbers of the learning curve by name.
 
     Args:
         config: the run.
         actor: the point of differentiation.
-        images: (T, B, height, width).
-        sequences: (T, B, ...) of the same worlds.
+        images: (T, B, height, width) images of the rollout.
+        sequences: (T, B, ...) other numbers of the same worlds.
         key: selects the images for the encoder's gradient, with `episode.image_stride`.
     """
     steps, batch = images.shape[:2]
@@ -119,13 +121,17 @@ def actor_gradient(
 
 
 def curve_numbers(records: Record) -> dict[str, jax.Array]:
-    """Return a rollout's numbers of the curve; gates are those of each world's first episode."""
-    first = jnp.cumprod(
+    """Return a rollout's numbers of the learning curve by name.
+
+    Of the passed gates, only those of each world's first episode count.
+    """
+    # 1 until the end of a world's first episode, then 0.
+    in_first_episode = jnp.cumprod(
         1 - jnp.concatenate([jnp.zeros_like(records.done[:1]), records.done[:-1]]), 0
     )
     numbers = {
         "reward": records.reward.total().mean(),
-        "gates": (records.passed * first).sum(0).mean(),
+        "gates": (records.passed * in_first_episode).sum(0).mean(),
         "collided": records.done.any(0).mean(),
         "speed": records.speed.mean(),
         "speed_max": records.speed.max(0).mean(),
@@ -136,7 +142,9 @@ def curve_numbers(records: Record) -> dict[str, jax.Array]:
 def make_update(
     config: PpoConfig,
 ) -> Callable[[PpoState, Worlds], tuple[PpoState, dict[str, jax.Array]]]:
-    """Return update(state, worlds) -> (state', numbers of the curve), compiled on first call.
+    """Return update(state, worlds) -> (state', the curve's row), which makes one iteration of PPO.
+
+    It is compiled on the first call.
 
     Raises:
         ValueError: if `minibatches` does not divide `episode.batch`.
@@ -185,8 +193,8 @@ def make_update(
             return (cast(critic.Params, optax.apply_updates(params, change)), optimizer), None
 
         rows = shuffled(key, batch, config.critic_epochs, config.minibatches)
-        first = state.critic, state.critic_optimizer
-        (params, optimizer), _ = jax.lax.scan(learn, first, rows)
+        start = state.critic, state.critic_optimizer
+        (params, optimizer), _ = jax.lax.scan(learn, start, rows)
         return state._replace(critic=params, critic_optimizer=optimizer)
 
     @jax.jit
@@ -194,6 +202,7 @@ def make_update(
         keys = jax.random.split(jax.random.fold_in(seed, state.iteration), 4)
         worlds = worlds._replace(hidden=state.hidden * worlds.remembers[:, None])
         actor = state.actor
+        # The rollout, and the advantages of its actions.
         records, last_inputs = rollout(actor.params, actor.log_deviation, worlds, keys[0])
         inputs = jnp.concatenate([records.critic_inputs, last_inputs[None]])
         value = critic.value(state.critic, inputs)
@@ -208,6 +217,7 @@ def make_update(
             advantage=(advantage - advantage.mean()) / (advantage.std() + 1e-8),
             start=worlds.hidden[None],
         )
+        # Train both networks; then keep recurrent states for starts of the next rollout.
         state, numbers = train_actor(state, records.image, sequences, keys[1])
         state = train_critic(state, records.critic_inputs, goal, keys[2])
         step = jax.random.randint(keys[3], (batch,), 0, steps)
@@ -237,7 +247,7 @@ def train_ppo(
         config: the whole run.
         folder: where the run's files go; a run of the same configuration in it is resumed.
         console: shows progress.
-        watch: measures the policy during the training; its steps are iterations.
+        watch: measures the policy during the training.
 
     Raises:
         ValueError: for invalid settings, and if the folder has another run.
