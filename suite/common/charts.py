@@ -20,7 +20,7 @@ LINES = ("#2463c9", "#e0892b", "#2e8b57", "#b0413e", "#7a5cb8", "#8b93a1")
 DPI = 130
 """Resolution of the pictures [dots per inch]."""
 DRAWN = ("gates", "collided", "speed")
-"""Numbers of a training's curve that `curves_chart` draws."""
+"""Keys of the measures of a training's curve that `curves_chart` draws."""
 
 
 def titled(axes: Axes, title: str) -> None:
@@ -61,26 +61,27 @@ def curves_chart(
 ) -> bytes:
     """Return a PNG of gates, collisions and speed over gradient steps, a panel each.
 
-    Thick lines are running means, thin ones single steps.
+    Thick lines are running means, thin lines are single steps.
 
     Args:
-        curves: rows of metrics.jsonl by label; an empty one is left out.
-        colours: one for each curve.
-        follow: whether the curves after the first begin where the first one ends.
+        curves: label -> rows of the curve (metrics.jsonl); a curve without rows is left out.
+        colours: a colour for each curve.
+        follow: whether the curves after the first begin where the first one ends, as a fine-tuning
+            follows a training.
     """
     figure = Figure(figsize=(10.4, 3.1), layout="constrained")
     panels = figure.subplots(1, len(DRAWN))
-    first = len(next(iter(curves.values()))) if follow else 0
+    first_length = len(next(iter(curves.values()))) if follow else 0
     for axes, name in zip(panels, DRAWN, strict=True):
-        start = 0
+        offset = 0
         for (label, rows), colour in zip(curves.items(), colours, strict=False):
             if not rows:
                 continue
             values = METRICS[name].scale * np.array([row[name] for row in rows], float)
-            steps = start + np.array([row["iteration"] for row in rows])
+            steps = offset + np.array([row["iteration"] for row in rows])
             axes.plot(steps, values, color=colour, lw=0.7, alpha=0.25)
             axes.plot(steps, _running_mean(values), color=colour, lw=1.8, label=label)
-            start = first
+            offset = first_length
         titled(axes, METRICS[name].heading)
         axes.set_xlabel("gradient steps", fontsize=9)
         axes.set_ylim(bottom=0)
@@ -90,16 +91,16 @@ def curves_chart(
 
 
 def _running_mean(values: np.ndarray) -> np.ndarray:
-    """Return means over a twentieth of the values, shorter at the ends."""
+    """Return running means over a twentieth of the values; at the ends over fewer values."""
     half_width = max(1, len(values) // 40)
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    first = np.maximum(np.arange(len(values)) - half_width, 0)
-    last = np.minimum(np.arange(len(values)) + half_width + 1, len(values))
-    return (total[last] - total[first]) / (last - first)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    begin = np.maximum(np.arange(len(values)) - half_width, 0)
+    end = np.minimum(np.arange(len(values)) + half_width + 1, len(values))
+    return (sums[end] - sums[begin]) / (end - begin)
 
 
 def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG file's bytes."""
+    """Return the bytes of the figure as a PNG file."""
     FigureCanvasAgg(figure)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI)

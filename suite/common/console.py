@@ -1,4 +1,4 @@
-"""A command's text output: results on standard output, progress on standard error."""
+"""The text output of a command: results on standard output, progress on standard error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.segment import Segment
 
 PLAIN_PERIOD_S = 10.0
-"""Time between the plain progress lines if standard error is no terminal [s]."""
+"""Time between two lines about the progress if standard error is no terminal [s]."""
 
 
 class Update(Protocol):
@@ -58,10 +58,10 @@ class Console:
 
         Args:
             label: a short description of the work.
-            total: the value of `done` at its end, in any unit.
+            total: the value of `done` at the end of the work, in any unit.
             clock: returns the time [s].
-            begun: the value of `done` at its beginning, which does not count for the remaining
-                time.
+            begun: the value of `done` at the beginning of the work, such as what an earlier call
+                has finished. It does not count for the estimate of the remaining time.
         """
         if sys.stderr.isatty():
             with _bar(label, total, begun) as update:
@@ -75,8 +75,10 @@ class Console:
             if now - last < PLAIN_PERIOD_S:
                 return
             last = now
-            new = done - begun
-            remaining = duration((now - started) * (total - done) / new) if new else "unknown"
+            newly_done = done - begun
+            remaining = (
+                duration((now - started) * (total - done) / newly_done) if newly_done else "unknown"
+            )
             self.note(f"{label}: {done:g} of {total:g}, {remaining} left{note and ', ' + note}")
 
         yield update
@@ -128,7 +130,10 @@ def _bar(label: str, total: float, begun: float) -> Iterator[Update]:
 
 @contextmanager
 def stdout_kept_clean() -> Iterator[None]:
-    """Send all output to standard error in the meantime, including that of native libraries."""
+    """Send all output to standard error while the context lasts, also that of native libraries.
+
+    With --json standard output has nothing but the JSON object.
+    """
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     os.dup2(2, 1)
@@ -145,12 +150,12 @@ def duration(seconds: float) -> str:
     """Return `seconds` as text: "0.4 s", "12 s", "3 min 20 s", "2 h 05 min"."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    seconds_rounded = round(seconds)
+    if seconds_rounded < 60:
+        return f"{seconds_rounded} s"
+    if seconds_rounded < 3600:
+        return f"{seconds_rounded // 60} min {seconds_rounded % 60:02d} s"
+    return f"{seconds_rounded // 3600} h {seconds_rounded % 3600 // 60:02d} min"
 
 
 def size(count: float) -> str:

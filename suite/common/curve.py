@@ -1,6 +1,6 @@
-"""Read and write the curve of a training run: a file with a JSON object per gradient step.
+"""Read and write the curve of a training run: a file with a row (JSON object) per gradient step.
 
-A resumed run truncates it at the checkpoint that it continues from.
+A resumed run removes the rows after the checkpoint from which it continues.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from tracks.common.files import naming, to_json, write_text
 CURVE = "metrics.jsonl"
 """File with a row per gradient step."""
 WATCHED = "validation.jsonl"
-"""File with a row per measurement of the policy during the training; `iteration` is the number of
-gradient steps before it."""
+"""File with a row per measurement of the policy during the training. In it `iteration` is the
+number of gradient steps before the measurement."""
 
 
 class Metric(NamedTuple):
-    """How tables and charts show a number of a training."""
+    """How tables and charts show a measure of a training, such as the passed gates."""
 
     title: str
-    """Name with its unit."""
+    """Name of the measure with its unit."""
     scale: float
     """Factor from the stored to the shown number."""
     digits: int
-    """Decimal places."""
+    """Number of decimal places in tables."""
 
     @property
     def heading(self) -> str:
-        """The title over a chart."""
+        """The title above a chart."""
         return self.title if self.title.startswith("v_max") else self.title.capitalize()
 
 
@@ -45,10 +45,10 @@ METRICS = {
     "collided": Metric("collided [%]", 100, 0),
     "speed": Metric("mean speed [m/s]", 1, 1),
 }
-"""Numbers of a training's curve and of the measurements of its policy, by their key."""
+"""Key in the rows of the curve and of the measurements -> how the measure is shown."""
 
 Mirror = Callable[[list[dict[str, Any]]], None]
-"""A function that receives the rows of the curve as they are written."""
+"""Function that receives the rows of the curve when they are written, for another program."""
 
 
 def append(folder: Path, rows: list[dict[str, Any]], name: str = CURVE) -> None:
@@ -77,7 +77,7 @@ def read(folder: Path, name: str = CURVE) -> list[dict[str, Any]]:
 
 
 def cut(folder: Path, iteration: int, name: str = CURVE) -> None:
-    """Remove the rows from `iteration` on, which are computed again."""
+    """Remove the rows from `iteration` on; the run computes them again."""
     if not (folder / name).exists():
         return
     rows = [row for row in read(folder, name) if row["iteration"] < iteration]
@@ -99,6 +99,7 @@ def tensorboard(folder: Path) -> Mirror:
             "--tensorboard needs the package tensorboardX: pip install "
             "'diffracing-suite[tensorboard]', or leave --tensorboard out"
         ) from None
+    # Empty until the first row, whose step says from where on earlier rows are replaced.
     writers: list[Any] = []
 
     def mirror(rows: list[dict[str, Any]]) -> None:

@@ -13,31 +13,33 @@ from pathlib import Path
 from types import TracebackType
 
 SHOWN = 300
-"""Most characters of a name in a message."""
+"""Largest number of characters of a name in a message."""
 DONE = 0
-"""The work is done."""
+"""Exit code: the work is done."""
 FAILED = 1
-"""The work failed: the disk is full, training diverged, or a bug of ours."""
+"""Exit code: the work failed. The disk is full, a training diverged, or the suite has a bug."""
 UNUSABLE = 2
-"""The input cannot be used: a wrong name, value or file."""
+"""Exit code: the input cannot be used. A name, a value or a file is wrong."""
 INTERRUPTED = 130
-"""Ctrl-C, or a signal to end."""
+"""Exit code: the command was interrupted by Ctrl-C or by a signal to end."""
 
 _ROOT = Path(__file__).resolve().parents[2]
-_ROOMS = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
+_PACKAGES = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
 """Folders of the suite's four packages."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of the operating system about a full disk or a used-up quota."""
 _BAD_PATH = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENXIO, errno.EINVAL)
 """Errors of the operating system about a path that cannot be used."""
 _BUGS = (errno.EBADF, errno.EFAULT, errno.EDOM, errno.ERANGE, errno.ENOTSOCK, errno.ECHILD)
 """Errors of the operating system that a mistake in the program causes."""
 _NO_SUCH_INPUT = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)
+"""Errors about a file or folder that the user named wrongly."""
 _NUL = "embedded null"
 """Part of Python's message about a name with a NUL character."""
 _NO_BACKEND = ("Unable to initialize backend", "Unknown backend")
 """Beginnings of JAX's message if JAX_PLATFORMS names a missing backend."""
 _NO_SETTING = "invalid value for environment variable"
-"""Beginning of MuJoCo's message about MUJOCO_GL."""
+"""Beginning of MuJoCo's message if MUJOCO_GL has a wrong value."""
 
 
 class WorkFailed(RuntimeError):
@@ -47,8 +49,9 @@ class WorkFailed(RuntimeError):
 def explain(error: BaseException) -> tuple[int, str] | None:
     """Return (exit code, message) for an error that needs no traceback, None for a bug.
 
-    A `ValueError` counts as a message to the user only if the suite raised it with a `raise`
-    statement, or its class is the suite's: one from numpy or a conversion is a bug.
+    A `ValueError` counts as a message to the user only if the suite raised it on purpose: by a
+    `raise` statement in its code, or as an exception class of the suite. A `ValueError` from numpy
+    or from a conversion is a bug.
     """
     from tracks.common.work import WorkerDied
 
@@ -88,20 +91,23 @@ def _explain_os(error: OSError) -> tuple[int, str] | None:
 
 
 def _is_suite_module(module: str | None) -> bool:
-    return (module or "").split(".")[0] in {Path(room).name for room in _ROOMS}
+    """Return whether a module with this name belongs to the four packages of the suite."""
+    return (module or "").split(".")[0] in {Path(room).name for room in _PACKAGES}
 
 
 def _is_message(error: ValueError) -> bool:
     """Return whether the suite raised the error on purpose, by a raise statement or its class."""
     if _is_suite_module(type(error).__module__):
         return True
+    # An error of a worker process comes with its traceback as text, as the cause.
     remote = error.__cause__
     if type(remote).__name__ == "_RemoteTraceback":
         return _ends_at_raise(str(remote))
+    # The last frame is where the error was raised.
     last: TracebackType | None = error.__traceback__
     while last is not None and last.tb_next is not None:
         last = last.tb_next
-    if last is None or not last.tb_frame.f_code.co_filename.startswith(_ROOMS):
+    if last is None or not last.tb_frame.f_code.co_filename.startswith(_PACKAGES):
         return False
     # A failing C function has no frame of its own: only a raise statement is on purpose.
     opcode = last.tb_frame.f_code.co_code[last.tb_lasti]
@@ -109,11 +115,11 @@ def _is_message(error: ValueError) -> bool:
 
 
 def _ends_at_raise(text: str) -> bool:
-    """Return whether a worker process's traceback (text) ends at a raise statement of the suite."""
+    """Return whether a traceback as text ends at a raise statement in the code of the suite."""
     lines = text.splitlines()
     frames = [i for i, line in enumerate(lines) if line.startswith('  File "')]
     if not frames:
         return False
     path = lines[frames[-1]].split('"')[1]
     statement = lines[frames[-1] + 1].strip() if frames[-1] + 1 < len(lines) else ""
-    return path.startswith(_ROOMS) and statement.startswith("raise ")
+    return path.startswith(_PACKAGES) and statement.startswith("raise ")

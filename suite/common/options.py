@@ -1,8 +1,9 @@
-"""Make command-line options from the fields of a dataclass, with the texts below the fields.
+"""Make command-line options from the fields of a dataclass.
 
-The parser is tyro. Rare options are annotated `Advanced[...]` and are at the end of the help. A
-nested dataclass only groups options in the code: its fields are options of the command like all
-others. `settings` lists the settings of a training in the same way.
+The text below a field is the description of its option. The parser is the package tyro. Rare
+options are annotated `Advanced[...]` and are at the end of the help. A nested dataclass only groups
+options in the code: its fields are options of the command like all others. `settings` lists the
+settings of a training in the same way.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from tracks.input.ranges import ranged
 
 T = TypeVar("T")
 GROUP = "advanced"
-"""Title of the rare options, and the mark of each."""
+"""Title of the group of rare options in the help, and annotation that marks a rare option."""
 Advanced = Annotated[T, GROUP]
-"""Type of a rare option."""
+"""Type of a rare option: `Advanced[int]` is an int in the group of rare options."""
 VALUES = {str: "STR", int: "INT", float: "FLOAT", Path: "PATH"}
 """Type -> placeholder of a value in the help."""
 NUMBERS = {int: "a whole number", float: "a number"}
-"""Types of numbers and their names in messages."""
+"""Type of a number -> its name in messages."""
 SILENT = ("", "''", "None", "False")
-"""Defaults that are not printed: the option's text describes the behaviour without it."""
+"""Defaults that the help does not print, because the description of the option says what happens
+without it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,8 @@ class Command:
     """Print one JSON object to standard output and nothing else."""
 
     LOCKED = ()
-    """Names of the options with folders into which no other command may write at that time."""
+    """Names of the options whose folders this command writes; while it runs, no other command may
+    write there."""
 
     def written(self) -> list[Path]:
         """Return the folders of the options in `LOCKED`."""
@@ -52,19 +55,19 @@ class Option(NamedTuple):
     """One option of a command."""
 
     field: str
-    """Name of its field in the configuration."""
+    """Name of the field in the configuration."""
     kind: Any
     """Type of the field, with annotations."""
     default: Any
-    """Its default; `dataclasses.MISSING` if it is required."""
+    """Default of the option; `dataclasses.MISSING` if the option is required."""
     about: str
-    """Its description."""
+    """Description of the option, the text below the field."""
     advanced: bool
-    """Whether it is rare."""
+    """Whether the option is rare."""
 
     @property
     def notes(self) -> tuple[Any, ...]:
-        """The annotations of its type."""
+        """The annotations of the type."""
         return getattr(self.kind, "__metadata__", ())
 
     @property
@@ -74,12 +77,12 @@ class Option(NamedTuple):
 
     @property
     def repeated(self) -> bool:
-        """Whether the option is repeated for each value."""
+        """Whether the option is written again for each value: `--policy a --policy b`."""
         return tyro.conf.UseAppendAction in self.notes
 
     @property
     def listed(self) -> bool:
-        """Whether the option takes several values at once, none of them a path."""
+        """Whether the option takes several values at once (`--speed 0.3 1`), none of them a path."""
         return (
             get_origin(self.bare) is tuple
             and not self.repeated
@@ -96,6 +99,7 @@ class Option(NamedTuple):
         """The option as it is written, such as --track; a positional one is in capitals."""
         if self.positional:
             return self.field.upper()
+        # An annotation may give an option another name than its field.
         name = next((note.name for note in self.notes if getattr(note, "name", None)), self.field)
         return f"--{name.replace('_', '-')}"
 
@@ -111,9 +115,9 @@ def options(command: type, default: Any = None, advanced: bool = False) -> Itera
     Inherited options come last.
 
     Args:
-        command: the dataclass.
-        default: an instance with the defaults, in place of those of `command`.
-        advanced: whether all of its options are rare.
+        command: class of the configuration, a dataclass.
+        default: an instance whose values are the defaults, in place of those of `command`.
+        advanced: whether all options of `command` are rare.
     """
     hints, texts = get_type_hints(command, include_extras=True), all_field_texts(command)
     not_inherited = command.__dict__.get("__annotations__", {})
@@ -134,7 +138,7 @@ def read_options(
     """Return the configuration from `args`, and the words that belong to no option.
 
     Args:
-        kind: the type of the configuration.
+        kind: class of the configuration.
         prog: name of the program in the help.
         about: beginning of the help.
         args: the words of the command line.
@@ -144,8 +148,8 @@ def read_options(
         SystemExit: after --help (code 0), and for invalid options (code 2).
     """
     registry = tyro.constructors.ConstructorRegistry()
-    registry.struct_rule(_read)
-    registry.primitive_rule(_number)
+    registry.struct_rule(_command_rule)
+    registry.primitive_rule(_number_rule)
     marks = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     with registry:
         if all_known:
@@ -156,19 +160,24 @@ def read_options(
 
 
 def _is_instance_of_dataclass(value: Any) -> bool:
+    """Return whether `value` is an instance of a dataclass, not a dataclass itself."""
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def _read(
+def _command_rule(
     info: tyro.constructors.StructTypeInfo,
 ) -> tyro.constructors.StructConstructorSpec | None:
-    """Return the specification of a configuration for tyro, with rare options in a group."""
+    """Return the specification of a configuration for tyro, with rare options in a group.
+
+    tyro calls this for every dataclass; None leaves the class to tyro's own rules, as for the group
+    of rare options that is made here.
+    """
     command: Any = info.type
     if not hasattr(command, "__dataclass_fields__") or command.__name__ == GROUP:
         return None
     all_options = list(options(command))
-    fields = [_field(option) for option in all_options if not option.advanced]
-    rare = [_field(option) for option in all_options if option.advanced]
+    fields = [_tyro_field(option) for option in all_options if not option.advanced]
+    rare = [_tyro_field(option) for option in all_options if option.advanced]
     if rare:
         members = list[Any]()
         for spec in rare:
@@ -179,15 +188,18 @@ def _read(
         fields.append(tyro.constructors.StructFieldSpec(GROUP, kind, group()))
 
     def build(**values: Any) -> Any:
-        return _build(command, {**values, **(vars(values[GROUP]) if rare else {})})
+        return _build_config(command, {**values, **(vars(values[GROUP]) if rare else {})})
 
     return tyro.constructors.StructConstructorSpec(build, tuple(fields))
 
 
-def _number(
+def _number_rule(
     info: tyro.constructors.PrimitiveTypeInfo,
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """Return the specification of a number for tyro, with a plain message for other text."""
+    """Return the specification of a number for tyro, with a plain message for other text.
+
+    tyro calls this for every type; None leaves it to tyro's own rules. `int | None` is a number too.
+    """
     kinds = {_bare(kind) for kind in get_args(info.type) or (info.type,)} - {type(None)}
     kind: Any = kinds.pop() if len(kinds) == 1 else None
     if kind not in NUMBERS or get_origin(info.type) is tuple:
@@ -205,11 +217,11 @@ def _number(
     )
 
 
-def _build(command: Any, values: dict[str, Any]) -> Any:
-    """Return an instance of `command`, and of the dataclasses in it, from values by field name."""
+def _build_config(command: Any, values: dict[str, Any]) -> Any:
+    """Return an instance of `command`, and of the dataclasses in it, from `values` by field name."""
     return command(
         **{
-            field.name: _build(type(field.default), values)
+            field.name: _build_config(type(field.default), values)
             if _is_instance_of_dataclass(field.default)
             else values[field.name]
             for field in dataclasses.fields(command)
@@ -217,7 +229,7 @@ def _build(command: Any, values: dict[str, Any]) -> Any:
     )
 
 
-def _field(option: Option) -> tyro.constructors.StructFieldSpec:
+def _tyro_field(option: Option) -> tyro.constructors.StructFieldSpec:
     """Return the specification of an option for tyro, with its placeholder and default."""
     required, metavar = option.default is dataclasses.MISSING, None
     types = get_args(option.bare)
@@ -240,34 +252,34 @@ class Setting(NamedTuple):
     """One setting of a training."""
 
     path: str
-    """Its name in `--set`, such as loss.progress."""
+    """Name of the setting in `--set`, such as loss.progress."""
     default: Any
-    """Its value in this configuration."""
+    """Value of the setting in the listed configuration."""
     allowed: str
-    """Its range; "" if only its type limits it."""
+    """Allowed range; "" if only the type limits the value."""
     about: str
-    """Its description, with its unit."""
+    """Description of the setting, with its unit."""
 
 
 def settings(config: Any) -> Iterator[Setting]:
     """Yield every setting of a dataclass and of the dataclasses in its fields, in their order."""
     allowed = {".".join(path): str(limits) for path, _, limits in ranged(config)}
-    yield from _settings(config, "", allowed)
+    yield from _nested_settings(config, "", allowed)
 
 
-def _settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
+def _nested_settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
     texts = all_field_texts(type(config))
     for field in dataclasses.fields(config):
         path, value = f"{prefix}{field.name}", getattr(config, field.name)
         if dataclasses.is_dataclass(value):
-            yield from _settings(value, f"{path}.", allowed)
+            yield from _nested_settings(value, f"{path}.", allowed)
         else:
             yield Setting(path, value, allowed.get(path, ""), texts.get(field.name, ""))
 
 
 @functools.cache
 def all_field_texts(cls: type) -> dict[str, str]:
-    """Return the text below each field of a dataclass, read from the source."""
+    """Return the text below each field of a dataclass and its bases, read from the source code."""
     texts = dict[str, str]()
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
@@ -276,7 +288,10 @@ def all_field_texts(cls: type) -> dict[str, str]:
 
 
 def field_texts(cls: type) -> dict[str, str]:
-    """Return the text below each field of one class, without its bases, read from the source."""
+    """Return the text below each field of one class, without its bases, read from the source code.
+
+    Python does not keep these texts, so the source code is parsed.
+    """
     try:
         source = inspect.getsource(cls)
     except OSError:
@@ -284,9 +299,9 @@ def field_texts(cls: type) -> dict[str, str]:
     (definition,) = ast.parse(textwrap.dedent(source)).body
     assert isinstance(definition, ast.ClassDef)
     texts = {}
-    for field, after in zip(definition.body, definition.body[1:], strict=False):
+    for field, statement_below in zip(definition.body, definition.body[1:], strict=False):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            text = after.value if isinstance(after, ast.Expr) else None
+            text = statement_below.value if isinstance(statement_below, ast.Expr) else None
             if isinstance(text, ast.Constant) and isinstance(text.value, str):
                 texts[field.target.id] = " ".join(text.value.split())
     return texts

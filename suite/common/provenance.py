@@ -19,7 +19,7 @@ PACKAGES = (
     *("dm-control", "gymnasium", "trimesh", "torch", "rotorpy", "onnx", "onnxruntime"),
     *("pyarrow", "rerun-sdk"),
 )
-"""Packages that can change a result."""
+"""Names of the packages that can change a result."""
 
 
 def package_versions() -> dict[str, str | None]:
@@ -34,18 +34,18 @@ def package_versions() -> dict[str, str | None]:
 
 
 def machine() -> dict[str, Any]:
-    """Return the machine's system, processor, usable cores and memory [bytes]."""
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Return the system, processor, number of usable cores and memory [bytes] of this machine."""
+    memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {
         "system": platform.platform(),
         "processor": _processor(),
         "cores": usable_cores(),
-        "memory_bytes": pages,
+        "memory_bytes": memory_bytes,
     }
 
 
 def _processor() -> str:
-    """Return the processor's model name."""
+    """Return the model name of the processor."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
@@ -58,8 +58,8 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
     """Return everything that is needed to repeat a run: stamp, versions, machine and `config`.
 
     Args:
-        config: the resolved configuration, a dataclass.
-        seed: the run's seed; None if it has none.
+        config: the configuration with all defaults filled in, a dataclass.
+        seed: seed of the run; None if it has none.
     """
     return {
         **stamp(schema=1, seed=seed),
@@ -73,6 +73,7 @@ def run_record(config: Any, seed: int | None) -> dict[str, Any]:
 
 
 def _type_name(config: Any) -> str:
+    """Return the full name of a configuration's class, which shows the kind of a run."""
     return f"{type(config).__module__}.{type(config).__qualname__}"
 
 
@@ -101,18 +102,24 @@ def write_run_record(
     """Write `run_record` to `folder`/run.json.
 
     Args:
-        folder: the run's folder.
-        config: the resolved configuration, a dataclass.
-        seed: the run's seed; None if it has none.
-        resumed: whether the folder's run continues. The git commits of its record are then kept
-            as `earlier_commits`, since their code made a part of the run.
+        folder: folder of the run.
+        config: the configuration with all defaults filled in, a dataclass.
+        seed: seed of the run; None if it has none.
+        resumed: whether an interrupted run in this folder continues. The git commits in its record
+            are then kept as `earlier_commits`, since their code made a part of the run.
+
+    Raises:
+        ValueError: if the existing record cannot be read.
     """
     path, record = Path(folder) / "run.json", run_record(config, seed)
     commits: set[str] = set()
     if resumed and path.is_file():
         try:
-            old = read_json(path)
-            commits = {*old.get("earlier_commits", []), old["git_commit"] or "unknown"}
+            old_record = read_json(path)
+            commits = {
+                *old_record.get("earlier_commits", []),
+                old_record["git_commit"] or "unknown",
+            }
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not the record of a run ({error}); move it away") from error
     earlier = sorted(commits - {record["git_commit"]})

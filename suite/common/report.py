@@ -14,7 +14,7 @@ from tracks.common.files import write_text
 from tracks.common.grid import Grid, html_table
 
 TEMPLATE = Path(__file__).with_name("report.html")
-"""The page around a report's contents, with its style."""
+"""HTML page with places for the contents of a report, and the style sheet."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Picture:
     """A picture that is embedded in the page."""
 
     png: bytes
-    """The PNG file's bytes."""
+    """Bytes of the PNG file."""
     caption: str
     """Text below the picture, and its alternative text; may be empty."""
 
@@ -32,7 +32,7 @@ class Links:
     """A list of links to files next to the report."""
 
     entries: Sequence[tuple[str, str]]
-    """Path relative to the report's folder, and a description."""
+    """For each link: path relative to the folder of the report, and a description."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Details:
     """A long text that is folded at first."""
 
     summary: str
-    """The line above it, always visible."""
+    """Line that is always visible; a click on it unfolds the text."""
     text: str
-    """The text, shown as it is when unfolded."""
+    """The long text, with its line breaks."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Steps:
     """A numbered list."""
 
     texts: Sequence[str]
-    """Its items."""
+    """Texts of the items."""
 
 
 Part = str | Grid | Picture | Links | Details | Steps
@@ -64,7 +64,7 @@ class Section:
     title: str
     """The heading."""
     parts: Sequence[Part]
-    """Its items, from top to bottom."""
+    """Items of the section, from top to bottom."""
     folded: bool = False
     """Whether only the heading is shown at first."""
 
@@ -78,9 +78,9 @@ class Report:
     lead: str
     """The result in one or two sentences."""
     facts: Mapping[str, str]
-    """Conditions by name, below the lead."""
+    """Name -> value of the conditions, such as files and versions; shown below the lead."""
     sections: Sequence[Section]
-    """All other content."""
+    """All other contents."""
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> Path:
@@ -106,6 +106,7 @@ def html(report: Report) -> str:
 
 
 def _section(section: Section) -> str:
+    """Return a section as HTML."""
     title, parts = escape(section.title), "\n".join(_part(part) for part in section.parts)
     if section.folded:
         return f'<details class="section"><summary>{title}</summary>\n{parts}\n</details>'
@@ -113,6 +114,7 @@ def _section(section: Section) -> str:
 
 
 def _part(part: Part) -> str:
+    """Return an item of a section as HTML."""
     if isinstance(part, Grid):
         return html_table(part)
     if isinstance(part, Picture):

@@ -1,7 +1,7 @@
-"""Run a long command in stages, each with a folder: a finished stage is not repeated.
+"""Run a long command in stages; each has a folder, and a finished stage is not repeated.
 
-The same command with the same configuration continues at the first unfinished stage. Time and
-memory of the remaining work are estimated and printed before it starts.
+The same command with the same configuration continues at the first unfinished stage. Before it
+starts, it prints an estimate of the time and the memory of the remaining work.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from tracks.common.files import plain, write_json
 from tracks.input.reading import read_json
 
 MARK = "stage.json"
-"""Name of the file that marks a finished stage; written last."""
+"""Name of the file in a stage's folder that marks the stage as finished; written last."""
 
 
 def claim(out: Path, config: Any, seed: int) -> None:
-    """Make `out` the folder of a run of `config`, or check that it is.
+    """Make `out` the folder of a run of `config`, or check that it is this already.
 
     Raises:
-        ValueError: if `out` has a run of another configuration, with the differences.
+        ValueError: with the differences, if `out` has a run of another configuration.
     """
     path = out / "run.json"
     if not path.is_file():
@@ -45,7 +45,13 @@ def claim(out: Path, config: Any, seed: int) -> None:
 
 
 def differences(stored: Any, new: Any, name: str = "") -> list[str]:
-    """Return the differences of two plain values, as "name is X there, Y here"."""
+    """Return the differences of two plain values (as in JSON), as "name is X there, Y here".
+
+    Args:
+        stored: the value of an earlier run ("there").
+        new: the value of this run ("here").
+        name: name of the compared values; the names of nested ones are appended to it.
+    """
     if isinstance(stored, Mapping) and isinstance(new, Mapping):
         changes = []
         for key in dict.fromkeys([*new, *stored]):
@@ -66,15 +72,15 @@ class Stage:
     """One stage of a run."""
 
     name: str
-    """Name of its folder in the run's folder."""
+    """Name of the stage, and of its folder within that of the run."""
     title: str
     """Description for the console."""
     estimate: Estimate
-    """Time and memory of its work."""
+    """Time and memory of the work."""
     work: Callable[[Path], Any]
-    """Does the stage in the given folder; must continue an interrupted earlier call."""
+    """Function that does the stage in the given folder. It must continue an interrupted call."""
     show_result: Callable[[Path], None] = lambda folder: None
-    """Prints the result of the finished stage in the given folder."""
+    """Function that prints the result of the finished stage in the given folder."""
 
 
 def run_stages(
@@ -83,7 +89,7 @@ def run_stages(
     """Do the unfinished stages one after the other, each in its folder.
 
     Args:
-        out: the run's folder.
+        out: folder of the run.
         stages: all stages of the run, in order.
         console: shows the estimate of the remaining work, and each stage.
         title: short description of the run.
@@ -110,7 +116,10 @@ def is_done(folder: Path) -> bool:
 
 
 def _run_stage(stage: Stage, folder: Path, number: str, console: Console) -> float:
-    """Do a stage unless it is finished, and return the time that it took [s]."""
+    """Do a stage unless it is finished, and return the time that it took [s].
+
+    `number` is its place among all stages as text, such as "[2/5]".
+    """
     if is_done(folder):
         console.note(f"{number} {stage.title}: done before, in {folder}")
         try:

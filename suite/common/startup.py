@@ -1,7 +1,8 @@
 """Prepare a command's process: standard streams, environment variables of JAX, and file names.
 
-This happens before anything slow is imported: JAX reads its settings at import, and a file that
-gets the number of a closed stream would receive the printed text.
+This happens before other packages are imported, for two reasons. JAX reads its settings at import.
+And a file that is opened while a standard stream is closed gets the number of that stream, so it
+would receive the printed text.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ KEPT_PREFIXES = (
     *("JAX_PLATFORM", "JAX_CUDA_", "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_"),
     *("JAX_TRACEBACK_", "JAX_LOGGING_LEVEL"),
 )
-"""Prefixes of JAX's environment variables on devices, caches and logging, which are kept."""
+"""Prefixes of the environment variables of JAX that are kept: devices, caches and logging."""
 DEBUG_SWITCHES = (
     *("JAX_DISABLE_JIT", "JAX_DEBUG_NANS", "JAX_DEBUG_INFS", "JAX_LOG_COMPILES"),
     *("JAX_EXPLAIN_CACHE_MISSES", "JAX_ENABLE_COMPILATION_CACHE", "JAX_CHECK_TRACER_LEAKS"),
     "JAX_DISABLE_MOST_OPTIMIZATIONS",
 )
-"""JAX's variables for debugging, 0 or 1, which are kept."""
+"""Environment variables of JAX for debugging that are kept if they are a switch (0 or 1)."""
 FULL_PRECISION = ("JAX_DEFAULT_MATMUL_PRECISION", "highest")
-"""Unrounded float32: accelerators multiply with fewer bits by default, too few for a rotation."""
+"""Variable and value with which JAX multiplies matrices in unrounded float32. By default
+accelerators use fewer bits, too few for a rotation."""
 CACHE_WARNINGS = tuple(
     f"Error {action} persistent compilation cache" for action in ("reading", "writing")
 )
@@ -49,7 +51,7 @@ class _UnfailingStderr(io.FileIO):
 
 
 class _NamedStdout(io.FileIO):
-    """Standard output whose name is in the message of a failed write."""
+    """Standard output; the message of a failed write has its name."""
 
     def write(self, data: Any) -> int:
         try:
@@ -60,10 +62,10 @@ class _NamedStdout(io.FileIO):
 
 
 def open_streams() -> None:
-    """Replace missing standard streams by the null device.
+    """Open the standard streams again so that they never fail in an unclear way.
 
-    Characters outside the terminal's encoding are printed as escapes; text that cannot be written
-    to standard error is lost.
+    Missing streams become the null device. Characters outside the terminal's encoding are printed
+    as escapes. Text that cannot be written to standard error is lost.
     """
     for number in range(3):
         try:
@@ -76,19 +78,20 @@ def open_streams() -> None:
 
 
 def _text_stream(raw: io.FileIO, old: TextIO | None) -> TextIO:
-    """Return a text stream on `raw` with the encoding and the buffering of the `old` one."""
+    """Return a text stream on `raw`, with the encoding and the buffering of the stream `old`."""
     encoding = old.encoding if old else "utf-8"
     unbuffered = getattr(old, "write_through", False)  # python -u, PYTHONUNBUFFERED
-    by_line = raw.isatty() or unbuffered or isinstance(raw, _UnfailingStderr)
+    line_buffering = raw.isatty() or unbuffered or isinstance(raw, _UnfailingStderr)
     return io.TextIOWrapper(
-        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=by_line
+        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=line_buffering
     )
 
 
 def suppress_warnings() -> None:
     """Suppress warnings that do not help the user, here and in worker processes.
 
-    They are numpy's runtime warnings, and JAX's about its cache of compiled programs.
+    They are the runtime warnings of numpy, and the warnings of JAX about its cache of compiled
+    programs. If the user has chosen which warnings are shown, nothing changes.
     """
     if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -100,10 +103,13 @@ def suppress_warnings() -> None:
 
 
 def check_names(args: Iterable[str]) -> None:
-    """Refuse words of a command line that no result file could name, and folders called ~.
+    """Refuse words of a command line that are not UTF-8 or begin with ~/.
+
+    A result file could not store a word that is not UTF-8. A ~ that the shell did not replace would
+    make a folder with this name.
 
     Raises:
-        ValueError: for a word that is not UTF-8, or begins with a ~ that the shell did not replace.
+        ValueError: for such a word.
     """
     for arg in args:
         if arg.partition("=")[2].startswith("~/") or arg.startswith("~/"):
@@ -123,10 +129,10 @@ def check_names(args: Iterable[str]) -> None:
 
 
 def clean_jax_environment(environment: MutableMapping[str, str] | None = None) -> list[str]:
-    """Remove variables of JAX that could change results or end the command, in place.
+    """Remove environment variables of JAX that could change results or end the command.
 
-    JAX has about a hundred variables, so the harmless ones are listed here. Products of matrices
-    are computed in full precision.
+    JAX has about a hundred variables, so the harmless ones are listed here (KEPT_PREFIXES and
+    DEBUG_SWITCHES). FULL_PRECISION is set.
 
     Args:
         environment: changed in place; by default that of this process.
@@ -155,8 +161,8 @@ def clean_jax_environment(environment: MutableMapping[str, str] | None = None) -
 def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
     """Make JAX keep compiled programs in the user's cache, unless another folder is set.
 
-    XLA compiles the model of a diagnosis for 15 s and a trainer for longer; a second call of the
-    same command reads the compiled programs.
+    XLA, the compiler of JAX, needs 15 s for the model of a diagnosis and longer for a training. A
+    second call of the same command reads the compiled programs.
 
     Args:
         environment: changed in place; by default that of this process. An existing
@@ -164,7 +170,7 @@ def keep_compiled(environment: MutableMapping[str, str] | None = None) -> None:
     """
     values = os.environ if environment is None else environment
     if "JAX_COMPILATION_CACHE_DIR" not in values:
-        # Machines with a common home folder must not share machine code.
+        # Machines with a common home folder must not share machine code: their processors differ.
         folder = user_cache(values) / "jax" / (platform.node() or "here")
         values["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     if values["JAX_COMPILATION_CACHE_DIR"]:
@@ -187,7 +193,7 @@ def use_device(device: str | None) -> None:
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else device)
     try:
         jax.devices()
-    except (RuntimeError, AssertionError):  # which one depends on the driver
+    except (RuntimeError, AssertionError):  # which of them is raised depends on the driver
         raise ValueError(
             f"--device {device}: JAX finds none; leave --device out, or install JAX for your GPU: "
             "pip install 'jax[cuda12]'"
@@ -195,7 +201,7 @@ def use_device(device: str | None) -> None:
 
 
 def remove_empty_entries(folder: Path) -> None:
-    """Remove the cache's empty files, which a killed process leaves and JAX does not replace."""
+    """Remove empty files from the cache `folder`; a killed process leaves them, and JAX fails."""
     for entry in folder.glob("*-cache"):
         with contextlib.suppress(OSError):
             if not entry.stat().st_size:

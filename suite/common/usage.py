@@ -1,6 +1,7 @@
 """The help texts of `suite` and its commands, and what happens to arguments before parsing.
 
-`with_lists` accepts lists with commas or spaces, `renamed` replaces options of earlier versions.
+`with_lists` converts lists with commas or spaces to the form that an option reads. `renamed`
+replaces options of earlier versions.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ GROUPS: dict[str, dict[str, str]] = {
 COMMANDS: dict[str, str] = {
     name: summary for group in GROUPS.values() for name, summary in group.items()
 }
-"""Name -> one-line summary."""
+"""Name of each command -> one-line summary."""
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "eval": (
@@ -116,7 +117,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 """Command -> examples that its help begins with."""
 
 JOINED = ("--track", "--difficulty")
-"""Options whose value is one text with a list."""
+"""Options that read a list as one word with commas, such as `--track ellipse,zigzag`."""
 
 
 def overview() -> str:
@@ -149,13 +150,20 @@ def first_paragraph(text: str | None) -> str:
 
 
 def description(name: str, about: str) -> str:
-    """Return the head of a command's help: its purpose, its examples, then further notes."""
-    first, *more = [" ".join(part.split()) for part in about.split("\n\n")]
+    """Return the beginning of a command's help: its purpose, its examples, then further notes.
+
+    Args:
+        name: name of the command.
+        about: docstring of its options; the first paragraph is the purpose, the others are notes.
+    """
+    purpose, *paragraphs = [" ".join(part.split()) for part in about.split("\n\n")]
     # A line that begins with a space keeps its break; others are joined, and not wrapped.
-    notes = [line for part in more for line in textwrap.wrap(part, 76, break_on_hyphens=False)]
+    notes = [
+        line for part in paragraphs for line in textwrap.wrap(part, 76, break_on_hyphens=False)
+    ]
     sections = {"Examples": EXAMPLES.get(name, ()), "Notes": notes}
     texts = ["\n  ".join([f"{title}:", *lines]) for title, lines in sections.items() if lines]
-    return "\n\n".join([first, *texts])
+    return "\n\n".join([purpose, *texts])
 
 
 def with_lists(
@@ -164,14 +172,15 @@ def with_lists(
     joined: Container[str] = (),
     repeated: Container[str] = (),
 ) -> list[str]:
-    """Return `args` with each list as its option reads it, whether commas or spaces separate it.
+    """Return `args` with each list in the form that its option reads.
 
-    A word with "=" keeps its commas: they are within a value, as in `--set fov_deg=87,58`.
+    The user may separate the entries of a list by commas or by spaces. A word with "=" keeps its
+    commas: they are within a value, as in `--set fov_deg=87,58`.
 
     Args:
         args: the words of a command line.
         listed: options that read one word for each value: `--speed 0.3,1` becomes `--speed 0.3 1`.
-        joined: options that read one text: `--track a b` becomes `--track a,b`.
+        joined: options that read one word for all: `--track a b` becomes `--track a,b`.
         repeated: options that are repeated for each value: `--policy a b`, which a shell makes of
             `--policy runs/*`, becomes `--policy a --policy b`.
     """
@@ -193,10 +202,11 @@ def with_lists(
 
 
 def _simulator(value: str) -> list[str]:
+    """Return the option that replaces `--world` in most commands."""
     return ["--simulator", value]
 
 
-def _hidden(value: str) -> list[str]:
+def _hidden_vehicle(value: str) -> list[str]:
     """Return the options for `suite loop --world`, whose value was SIMULATOR, FILE or both."""
     from eval.worlds import WORLDS
 
@@ -210,23 +220,23 @@ RENAMED: dict[str, dict[str, Callable[[str], list[str]]]] = {
     "eval": {"--world": _simulator},
     "collect": {"--world": _simulator},
     "reproduce": {"--world": _simulator},
-    "loop": {"--world": _hidden},
+    "loop": {"--world": _hidden_vehicle},
     "export": {"--formats": lambda value: ["--format", value]},
 }
-"""Command -> option of an earlier version -> function that returns its replacement. Version 0.2
-removes them."""
+"""Command -> option of an earlier version -> function (value) -> words that replace the option.
+Version 0.2 removes these options."""
 
 
 def renamed(name: str, args: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return `args` with options of earlier versions replaced, and a note for each of them."""
-    old, out, notes = RENAMED.get(name, {}), list[str](), list[str]()
+    replacements, out, notes = RENAMED.get(name, {}), list[str](), list[str]()
     words = iter(args)
     for word in words:
         option, _, value = word.partition("=")
-        if option not in old:
+        if option not in replacements:
             out.append(word)
             continue
-        new = old[option](value or next(words, ""))
-        out += new
-        notes.append(f"{option} is now {' '.join(new)}; version 0.2 removes {option}")
+        replacement = replacements[option](value or next(words, ""))
+        out += replacement
+        notes.append(f"{option} is now {' '.join(replacement)}; version 0.2 removes {option}")
     return out, notes

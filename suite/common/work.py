@@ -1,6 +1,7 @@
-"""Do long jobs in parallel: in processes of this machine, or on a cluster (option `--workers`).
+"""Do long jobs in parallel: in processes of this machine, or on a cluster.
 
-A job is work whose product is a folder, such as one training.
+A job is work whose product is a folder, such as one training. The user chooses the workers by the
+option `--workers`: a number of processes, or the address of the scheduler of a cluster.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ def read_workers_option(text: str | None, whole_cores: bool = False) -> Workers 
     """Return the workers of the option `--workers`; None without it.
 
     Args:
-        text: the option's value.
-        whole_cores: refuse more processes than this machine has cores, for work that keeps its
-            cores busy.
+        text: value of the option.
+        whole_cores: refuse more processes than this machine has cores, because each of them keeps
+            a core busy.
 
     Raises:
         ValueError: with the option and what is allowed.
@@ -80,9 +81,9 @@ def do_jobs(
             result must contain no path.
         jobs: the jobs; afterwards their folders have the products.
         workers: None or 1 is this process, on all cores. Several processes of this machine are
-            pinned to separate cores; those of a cluster get folders as content.
-        console: shows the number of finished jobs; `do` gets it in this process, and a silent one
-            in others.
+            pinned to separate cores. Processes of a cluster get the content of folders.
+        console: shows the number of finished jobs. In this process `do` gets it too; in other
+            processes `do` gets a silent one.
         title: short description of the jobs.
 
     Raises:
@@ -117,9 +118,11 @@ def do_jobs(
 
 
 def _do_silently(do: Callable[[Job, Console], Result], job: Job) -> Result:
+    """Do a job in a worker process, without output."""
     share_threads()
     return do(job, Silent())
 
 
 def _yield_result(do: Callable[[Job, Console], Result], job: Job) -> Iterator[Result]:
+    """Do a job in a worker process and yield its one result, as `run_pieces` expects."""
     yield _do_silently(do, job)

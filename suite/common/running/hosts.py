@@ -1,7 +1,7 @@
 """Run one command in several connected JAX processes, on one host or many.
 
-All processes run the same command. JAX connects them through the first one, the coordinator, which
-writes the files; the others need no access to its folders.
+All processes run the same command. JAX connects them through the first process, the coordinator.
+Only that process writes files; the others need no access to its folders.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ ENVIRONMENTS = (
 """Environment variables of each scheduler, SLURM and Open MPI: the number of this process, the
 number of processes, and the coordinator."""
 MOST_PROCESSES = 100_000
+"""Largest number of processes."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,20 @@ class ProcessOptions:
 
 
 class Member(NamedTuple):
-    """A process among several."""
+    """The place of this process among several."""
 
     number: int
-    """From 0."""
+    """Number of this process, from 0."""
     processes: int
-    """How many there are."""
+    """Number of processes."""
     coordinator: str | None
     """HOST:PORT of the first process; None: JAX finds it in the scheduler's environment."""
 
 
 def read_member(options: ProcessOptions, environment: Mapping[str, str] | None = None) -> Member:
-    """Return this process's number from the options or the environment; (0, 1) if it is alone.
+    """Return the place of this process, from the options or the environment of a scheduler.
+
+    A process that is alone has the number 0 of 1.
 
     Raises:
         ValueError: for incomplete options, or numbers out of range.
@@ -120,15 +123,15 @@ def is_distributed() -> bool:
 
 
 def is_writer() -> bool:
-    """Return whether this process writes the files: the first one does."""
+    """Return whether this process writes the files, which only the first one does."""
     return not is_distributed() or sys.modules["jax"].process_index() == 0
 
 
 def check_same(settings: Mapping[str, Any]) -> None:
-    """Check that all processes have the same settings (by name) and software.
+    """Check that all processes have the same `settings` (by name) and the same software.
 
     Raises:
-        ValueError: naming the settings that differ.
+        ValueError: with the names of the settings that differ.
     """
     if not is_distributed():
         return
@@ -137,20 +140,21 @@ def check_same(settings: Mapping[str, Any]) -> None:
 
     from tracks.common.work.pickling import software
 
+    # Each process sends a checksum of every setting: 28 bits, which fit into an int32.
     texts = [*map(to_json, settings.values()), to_json(software())]
-    sums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in texts]
-    all_sums = np.asarray(multihost_utils.process_allgather(np.asarray(sums, np.int32)))
-    differing = [name for name, column in zip([*settings, "software"], all_sums.T, strict=True)
+    checksums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in texts]
+    all_checksums = np.asarray(multihost_utils.process_allgather(np.asarray(checksums, np.int32)))
+    differing = [name for name, column in zip([*settings, "software"], all_checksums.T, strict=True)
                  if len(set(column.tolist())) > 1]  # fmt: skip
     if differing:
         raise ValueError(
-            f"the {len(all_sums)} processes differ in {', '.join(differing)}. Give all of them the "
+            f"the {len(all_checksums)} processes differ in {', '.join(differing)}. Give all of them the "
             "same command and the same version, or --processes 1 to each for separate runs"
         )
 
 
 def broadcast_from_first(tree: Any) -> Any:
-    """Return the first process's arrays in all processes."""
+    """Return the tree of arrays of the first process, in all processes."""
     if not is_distributed():
         return tree
     from jax.experimental import multihost_utils
@@ -159,7 +163,10 @@ def broadcast_from_first(tree: Any) -> Any:
 
 
 def gather(trees: list[Any]) -> list[Any]:
-    """Return the trees of arrays of all processes in order; each passes the same number."""
+    """Return the trees of arrays of all processes, in the order of the processes.
+
+    Every process must pass the same number of trees.
+    """
     if not is_distributed():
         return trees
     import jax

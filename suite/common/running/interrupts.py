@@ -1,13 +1,14 @@
 """Handle Ctrl-C and SIGTERM: a command ends within seconds with code 130, whatever it computes.
 
-Python handles a signal between two of its own instructions, but XLA may compile for half a minute
-within one. An interpreter that exits while XLA's threads work crashes, since it frees their memory.
-So a second thread waits for signals: if the main thread does not handle one in time, the process
-ends at once. This is as safe as kill -9: files are written completely or not at all, folder locks
-belong to the system, and the next command removes partial files.
+Python handles a signal between two of its own instructions, but XLA (the compiler of JAX) may work
+for half a minute within one instruction. An interpreter that exits while the threads of XLA work
+crashes, since it frees their memory. So a second thread waits for signals. If the main thread does
+not handle a signal in time, the second thread ends the process at once. This is as safe as kill -9:
+files are written completely or not at all, folder locks belong to the system, and the next command
+removes partial files.
 
-An exception in a destructor or a callback of the garbage collector is lost: Python only reports it.
-An interrupt that is lost in this way is sent again.
+An exception in a destructor or in a callback of the garbage collector is lost: Python only reports
+it. An interrupt that is lost in this way is sent again.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from typing import NoReturn
 from suite.common.errors import INTERRUPTED
 
 RESEND_S = 0.05
-"""Time before a lost interrupt is sent again [s]."""
+"""Time between the loss of an interrupt and its repetition [s]."""
 PATIENCE_S = 3.0
-"""Time for the main thread to handle a signal [s]."""
+"""Time that the main thread has to handle a signal [s]."""
 MESSAGE = (
     "suite: interrupted in a step that cannot be stopped (mostly the compiler), so ended at once; "
     "what was saved is kept\n"
@@ -65,6 +66,8 @@ def ends_in_seconds() -> Iterator[None]:
         timer.start()
 
     signals = [s for s in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(s) != signal.SIG_IGN]
+    # Python writes the number of every signal into a pipe (the wakeup file), which the second
+    # thread reads.
     source, sink = os.pipe()
     os.set_blocking(sink, False)
     listener = threading.Thread(target=_listen, args=(source, signals, handled), daemon=True)
@@ -80,6 +83,7 @@ def ends_in_seconds() -> Iterator[None]:
         signal.set_wakeup_fd(old_fd)
         for number, handler in old_handlers.items():
             signal.signal(number, handler)
+        # The second thread ends when the pipe is closed and it waits for no signal.
         os.close(sink)
         handled.set()
         listener.join()

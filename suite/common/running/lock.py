@@ -1,8 +1,8 @@
 """Lock an output folder, so that only one command writes into it at a time.
 
-The lock is `flock` on an empty file in the folder, so it ends with the process that holds it. The
-holder is described in a second file, which is written under another name and renamed. Both files
-have no meaning after the process has ended.
+The lock is the system call `flock` on an empty file in the folder, so it ends with the process that
+holds it. A second file describes the command of that process (the holder), for the message to
+others. Both files have no meaning after the process has ended.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from tracks.common.files import folder_while_used, sweep_parts, write_json
 from tracks.input.reading import InputError, read_json
 
 LOCK, HOLDER = ".suite-lock", ".suite-lock.json"
-"""Names of the two files in the folder; removed when the command ends."""
+"""Names of the lock file and of the file that describes its holder; both are removed at the end."""
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
-"""Errors of a file system without locks."""
+"""Errors of the operating system on a file system without locks."""
 
 
 @contextmanager
 def one_writer(folder: Path) -> Iterator[None]:
     """Lock `folder`, and remove partial files of killed commands from it.
 
-    The folder is made, and removed again if it stays empty. On a file system without locks nothing
-    is locked.
+    A missing folder is made, and removed again if it stays empty. On a file system without locks
+    nothing is locked.
 
     Raises:
-        ValueError: if another command writes there, with its name, its start and what to do.
+        ValueError: if another command writes there. The message has its command line, its start
+            and what to do.
         OSError: if the folder cannot be made or written.
     """
     from filelock import FileLock, Timeout
@@ -71,7 +72,10 @@ def one_writer(folder: Path) -> Iterator[None]:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether the file at `path` is no lock of the suite; it may vanish at any moment."""
+    """Return whether the file at `path` is no lock of the suite, which is an empty file.
+
+    Another command may remove the file at any moment.
+    """
     try:
         status = path.stat()
     except FileNotFoundError:
@@ -98,7 +102,7 @@ def _this_command() -> dict[str, object]:
 
 
 def _holder(folder: Path) -> str:
-    """Return a description of the command that holds the lock."""
+    """Return a description of the command that holds the lock of `folder`."""
     try:
         holder = read_json(folder / HOLDER)
         process = f"pid {holder['pid']} on {holder['host']}, since {holder['since']}"

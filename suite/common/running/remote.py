@@ -1,8 +1,8 @@
-"""Do a job on another machine of a cluster, which gets and returns folders as content.
+"""Do a job on another machine of a cluster, which shares no files with this one.
 
-A job is work whose product is a folder. The other machine works in a folder of the user's cache
-that is named by the SHA-256 of the job. So the next worker continues from the files of a killed
-one.
+A job is work whose product is a folder. The other machine gets and returns the content of folders.
+It works in a folder of the user's cache that is named by the SHA-256 of the job. So a second worker
+continues from the files of one that was killed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tracks.common.work.pickling import pack
 
 Result = TypeVar("Result")
 Content = dict[str, bytes]
-"""Content of a folder's files, by relative path."""
+"""Path of each file relative to its folder -> content of the file."""
 
 
 class Job(NamedTuple):
@@ -31,26 +31,26 @@ class Job(NamedTuple):
     task: Any
     """Data that describe the work."""
     folder: Path
-    """Folder of the product; the work continues from files of an earlier call."""
+    """Folder of the product; the work continues from files of an earlier call in it."""
     reads: Path | None = None
-    """Another folder that the work reads."""
+    """Another folder that the work reads, if there is one."""
 
 
 class Parcel(NamedTuple):
-    """A job with the content of its folders."""
+    """A job that can be sent to another machine: it has the content of its folders."""
 
     task: Any
     """Data that describe the work."""
     name: str
-    """Name of the product's folder."""
+    """Name of the folder of the product."""
     folder: Content
-    """Content of the product's folder."""
+    """Content of the folder of the product."""
     reads: Content | None
     """Content of the folder that the work reads, if there is one."""
 
 
 def parcels(jobs: Iterable[Job]) -> Iterator[Parcel]:
-    """Yield jobs with the content of their folders, each read when it is needed."""
+    """Yield the jobs as parcels; the folders of a job are read when its parcel is needed."""
     for job in jobs:
         reads = None if job.reads is None else content(job.reads)
         yield Parcel(job.task, job.folder.name, content(job.folder), reads)
@@ -74,7 +74,7 @@ def do_remotely(do: Callable[[Job], Result], parcel: Parcel) -> Iterator[tuple[R
 
 
 def content(folder: Path) -> Content:
-    """Return the content of a folder, empty if it does not exist."""
+    """Return the content of a folder without hidden files; empty if it does not exist."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {
         str(path.relative_to(folder)): path.read_bytes()
@@ -93,7 +93,10 @@ def replace_content(folder: Path, files: Mapping[str, bytes]) -> None:
 
 @contextmanager
 def _work_folder(name: str) -> Iterator[Path]:
-    """Lock a folder of that name in the user's cache, or make a temporary one; yields it."""
+    """Lock the folder `name` in the user's cache, and yield it.
+
+    If it is locked already or cannot be made, yield a temporary folder instead.
+    """
     folder = user_cache() / "pieces" / name
     with ExitStack() as stack:
         try:

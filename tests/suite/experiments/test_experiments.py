@@ -43,7 +43,10 @@ def test_an_experiment_that_does_not_exist_is_code_2(capsys):
         ("table2 --policy nowhere/policy", "nowhere/policy: no such file"),
         ("table2 --vehicle referense", "Did you mean 'reference'?"),
         ("simulators --policy {folder}/mine.pt2", "suite reproduce never does"),
-        ("simulators --simulator reference", "--simulator reference: the page compares with mujoco"),
+        (
+            "simulators --simulator reference",
+            "--simulator reference: the page compares with mujoco",
+        ),
         ("simulators --simulator rotorpi", "Did you mean 'rotorpy'?"),
         ("simulators --simulator mjx --simulator mjx", "--simulator mjx is given twice"),
         ("robustness --only linear_darg", "Did you mean 'linear_drag'?"),
