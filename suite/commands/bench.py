@@ -28,7 +28,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Run the benchmark `config.name`, both sides in turn, and show figures and ratio.
+    """Run the benchmark `config.name`, and show the speeds of both sides and their ratio.
 
     Raises:
         ValueError: for an unknown benchmark, or a policy for one that measures no policy.
@@ -50,6 +50,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         )
     from suite.experiments.bench.compare import load_warnings
 
+    # Measured before the benchmark, while this process is idle.
     load = load_warnings()
     bench = importlib.import_module(f"suite.experiments.bench.{config.name}")
     result = bench.run() if config.policy is None else bench.run(config.policy)

@@ -1,7 +1,7 @@
 """The command `suite blind`: make test cases with hidden effects, diagnose them, score the answers.
 
-An effect is one physical cause of a mismatch, such as drag. The cases' answers are kept in a folder
-that the diagnosis does not read.
+An effect is one physical cause of a mismatch, such as drag. The true effects of the cases (the
+answers) are in a folder that the diagnosis does not read.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Config(Command):
     HOST:PORT, whose owner can run code here. Without it one case follows the other."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write at that time."""
+        """Return the folders that this command writes; while it runs, no other may write there."""
         return [self.out] if self.what in ("make", "run") else []
 
 
@@ -65,7 +65,7 @@ USED_BY = {
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Do `config.what`.
+    """Do the action `config.what`.
 
     Raises:
         ValueError: for an option of another action, a folder that holds another set, or names that
@@ -114,7 +114,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _show_manifest(manifest: Manifest, config: Config, console: Console) -> dict[str, Any]:
-    """Print the numbers of made and failed cases, and return them for --json."""
+    """Print how many cases were made and which ones failed, and return both for --json."""
     from tracks.common.files import plain
 
     count = len(manifest.cases)
@@ -125,6 +125,7 @@ def _show_manifest(manifest: Manifest, config: Config, console: Console) -> dict
 
 
 def _strengths(console: Console) -> dict[str, Any]:
+    """Compute the table of detectable strengths, and return its path for --json."""
     from suite.blind.oracle.strength import write_table
 
     path = write_table(console)
@@ -133,7 +134,7 @@ def _strengths(console: Console) -> dict[str, Any]:
 
 
 def _plan(config: Config, console: Console) -> dict[str, Any]:
-    """Print flights that separate `config.effects`, and return them for --json."""
+    """Print flights that separate `config.effects`, and return the flights for --json."""
     from eval.effects import find_effect
     from suite.diagnose.plan import plan_for, separations_of
     from tracks.common.files import plain

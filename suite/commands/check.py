@@ -1,6 +1,7 @@
 """The command `suite check`: find faults of an interface in logs, vehicle and policy files.
 
-A fault is a wrong unit, sign, scale, order, delay or rate; a finding is a record of one.
+A fault is a wrong unit, sign, scale, order, delay or rate. A finding is a record of a fault, or of
+a doubtful value.
 """
 
 from __future__ import annotations
@@ -37,12 +38,16 @@ class Config(Command):
     """Also load policy files that can run code on this machine (.pt2, .pt, .c)."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write at that time."""
+        """Return the folders that this command writes; while it runs, no other may write there."""
         return [self.out] if self.fix else []
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
     """List the assumptions about the interface, and probable faults.
+
+    Returns:
+        `findings`, `not_identifiable` (faults that these files can neither show nor exclude), and
+        facts about the checked files.
 
     Raises:
         ValueError: if there is nothing to check, or a file is refused.

@@ -1,7 +1,7 @@
 """The command `suite collect`: record simulated flights as logs.
 
-They are for the diagnosis, or for fitting a Delta Action Model, a network that corrects actions so
-that simulated flights match measured ones.
+The logs are for the diagnosis, or for the fit of a Delta Action Model, a network that corrects
+actions so that simulated flights match measured ones.
 """
 
 from __future__ import annotations

@@ -31,6 +31,8 @@ class Config(Command):
 def run(config: Config, console: Console) -> dict[str, Any]:
     """Compare the runs and print a sentence about each comparison.
 
+    With several runs on one side of --against, the means over the training seeds are compared.
+
     Raises:
         ValueError: for too few runs, or runs under different conditions.
     """

@@ -1,4 +1,7 @@
-"""The command `suite completion`: print the script with which a shell completes commands."""
+"""The command `suite completion`: print the script with which a shell completes commands.
+
+Completion: after the first letters of a word, the Tab key writes the others.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +30,10 @@ BASH = """_suite() {{
 }}
 complete -o default -F _suite suite
 """
-"""A function of bash that completes commands and options, and files elsewhere."""
+"""Function of bash that completes names of commands and options; other words are completed as
+files. `commands` and `cases` are filled in."""
 ZSH = "#compdef suite\nautoload -U +X bashcompinit && bashcompinit\n"
-"""Lines with which zsh runs a function of bash."""
+"""Lines before it with which zsh runs a function of bash."""
 
 
 @dataclass(frozen=True)

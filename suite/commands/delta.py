@@ -1,6 +1,7 @@
 """The command `suite delta`: fit a Delta Action Model to recorded flights.
 
-It is a network that adds a correction to the action, so that simulated flights match measured ones.
+This model is a network that adds a correction to the action, so that simulated flights match
+measured ones.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Fit, and show the errors on held-out flights with the model and without.
+    """Fit the model, and show the errors on held-out flights with the model and without it.
 
     Raises:
         ValueError: for an unknown recipe or logs that cannot be used.

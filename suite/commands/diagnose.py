@@ -87,9 +87,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     )
     console.say(f"verdict: {result['verdict']}")
     console.say(result["headline"])
+    # The named effects, each with its parameters; significant ones first.
     for effect in result["effects"]:
-        rivals = ", ".join(effect["alternatives"])
-        note = f" (not distinguishable from {rivals} on these flights)" if rivals else ""
+        alternatives = ", ".join(effect["alternatives"])
+        note = (
+            f" (not distinguishable from {alternatives} on these flights)" if alternatives else ""
+        )
         console.say(f"  {effect['name']}{note}")
         for component in sorted(
             components(effect), key=lambda component: not component.is_significant
@@ -101,11 +104,12 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(f"warnings: {len(result['warnings'])}, printed above and in the report")
     for step in next_steps(result):
         console.say(f"next: {step}")
-    for side in ("held_out", "outside"):
-        comparison = (result.get("black_box") or {}).get(side)
+    # With --compare-delta: the gaps of the Delta Action Model, a model without physics.
+    for flights_kind in ("held_out", "outside"):
+        comparison = (result.get("black_box") or {}).get(flights_kind)
         if comparison:
-            named = comparison["named"]
-            named_gap = f"{named['gap']:.2f} with the names, " if named else ""
+            gap_with_names = comparison["named"]
+            named_gap = f"{gap_with_names['gap']:.2f} with the names, " if gap_with_names else ""
             console.say(
                 f"on {comparison['judged_on']}: {comparison['before']['gap']:.2f} before, "
                 f"{named_gap}{comparison['black_box']['gap']:.2f} with a Delta Action Model"

@@ -1,6 +1,6 @@
 """The command `suite effects`: list the catalogue of physical effects, or describe one.
 
-An effect is one physical cause of a mismatch between simulation and flights; a vehicle file may
+An effect is one physical cause of a mismatch between simulation and flights. A vehicle file may
 have any number of them.
 """
 
@@ -50,9 +50,10 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         count = f" x {parameter.size}" if parameter.size else ""
         low, high = parameter.typical
         neutral = bound_value(parameter.neutral, vehicle)
+        # With `whole` the usual range is one of values, else of differences from neutral.
         reference = f" away from {neutral:g}" if neutral and not parameter.whole else ""
-        by_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
-        condition = f" (for vehicle {vehicle.name})" if by_vehicle else ""
+        depends_on_vehicle = any(map(callable, (parameter.low, parameter.high, parameter.neutral)))
+        condition = f" (for vehicle {vehicle.name})" if depends_on_vehicle else ""
         optional = "" if parameter.required else "; optional"
         least, most = bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
         console.say(
@@ -63,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _facts(effect: Effect) -> dict[str, Any]:
-    """Return an effect's description for --json."""
+    """Return the description of an effect for --json; a limit that depends on the vehicle is None."""
     return {
         "summary": effect.summary,
         "equation": effect.equation,

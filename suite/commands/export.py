@@ -32,7 +32,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     """Write the files and print their paths.
 
     Raises:
-        ValueError: if the policy is not the suite's, or a format or type is unknown.
+        ValueError: if the policy was not trained by the suite, or a format or type is unknown.
     """
     from policies import shipped
     from suite.judging.deploy.exporting import export

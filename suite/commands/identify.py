@@ -37,12 +37,12 @@ class Config(Command):
     prints."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write at that time."""
+        """Return the folders that this command writes; while it runs, no other may write there."""
         return [_out_path(self).parent]
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Estimate, and print the parameters that are identifiable and those that are not.
+    """Estimate the parameters, and print which ones are identifiable and which are not.
 
     Raises:
         ValueError: for flights or a vehicle file that cannot be used.
@@ -51,13 +51,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     if config.sensors:
-        from suite.diagnose.sensors import identify as of_sensors
+        from suite.diagnose.sensors import identify as sensor_errors
 
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
-        result = of_sensors.identify_sensors(config.flights, out, console)
+        result = sensor_errors.identify_sensors(config.flights, out, console)
         _show_parameters(result, console)
-        of_sensors.say_held_out(result, console)
+        sensor_errors.say_held_out(result, console)
         return _show_end(result, out, console)
     from suite.diagnose.identify.run import identify_files
 
@@ -80,7 +80,8 @@ def _show_parameters(result: dict[str, Any], console: Console) -> None:
         values, intervals = entry["value"], entry["ci95"]
         if not isinstance(values, list):
             values, intervals = [values], [intervals]
-        # Inertia about z is scaled with those about x and y, of which one is identifiable then.
+        # The inertia about z (entry 2) is not identifiable alone: it is scaled like those about x
+        # and y.
         notes = {2: "goes with the others"} if key == "inertia" else {}
         shown = [
             f"{value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})"
@@ -92,7 +93,7 @@ def _show_parameters(result: dict[str, Any], console: Console) -> None:
 
 
 def _show_end(result: dict[str, Any], out: Path, console: Console) -> dict[str, Any]:
-    """Print the warnings and the written file; return `result`."""
+    """Print the warnings and the path of the written file; return `result`."""
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
     console.say(f"written: {out}")
@@ -111,4 +112,4 @@ MODEL_INPUTS = {
     "rates": "commanded thrust and body rates",
     "thrust": "commanded thrust alone",
 }
-"""The model's input in the result -> its description."""
+"""Input of the fitted model, as in the result -> its description."""

@@ -64,7 +64,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Convert the log, and print the findings, records of probable faults.
+    """Convert the log, and print the findings (records of probable faults).
 
     Raises:
         ValueError: for a file, a mapping or an option that cannot be used.
@@ -100,7 +100,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         console.say(line)
     for warning in log.warnings:
         console.say(f"note      file: {warning}")
-    rows, speed = len(log.time_s), _largest(log.speed)
+    rows, speed = len(log.time_s), _largest_finite(log.speed)
     speed_text = "no speed" if speed is None else f"up to {speed:.1f} m/s"
     console.say(f"{rows} rows, {log.duration_s:.1f} s, {speed_text}: {config.out}")
     return {
@@ -124,8 +124,8 @@ def _check(config: Config) -> None:
     check_no_input(config.out, [config.file, config.pose], "--out")
 
 
-def _largest(speed: Any) -> float | None:
-    """Return the largest finite value of an array; None without any."""
+def _largest_finite(speed: Any) -> float | None:
+    """Return the largest finite value of an array; None if it has no finite value."""
     import numpy as np
 
     return float(np.nanmax(speed)) if np.isfinite(speed).any() else None

@@ -44,6 +44,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _jax_devices() -> list[str]:
+    """Return a line about each device that JAX finds, or its error message."""
     try:
         import jax
 

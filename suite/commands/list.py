@@ -31,7 +31,7 @@ class Config(Command):
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """List a kind with a line about each, or the names of all kinds.
+    """List the names of a kind with a line about each, or the names of all kinds.
 
     Raises:
         ValueError: for an unknown kind or recipe.
@@ -68,12 +68,12 @@ def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
 
 
 class Kind(NamedTuple):
-    """A kind of names; packages that only the descriptions need are loaded with these."""
+    """A kind of names. Slow packages that only the descriptions need are not loaded for the names."""
 
     names: Callable[[], Iterable[str]]
-    """Returns all names."""
+    """Function that returns all names."""
     describe: Callable[[str], str]
-    """Returns a line about a name."""
+    """Function that returns a line about a name."""
 
 
 def _module(name: str) -> Any:
@@ -82,25 +82,30 @@ def _module(name: str) -> Any:
 
 
 def _vehicle(name: str) -> str:
+    """Return a line about a shipped vehicle."""
     vehicle = _module("eval.quadrotor.vehicle_file").load_vehicle(name)
     effects = ", ".join(vehicle.effects) or "no effects"
     return f"{vehicle.mass:g} kg, controller {vehicle.controller.kind}; {effects}"
 
 
 def _policy(name: str) -> str:
+    """Return a line about a shipped policy."""
     spec = _module("policies.policy").load_policy(name).spec
     return f"{spec.action.kind}, {spec.rate_hz:g} Hz, {spec.state_size} state inputs and depth"
 
 
 def _recipe(name: str) -> str:
+    """Return a line about a recipe of `suite train`."""
     return first_paragraph(_module("suite.train.recipes").RECIPES[name].__doc__)
 
 
 def _sensors(name: str) -> str:
+    """Return the sensor models of a shipped sensors file."""
     return ", ".join(_module("eval.sensors.sensors_file").load_sensors(name).models) or "no errors"
 
 
 def _simulator(name: str) -> str:
+    """Return a line about a simulator."""
     return first_paragraph(_module("eval.worlds").WORLDS.find(name).__doc__)
 
 
@@ -124,4 +129,4 @@ KINDS: dict[str, Kind] = {
         lambda name: _module("suite.experiments.bench").BENCHES[name],
     ),
 }
-"""Name of a kind -> the kind."""
+"""Name of each kind -> its names and their descriptions."""

@@ -1,8 +1,8 @@
 """The command `suite loop`: correct a simulation from flights, and fine-tune a policy in it.
 
-The stages are: train, fly, record, fit a Delta Action Model or name the hidden effect, fine-tune,
-fly again. A Delta Action Model is a network that corrects actions so that simulated flights match
-measured ones.
+The stages are: train a policy; fly it; record flights; fit a Delta Action Model to them, or name
+the hidden effect; fine-tune the policy; fly again. A Delta Action Model is a network that corrects
+actions so that simulated flights match measured ones.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Config(Command):
 
 
 OTHER_OPTIONS = ("set", "no_delta", "out", "workers", "json")
-"""Options that are no arguments of `suite.loop.config.resolve`, or have another name there."""
+"""Options that `suite.loop.config.resolve` does not take, or takes under another name."""
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:

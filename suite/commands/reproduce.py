@@ -38,14 +38,18 @@ class Config(Command):
     follows the other."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write at that time."""
+        """Return the folders that this command writes; while it runs, no other may write there.
+
+        Without a page (`experiment`) it writes nothing.
+        """
         return [self.out, self.cache] if hasattr(self, "experiment") else []
 
 
 def config_of(args: Sequence[str]) -> tuple[Any, str, list[str]]:
-    """Return the options of the page that `args` name, its name, and the other words.
+    """Return the configuration class of the page that `args` name, its name, and the other words.
 
-    Only the module of that page is loaded, because loading all of them takes seconds.
+    The class has the options of this command and those of the page, in the field `experiment`. Only
+    the module of that page is loaded, because loading all of them takes seconds.
 
     Raises:
         ValueError: for an unknown page.
@@ -91,6 +95,7 @@ def run(config: Any, console: Console) -> dict[str, Any]:
         from suite.cli import parse
 
         def make(name: str, options: Sequence[str]) -> dict[str, Any]:
+            # The options of a page are parsed as in a command of its own.
             _, page = parse("reproduce", [name, *options])
             return _make_page(replace(config, experiment=page.experiment), console)
 
@@ -99,14 +104,17 @@ def run(config: Any, console: Console) -> dict[str, Any]:
 
 
 def _make_page(config: Any, console: Console) -> dict[str, Any]:
-    """Run the experiment of a page and write its files; return its numbers for --json."""
+    """Run the experiment of a page and write its files; return the numbers of the page for --json."""
     from suite.experiments.pages.document import Workspace, check_page, write_document
     from suite.experiments.study.options import check
 
     workers = read_workers_option(config.workers, whole_cores=True)
     check(config.experiment)
-    place, module = Workspace(config.out, config.cache, workers), type(config.experiment).__module__
+    workspace, module = (
+        Workspace(config.out, config.cache, workers),
+        type(config.experiment).__module__,
+    )
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
-    check_page(place.out, name)
-    contents = document(config.experiment, place, console)
-    return write_document(place, name, config.experiment, contents, console)
+    check_page(workspace.out, name)
+    contents = document(config.experiment, workspace, console)
+    return write_document(workspace, name, config.experiment, contents, console)

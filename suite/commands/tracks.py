@@ -57,6 +57,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         name = Path(track.family).stem
         picture = config.out / f"{name}-{track.level}-{track.seed}.png"
         write_picture(picture, track)
+        # `names` has a name for each solid, of a gate or of an obstacle.
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))
         console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
         pictures.append({"picture": picture, "gates": gates, "obstacles": solids - gates})
@@ -82,7 +83,7 @@ def _list_families(console: Console) -> dict[str, Any]:
 
 
 def family_text(name: str) -> str:
-    """Return the description of a track family, from its source."""
+    """Return the description of a track family, from the docstring of its code."""
     from tracks.families import FAMILIES
 
     make = FAMILIES.find(name)

@@ -80,17 +80,22 @@ class Config(Command):
     """The place of this process among several."""
 
     def written(self) -> list[Path]:
-        """Return the folders into which no other command may write at that time."""
+        """Return the folders that this command writes; while it runs, no other may write there.
+
+        Of several processes only the first one writes.
+        """
         is_first = read_member(self.process_options).number == 0
         return [self.out] if is_first and not self.list_settings else []
 
 
 def resolve(config: Config) -> TrainConfig:
-    """Return the training that the options describe.
+    """Return the configuration of the training that the options describe.
+
+    Later steps override earlier ones: recipe, model, fine-tuning, sensors, iterations, changes.
 
     Raises:
-        ValueError: for an unknown recipe, setting or vehicle, or a vehicle without its model,
-            naming what is allowed.
+        ValueError: with what is allowed, for an unknown recipe, setting or vehicle, or a vehicle
+            for a recipe that trains the point mass.
     """
     run = replace(named_recipe(config.recipe), seed=config.seed)
     run = with_model(run, config.model, config.vehicle)
@@ -110,7 +115,7 @@ def resolve(config: Config) -> TrainConfig:
 
 
 def run(config: Config, console: Console) -> dict[str, Any]:
-    """Train; print the policy's folder and the last numbers of the curve.
+    """Train a policy; print its folder and the last row of the curve.
 
     Raises:
         ValueError: for options that cannot be used or do not go together.
@@ -120,7 +125,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     member = read_member(config.process_options)
     use_device(config.device)
     connect(member)
-    if member.number:
+    if member.number:  # of several processes only the first one prints
         console = Silent()
 
     import jax

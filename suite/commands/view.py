@@ -81,9 +81,9 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     for rollout in rollouts:
         written.append(write_picture(config.out / f"{_name(rollout)}.png", *rollout))
         result = rollout[2]
-        solid = f" with {result.collided_with}" if result.collided_with else ""
+        collision = f" with {result.collided_with}" if result.collided_with else ""
         console.say(
-            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{solid} after "
+            f"{_name(rollout)}: {result.gates_passed} gates, {result.ended_by}{collision} after "
             f"{result.time_s:.1f} s"
         )
     for ending, is_requested in ((".mp4", config.video), (".gif", config.gif)):
@@ -97,6 +97,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _write_video(path: Path, rollout: Rollout, console: Console) -> Path:
+    """Write a video or a GIF, by the ending of `path`, and return the path."""
     from eval.view.video import SMALL, VideoOptions, frame_times, write_video
 
     options, flight = SMALL if path.suffix == ".gif" else VideoOptions(), rollout[1]
@@ -106,13 +107,16 @@ def _write_video(path: Path, rollout: Rollout, console: Console) -> Path:
 
 
 def _name(rollout: Rollout) -> str:
-    """Return a trial's name for its files."""
+    """Return the name of a trial for its files; a rollout is (track, flight, result)."""
     result = rollout[2]
     return f"{Path(result.track).stem}-{result.difficulty}-{result.seed}"
 
 
 def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
-    """Return the settings, the chosen trials and, for a run, the SHA-256 of its inputs."""
+    """Return the evaluation (policies and conditions), the chosen trials, and SHA-256 of the inputs.
+
+    The last is None if RUN is a policy: there is no earlier evaluation to compare the inputs with.
+    """
     from suite.judging.replay import first_trials, read_digests, read_evaluation
     from suite.judging.requests import Evaluation
 

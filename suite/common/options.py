@@ -82,7 +82,7 @@ class Option(NamedTuple):
 
     @property
     def listed(self) -> bool:
-        """Whether the option takes several values at once (`--speed 0.3 1`), none of them a path."""
+        """Whether the option takes several values (`--speed 0.3 1`), none of them a path."""
         return (
             get_origin(self.bare) is tuple
             and not self.repeated
@@ -198,7 +198,7 @@ def _number_rule(
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
     """Return the specification of a number for tyro, with a plain message for other text.
 
-    tyro calls this for every type; None leaves it to tyro's own rules. `int | None` is a number too.
+    tyro calls this for every type; None leaves it to tyro's rules. `int | None` is a number too.
     """
     kinds = {_bare(kind) for kind in get_args(info.type) or (info.type,)} - {type(None)}
     kind: Any = kinds.pop() if len(kinds) == 1 else None
@@ -218,7 +218,7 @@ def _number_rule(
 
 
 def _build_config(command: Any, values: dict[str, Any]) -> Any:
-    """Return an instance of `command`, and of the dataclasses in it, from `values` by field name."""
+    """Return an instance of `command` and of the dataclasses in it, from `values` by field name."""
     return command(
         **{
             field.name: _build_config(type(field.default), values)

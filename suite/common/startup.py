@@ -201,7 +201,10 @@ def use_device(device: str | None) -> None:
 
 
 def remove_empty_entries(folder: Path) -> None:
-    """Remove empty files from the cache `folder`; a killed process leaves them, and JAX fails."""
+    """Remove empty files from the cache `folder`, which a killed process leaves.
+
+    JAX does not replace them, so the programs would be compiled again in every run.
+    """
     for entry in folder.glob("*-cache"):
         with contextlib.suppress(OSError):
             if not entry.stat().st_size:

@@ -143,12 +143,12 @@ def check_same(settings: Mapping[str, Any]) -> None:
     # Each process sends a checksum of every setting: 28 bits, which fit into an int32.
     texts = [*map(to_json, settings.values()), to_json(software())]
     checksums = [int(hashlib.sha256(text.encode()).hexdigest()[:7], 16) for text in texts]
-    all_checksums = np.asarray(multihost_utils.process_allgather(np.asarray(checksums, np.int32)))
-    differing = [name for name, column in zip([*settings, "software"], all_checksums.T, strict=True)
+    gathered = np.asarray(multihost_utils.process_allgather(np.asarray(checksums, np.int32)))
+    differing = [name for name, column in zip([*settings, "software"], gathered.T, strict=True)
                  if len(set(column.tolist())) > 1]  # fmt: skip
     if differing:
         raise ValueError(
-            f"the {len(all_checksums)} processes differ in {', '.join(differing)}. Give all of them the "
+            f"the {len(gathered)} processes differ in {', '.join(differing)}. Give all of them the "
             "same command and the same version, or --processes 1 to each for separate runs"
         )
 
