@@ -51,13 +51,13 @@ def run(config: Config, console: Console) -> dict[str, Any]:
     if out.suffix.lower() != ".toml":
         raise ValueError(f"--out is {str(out)!r}; its ending must be .toml")
     if config.sensors:
-        from suite.diagnose.sensors import identify as sensor_errors
+        from suite.diagnose.sensors import identify as of_sensors
 
         if config.vehicle or config.leave or config.accept:
             raise ValueError("--sensors takes no --vehicle, --leave and --accept: leave them out")
-        result = sensor_errors.identify_sensors(config.flights, out, console)
+        result = of_sensors.identify_sensors(config.flights, out, console)
         _show_parameters(result, console)
-        sensor_errors.say_held_out(result, console)
+        of_sensors.say_held_out(result, console)
         return _show_end(result, out, console)
     from suite.diagnose.identify.run import identify_files
 

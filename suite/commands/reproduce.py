@@ -104,7 +104,7 @@ def run(config: Any, console: Console) -> dict[str, Any]:
 
 
 def _make_page(config: Any, console: Console) -> dict[str, Any]:
-    """Run the experiment of a page and write its files; return the numbers of the page for --json."""
+    """Run the experiment of a page and write its files; return the page's numbers for --json."""
     from suite.experiments.pages.document import Workspace, check_page, write_document
     from suite.experiments.study.options import check
 

@@ -57,7 +57,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
         name = Path(track.family).stem
         picture = config.out / f"{name}-{track.level}-{track.seed}.png"
         write_picture(picture, track)
-        # `names` has a name for each solid, of a gate or of an obstacle.
+        # `names` has the gate or obstacle that each solid belongs to.
         gates, solids = len(track.scene.gates.center_w), len(set(track.names))
         console.say(f"{picture}: {gates} gates, {solids - gates} obstacles")
         pictures.append({"picture": picture, "gates": gates, "obstacles": solids - gates})

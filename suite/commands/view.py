@@ -113,7 +113,7 @@ def _name(rollout: Rollout) -> str:
 
 
 def _choose_trials(config: Config) -> tuple[Evaluation, list[TrialSpec], dict[str, str] | None]:
-    """Return the evaluation (policies and conditions), the chosen trials, and SHA-256 of the inputs.
+    """Return the evaluation (policies and conditions), the chosen trials, and the inputs' SHA-256.
 
     The last is None if RUN is a policy: there is no earlier evaluation to compare the inputs with.
     """
