@@ -1,1 +1,1 @@
-"""Flight logs as what is fitted to: windows, noise, hold-out."""
+"""Prepares flight logs for fits: windows of 1 s, measurement noise, held-out flights."""

@@ -1,11 +1,11 @@
 """Estimates autocorrelated (coloured) measurement noise, such as errors of a state estimator.
 
-Position, attitude and velocity have white noise plus a first-order Gauss-Markov process, whose
-correlation decays as exp(-t / T). Its share of the variance and T maximise the likelihood of the
-windows (1 s stretches of flights) after a polynomial is subtracted (restricted likelihood;
-Patterson & Thompson 1971). An error of the model accumulates along a window; noise does not. So the
-likelihood also contains a model error that is white in force and torque, which would count as noise
-otherwise.
+The noise of position, attitude and velocity is modelled as white noise plus a first-order
+Gauss-Markov process, whose correlation decays as exp(-t / T). Estimated are T and the share of the
+variance that this process has. They maximise the likelihood of the residuals in windows (1 s
+stretches of flights), after a polynomial is subtracted (restricted likelihood; Patterson & Thompson
+1971). An error of the model, in contrast to noise, accumulates along a window (drift). So the
+likelihood also contains a drift by random force and torque; it would count as noise otherwise.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ from suite.diagnose.data.windows import SLICES, FlightWindows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 TIMES_S = tuple(np.geomspace(0.012, 0.2, 8).tolist())
-"""Tested correlation times T [s]; the free start state of a window absorbs longer ones."""
+"""Tested correlation times T [s]. Noise that lasts longer acts as an error of a window's start
+state, which is fitted anyway."""
 MISFIT_TIMES_S = tuple(np.geomspace(0.03, 1.0, 6).tolist())
-"""The same where the whole residual counts as noise [s]."""
+"""Tested correlation times if the whole residual counts as noise [s]."""
 DRIFTS = (0.0, *np.logspace(-3.0, 5.0, 17).tolist())
-"""Tested sizes of the model's error: its variance after a second, over that of the noise."""
+"""Tested sizes of the model's error: its variance after a second over the variance of the noise."""
 ESTIMATED = ("position", "attitude", "velocity")
-"""Groups of channels from one state estimator, with the same T. Other sensors have white noise."""
+"""Groups of channels that come from one state estimator and have the same T. The noise of other
+sensors is white."""
 INTEGRATED = {"position": 2, "attitude": 2, "velocity": 1}
-"""By group, how many times a force or torque is integrated to change it; 0 for other groups."""
+"""Group of channels -> how many times a force or torque is integrated to give it; others: 0."""
 LEAST_ROWS = 30
-"""Least number of rows of a window to estimate T."""
+"""Smallest number of rows of a window from which T is estimated."""
 
 
 class Noise(NamedTuple):
@@ -41,32 +43,32 @@ class Noise(NamedTuple):
     sigma: np.ndarray
     """(19,) standard deviation of each channel in its unit; NaN where nothing was measured."""
     coloured: dict[str, tuple[float, float]]
-    """By group of channels with autocorrelated noise: its share of the variance, and its
-    correlation time T [s]."""
+    """Group of channels with autocorrelated noise -> (share of its variance that is autocorrelated,
+    correlation time T [s])."""
 
 
 class _Stretches(NamedTuple):
-    """N rows of a group of C channels in V windows, at about the same times in all."""
+    """N rows of a group of C channels in V windows, at about the same times in all windows."""
 
     time_s: np.ndarray
-    """(N,) [s]."""
+    """(N,) times of the rows in a window [s]."""
     values: np.ndarray
     """(N, V * C) residuals."""
     powers: np.ndarray
-    """(N, P) polynomial that is subtracted."""
+    """(N, P) terms of the polynomial that is subtracted."""
     drift: np.ndarray
-    """(N, N) covariance of the model's error, for a variance of 1 after a second."""
+    """(N, N) covariance of the model's accumulated error, scaled to a variance of 1 after 1 s."""
 
 
 class _Process(NamedTuple):
-    """Noise of unit variance, and the model's error."""
+    """Parameters of noise with a variance of 1, and of the model's error."""
 
     share: float
     """Share of the noise's variance that is autocorrelated."""
     lasts_s: float
     """Correlation time T [s]."""
     drift: float
-    """Variance of the model's error after a second."""
+    """Variance of the model's error after a second, over the variance of the noise."""
 
 
 def measured_noise(
@@ -75,13 +77,13 @@ def measured_noise(
     windows: FlightWindows,
     limits: Thresholds = THRESHOLDS,
 ) -> Noise:
-    """Return the measurement noise in residuals.
+    """Estimate the measurement noise from residuals.
 
     Args:
         residual: (W, N, 19) measured - simulated.
-        start_slope: (W, N, 19, F) of the simulated values along each window's start state.
+        start_slope: (W, N, 19, F) derivative of the simulated values by each window's start state.
         windows: W stretches of 1 s.
-        limits: least gain in likelihood by autocorrelated noise.
+        limits: the gain in likelihood that autocorrelated noise needs, among others.
     """
     sigma = noise_of(residual, windows, limits=limits)
     residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
@@ -90,6 +92,7 @@ def measured_noise(
     fits = {name: _fit_by_time(stretches, limits) for name, stretches in groups.items()}
     gains = np.sum([[gain for _, gain in by_time] for by_time in fits.values()], axis=0)
     coloured = {}
+    # All groups share one T. Without a clear gain by it, the noise is white.
     for name in groups if np.max(gains) >= limits.colour_gain else ():
         process, _ = fits[name][int(gains.argmax())]
         energy, freedom, _ = _without_polynomial(groups[name], process)
@@ -104,10 +107,10 @@ def residual_as_noise(
     windows: FlightWindows,
     limits: Thresholds = THRESHOLDS,
 ) -> Noise:
-    """Return the noise if the whole residual counts as noise, the model's error included.
+    """Return the noise if the whole residual counts as noise, including the model's error.
 
-    Where the best model is off by more than noise, this bounds the bias of fitted numbers. The
-    arguments are those of `measured_noise`.
+    It is used where even the best model does not fit: intervals then allow for the bias that the
+    wrong model causes. The arguments are those of `measured_noise`.
     """
     sigma = noise_of(residual, windows, limits=limits)
     residual = _without_start(residual, start_slope, np.where(windows.valid, 1.0 / sigma, 0.0))
@@ -127,7 +130,8 @@ def residual_as_noise(
 def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray:
     """Return matrices (W, N, N) that make the rows of the group `name` independent.
 
-    They are applied to rows over their standard deviation. Rows without a value are unchanged.
+    They are applied to rows that are divided by their standard deviation. Rows without a value are
+    unchanged.
     """
     valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
     correlation = _correlation(np.asarray(windows.row_s), *noise.coloured[name])
@@ -139,15 +143,18 @@ def colour_filter(noise: Noise, name: str, windows: FlightWindows) -> np.ndarray
 
 
 def _correlation(time_s: np.ndarray, share: float, lasts_s: float) -> np.ndarray:
-    """Return the correlation (..., N, N) of noise at times (..., N)."""
+    """Return the correlation (..., N, N) of noise at the times `time_s` (..., N).
+
+    `share` of the variance is autocorrelated, with the correlation time `lasts_s` [s].
+    """
     lag_s = np.abs(time_s[..., :, None] - time_s[..., None, :])
     return (1.0 - share) * np.eye(time_s.shape[-1]) + share * np.exp(-lag_s / lasts_s)
 
 
 def _without_start(residual: np.ndarray, slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return `residual` (W, N, 19) less the best fit of an error of each window's start state.
+    """Return `residual` (W, N, 19) without what an error of each window's start state explains.
 
-    `slope` (W, N, 19, F) is along the start state, and `weight` (W, N, 19) is 1 / noise.
+    `slope` (W, N, 19, F) is the derivative by the start state, and `weight` (W, N, 19) 1 / noise.
     """
     rows = (slope * np.nan_to_num(weight)[..., None]).reshape(len(slope), -1, slope.shape[-1])
     white = (residual * np.nan_to_num(weight)).reshape(len(slope), -1, 1)
@@ -165,7 +172,7 @@ def _all_stretches(
     names: Iterable[str],
     limits: Thresholds,
 ) -> dict[str, _Stretches]:
-    """Return the stretches of those groups of channels in `names` with enough measurements."""
+    """Return the stretches by group of channels, of those in `names` with enough measurements."""
     groups = {}
     for name in names:
         if np.isfinite(sigma[SLICES[name]]).all():
@@ -178,19 +185,24 @@ def _all_stretches(
 def _stretches(
     values: np.ndarray, windows: FlightWindows, name: str, limits: Thresholds
 ) -> _Stretches | None:
-    """Return the rows of `values` (W, N, C) of the group `name`; None with too few rows."""
+    """Return the stretches of `values` (W, N, C), residuals of the group of channels `name`.
+
+    None with too few rows. All stretches get the same number of rows: that which nine of ten usable
+    windows have.
+    """
     valid = np.asarray(np.all(windows.valid[..., SLICES[name]], axis=-1))
     count = valid.sum(axis=1)
     if not len(count) or count.max() < LEAST_ROWS:
         return None
     rows = int(np.quantile(count[count >= LEAST_ROWS], 0.1))
     chosen = np.flatnonzero(count >= rows)
-    first = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
-    times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first, axis=1)
+    first_rows = np.argsort(~valid[chosen], axis=1, kind="stable")[:, :rows]
+    times_s = np.take_along_axis(np.asarray(windows.row_s)[chosen], first_rows, axis=1)
     time_s = np.median(times_s, axis=0)
-    # A lost row or jitter shifts rows by little, and the correlation is the same; a hole does not.
-    near = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
-    stacked = np.take_along_axis(values[chosen], first[..., None], axis=1)[near]
+    # Windows with a lost row or jitter stay, since their times differ little from the median times.
+    # Windows with a hole are left out.
+    alike = np.abs(times_s - time_s).max(axis=1) <= limits.colour_aside * np.diff(time_s).mean()
+    stacked = np.take_along_axis(values[chosen], first_rows[..., None], axis=1)[alike]
     if not len(stacked):
         return None
     time = (time_s - time_s.mean()) / (time_s[-1] - time_s[0])
@@ -203,7 +215,10 @@ def _stretches(
 
 
 def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
-    """Return the covariance (N, N) of white noise integrated 0, 1 or 2 times, 1 after a second."""
+    """Return the covariance (N, N) of white noise that is integrated once or twice; else zeros.
+
+    The variance after a second is 1.
+    """
     early, late = np.minimum.outer(time_s, time_s), np.maximum.outer(time_s, time_s)
     if integrations == 2:
         return 0.5 * early**2 * (3.0 * late - early)
@@ -213,7 +228,9 @@ def _drift_covariance(time_s: np.ndarray, integrations: int) -> np.ndarray:
 def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.ndarray, int, float]:
     """Return the energy (V * C,) without the polynomial, its freedom, and half a log-determinant.
 
-    Rows are whitened by `process` first.
+    The energy is the sum of squares of each column after rows are whitened by `process` and the
+    polynomial is subtracted. The freedom is its number of independent rows, and the log-determinant
+    a term of the restricted likelihood.
     """
     correlation = _correlation(stretches.time_s, process.share, process.lasts_s)
     lower = np.linalg.cholesky(correlation + process.drift * stretches.drift)
@@ -230,7 +247,7 @@ def _without_polynomial(stretches: _Stretches, process: _Process) -> tuple[np.nd
 def _likelihood(stretches: _Stretches, process: _Process) -> float:
     """Return the restricted log-likelihood of `process`.
 
-    Every stretch has its own noise variance, so that a few bad ones do not dominate.
+    Every stretch has a noise variance of its own, so that a few bad stretches do not dominate.
     """
     energy, freedom, half_log_det = _without_polynomial(stretches, process)
     size = 0.5 * freedom * np.log(np.maximum(energy, 1e-300))
@@ -240,9 +257,10 @@ def _likelihood(stretches: _Stretches, process: _Process) -> float:
 def _fit_by_time(
     stretches: _Stretches, limits: Thresholds, times_s: Sequence[float] = TIMES_S
 ) -> list[tuple[_Process, float]]:
-    """Return for each of `times_s` the most likely process, and its gain over white noise.
+    """Return for each T in `times_s` the most likely process, and its gain over white noise.
 
-    A drift (an error of the model) needs a clearly higher likelihood than noise alone.
+    The gain is a difference of log-likelihoods. A process with a drift (an error of the model) is
+    chosen only if its likelihood is clearly higher than without it.
     """
 
     def score(process: _Process) -> float:

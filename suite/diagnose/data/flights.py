@@ -1,10 +1,11 @@
 """Prepares flights for the views: fills missing signals, smooths, splits off held-out flights.
 
-Missing signals of a partial log follow from others. Rates are derived from the attitude. Without an
-attitude, the body's z axis is along the path's acceleration less gravity, since thrust is along
-body z and nearly all of the force in slow flight (differential flatness; Mellinger and Kumar 2011);
-yaw is set to 0. A force across the thrust is not identifiable then, and rates only as means over 1
-s.
+A view is a part of the dynamics that a log allows to test alone: here the force or the torque. A
+partial log lacks a required signal, which is then derived from others. Rates are derived from the
+attitude. A missing attitude is derived from the path: thrust is along body z, and in slow flight it
+is nearly all of the force, so body z is along the acceleration minus gravity (differential
+flatness; Mellinger and Kumar 2011). Yaw is set to 0. From such an attitude, forces across the
+thrust are not identifiable, and rates only as means over 1 s.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from suite.diagnose.verdict.actuators import wrench_difference
 from tracks.geometry.rotation import rot_to_quat
 
 SLOW_WIDTH_S = 1.0
-"""Width of the bumps where rates come from a path, which gives them as means over a second [s]."""
+"""Width of the bumps (smooth weights over time) where rates come from a path, which shows them only
+as means over a second [s]."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +54,19 @@ class ViewFlights:
     """Flights, ready for the views that all of them allow."""
 
     views: tuple[View, ...]
-    """What all of them allow."""
+    """The views that all flights allow."""
     names: tuple[str, ...]
-    """Of F flights."""
+    """Names of the F flights."""
     smoothed: dict[str, list[SmoothedFlight]]
-    """By view, F each."""
+    """The F flights with their mean accelerations, by name of the view."""
     floor: dict[str, np.ndarray]
-    """By view: noise (3,) of a mean acceleration, from the noise of velocity or rates."""
+    """(3,) noise of a mean acceleration, by name of the view; from that of velocity or rates."""
     source: str
     """Where the rotor speeds come from, in words."""
     kept: tuple[int, ...] = ()
-    """Numbers of the logs that these flights are of; others have no stretch."""
+    """Numbers of the logs from which these flights are. The other logs have no usable stretch."""
     notes: tuple[str, ...] = ()
-    """What was left out, in words."""
+    """What was left out and why, in words."""
 
 
 def ready(
@@ -73,12 +75,14 @@ def ready(
     limits: Thresholds = THRESHOLDS,
     others: Sequence[FlightLog] = (),
 ) -> ViewFlights:
-    """Return those of `logs` that have a stretch, for the views that all of them allow.
+    """Return those of `logs` that have a usable stretch, for the views that all of them allow.
 
-    `others` are flights that these are compared with: axes and means are what they allow too.
+    `others` are flights with which these are compared. Axes and widths of the views are then those
+    that the signals of both allow.
 
     Raises:
-        ValueError: where a log has nothing that turns or pushes, or none has a stretch.
+        ValueError: if rotor speeds of a log are unknown, if the logs allow no view, or if no log
+            has a usable stretch.
     """
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
@@ -86,18 +90,20 @@ def ready(
         if one is None:
             needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
             raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
-    acting = [one for one in rotors if one is not None]
-    whole = [on_every_row(completed(log), limits) for log in posed(logs)]
+    known_rotors = [one for one in rotors if one is not None]
+    filled = [on_every_row(completed(log), limits) for log in posed(logs)]
     rows = [
-        rows_of(log, vehicle, one.speed, limits) for log, one in zip(whole, acting, strict=True)
+        rows_of(log, vehicle, one.speed, limits)
+        for log, one in zip(filled, known_rotors, strict=True)
     ]
+    # Choose the views, with the axes and widths that the available signals allow.
     inertial = [is_inertial(log) for log in logs]
     views = [SPECIFIC if all(inertial) else FORCE]
     if any("pos" in log.partial and not own for log, own in zip(logs, inertial, strict=True)):
         views = []
     elif any("quat" in log.partial and not is_inertial(log) for log in (*logs, *others)):
         views = [replace(views[0], axes=(2,))]
-    if all(one.each for one in acting):
+    if all(one.each for one in known_rotors):
         slow = any({"quat", "rate"} <= set(log.partial) for log in (*logs, *others))
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
     if not views:
@@ -110,8 +116,9 @@ def ready(
     if TORQUE.name in parts:
         parts[TORQUE.name] = [
             _calibrated(flight, one, vehicle)
-            for flight, one in zip(parts[TORQUE.name], acting, strict=True)
+            for flight, one in zip(parts[TORQUE.name], known_rotors, strict=True)
         ]
+    # Leave out flights without a usable stretch, and a second view that some flight does not allow.
     kept = [k for k, flight in enumerate(parts[main.name]) if len(flight.form.middle_s)]
     without = f"no stretch of {main.width_s:g} s in flight without a hole"
     if not kept:
@@ -135,13 +142,14 @@ def ready(
         tuple(logs[k].name for k in kept),
         parts,
         {view.name: _floor(view, parts[view.name]) for view in views},
-        acting[0].source,
+        known_rotors[0].source,
         tuple(kept),
         tuple(notes),
     )
 
 
 def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) -> SmoothedFlight:
+    """Return `flight` corrected for noise of the rotor speeds and for torque between rows."""
     if rotors.noise is None:
         return flight
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
@@ -156,49 +164,53 @@ def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) 
 def parted(
     flights: ViewFlights, held: Sequence[int], limits: Thresholds = THRESHOLDS
 ) -> tuple[dict[str, list[SmoothedFlight]], dict[str, list[SmoothedFlight]]]:
-    """Return the fitted and the `held` flights by view; a lone flight is split in time.
+    """Return the fitted flights and the `held` out ones, each by view; split a single one in time.
+
+    `held` are numbers of flights.
 
     Raises:
-        ValueError: for a lone flight that is too short to part.
+        ValueError: for a single flight that is too short to be split.
     """
     count = len(flights.names)
     if count > 1:
-        inside = [k for k in range(count) if k not in held]
+        inside = [number for number in range(count) if number not in held]
         return (
-            {name: [part[k] for k in inside] for name, part in flights.smoothed.items()},
-            {name: [part[k] for k in held] for name, part in flights.smoothed.items()},
+            {name: [part[number] for number in inside] for name, part in flights.smoothed.items()},
+            {name: [part[number] for number in held] for name, part in flights.smoothed.items()},
         )
-    first, last = {}, {}
-    # Of what was flown: a log may begin or end on the ground.
+    fitted_part, held_part = {}, {}
+    # The share is of the time in flight, since a log may begin or end on the ground.
     flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
     until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
-        whole = flights.smoothed[view.name][0]
-        rows, reliability = whole.rows, whole.reliability
+        single = flights.smoothed[view.name][0]
+        rows, reliability = single.rows, single.reliability
         early = rows.time_s <= until_s
-        for part, chosen in ((first, early), (last, ~early)):
-            some = smoothed(view, _only(rows, chosen), limits)
-            if not len(some.form.middle_s):
+        for part, chosen in ((fitted_part, early), (held_part, ~early)):
+            split = smoothed(view, _only(rows, chosen), limits)
+            if not len(split.form.middle_s):
                 raise ValueError(
                     f"{flights.names[0]}: too short to hold a part of it out; fly longer"
                 )
-            part[view.name] = [some._replace(reliability=reliability)]
-    return first, last
+            part[view.name] = [split._replace(reliability=reliability)]
+    return fitted_part, held_part
 
 
 def _only(rows: FlightRows, chosen: np.ndarray) -> FlightRows:
+    """Return `rows`, of which only those `chosen` (N,) bool can be used."""
     return rows._replace(good=np.asarray(rows.good) & chosen)
 
 
 def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
-    """Return the noise (3,) of the measured accelerations, by that of neighbouring rows."""
+    """Return the noise (3,) of the mean accelerations, from differences of neighbouring rows."""
     power = []
     for flight in flights:
         imu_acc_w = flight.rows.imu_acc_w if view.in_world else None
         path = flight.rows.vel_w if view.in_world else flight.rows.rate_b
         series = np.asarray(path if imu_acc_w is None else imu_acc_w)[np.asarray(flight.rows.good)]
         bend = series[2:] - 2.0 * series[1:-1] + series[:-2]
-        # The median ignores the occasional steps of a filter or an estimator.
+        # The median ignores the occasional steps of a filter or an estimator. It is 0.6745 standard
+        # deviations of a normal variable; a second difference has 6 times the variance of a row.
         sigma = np.median(np.abs(bend), axis=0) / 0.6745 / np.sqrt(6.0)
         weights = flight.form.change if imu_acc_w is None else flight.form.mean
         gain = weights.power(2).sum(axis=1).mean()
@@ -208,14 +220,14 @@ def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
 
 
 SMOOTH_S = 0.1
-"""Standard deviation of what smooths the path's acceleration [s]."""
+"""Standard deviation of the Gaussian that smooths the velocity before it is differentiated [s]."""
 
 
 def completed(log: FlightLog) -> FlightLog:
     """Return `log` with a missing attitude from its path, and missing rates from the attitude.
 
-    A flight without position and accelerometer gets a constant pose: only its rotation is used. See
-    `posed` for flights with an accelerometer.
+    A flight without position gets a constant pose, as only its rotation is used; see `posed` for
+    flights with an accelerometer.
 
     Raises:
         ValueError: for a log without positions and without rates.
@@ -235,7 +247,7 @@ def completed(log: FlightLog) -> FlightLog:
 
 
 def leaning(log: FlightLog) -> np.ndarray:
-    """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration less gravity."""
+    """Return attitudes (N, 3, 3) whose z axis is along the path's acceleration minus gravity."""
     step = float(np.median(np.diff(log.time_s)))
     if not np.isfinite(log.vel_w).any(axis=0).all():
         raise ValueError(f"{log.name}: no velocity and no positions to derive it from")
@@ -249,13 +261,13 @@ def leaning(log: FlightLog) -> np.ndarray:
 
 
 def turning_of(time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
-    """Return the body rates (T, 3) of attitudes (T, 4), by each row's neighbours [rad/s].
+    """Return the body rates (T, 3) of attitudes (T, 4), from each row's two neighbours [rad/s].
 
-    NaN where one of them is missing, and in the first and the last row.
+    NaN where a neighbour is missing, and so in the first and the last row.
     """
     rate_b = np.full((len(quat_wxyz), 3), np.nan)
-    whole = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
-    rows = 1 + np.flatnonzero(whole[:-2] & whole[2:])
+    complete = np.asarray(np.isfinite(quat_wxyz).all(axis=1))
+    rows = 1 + np.flatnonzero(complete[:-2] & complete[2:])
     if len(rows):
         before, after = (
             Rotation.from_quat(quat_wxyz[rows + d], scalar_first=True) for d in (-1, 1)
@@ -272,27 +284,29 @@ def choose_held_out(
     information: np.ndarray,
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[np.ndarray, list[str]]:
-    """Return which windows are fitted, (W,) bool, and the names of what is held out.
+    """Return for each window (W,) whether it is fitted, and the names of the held-out flights.
 
-    `flight` (W,) is the number of each window's flight, `start_s` (W,) when it starts there.
+    `flight` (W,) is the number of each window's flight, `start_s` (W,) the window's start in it.
+    `information` (W, K) is the information of each window on each of K parameters.
 
-    The flights are held out whose `information` (W, K), of each window on each number, the others
-    contain best. Only the manoeuvres decide, not the errors: a single chirp or the only pass near
-    the ground is fitted.
+    Held out are the flights whose information the others contain, too. So a flight with the only
+    chirp (a command of rising frequency) or the only pass near the ground is fitted. The choice
+    does not depend on the errors. Of a single flight, the end is held out.
     """
     flight = np.asarray(flight)
-    there = list(np.unique(flight))
-    if len(there) == 1:
-        log = logs[int(there[0])]
+    numbers = list(np.unique(flight))
+    if len(numbers) == 1:
+        log = logs[int(numbers[0])]
         cut_s = limits.lone_fitted_share * log.duration_s
         return np.asarray(start_s) + LENGTH_S <= cut_s, [f"{log.name} from {cut_s:.1f} s"]
-    by_flight = {k: information[flight == k].sum(axis=0) for k in there}
+    by_flight = {k: information[flight == k].sum(axis=0) for k in numbers}
     held: list[int] = []
-    for _ in range(max(1, round(limits.held_out_share * len(there)))):
-        kept = [k for k in there if k not in held]
-        whole = np.sum([by_flight[k] for k in kept], axis=0)
-        seen = whole > 0.0
-        lost = {k: (by_flight[k][seen] / whole[seen]).max(initial=0.0) for k in kept}
+    for _ in range(max(1, round(limits.held_out_share * len(numbers)))):
+        kept = [k for k in numbers if k not in held]
+        total = np.sum([by_flight[k] for k in kept], axis=0)
+        informed = total > 0.0
+        # The largest share of the information on any parameter that is lost without the flight.
+        lost = {k: (by_flight[k][informed] / total[informed]).max(initial=0.0) for k in kept}
         held.append(min(reversed(kept), key=lambda k: lost[k]))
     return ~np.isin(flight, held), [logs[int(k)].name for k in sorted(held)]
 
@@ -301,22 +315,23 @@ class ActingRotors(NamedTuple):
     """Rotor speeds of a log."""
 
     speed: np.ndarray
-    """(N, 4) [rad/s]."""
+    """(N, 4) rotor speeds, measured or from commands [rad/s]."""
     source: str
-    """For people."""
+    """Where the speeds come from, for people."""
     each: bool
-    """Whether each rotor's speed is known; a collective thrust gives only their sum."""
+    """Whether the speed of each rotor is known. From a collective thrust only the sum is known."""
     noise: np.ndarray | None = None
-    """(N, 4) simulated noise of the same size [rad/s]; None where speeds were not measured."""
+    """(N, 4) simulated noise of the same size as that of the measured speeds [rad/s]; None if the
+    speeds were not measured."""
 
 
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
 ) -> ActingRotors | None:
-    """Return the rotor speeds of `log`, measured or from commands; None where neither is there.
+    """Return the rotor speeds of `log`, measured or from commands; None where it has neither.
 
-    They are interpolated to every row, but not across holes. Commanded speeds pass through the
-    vehicle's delay and lag.
+    They are interpolated to every row, but not across holes (long times without a value). Commanded
+    speeds pass through the vehicle's delay and rotor lag.
     """
     noise = None
     if log.rotor_speed is not None:
@@ -346,18 +361,22 @@ def acting_rotors(
 
 
 def _lagged(log: FlightLog, vehicle: Vehicle, wanted: np.ndarray) -> np.ndarray:
-    """Return commanded speeds `wanted` (N, 4), held until the next row, behind delay and lag."""
+    """Return the rotor speeds (N, 4) that follow commanded ones `wanted` (N, 4).
+
+    A command is held until the next row. It acts after the vehicle's delay, and the speeds follow
+    with a first-order lag. They are NaN where the command is.
+    """
     constants = make_plant(vehicle, LONGEST_S).constants
-    since = log.time_s - float(constants.delay)
-    row = np.searchsorted(log.time_s, since + 1e-9, side="right") - 1
-    wanted = wanted[np.maximum(row, 0)]  # with its gaps
+    command_time_s = log.time_s - float(constants.delay)
+    row = np.searchsorted(log.time_s, command_time_s + 1e-9, side="right") - 1
+    wanted = wanted[np.maximum(row, 0)]  # NaN in holes stay NaN
     lag = float(constants.time_constant)
     if lag <= 0.0:
         return wanted
-    left = np.exp(-np.diff(log.time_s) / lag)[:, None]
+    remaining_share = np.exp(-np.diff(log.time_s) / lag)[:, None]
     speed = wanted.copy()
     for row in range(1, len(wanted)):
-        before = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
-        target = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], before)
-        speed[row] = target + left[row - 1] * (before - target)
+        last_speed = np.where(np.isfinite(speed[row - 1]), speed[row - 1], wanted[row])
+        target = np.where(np.isfinite(wanted[row - 1]), wanted[row - 1], last_speed)
+        speed[row] = target + remaining_share[row - 1] * (last_speed - target)
     return np.where(np.isfinite(wanted), speed, np.nan)

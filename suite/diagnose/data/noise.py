@@ -1,6 +1,7 @@
-"""Estimates each channel's measurement noise from residuals that change too fast for a model.
+"""Estimates the measurement noise of each channel from the fast part of its residuals.
 
-A polynomial is subtracted from a few consecutive rows at a time; the remainder is noise.
+A model's error is smooth, noise is not. So a polynomial is subtracted from a few consecutive rows
+at a time, and the remainder is noise.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 def rotor_noise(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return an upper limit of the noise of measured rotor speeds that are an input [rad/s].
 
-    There are no residuals, so a cubic over few rows is subtracted from the speeds themselves: their
-    true changes within 30 ms count as noise.
+    An input has no residuals, so the polynomial is subtracted from the speeds themselves. True
+    changes of the speeds that are too fast for it count as noise; hence an upper limit.
     """
     rotors = SLICES["rotor speed"]
     speeds = np.zeros(np.asarray(windows.valid).shape)
@@ -40,23 +41,24 @@ def noise_of(
     Args:
         residual: (W, N, 19) measured - simulated.
         windows: W stretches of 1 s.
-        rows_together: rows of a channel from which one polynomial is subtracted; by default
-            `limits.noise_rows`, or all rows of a window where it has fewer.
-        limits: degree of the polynomial, and least noise.
+        rows_together: number of rows of a channel from which one polynomial is subtracted; by
+            default `limits.noise_rows`, or all rows of a window with fewer rows.
+        limits: degree of the polynomial, and lower limit of the noise.
     """
-    block, degree = rows_together or limits.noise_rows, limits.noise_degree
+    block_rows, degree = rows_together or limits.noise_rows, limits.noise_degree
     power: list[list[float]] = [[] for _ in range(CHANNELS)]
     freedom: list[list[int]] = [[] for _ in range(CHANNELS)]
     valid = np.asarray(windows.valid)
+    # For each window, and each set of channels that were measured in the same rows.
     for w in range(len(residual)):
-        for mask in {column.tobytes() for column in valid[w].T}:  # channels with the same rows
-            own = np.flatnonzero(np.frombuffer(mask, dtype=bool))
+        for mask in {column.tobytes() for column in valid[w].T}:
+            channel_rows = np.flatnonzero(np.frombuffer(mask, dtype=bool))
             channels = [c for c in range(CHANNELS) if valid[w, :, c].tobytes() == mask]
-            count = min(block, len(own))
+            count = min(block_rows, len(channel_rows))
             if count < degree + 4:
                 continue
-            for first in range(0, len(own) - count + 1, count):
-                rows = own[first : first + count]
+            for begin in range(0, len(channel_rows) - count + 1, count):
+                rows = channel_rows[begin : begin + count]
                 values = residual[w, rows][:, channels]
                 basis = np.linalg.qr(_powers(np.asarray(windows.row_s)[w, rows], degree))[0]
                 remainder = values - basis @ (basis.T @ values)
@@ -66,42 +68,47 @@ def noise_of(
     sigma = np.full(CHANNELS, np.nan)
     for c in range(CHANNELS):
         if power[c]:
-            n = np.array(freedom[c])
-            sigma[c] = np.sqrt(typical_variance(np.array(power[c]), n))
+            freedoms = np.array(freedom[c])
+            sigma[c] = np.sqrt(typical_variance(np.array(power[c]), freedoms))
         elif valid[..., c].any():
             sigma[c] = np.sqrt((residual[..., c][valid[..., c]] ** 2).mean())
     return at_least(sigma, limits)
 
 
 def at_least(sigma: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return noise `sigma` (19,), raised to that of rounding and of the model's time steps."""
+    """Return the noise `sigma` (19,), raised to a lower limit by rounding and the model's steps."""
     return np.maximum(sigma, np.repeat(limits.least_noise, [3, 3, 3, 3, 3, 4]))
 
 
 def typical_variance(energy: np.ndarray, freedom: np.ndarray | int) -> np.ndarray:
     """Return the variance of noise from the `energy` (V, ...) of blocks with `freedom` each.
 
-    It follows from the median, so that a few bad blocks do not matter: the median of chi-square
-    with n degrees of freedom, over n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
+    The energy is a sum of squares, and `freedom` its degrees of freedom. The variance follows from
+    the median over blocks, so that a few bad blocks do not matter. The median of chi-square with n
+    degrees of freedom, divided by n, is (1 - 2 / 9n)^3 (Wilson and Hilferty 1931).
     """
     return np.median(energy / freedom / (1.0 - 2.0 / (9.0 * freedom)) ** 3, axis=0)
 
 
 def noise_like(speed: np.ndarray, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return simulated noise (T, R) of the same size as that in the rotor speeds `speed` (T, R).
+    """Return simulated noise (T, R) of the same size as the noise of rotor speeds `speed` (T, R).
 
-    It shows the effect of the real noise on sums over rows. The noise is the remainder of a cubic
-    over a few of a rotor's own rows; zero with too few rows, and NaN where the speed is NaN.
+    With it the effect of the real noise on sums over rows is estimated. The size of a rotor's noise
+    follows from the remainder of a polynomial over a few of its rows. It is zero with too few rows,
+    and NaN where the speed is NaN.
     """
     draw = np.random.default_rng(0).standard_normal(speed.shape)
-    out = np.full(speed.shape, np.nan)
+    noise = np.full(speed.shape, np.nan)
     for k, column in enumerate(speed.T):
-        own = np.flatnonzero(np.isfinite(column))
-        out[own, k] = _rotor_sigma(column[own], limits) * draw[: len(own), k]
-    return out
+        measured_rows = np.flatnonzero(np.isfinite(column))
+        noise[measured_rows, k] = (
+            _rotor_sigma(column[measured_rows], limits) * draw[: len(measured_rows), k]
+        )
+    return noise
 
 
 def _rotor_sigma(speed: np.ndarray, limits: Thresholds) -> float:
+    """Return the standard deviation of the noise of one rotor's `speed` (T,); 0 with few rows."""
     block, degree = limits.rotor_noise_rows, limits.noise_degree
     blocks = speed[: len(speed) // block * block].reshape(-1, block)
     if not len(blocks):
@@ -112,5 +119,6 @@ def _rotor_sigma(speed: np.ndarray, limits: Thresholds) -> float:
 
 
 def _powers(time_s: np.ndarray, degree: int) -> np.ndarray:
+    """Return the powers (N, degree + 1) of scaled times, the terms of a polynomial."""
     span = max(float(time_s[-1] - time_s[0]), 1e-9)
     return np.vander((time_s - time_s.mean()) / span, degree + 1)

@@ -1,8 +1,9 @@
 """Resamples signals of different sampling rates on common rows and at other times.
 
 A log has one row for each time at which any of its signals was sampled, so a slow signal has no
-value in most rows. Between a signal's own rows, measurements are interpolated linearly, but not
-across holes (long times without a value), and commands are held.
+value (NaN) in most rows. A signal's own rows are those in which it has a value. Between them,
+measurements are interpolated linearly, and commands are held; neither across a hole, which is a
+long time without a value.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ HELD = ("thrust_cmd", "rate_cmd_b", "torque_cmd_b", "pwm", "rotor_speed_cmd")
 
 
 def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
-    """Return `log` with every signal on every row, but not across holes.
+    """Return `log` with a value of every signal in every row, except in holes.
 
-    A log whose signals share all rows is returned unchanged.
+    Each signal is interpolated or held, see `MEASURED` and `HELD`. A log whose signals have values
+    in all rows is returned unchanged.
     """
     filled = {}
     for name in (*MEASURED, *HELD):
@@ -47,9 +49,10 @@ def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
 def without_slow_rotors(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` without rotor speeds that are sampled too slowly, and notes on these logs.
+    """Return `logs` without rotor speeds that are sampled too slowly, and a note on each such log.
 
-    Between rows further apart than the longest hole the rotor speeds are unknown.
+    Too slow means that neighbouring rows are further apart than the longest allowed hole, so that
+    the rotor speeds between them are unknown.
     """
     usable, notes = [], []
     for log in logs:
@@ -67,11 +70,13 @@ def without_slow_rotors(
 def with_fewer_rows(
     logs: Sequence[FlightLog], limits: Thresholds = THRESHOLDS
 ) -> tuple[list[FlightLog], list[str]]:
-    """Return `logs` thinned to the largest number of rows, and a note if rows were left out.
+    """Return `logs` with at most `limits.most_rows` rows, and a note if rows were left out.
 
-    Every n-th value of each signal is used, as each signal may have other rows.
+    Of each signal every n-th value is used. The signals are thinned one by one, because each may
+    have values in other rows.
     """
     count = sum(len(log.time_s) for log in logs)
+    # -(-a // b) is a / b, rounded up.
     stride = -(-count // limits.most_rows)
     if stride <= 1:
         return list(logs), []
@@ -83,8 +88,10 @@ def with_fewer_rows(
             if values is None:
                 continue
             signals[name] = np.full_like(values, np.nan)
-            own = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(axis=1))[::stride]
-            signals[name][own] = values[own]
+            own_rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(axis=1))[
+                ::stride
+            ]
+            signals[name][own_rows] = values[own_rows]
         rows = np.zeros(len(log.time_s), bool)
         for values in signals.values():
             rows |= np.isfinite(values.reshape(len(rows), -1)).all(axis=1)
@@ -98,75 +105,83 @@ def with_fewer_rows(
 def own_spacing_s(time_s: np.ndarray, values: np.ndarray) -> float:
     """Return the median time [s] between the rows of the slowest column of `values` (T, K).
 
-    Infinite where a column has values in fewer than two rows.
+    It is infinite if a column has values in fewer than two rows.
     """
     rows = [time_s[np.isfinite(column)] for column in values.T]
     return max(float(np.median(np.diff(t))) if len(t) > 1 else np.inf for t in rows)
 
 
 def longest_gap_s(time_s: np.ndarray, since_s: float, until_s: float) -> float:
-    """Return the longest time [s] without a row between two times.
+    """Return the longest time [s] between neighbouring rows from `since_s` to `until_s`.
 
-    It is counted from the last of the rows `time_s` (T,) at or before `since_s` on.
+    `time_s` (T,) are the times of the rows. The row before `since_s` counts as the first one, and
+    the time after the last row counts up to `until_s`.
     """
-    first = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
-    rows_s = time_s[first : np.searchsorted(time_s, until_s + 1e-9)]
+    first_row = max(int(np.searchsorted(time_s, since_s + 1e-9)) - 1, 0)
+    rows_s = time_s[first_row : np.searchsorted(time_s, until_s + 1e-9)]
     if not len(rows_s):
         return np.inf
     return float(np.max(np.diff(rows_s, prepend=min(since_s, rows_s[0]), append=until_s)))
 
 
 def thinned(valid: np.ndarray, time_s: np.ndarray, most: int) -> np.ndarray:
-    """Return the indices of at most `most` rows that keep every signal as evenly as possible.
+    """Return the indices of at most `most` rows in which every signal is sampled evenly.
 
     Args:
-        valid: (N, K) bool: which of K signals each row has.
-        time_s: (N,) [s].
+        valid: (N, K) bool, whether each row has a value of each of K signals.
+        time_s: (N,) times of the rows [s].
         most: largest number of rows.
     """
     step = -(-len(valid) // most)
     if step <= 1 or (valid == valid[:1]).all():
         return np.arange(0, len(valid), step)
-    # Of each group of rows the one whose signals have gone longest without a row.
+    # Of each group of neighbouring rows, choose the one whose signals were not chosen for longest.
     last_s = np.full(valid.shape[1], time_s[0] - 1.0)
     chosen = []
-    for first in range(0, len(valid), step):
-        group = valid[first : first + step]
-        row = first + int((group * (time_s[first] - last_s + 1e-6)).sum(axis=1).argmax())
+    for begin in range(0, len(valid), step):
+        group = valid[begin : begin + step]
+        row = begin + int((group * (time_s[begin] - last_s + 1e-6)).sum(axis=1).argmax())
         last_s = np.where(valid[row], time_s[row], last_s)
         chosen.append(row)
     return np.array(chosen)
 
 
 def _filled(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -> np.ndarray:
-    """Return `column` (T,) held or interpolated between its own rows; NaN in and near holes."""
-    own = np.flatnonzero(np.isfinite(column))
-    if len(own) < 2:
+    """Return `column` (T,) with values between its own rows, but NaN in holes.
+
+    They are `held` or interpolated. Rows further apart than `hole_s` [s] are a hole.
+    """
+    own_rows = np.flatnonzero(np.isfinite(column))
+    if len(own_rows) < 2:
         return column
-    place = np.clip(np.searchsorted(own, np.arange(len(column)), side="right") - 1, 0, len(own) - 2)
-    before, after = own[place], own[place + 1]
+    interval = np.clip(
+        np.searchsorted(own_rows, np.arange(len(column)), side="right") - 1, 0, len(own_rows) - 2
+    )
+    before, after = own_rows[interval], own_rows[interval + 1]
     if held:
-        values = np.where(np.arange(len(column)) >= own[-1], column[own[-1]], column[before])
+        values = np.where(
+            np.arange(len(column)) >= own_rows[-1], column[own_rows[-1]], column[before]
+        )
     else:
-        values = np.interp(time_s, time_s[own], column[own])
-    inside = (time_s >= time_s[own[0]]) & (held | (time_s <= time_s[own[-1]]))
-    since_last_s = np.where(time_s >= time_s[own[-1]], time_s - time_s[own[-1]], 0.0)
-    near = (time_s[after] - time_s[before] <= hole_s) & (since_last_s <= hole_s)
-    return np.where(np.isfinite(column), column, np.where(inside & near, values, np.nan))
+        values = np.interp(time_s, time_s[own_rows], column[own_rows])
+    inside = (time_s >= time_s[own_rows[0]]) & (held | (time_s <= time_s[own_rows[-1]]))
+    since_last_s = np.where(time_s >= time_s[own_rows[-1]], time_s - time_s[own_rows[-1]], 0.0)
+    no_hole = (time_s[after] - time_s[before] <= hole_s) & (since_last_s <= hole_s)
+    return np.where(np.isfinite(column), column, np.where(inside & no_hole, values, np.nan))
 
 
 def sign_continuous(quat: np.ndarray) -> np.ndarray:
-    """Return quaternions (T, 4) with signs chosen so that neighbours do not jump; gaps are NaN."""
-    own = np.flatnonzero(np.isfinite(quat).all(axis=1))
-    out = quat.copy()
-    out[own] = continuous(quat[own])
-    return out
+    """Return quaternions (T, 4) with signs so that neighbours do not jump; rows with NaN stay."""
+    own_rows = np.flatnonzero(np.isfinite(quat).all(axis=1))
+    continued = quat.copy()
+    continued[own_rows] = continuous(quat[own_rows])
+    return continued
 
 
 def interpolate(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Return `series` (T, K) at times `at_s` (S,), linear between finite values.
+    """Return `series` (T, K) at the times `at_s` (S,), interpolated between finite values: (S, K).
 
-    A column without any finite value is 0.
+    `time_s` (T,) are the times of its rows. A column without any finite value becomes 0.
     """
     columns = []
     for column in series.T:
@@ -178,9 +193,9 @@ def interpolate(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.
 
 
 def hold(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Return the last finite row of `series` (T, K) at each of `at_s` (S,); NaN without any row.
+    """Return the last finite row of `series` (T, K) at each of the times `at_s` (S,): (S, K).
 
-    Before the first row that one is held.
+    Before the first finite row its value is used. Without any finite row the result is NaN.
     """
     finite = np.flatnonzero(np.isfinite(series).all(axis=1))
     if not len(finite):
@@ -190,20 +205,21 @@ def hold(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray
 
 
 def voltage_drop(log: FlightLog, at_s: np.ndarray) -> np.ndarray:
-    """Return the battery's first voltage less that at times `at_s` (S,), (S,) [V].
+    """Return by how much the battery voltage is below its first value, (S,) [V].
 
-    Zeros for a log without a voltage.
+    It is computed at the times `at_s` (S,), and is 0 for a log without a voltage.
     """
     if log.voltage is None or not np.isfinite(log.voltage).any():
         return np.zeros(len(at_s))
-    first = log.voltage[np.isfinite(log.voltage)][0]
-    return first - interpolate(at_s, log.time_s, log.voltage[:, None])[:, 0]
+    first_voltage = log.voltage[np.isfinite(log.voltage)][0]
+    return first_voltage - interpolate(at_s, log.time_s, log.voltage[:, None])[:, 0]
 
 
 def follow_lag(commanded: np.ndarray, dt: float, time_constant: float) -> np.ndarray:
-    """Return rotor speeds (S, 4) behind a first-order lag, at the end of each step of `dt` [s].
+    """Return the rotor speeds (S, 4) at the end of each time step, which follow `commanded` ones.
 
-    They begin at the `commanded` speeds (S, 4) of the first step.
+    They follow with a first-order lag of `time_constant` [s] and begin at the commanded speeds of
+    the first step. `dt` is the length of a step [s].
     """
     decay = np.exp(-dt / time_constant) if time_constant > 1e-6 else 0.0
     filtered, _ = lfilter([1.0 - decay], [1.0, -decay], commanded, axis=0, zi=decay * commanded[:1])

@@ -1,9 +1,10 @@
 """Places the model's time steps between the rows of a log, and computes its inputs on them.
 
-A command acts from the time of its row on, and the vehicle's rate loop starts its period there, so
-every step of the model lies between two rows. Within a step the loop samples about as often as the
-vehicle's own, or every `LONGEST_S` if that is longer, and predicts the rates over the difference.
-Where measured rotor speeds are the input, they are interpolated by the rotors' lag.
+A command acts from the time of its row on, and the vehicle's rate loop (which turns body rates into
+torques) starts its period at this time. So every step of the model lies between two rows. A sample
+of the loop is an evaluation with new rates. The model's loop samples about as often as that of the
+vehicle, but not more often than every `LONGEST_S`; it predicts the rates over the difference. Where
+measured rotor speeds are the input, they are interpolated with the rotors' lag (first-order delay).
 """
 
 from __future__ import annotations
@@ -21,23 +22,24 @@ from eval.quadrotor.stepper import wanted_speed
 from eval.vehicles.vehicle import Vehicle
 
 LONGEST_S = 0.002
-"""About the longest step [s]; the integrator's error over a second is then far below noise."""
+"""Approximate length of the longest step [s]. With it the integrator's error over a second is far
+below the noise."""
 LOST = 1.75
-"""Rows further apart than this multiple of the usual spacing have lost rows between them."""
+"""Between rows that are further apart than this multiple of the usual spacing, rows were lost."""
 
 LEAST_START_ERROR = 1e-3
 """Lower limit of the error of rotor speeds at a window's start [rad/s]."""
 
 
 def step_s(vehicle: Vehicle) -> float:
-    """Return about the length of a step [s]: the rate loop's period, at least 2 ms."""
+    """Return the approximate length of a step [s]: the rate loop's period, but at least 2 ms."""
     return max(1.0 / vehicle.controller.frequency, LONGEST_S)
 
 
 def has_firmware_loop(vehicle: Vehicle) -> bool:
-    """Return whether the rate loop is a firmware's, with integrators and filters.
+    """Return whether the vehicle has the rate loop of a firmware, with integrators and filters.
 
-    No log contains the state of these at the start of a window.
+    No log contains the state of integrators and filters at the start of a window.
     """
     return vehicle.controller.kind != NOMINAL
 
@@ -48,52 +50,57 @@ class StepGrid(NamedTuple):
     edge_s: np.ndarray
     """(T + 1,) ends of steps [s]."""
     sample_s: np.ndarray
-    """(T,) time from a sample of the rate loop to the next [s]; 0 where a step starts with none."""
+    """(T,) time until the rate loop's next sample [s]; 0 if the step starts without a sample."""
     lead_s: np.ndarray
-    """(T,) mean delay of the vehicle's samples after those of the steps [s]."""
+    """(T,) mean time by which the vehicle's samples are later than those of the model [s]."""
 
 
 def step_grid(row_s: np.ndarray, period_s: float, longest_s: float = LONGEST_S) -> StepGrid:
     """Return steps from the first to the last of `row_s` (R,), R >= 2.
 
     Args:
-        row_s: times at which commands may change [s], increasing.
-        period_s: of the rate loop, which restarts at each row.
-        longest_s: about the longest step.
+        row_s: (R,) times at which commands may change [s], increasing.
+        period_s: period of the vehicle's rate loop, which restarts at each row [s].
+        longest_s: approximate length of the longest step [s].
     """
     row_s = np.asarray(row_s, dtype=float)
     spacing = np.diff(row_s)
     edges = _step_rows(row_s, 0.75 * longest_s)
-    # The age of the rates that the vehicle's loop uses, integrated over each step between edges.
+    # The age of the rates that the vehicle's loop uses grows from 0 over each period. Here it is
+    # integrated over the time between two edges.
     periods = np.floor(spacing / period_s + 1e-6)
     remainder = np.maximum(spacing - periods * period_s, 0.0)
     age = np.add.reduceat(0.5 * (periods * period_s**2 + remainder**2), edges[:-1])
+    # Between two edges there are some samples of the model's loop, and some steps for each sample.
     length = np.diff(row_s[edges])
     samples = np.maximum(np.rint(length / max(period_s, longest_s)), 1).astype(int)
     hold_s = length / samples
     substeps = np.maximum(np.rint(hold_s / longest_s), 1).astype(int)
     count = samples * substeps
-    of_row = np.repeat(np.arange(len(count)), count)
-    number = np.arange(len(of_row)) - np.repeat(np.cumsum(count) - count, count)
-    edge_s = row_s[edges][of_row] + number * (length / count)[of_row]
+    interval = np.repeat(np.arange(len(count)), count)
+    step_number = np.arange(len(interval)) - np.repeat(np.cumsum(count) - count, count)
+    edge_s = row_s[edges][interval] + step_number * (length / count)[interval]
     lead_s = 0.5 * hold_s - age / length
     return StepGrid(
         np.append(edge_s, row_s[-1]),
-        np.where(number % substeps[of_row] == 0, hold_s[of_row], 0.0),
-        lead_s[of_row],
+        np.where(step_number % substeps[interval] == 0, hold_s[interval], 0.0),
+        lead_s[interval],
     )
 
 
 def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `time_s` (R,) and `command` (R, K) with lost rows interpolated linearly.
+    """Return `time_s` (R,) and `command` (R, K) with the lost rows, interpolated linearly.
 
-    The vehicle received a command at each lost row; holding the last known one would be too late.
+    The vehicle received a command at each lost row, too. If the last logged command were held
+    instead, changes would come too late.
     """
     spacing = np.diff(time_s)
     if not len(spacing):
         return time_s, command
-    usual = float(np.median(spacing))
-    missing = np.where(spacing > LOST * usual, np.rint(spacing / usual) - 1.0, 0.0).astype(int)
+    usual_spacing = float(np.median(spacing))
+    missing = np.where(
+        spacing > LOST * usual_spacing, np.rint(spacing / usual_spacing) - 1.0, 0.0
+    ).astype(int)
     if not missing.any():
         return time_s, command
     count = missing + 1
@@ -105,9 +112,10 @@ def with_lost_rows(time_s: np.ndarray, command: np.ndarray) -> tuple[np.ndarray,
 
 
 def integral_of_held(time_s: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Return the integral (K, 4) of a held `command` (K, 4) from the first of `time_s` (K,) on.
+    """Return the integral (K, 4) of `command` (K, 4) from the first time to each time.
 
-    Infinite times are padding, over which nothing is integrated.
+    `time_s` (K,) are the times; each command is held until the next one. Infinite times are padding
+    and add nothing.
     """
     finite = np.isfinite(time_s)
     span_s = np.diff(np.where(finite, time_s, time_s[finite].max()))
@@ -115,7 +123,7 @@ def integral_of_held(time_s: np.ndarray, command: np.ndarray) -> np.ndarray:
 
 
 def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
-    """Return `grid` padded to `count` steps with steps of zero length, which have no effect."""
+    """Return `grid` with `count` steps; the added ones have zero length, and so no effect."""
     missing = count - len(grid.sample_s)
     ends = (missing, 0) if at_front else (0, missing)
     return StepGrid(
@@ -126,7 +134,7 @@ def padded_grid(grid: StepGrid, count: int, at_front: bool = False) -> StepGrid:
 
 
 def _step_rows(row_s: np.ndarray, shortest_s: float) -> np.ndarray:
-    """Return the first row, the last, and those between that are `shortest_s` apart or more."""
+    """Return the indices of rows at least `shortest_s` apart, with the first and the last row."""
     if len(row_s) < 3 or np.diff(row_s).min() >= shortest_s:
         return np.arange(len(row_s))
     chosen = [0]
@@ -147,24 +155,27 @@ def rotors_at(
 ) -> np.ndarray:
     """Return measured rotor speeds (S, 4) at other times.
 
-    Between rows they follow the first-order response to a constant command. A firmware's loop
-    changes its commands all the time, by filtered derivatives of rates: there a spline is closer.
+    Between two rows they follow the first-order response to a constant command. A firmware's rate
+    loop changes its commands all the time, by filtered derivatives of rates. There a spline is more
+    accurate.
 
     Args:
-        at_s: (S,) [s].
-        time_s: (T,) of the log's rows [s].
-        speed: (T, 4) with NaN where a rotor was not measured [rad/s].
-        vehicle: whose rotor lag and kind of rate loop are used.
-        stride: use every so many of each rotor's own rows.
+        at_s: (S,) times of the result [s].
+        time_s: (T,) times of the log's rows [s].
+        speed: (T, 4) measured speeds, NaN where a rotor was not measured [rad/s].
+        vehicle: vehicle whose rotor lag and kind of rate loop are used.
+        stride: use every `stride`-th measured row of each rotor.
     """
     columns = []
     for column in speed.T:
-        own = np.flatnonzero(np.isfinite(column))[::stride]
+        own_rows = np.flatnonzero(np.isfinite(column))[::stride]
         if has_firmware_loop(vehicle):
-            columns.append(CubicSpline(time_s[own], column[own])(at_s))
+            columns.append(CubicSpline(time_s[own_rows], column[own_rows])(at_s))
             continue
-        row = np.clip(np.searchsorted(time_s[own], at_s, side="right") - 1, 0, len(own) - 2)
-        before, after = own[row], own[row + 1]
+        row = np.clip(
+            np.searchsorted(time_s[own_rows], at_s, side="right") - 1, 0, len(own_rows) - 2
+        )
+        before, after = own_rows[row], own_rows[row + 1]
         span_s, since_s = time_s[after] - time_s[before], at_s - time_s[before]
         lag_s = max(vehicle.rotors.time_constant, 1e-4)
         share = (1.0 - np.exp(-since_s / lag_s)) / (1.0 - np.exp(-span_s / lag_s))
@@ -175,12 +186,12 @@ def rotors_at(
 def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
     """Return the share (3,) of the rotors' torque that rows `step_s` [s] apart do not show.
 
-    A rate loop that samples more often than the log has rows commands less torque as the body
-    turns: the slope of an angular acceleration `a` falls by `gain * step * a / lag` from a row to
-    the next, and the trapezoidal rule misses `step / 12` of that fall (Euler and Maclaurin). Where
-    rows are further apart than the lag, rotors settle between them: without any lag half of the
-    fall is missed. The settings of a firmware's loop are not gains in 1/s; such a loop is assumed
-    to be as fast as the rotors.
+    A rate loop may sample more often than the log has rows. As the body turns, it commands less
+    torque: from one row to the next, the slope of an angular acceleration `a` falls by
+    `gain * step * a / lag`. An integral by the trapezoidal rule misses `step / 12` of that fall
+    (Euler and Maclaurin). If rows are further apart than the lag, the rotors settle between them;
+    without any lag half of the fall is missed. The settings of a firmware's loop are not gains in
+    1/s, so such a loop is assumed to be as fast as the rotors.
     """
     lag, loop = vehicle.rotors.time_constant, vehicle.controller
     if step_s <= 1.0 / loop.frequency:
@@ -191,17 +202,18 @@ def torque_between_rows(vehicle: Vehicle, step_s: float) -> np.ndarray:
 
 
 def rows_show_torque(vehicle: Vehicle, step_s: float) -> bool:
-    """Return whether rotor speeds `step_s` [s] apart are dense enough to interpolate.
+    """Return whether rotor speeds `step_s` [s] apart are dense enough to interpolate between them.
 
-    With a firmware's loop a smooth curve always is; else the lag has to be longer than the step.
+    With a firmware's loop, whose speeds are smooth, they always are. Else the lag must not be
+    shorter than `step_s`.
     """
     return vehicle.controller.kind != "p" or step_s <= vehicle.rotors.time_constant
 
 
 def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np.ndarray:
-    """Return rotor speeds (S, 4) with the torque that rows `step_s` [s] apart do not show.
+    """Return rotor speeds (S, 4) with the additional torque that rows `step_s` apart do not show.
 
-    They are unchanged where the rows are dense enough (see `rows_show_torque`).
+    The speeds are unchanged if the rows are dense enough (see `rows_show_torque`).
     """
     if rows_show_torque(vehicle, step_s):
         return speed
@@ -211,19 +223,19 @@ def with_hidden_torque(speed: np.ndarray, vehicle: Vehicle, step_s: float) -> np
 
 
 def rotor_mixer(vehicle: Vehicle) -> np.ndarray:
-    """Return the matrix (4, 4) from the rotors' thrusts [N] to collective thrust and torque_b."""
+    """Return the matrix (4, 4) from rotor thrusts [N] to collective thrust and body torques."""
     rotors = vehicle.rotors
     ratio = rotors.torque_coefficient / rotors.thrust_coefficient
     return mixer_matrix(np.array(rotors.position), np.array(rotors.spin), ratio)
 
 
 def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) -> float:
-    """Return the RMS error [rad/s] of rotor speeds that the rate loop gives at measured rates.
+    """Return the RMS error [rad/s] of the rotor speeds that the rate loop gives at measured rates.
 
-    The rates `rate_b` (N, 3) between rows are interpolated, which causes an error in the commanded
-    speeds. The interpolation error of every second row is measured at the row in the middle. That
-    between neighbouring rows is a quarter of it where rates are smooth, and about all of it where
-    they are noise: half is taken.
+    The rates `rate_b` (N, 3) are interpolated between rows, which causes an error of the commanded
+    speeds. To estimate it, each row is compared with the interpolation between the rows before and
+    after it. The error between neighbouring rows is smaller: a quarter of that if rates are smooth,
+    about all of it if they are noise. Half is used.
     """
     if len(time_s) < 3:
         return LEAST_START_ERROR
@@ -232,6 +244,7 @@ def start_rotor_error(time_s: np.ndarray, rate_b: np.ndarray, vehicle: Vehicle) 
     rate_error = rate_error[np.isfinite(rate_error).all(axis=1)]
     if not len(rate_error):
         return LEAST_START_ERROR
+    # From rates to commanded rotor speeds, by finite differences at hover.
     plant = make_plant(vehicle, LONGEST_S)
     hover = Command(np.full(4, GRAVITY), np.zeros((4, 3)))
     rates = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])

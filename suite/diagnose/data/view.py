@@ -1,9 +1,10 @@
 """Views: force or torque of a flight, as mean accelerations over short smooth windows (bumps).
 
-A view is one part of the dynamics, which is compared with the model while all other signals are as
-measured. Measured velocities and modelled accelerations are weighted by the same bumps w(t), which
-are zero at both ends. The mean of an acceleration is then -integral(w' v) / integral(w), so that
-measurements are never differentiated (modulating functions; Shinbrot 1957, Trans. ASME 79).
+A view is one part of the dynamics. It is compared with the model while all other signals are as
+measured. A bump w(t) is a weight over time that is zero at both ends. Means of modelled
+accelerations are weighted by w. Those of measured accelerations follow from the velocity v as
+-integral(w' v) / integral(w), so measurements are never differentiated (modulating functions;
+Shinbrot 1957, Trans. ASME 79). The means by all bumps of a flight are called its weak form.
 """
 
 from __future__ import annotations
@@ -25,29 +26,29 @@ from tracks.geometry.scene import Array
 
 
 class FlightRows(NamedTuple):
-    """N rows of one flight; where a signal is missing, it is filled in and the row not `good`."""
+    """N rows of one flight. A missing signal has a filled-in value, and its row is not `good`."""
 
     time_s: Array
-    """(N,) since the flight's first row [s]."""
+    """(N,) time from the first row of the flight [s]."""
     pos_w: Array
-    """(N, 3) [m]."""
+    """(N, 3) position [m]."""
     rot_w: Array
-    """(N, 3, 3) body to world."""
+    """(N, 3, 3) attitude, body to world."""
     vel_w: Array
-    """(N, 3) [m/s]."""
+    """(N, 3) velocity [m/s]."""
     rate_b: Array
-    """(N, 3) [rad/s]."""
+    """(N, 3) body rates [rad/s]."""
     rotor_speed: Array
-    """(N, 4) [rad/s]."""
+    """(N, 4) rotor speeds [rad/s]."""
     voltage_drop: Array
-    """(N,) battery voltage at the start less the present one [V]; zeros without a voltage."""
+    """(N,) fall of the battery voltage since its first value [V]; zeros without a voltage."""
     good: Array
-    """(N,) bool: which rows are in flight and have all signals."""
+    """(N,) bool, whether a row is in flight and has all signals."""
     imu_acc_w: Array | None = None
-    """(N, 3) acceleration by the accelerometer [m/s^2]; only in flights without a pose."""
+    """(N, 3) acceleration from the accelerometer [m/s^2]; only in flights without a pose."""
     pose_slope_b: Array | None = None
-    """(N, 3, K) change of the drag's acceleration by each uncertainty of such a flight's pose
-    [m/s^2]."""
+    """(N, 3, K) change of the drag's acceleration by one standard deviation of each of K unknown
+    numbers of the pose [m/s^2]; only in flights without a pose."""
 
     @property
     def vel_b(self) -> Array:
@@ -63,8 +64,8 @@ def rows_of(
 ) -> FlightRows:
     """Return the rows of `log` with rotor speeds `rotor_speed` (N, 4) [rad/s].
 
-    Rows at rest with too little thrust to fly are on the ground. They, and rows near them in time,
-    are not good.
+    A row is on the ground if the vehicle is at rest with too little thrust to fly. Such rows, and
+    rows near them in time, are not `good`.
     """
     rot_w = log.rot_w
     signals = (log.pos_w, log.vel_w, log.rate_b, rotor_speed)
@@ -96,7 +97,7 @@ def rows_of(
 
 
 def _near(time_s: np.ndarray, marked: np.ndarray, margin_s: float) -> np.ndarray:
-    """Return which rows (N,) are within `margin_s` of a `marked` row (N,)."""
+    """Return for each row (N,) whether it is within `margin_s` [s] of a `marked` row (N,) bool."""
     if not marked.any():
         return marked
     marked_s = time_s[marked]
@@ -111,19 +112,20 @@ class View:
     """One part of the dynamics, force or torque, with all other signals as measured."""
 
     name: str
-    """Its name in a diagnosis."""
+    """Name in a diagnosis."""
     about: str
-    """What is compared under which measurements, for people."""
+    """Description for people: what is compared, and with which measured signals."""
     unit: str
-    """Unit of its three axes."""
+    """Unit of the accelerations."""
     columns: slice
-    """Its columns in the model's accelerations."""
+    """Columns of the view in the model's six accelerations (three linear, three angular)."""
     width_s: float
     """Width of the bumps [s]."""
     in_world: bool
-    """Whether its accelerations are in world axes; residuals are rotated into body axes."""
+    """Whether the accelerations are in world axes, as in the force view. Their residuals are then
+    rotated into body axes."""
     axes: tuple[int, ...] = (0, 1, 2)
-    """Body axes along which it is identifiable."""
+    """Body axes along which the accelerations are identifiable."""
 
 
 FORCE = View(
@@ -141,9 +143,9 @@ class SmoothedFlight(NamedTuple):
     rows: FlightRows
     form: WeakForm
     measured: np.ndarray
-    """(M, 3) mean accelerations, in the view's axes."""
+    """(M, 3) measured mean accelerations, in the axes of the view."""
     reliability: np.ndarray = np.ones(3)
-    """(3,) factor on deviations of the model from its mean over the flight: the share of the
+    """(3,) factor on the model's deviations from its mean over the flight. It is the share of the
     rotors' torque that is not noise, times a correction for torque between rows."""
 
 
@@ -166,9 +168,9 @@ def calibrated(
     calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4).
 
     Args:
-        flight: in the torque view.
+        flight: the flight in the torque view.
         acceleration: (N, 3) angular acceleration by the measured rotor speeds [rad/s^2].
-        noise: (N, 3) addition to it by simulated noise of the same size.
+        noise: (N, 3) change of this acceleration by simulated noise of the same size [rad/s^2].
     """
     mean = flight.form.mean
     if len(flight.form.middle_s) < 2:
@@ -179,19 +181,19 @@ def calibrated(
 
 
 class WeakForm(NamedTuple):
-    """M bumps over the N rows of a flight, as matrices on series of the rows."""
+    """M bumps over the N rows of a flight, as matrices that are applied to series of rows."""
 
     middle_s: np.ndarray
-    """(M,) middle of each bump, since the first row [s]."""
+    """(M,) middle of each bump, from the first row of the flight [s]."""
     middle_row: np.ndarray
-    """(M,) row nearest to it."""
+    """(M,) number of the row nearest to the middle."""
     change: sparse.csr_array
-    """(M, N) takes velocities to mean accelerations."""
+    """(M, N) matrix from velocities to mean accelerations."""
     mean: sparse.csr_array
-    """(M, N) takes accelerations to their means."""
+    """(M, N) matrix from accelerations to their means."""
 
     def take(self, chosen: np.ndarray) -> WeakForm:
-        """Return the bumps that are `chosen` (M,) bool."""
+        """Return only the `chosen` bumps, (M,) bool."""
         bumps = np.flatnonzero(chosen)
         matrices = (sparse.csr_array(matrix[bumps]) for matrix in (self.change, self.mean))
         return WeakForm(self.middle_s[bumps], self.middle_row[bumps], *matrices)
@@ -203,33 +205,34 @@ def weak_form(
     """Return bumps of `width_s`, half a width apart, without a bad row or a hole inside.
 
     Args:
-        time_s: (N,) increasing [s].
-        good: (N,) bool: rows that can be used.
-        width_s: from the begin of a bump to its end [s].
+        time_s: (N,) times of the rows, increasing [s].
+        good: (N,) bool, whether each row can be used.
+        width_s: time from the start of a bump to its end [s].
         hole_s: rows further apart than this are a hole [s].
-        slope: weight by -w'(t) in place of the bump w(t): `mean` takes accelerations to the mean
-            of their slopes, and `change` positions to mean accelerations.
+        slope: weight by -w'(t) in place of the bump w(t). Then `mean` takes accelerations to means
+            of their derivatives, and `change` takes positions to mean accelerations.
     """
     span = np.diff(time_s)
     middle = 0.5 * (time_s[1:] + time_s[:-1])
     usable = good[1:] & good[:-1] & (span <= hole_s)
-    centres, rows, columns, shares, spans = [], [], [], [], []
+    centres, rows, columns, bumps, spans = [], [], [], [], []
     for centre in np.arange(time_s[0] + 0.5 * width_s, time_s[-1] - 0.5 * width_s, 0.5 * width_s):
+        # Steps between rows that are inside the bump.
         first, last = np.searchsorted(middle, (centre - 0.5 * width_s, centre + 0.5 * width_s))
         if last - first < LEAST_ROWS or not usable[first:last].all():
             continue
-        since = middle[first:last] - centre
+        from_centre = middle[first:last] - centre
         if slope:
-            share = np.sin(2.0 * np.pi * since / width_s)
-            share -= (share * span[first:last]).sum() / span[first:last].sum()
-            share /= (share * since * span[first:last]).sum()
+            bump = np.sin(2.0 * np.pi * from_centre / width_s)
+            bump -= (bump * span[first:last]).sum() / span[first:last].sum()
+            bump /= (bump * from_centre * span[first:last]).sum()
         else:
-            share = np.cos(np.pi * since / width_s) ** 2
-            share /= (share * span[first:last]).sum()
+            bump = np.cos(np.pi * from_centre / width_s) ** 2
+            bump /= (bump * span[first:last]).sum()
         rows.append(np.full(last - first, len(centres)))
         columns.append(np.arange(first, last))
-        shares.append(share)
-        spans.append(share * span[first:last])
+        bumps.append(bump)
+        spans.append(bump * span[first:last])
         centres.append(centre)
     shape = (len(centres), len(time_s))
     if not centres:
@@ -241,11 +244,11 @@ def weak_form(
         places = (np.concatenate([row, row]), np.concatenate([column, column + 1]))
         return sparse.csr_array((np.concatenate([before, after]), places), shape=shape)
 
-    share, weight = np.concatenate(shares), 0.5 * np.concatenate(spans)
+    bump, weight = np.concatenate(bumps), 0.5 * np.concatenate(spans)
     middle_s = np.array(centres)
     middle_row = nearest(time_s, middle_s)
-    return WeakForm(middle_s, middle_row, matrix(-share, share), matrix(weight, weight))
+    return WeakForm(middle_s, middle_row, matrix(-bump, bump), matrix(weight, weight))
 
 
 LEAST_ROWS = 4
-"""Least number of steps between rows in a bump."""
+"""Smallest number of steps from row to row in a bump."""

@@ -1,10 +1,11 @@
 """Whitens residuals of windows (1 s stretches of flights) and projects out their start states.
 
 Whitened residuals are in units of independent noise. A window's start state is measured with the
-same noise as its other rows, so it is a nuisance parameter: the effect of its 12 numbers is
-projected out of residuals and slopes. Errors of the rotor speeds are nuisance parameters too, with
-a prior on their size in additional rows: at knots (support points) all along a window where
-measured speeds are the model's input, else at its start.
+same noise as its other rows. So it is a nuisance parameter: what a change of its 12 numbers could
+explain is removed (projected out) from residuals and slopes. Errors of the rotor speeds are
+nuisance parameters, too. If measured speeds are the model's input, they have errors at knots
+(support points) all along a window, else only at its start. Additional rows hold a prior on the
+size of these errors. Start numbers are all nuisance parameters of a window: state and rotor speeds.
 """
 
 from __future__ import annotations
@@ -27,41 +28,43 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class Linearisation(NamedTuple):
-    """Residuals of W windows and their slopes along K directions."""
+    """Residuals of W windows, and derivatives (slopes) of the simulated values by K numbers."""
 
     residual: np.ndarray
     """(W, N, 19) measured - simulated; zero where nothing was measured."""
     slope: np.ndarray
-    """(W, N, 19, K) of the simulated values. The last F are often along the start numbers."""
+    """(W, N, 19, K) derivative of the simulated values; often the last F are by the start
+    numbers."""
     offset: np.ndarray
-    """(W, F) correction of each window's start numbers (state and rotor speeds), at which the
-    residuals were computed."""
+    """(W, F) correction of each window's start numbers with which the residuals were computed."""
 
     @property
     def start_slope(self) -> np.ndarray:
-        """(W, N, 19, 12) slopes along each window's start state, if the last F are as above."""
+        """(W, N, 19, 12) slopes along each window's start state; the last F must be as above."""
         size = self.offset.shape[1]
         return self.slope[..., self.slope.shape[-1] - size :][..., :STATE]
 
 
 class Whitening(NamedTuple):
-    """Whitening of W windows, with M rows and F nuisance parameters (start numbers) each."""
+    """What whitens W windows. Each has M whitened rows and F start numbers."""
 
     weight: np.ndarray
     """(W, N, 19) 1 / noise; 0 where nothing was measured."""
     prior: np.ndarray
-    """(F - 12,) 1 / standard deviation of each error of the rotor speeds; the last of M rows."""
+    """(F - 12,) 1 / standard deviation of each error of the rotor speeds. The last F - 12 of the M
+    rows hold this prior."""
     start: np.ndarray
-    """(W, M, F) orthonormal basis of the rows' changes by the start numbers."""
+    """(W, M, F) orthonormal basis of the changes of the rows by the start numbers."""
     upper: np.ndarray
-    """(W, F, F) upper triangular, from start numbers to coordinates in that basis."""
+    """(W, F, F) upper triangular matrix from start numbers to coordinates in that basis."""
     slow: np.ndarray
-    """(W, 19, N, L) unit errors that change slowly over a window (polynomials), by channel."""
+    """(W, 19, N, L) polynomials of unit length over the rows of each channel: errors that change
+    slowly over a window."""
     slow_freedom: np.ndarray
-    """(W, 19) expected energy along them by noise alone, by channel."""
+    """(W, 19) sum of squares along these polynomials that noise alone gives, by channel."""
     filters: Mapping[str, np.ndarray]
-    """(W, N, N) by group of channels with autocorrelated noise: takes rows over their standard
-    deviation to independent ones."""
+    """Group of channels with autocorrelated noise -> (W, N, N) matrices that make its rows
+    independent, after a division by the standard deviation."""
 
 
 def make_whitening(
@@ -72,37 +75,40 @@ def make_whitening(
 ) -> Whitening:
     """Return the whitening of `windows` by `noise`.
 
-    The last slopes in `linear` must be those along the start numbers.
+    The last F slopes in `linear` must be those along the start numbers.
     """
     sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 1.0)
     weight = np.where(windows.valid, 1.0 / sigma, 0.0)
     filters = {name: colour_filter(noise, name, windows) for name in noise.coloured}
     count, rows, channels = weight.shape
     size = linear.offset.shape[1]
+    # Basis of what the start numbers can change, with the rows of the prior.
     prior = np.full(size - STATE, 1.0 / rotor_spread(windows, limits))
     slope = _filtered(linear.slope[..., -size:] * weight[..., None], filters)
     slope = slope.reshape(count, -1, size)
-    held = np.zeros((count, size - STATE, size))
-    held[:, :, STATE:] = np.diag(prior)
-    start, upper = orthonormal(np.concatenate([slope, held], axis=1), limits.singular)
+    prior_rows = np.zeros((count, size - STATE, size))
+    prior_rows[:, :, STATE:] = np.diag(prior)
+    start, upper = orthonormal(np.concatenate([slope, prior_rows], axis=1), limits.singular)
     upper = upper + 1e-9 * np.eye(size)
+    # Slow errors: Legendre polynomials over the window. The part of them that start numbers explain
+    # is expected to be absent from the residual.
     time = 2.0 * np.asarray(windows.row_s)[..., None] - 1.0
     degrees = range(limits.slow_degree + 1)
     power = np.concatenate([eval_legendre(degree, time) for degree in degrees], axis=-1)
     slow = np.moveaxis((weight > 0)[..., None] * power[:, :, None], 1, 2)
     slow = slow / np.maximum(np.linalg.norm(slow, axis=2, keepdims=True), 1e-9)
     measured = start[:, : rows * channels].reshape(count, rows, channels, size)
-    taken = np.moveaxis(measured, 1, 3) @ slow
-    slow_freedom = (slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))
+    explained = np.moveaxis(measured, 1, 3) @ slow
+    slow_freedom = (slow**2).sum(axis=(2, 3)) - (explained**2).sum(axis=(2, 3))
     return Whitening(weight, prior, start, upper, slow, slow_freedom, filters)
 
 
 def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Q and upper triangular R of `matrix` (..., M, F), M much larger than F.
 
-    Cholesky's factor of the Gram matrix, twice (CholeskyQR2; Yamamoto et al. 2015): for so tall a
-    matrix it is faster than Householder's reflections. These are used where a column is nearly
-    dependent on the others, with a remainder of less than `singular`.
+    Cholesky's factor of the Gram matrix is used twice (CholeskyQR2; Yamamoto et al. 2015), since it
+    is faster for so tall a matrix than Householder's reflections. The latter are used where a
+    column nearly depends on the others, with an independent share of less than `singular`.
     """
     size = np.maximum(np.linalg.norm(matrix, axis=-2, keepdims=True), 1e-300)
     base, upper = matrix / size, np.swapaxes(size, -1, -2) * np.eye(matrix.shape[-1])
@@ -121,9 +127,9 @@ def orthonormal(matrix: np.ndarray, singular: float) -> tuple[np.ndarray, np.nda
 def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> float:
     """Return the standard deviation of the rotor speeds' errors as nuisance parameters [rad/s].
 
-    Where measured speeds are the input, white noise of rows is equivalent to errors that are linear
-    between knots 0.1 s apart, smaller by the root of the number of rows a knot. Else the errors are
-    those at the start.
+    If measured speeds are the input, their errors are linear between knots 0.1 s apart. White noise
+    of the rows is equivalent to knot errors that are smaller by the root of the number of rows per
+    knot. Otherwise the errors are those at the start of each window.
     """
     start = np.asarray(windows.start_rotor_error)
     if start.all():
@@ -134,7 +140,7 @@ def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> flo
 
 
 def whiten(whitening: Whitening, values: np.ndarray) -> np.ndarray:
-    """Return `values` (W, N, 19, K) in units of noise (W, M, K), zeros in the prior's rows."""
+    """Return `values` (W, N, 19, K) as rows in units of noise (W, M, K); the prior's rows are 0."""
     count, rows, channels, directions = values.shape
     scaled = _filtered(values * whitening.weight[..., None], whitening.filters)
     flat = scaled.reshape(count, rows * channels, directions)
@@ -143,7 +149,7 @@ def whiten(whitening: Whitening, values: np.ndarray) -> np.ndarray:
 
 
 def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return rows over their standard deviation (W, N, 19, K), made independent in place."""
+    """Make rows `scaled` (W, N, 19, K), over their standard deviation, independent in place."""
     count, rows, _, directions = scaled.shape
     for name, matrix in filters.items():
         group = scaled[:, :, SLICES[name]]
@@ -160,7 +166,7 @@ def project_out_start(whitening: Whitening, white: np.ndarray) -> np.ndarray:
 def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
     """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel.
 
-    The start numbers are projected out of the residual, and so need not be out of slow errors.
+    The start numbers are projected out of the residual, so the slow polynomials need no projection.
     """
     rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)
     amplitude = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
@@ -168,7 +174,7 @@ def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
 
 
 def whitened_residual(whitening: Whitening, linear: Linearisation) -> np.ndarray:
-    """Return the residuals of `linear` in units of noise, (W, M, 1), with those of the prior."""
+    """Return the residuals of `linear` in units of noise, (W, M, 1), with the prior's residuals."""
     white = whiten(whitening, linear.residual[..., None])
     if len(whitening.prior):
         white[:, -len(whitening.prior) :, 0] = -linear.offset[:, STATE:] * whitening.prior

@@ -1,1 +1,1 @@
-"""Numbers, their fit, intervals and chance."""
+"""Fits of parameters, their intervals, and tests of how much they explain by chance."""

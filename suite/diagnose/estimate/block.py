@@ -1,8 +1,9 @@
 """Blocks: whitened residuals and Jacobians of stretches of flights, and their normal equations.
 
-A stretch is a piece of a flight whose rows may be correlated. Fit, intervals, search and hold-out
-use blocks only, so a new kind of evidence is one class that makes blocks. A number is one scalar
-parameter of the vehicle model; all of them form one vector (`estimate/parameters.py`).
+A stretch is a piece of a flight whose rows may be correlated. Whitened residuals are in units of
+independent noise. Fit, intervals and search use blocks only, so a new kind of evidence is one class
+that makes blocks. A number is one scalar parameter of the vehicle model; all numbers together form
+one vector (`estimate/parameters.py`). Along a parameter means: by a change of this parameter.
 """
 
 from __future__ import annotations
@@ -23,33 +24,33 @@ class Estimate(NamedTuple):
     theta: np.ndarray
     """(P,) vector of the model's parameters."""
     free: np.ndarray = np.zeros((0, 0))
-    """(B, F) nuisance parameters of each of B stretches, such as a rollout's start state; (0, 0)
-    without any."""
+    """(B, F) nuisance parameters of B stretches, such as the start state of a simulated stretch;
+    (0, 0) without any."""
 
 
 @dataclass(frozen=True)
 class Block:
     """B stretches of M rows, linearised at one estimate, in units of independent noise.
 
-    The nuisance parameters of a stretch are projected out of its rows. Stretches with fewer rows
-    are padded with zeros.
+    What a change of the nuisance parameters of a stretch could explain is removed (projected out)
+    from its rows. Stretches with fewer rows are padded with zeros.
     """
 
     residual: np.ndarray
-    """(B, M) measured - model."""
+    """(B, M) residuals, measured - model."""
     slope: np.ndarray
-    """(B, M, K) derivative of the model along K parameters."""
+    """(B, M, K) derivative of the model's values by K parameters."""
     along: tuple[int, ...]
-    """Place in the vector of each column's parameter. Inactive parameters may have a second column,
-    at the end (see `search/evaluation.py`)."""
+    """Place of each column's parameter in the vector. A parameter without any effect at the present
+    estimate may have a second column, at the end (see `search/evaluation.py`)."""
     flight: np.ndarray
     """(B,) number of each stretch's flight."""
     start_s: np.ndarray
-    """(B,) since the first row of the flight [s]."""
+    """(B,) start of each stretch, from the first row of the flight [s]."""
     free: np.ndarray
-    """(B, F) best-fitting change of the nuisance parameters, at the present parameters."""
+    """(B, F) change of the nuisance parameters that fits best, at the present parameters."""
     free_slope: np.ndarray
-    """(B, F, K) decrease of that change for a unit change of each parameter."""
+    """(B, F, K) decrease of `free` for a unit change of each of the K parameters."""
 
     @cached_property
     def equations(self) -> NormalEquations:
@@ -62,7 +63,7 @@ class Block:
         )
 
     def acts(self) -> np.ndarray:
-        """Return which columns (K,) change the model at all."""
+        """Return for each column (K,) whether its parameter changes the model at all."""
         return np.abs(self.slope).max(axis=(0, 1), initial=0.0) > 0.0
 
 
@@ -75,34 +76,41 @@ class Linearised(Protocol):
         ...
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block at an estimate, along the parameters at `indices` or along all.
+        """Return the block at the estimate `at`, along the parameters at `indices` or along all.
 
-        A source that computes all slopes at once may return more columns.
+        Evidence that computes all slopes at once may return more columns.
         """
         ...
 
 
 class NormalEquations(NamedTuple):
-    """Terms of the normal equations of each of B stretches, along K parameters."""
+    """Terms of the normal equations of each of B stretches, along K parameters.
+
+    J are the slopes of a block, and r its residuals.
+    """
 
     hessian: np.ndarray
-    """(B, K, K) J'J."""
+    """(B, K, K) J'J, the information on the parameters."""
     gradient: np.ndarray
     """(B, K) J'r."""
     chi2: np.ndarray
-    """(B,) r'r."""
+    """(B,) r'r, the squared error in units of the noise variance."""
     flight: np.ndarray | None = None
     """(B,) number of each stretch's flight."""
     along: tuple[int, ...] | None = None
-    """As in a block; None where each column is along the parameter of its own place."""
+    """Place of each column's parameter in the vector; None where column k is along parameter k."""
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Place in the vector of each column's parameter."""
+        """Place of each column's parameter in the vector."""
         return tuple(range(self.gradient.shape[1])) if self.along is None else self.along
 
     def columns_of(self, candidate: Candidate) -> list[int]:
-        """Return the columns of `candidate`; for a composite the second ones, if there are any."""
+        """Return the columns of the parameters of `candidate`.
+
+        Of a parameter with two columns, a composite (several effects as one hypothesis) uses the
+        second one, which is computed as if the other effects were there.
+        """
         numbers = self.numbers
         place = {number: column for column, number in enumerate(numbers)}
         if not candidate.parts:
@@ -127,7 +135,7 @@ class NormalEquations(NamedTuple):
         return self.take([self.numbers.index(number) for number in indices])
 
     def sums(self, inside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return J'J (K, K) and J'r (K,) over all stretches, or those `inside` (B,) bool."""
+        """Return J'J (K, K) and J'r (K,), summed over all stretches or over those `inside`."""
         rows = slice(None) if inside is None else inside
         return self.hessian[rows].sum(axis=0), self.gradient[rows].sum(axis=0)
 
@@ -139,17 +147,17 @@ def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def stacked(rows: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-    """Return `rows` (R, ...) by stretch (B, M, ...), padded with zeros.
+    """Return `rows` (R, ...) arranged by stretch (B, M, ...), padded with zeros.
 
-    `stretch` (R,) is the number of each row's stretch, from 0 without a gap.
+    `stretch` (R,) is the number of each row's stretch: 0, 1, 2 and so on, none left out.
     """
     count = np.bincount(stretch) if len(stretch) else np.zeros(0, int)
     order = np.argsort(stretch, kind="stable")
-    first = np.cumsum(count) - count
-    place = np.arange(len(rows)) - np.repeat(first, count)
-    out = np.zeros((len(count), count.max(initial=0), *rows.shape[1:]))
-    out[stretch[order], place] = rows[order]
-    return out
+    first_row = np.cumsum(count) - count
+    place_in_stretch = np.arange(len(rows)) - np.repeat(first_row, count)
+    table = np.zeros((len(count), count.max(initial=0), *rows.shape[1:]))
+    table[stretch[order], place_in_stretch] = rows[order]
+    return table
 
 
 def without_nuisance(
@@ -160,18 +168,20 @@ def without_nuisance(
     flight: np.ndarray,
     start_s: np.ndarray,
 ) -> Block:
-    """Return the block of rows without nuisance parameters.
+    """Return the block of rows that have no nuisance parameters.
 
     Args:
-        residual: (R, C) over its noise.
-        slope: (R, C, K) over the noise.
-        along: place in the vector of each column's parameter.
-        stretch: (R,) number of each row's stretch, from 0 without a gap.
+        residual: (R, C) residuals of R rows and C channels, divided by the noise.
+        slope: (R, C, K) slopes along K parameters, divided by the noise.
+        along: place of each column's parameter in the vector.
+        stretch: (R,) number of each row's stretch, as in `stacked`.
         flight: (B,) number of each stretch's flight.
-        start_s: (B,) start of each stretch [s].
+        start_s: (B,) start of each stretch, from the first row of the flight [s].
     """
     count, size = len(flight), slope.shape[2]
     residual = stacked(residual, stretch).reshape(count, -1)
     slope = stacked(slope, stretch).reshape(count, residual.shape[1], size)
-    none = np.zeros((count, 0))
-    return Block(residual, slope, tuple(along), flight, start_s, none, np.zeros((count, 0, size)))
+    no_nuisance = np.zeros((count, 0))
+    return Block(
+        residual, slope, tuple(along), flight, start_s, no_nuisance, np.zeros((count, 0, size))
+    )

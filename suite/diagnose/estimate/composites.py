@@ -1,8 +1,8 @@
 """Composites: effects that are tested together as one hypothesis, such as a wind and a drag.
 
-Without a drag a wind has no effect, and without a wind a drag has none on a vehicle that hovers:
-where the vehicle file has neither, each alone explains nothing, but both together may. A composite
-is compared with single effects at the number of all its parameters; its parts are named.
+A wind acts only through a drag, and on a vehicle that hovers a drag acts only in a wind. So where
+the vehicle file has neither, each alone explains nothing, but both together may. A composite is
+compared with single effects; all its parameters count. If it wins, its parts are named one by one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class Composite:
     about: str
     """Description for people."""
     carried: str | None = None
-    """The part that only acts through the others; None where each acts on its own."""
+    """Name of the effect that only acts through the others (carried by them); None where each acts
+    on its own."""
 
 
 COMPOSITES = (
@@ -43,11 +44,11 @@ COMPOSITES = (
 )
 """All composites."""
 LEAST_USUAL = 0.3
-"""A fit of a composite begins with a drag of at least this share of its usual size."""
+"""Smallest drag with which a fit of a composite begins, as a share of a drag's usual size."""
 
 
 def composites(among: Sequence[Candidate]) -> list[Candidate]:
-    """Return the composites whose parts are all `among` the candidates."""
+    """Return a candidate for each composite whose parts are all `among` the candidates."""
     candidates = []
     for composite in COMPOSITES:
         parts = [c for name in composite.parts for c in among if c.name == name]
@@ -64,7 +65,7 @@ def acts_through(candidate: Candidate) -> bool:
 
 
 def carried(among: Sequence[Candidate]) -> list[Candidate]:
-    """Return the parts of composites `among` the candidates that only act through other parts."""
+    """Return those parts of composites in `among` that only act through other parts."""
     names = {composite.carried for composite in COMPOSITES}
     return [part for one in among for part in one.parts if part.name in names]
 
@@ -72,7 +73,7 @@ def carried(among: Sequence[Candidate]) -> list[Candidate]:
 def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
     """Return lines for people on the composites in a diagnosis.
 
-    Each of `sets` has the name of an effect, and then its alternatives.
+    Each of `sets` has the name of a named effect, and then the names of its alternatives.
     """
     names, alternatives = {one[0] for one in sets}, {name for one in sets for name in one[1:]}
     lines = []
@@ -89,43 +90,48 @@ def in_words(sets: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class Inactive:
-    """Parameters without an effect at the present estimate, and values at which they have one."""
+    """Parameters that change nothing at the present estimate, and values at which they do.
+
+    An example is a wind without a drag.
+    """
 
     indices: tuple[int, ...]
-    """Their places in the vector."""
+    """Places of these parameters in the vector of all."""
     theta: np.ndarray
-    """(P,) all parameters, with the effects through which these act at their usual size."""
+    """(P,) all parameters; the effects through which the inactive ones act have usual sizes."""
 
 
 def inactive_at(
     space: ParameterSpace, theta: np.ndarray, among: Sequence[Candidate], acts: np.ndarray
 ) -> Inactive | None:
-    """Return the parameters that only act through others and so have no effect at `theta` (P,).
+    """Return the parameters that act only through others, and so change nothing at `theta` (P,).
 
-    None where all of them have one. If several composites contain them, the first one counts.
+    None where there are none. If several composites contain them, the first composite counts.
 
     Args:
-        space: of the vehicle.
-        theta: (P,) all parameters.
+        space: parameters of the vehicle.
+        theta: (P,) values of all parameters.
         among: the candidates.
-        acts: (P,) bool: which parameters have an effect at `theta`.
+        acts: (P,) bool, whether each parameter changes the model at `theta`.
     """
     for composite in COMPOSITES:
-        whole = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
-        if composite.carried is None or whole is None:
+        composite_candidate = next((c for c in among if c.name == JOIN.join(composite.parts)), None)
+        if composite.carried is None or composite_candidate is None:
             continue
-        own = next(part for part in whole.parts if part.name == composite.carried).indices
-        if acts[list(own)].any() or theta[list(own)].any():
-            continue  # it acts; or it is named, and the effect through which it acts was dropped
+        carried_indices = next(
+            part for part in composite_candidate.parts if part.name == composite.carried
+        ).indices
+        if acts[list(carried_indices)].any() or theta[list(carried_indices)].any():
+            continue  # it acts, or it was named and the effect through which it acts was dropped
         raised, usual = theta.copy(), usual_size(space)
-        through = [i for i in whole.indices if i not in own]
-        raised[through] = theta[through] + usual[through]
-        return Inactive(own, raised)
+        carrier_indices = [i for i in composite_candidate.indices if i not in carried_indices]
+        raised[carrier_indices] = theta[carrier_indices] + usual[carrier_indices]
+        return Inactive(carried_indices, raised)
     return None
 
 
 def usual_size(space: ParameterSpace) -> np.ndarray:
-    """Return the usual magnitude (P,) of every parameter, the middle of its usual range."""
+    """Return the usual magnitude (P,) of every parameter: the middle of its usual range."""
     usual = {(e.name, p.name): p.typical for e in EFFECTS.values() for p in e.parameters}
     return np.array([np.mean(usual[entry.effect, entry.parameter]) for entry in space.entries])
 
@@ -138,29 +144,31 @@ def begin_of(
     change: np.ndarray,
     information: np.ndarray,
 ) -> np.ndarray:
-    """Return the parameters (P,) from which a composite with `inactive` parameters is fitted.
+    """Return the parameters (P,) with which the fit of a composite begins.
 
-    The linear fit only identifies the product of a drag and a wind. If its drag is too small, the
-    fit begins with the least usual drag, and with as much more wind.
+    A linear fit identifies a drag, and the product of drag and wind. The wind is that product over
+    the drag, relative to the drag's usual size. If the drag of the linear fit is too small, the
+    fit begins with `LEAST_USUAL` of the usual drag.
 
     Args:
-        space: of the vehicle.
-        theta: (P,) all parameters at the linear fit.
+        space: parameters of the vehicle.
+        theta: (P,) values of all parameters at which the linear fit was computed.
         candidate: the composite.
-        inactive: its parameters that act through the others, whose slopes were computed with those
-            at their usual size.
-        change: (P,) of all parameters by the linear fit.
-        information: (P,) of the flights on each parameter.
+        inactive: places of its parameters that act through the others. Their slopes were computed
+            with the others at their usual size.
+        change: (P,) change of all parameters by the linear fit.
+        information: (P,) information of the flights on each parameter.
     """
     begin = np.clip(theta + change, space.array("low"), space.array("high"))
-    through = np.array([i for i in candidate.indices if i not in inactive])
-    usual = usual_size(space)[through]
-    least = space.array("start")[through] + LEAST_USUAL * usual
-    begin[through] = np.maximum(begin[through], least)
-    share = (begin[through] - space.array("start")[through]) / usual
-    weight = information[through] * usual**2
+    carrier_indices = np.array([i for i in candidate.indices if i not in inactive])
+    usual = usual_size(space)[carrier_indices]
+    least = space.array("start")[carrier_indices] + LEAST_USUAL * usual
+    begin[carrier_indices] = np.maximum(begin[carrier_indices], least)
+    # Mean of the drag's components, as shares of their usual size, by their information.
+    share = (begin[carrier_indices] - space.array("start")[carrier_indices]) / usual
+    weight = information[carrier_indices] * usual**2
     total = weight.sum()
     mean = float((share * weight).sum() / total) if total > 0.0 else float(share.mean())
-    own = np.array(inactive, dtype=int)
-    begin[own] = theta[own] + change[own] / mean
+    carried_indices = np.array(inactive, dtype=int)
+    begin[carried_indices] = theta[carried_indices] + change[carried_indices] / mean
     return np.clip(begin, space.array("low"), space.array("high"))

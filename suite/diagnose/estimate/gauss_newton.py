@@ -1,7 +1,8 @@
-"""Gauss-Newton with bounds and step halving, and 95 % intervals, for every kind of evidence.
+"""Fits parameters by Gauss-Newton with bounds and step halving, and computes 95 % intervals.
 
-All functions work on blocks, the linearised residuals of stretches of flights, and on their normal
-equations (`estimate/block.py`).
+All functions work on blocks, which are the linearised residuals of stretches of flights, and on
+their normal equations (`estimate/block.py`). So every kind of evidence uses them. J is the Jacobian
+of the model and r the residual; chi-square is the squared error over the noise variance.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def solve(
         gradient: (K,) J'r.
         low: (K,) lower bound of the change.
         high: (K,) upper bound of the change.
-        scale: (K,) usual size of each parameter, which conditions the equations.
+        scale: (K,) usual size of each parameter. In these units the equations are well conditioned.
 
     Raises:
         ValueError: for values that are not finite.
@@ -45,12 +46,12 @@ def solve(
     matrix = hessian * np.outer(scale, scale)
     ridge = 1e-9 * max(float(np.trace(matrix)) / len(matrix), 1e-12)
     factor = np.linalg.cholesky(matrix + ridge * np.eye(len(matrix)))
-    right = np.linalg.solve(factor, gradient * scale)
-    unbounded = np.linalg.solve(factor.T, right)
+    scaled_gradient = np.linalg.solve(factor, gradient * scale)
+    unbounded = np.linalg.solve(factor.T, scaled_gradient)
     low, high = np.minimum(low / scale, -1e-12), np.maximum(high / scale, 1e-12)
     if np.all((unbounded >= low) & (unbounded <= high)):
         return unbounded * scale
-    return lsq_linear(factor.T, right, (low, high)).x * scale
+    return lsq_linear(factor.T, scaled_gradient, (low, high)).x * scale
 
 
 def gauss_newton_step(
@@ -59,13 +60,13 @@ def gauss_newton_step(
     space: ParameterSpace,
     inside: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
-    """Return the best change of the parameters and the expected fall of chi-square.
+    """Return the best change (K,) of the parameters, and the expected fall of chi-square.
 
     Args:
-        equations: along the K fitted parameters, computed at `theta`.
-        theta: (P,) all parameters.
-        space: their bounds.
-        inside: (B,) bool: which stretches are fitted; all if not given.
+        equations: normal equations along the K fitted parameters, computed at `theta`.
+        theta: (P,) values of all parameters.
+        space: bounds of all parameters.
+        inside: (B,) bool, whether each stretch is fitted; all are if not given.
     """
     hessian, gradient = equations.sums(inside)
     indices = np.array(equations.numbers, dtype=int)
@@ -87,10 +88,10 @@ def chi2_fall(
 def chi2_by_group(
     equations: NormalEquations, theta: np.ndarray, space: ParameterSpace, group: np.ndarray
 ) -> np.ndarray:
-    """Return the squared error (G,) of each group of stretches, fitted on the other groups.
+    """Return the squared error (G,) of each group of stretches, fitted to the other groups.
 
-    To first order about `theta` (P,), where the equations were computed; `group` (B,) is the number
-    of each stretch's group.
+    It is exact to first order about the parameters `theta` (P,), at which the equations were
+    computed. `group` (B,) is the number of each stretch's group.
     """
     errors = []
     for number in np.unique(group):
@@ -113,27 +114,28 @@ def fit(
     """Fit the parameters at `indices` and the nuisance parameters of every stretch.
 
     Args:
-        evidence: with known noise.
-        start: where the fit begins.
-        indices: places of the fitted parameters.
-        rounds: largest number of steps; that of `limits` if not given.
+        evidence: evidence whose noise is known.
+        start: estimate with which the fit begins.
+        indices: places of the fitted parameters in the vector.
+        rounds: largest number of steps; by default that of `limits`.
         known: the block at `start`, if it was computed before.
-        limits: numbers of steps and convergence.
+        limits: number of steps, and the fall of chi-square at which the fit has converged.
 
     Returns:
-        The best estimate, and the block there.
+        The best estimate, and the block at this estimate.
     """
     places, space = np.array(indices, dtype=int), evidence.space
     low, high = space.array("low")[places], space.array("high")[places]
     best, block = start, known or evidence.linearise(start, indices)
-    for done in range(limits.fit_rounds if rounds is None else rounds):
+    for steps_done in range(limits.fit_rounds if rounds is None else rounds):
         equations = block.equations.along_numbers(indices)
         change, expected_fall = gauss_newton_step(equations, best.theta, space)
         # The nuisance parameters are corrected at least once.
-        if expected_fall < limits.converged and (done or not block.free.shape[1]):
+        if expected_fall < limits.converged and (steps_done or not block.free.shape[1]):
             break
         columns = [block.along.index(index) for index in indices]
         free_change = block.free - block.free_slope[..., columns] @ change
+        # Halve the step until chi-square falls; give up below the smallest step.
         share, chi2_before = 1.0, float(equations.chi2.sum())
         while share > LEAST_STEP:
             theta = best.theta.copy()
@@ -152,26 +154,27 @@ def fit(
 
 
 LEAST_STEP = 0.1
-"""Smallest share of a step that is tried."""
+"""Steps of the fit are halved down to this share."""
 Z95 = 1.96
 """Half-width of a normal 95 % interval, in standard deviations."""
 TINY = 1e-12
-"""Information below this is none."""
+"""Smaller information counts as none."""
 RIDGE = 1e-9
-"""Gives parameters that are not identifiable a wide interval; a pseudo-inverse would hide them."""
+"""Added to the scaled information. So a parameter that is not identifiable gets a wide interval; a
+pseudo-inverse would give it a narrow one."""
 FEWEST = 3
-"""Least number of flights whose differences are tested."""
+"""Smallest number of flights whose differences are tested."""
 
 
 class Intervals(NamedTuple):
     """Uncertainty of K fitted parameters."""
 
     half_width: np.ndarray
-    """(K,) of the 95 % intervals."""
+    """(K,) half-widths of the 95 % intervals."""
     by_stretch: np.ndarray
-    """(K, K) covariance estimated from the differences between stretches."""
+    """(K, K) covariance of the parameters, estimated from the differences between stretches."""
     inverse: np.ndarray
-    """(K, K) inverse of the information, which is the covariance by independent noise."""
+    """(K, K) inverse of the information: the covariance of the parameters by independent noise."""
 
 
 def intervals95(
@@ -183,20 +186,22 @@ def intervals95(
 ) -> Intervals:
     """Return the 95 % intervals at a fit, from its normal equations.
 
-    Each half-width is the largest of three. By curvature: the covariance of independent noise. By
-    stretches: each is one random draw (the sandwich estimator; Liang and Zeger 1986), which holds
-    where errors within a stretch are not independent. By flights: each is left out in turn
-    (jackknife), where they differ by more than their stretches explain (Cochran's Q), since a
-    model's error is the same all along a flight.
+    Each half-width is the largest of up to three:
+
+    - by curvature: independent noise in all rows;
+    - by stretches: each stretch is one random draw (the sandwich estimator; Liang and Zeger 1986).
+      This holds if errors within a stretch are not independent;
+    - by flights: each flight is left out in turn (jackknife). This is used where flights differ by
+      more than their stretches explain (Cochran's Q): a model's error persists along a flight.
 
     Args:
-        equations: along the K fitted parameters.
-        differ_p: significance level of the test for differences between flights: with 0 they never
-            differ, with 1 always.
-        leave_out: leave stretches out in turn, too (CR3), as a stretch with much information fits
-            itself. With few stretches their spread is uncertain (Bell & McCaffrey 2002).
-        noise_share: least half-width, as a share of that by curvature.
-        prior: (K,) information on each parameter in addition to the flights'.
+        equations: normal equations along the K fitted parameters.
+        differ_p: significance level of the test for differences between flights. With 0 no
+            difference is significant, with 1 every one is.
+        leave_out: also leave out each stretch in turn (CR3; Bell & McCaffrey 2002), because a
+            stretch with much information pulls the fit towards itself.
+        noise_share: smallest half-width, as a share of that by curvature.
+        prior: (K,) information on each parameter in addition to that of the flights.
     """
     count, size = equations.gradient.shape
     if not size:
@@ -205,7 +210,7 @@ def intervals95(
     prior = np.zeros(size) if prior is None else prior
     hessian = equations.hessian.sum(axis=0) + np.diag(prior)
     gradient = equations.gradient
-    if not leave_out:  # at a bound the mean gradient is not zero, which is no spread
+    if not leave_out:  # at a bound the mean gradient is not zero; only the spread matters here
         gradient = gradient - gradient.mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), TINY))
     scales = np.outer(scale, scale)
@@ -214,11 +219,13 @@ def intervals95(
         return np.linalg.inv(matrix * scales + RIDGE * np.eye(size)) * scales
 
     def changes_without(own_hessian: np.ndarray, own_gradient: np.ndarray) -> np.ndarray:
-        """Return the change (N, K) of the parameters when each of N draws is left out."""
+        """Return the change (N, K) of the parameters if each of N draws is left out alone."""
         return np.einsum("nij,nj->ni", inverted(hessian - own_hessian), own_gradient)
 
+    # By curvature.
     inverse = inverted(hessian)
     half_width = noise_share * Z95 * np.sqrt(np.diag(inverse))
+    # By stretches.
     freedom = max(count - 1 if leave_out else count - size, 1 if leave_out else 2)
     if leave_out:
         change = changes_without(equations.hessian, gradient)
@@ -227,18 +234,19 @@ def intervals95(
     by_stretch = change.T @ change + inverse @ np.diag(prior) @ inverse
     spread = np.sqrt(np.diag(by_stretch)) * float(student.ppf(0.975, freedom))
     half_width = np.maximum(half_width, spread)
+    # By flights.
     flight = equations.flight
-    numbers = [] if flight is None or not differ_p else np.unique(flight)
-    if len(numbers) >= FEWEST:
-        inside = np.array([flight == number for number in numbers], dtype=float)
-        by_flight, share = inside @ change, len(numbers) / (len(numbers) - 1)
-        q = by_flight**2 / np.maximum(inside @ change**2, 1e-300)
-        differ = chi2.sf(q.sum(axis=0), len(numbers) - 1) < differ_p
-        if not leave_out:  # a flight with much information fits itself; its stretches do not
+    flight_numbers = [] if flight is None or not differ_p else np.unique(flight)
+    if len(flight_numbers) >= FEWEST:
+        inside = np.array([flight == number for number in flight_numbers], dtype=float)
+        by_flight, share = inside @ change, len(flight_numbers) / (len(flight_numbers) - 1)
+        cochran_q = by_flight**2 / np.maximum(inside @ change**2, 1e-300)
+        differ = chi2.sf(cochran_q.sum(axis=0), len(flight_numbers) - 1) < differ_p
+        if not leave_out:  # a flight with much information pulls the fit; its stretches do not
             own_hessian = np.einsum("fb,bij->fij", inside, equations.hessian)
             by_flight = changes_without(own_hessian, inside @ gradient)
             by_flight, share = by_flight - by_flight.mean(axis=0), 1.0 / share
         variance = share * (by_flight**2).sum(axis=0)
-        wide = np.sqrt(variance) * float(student.ppf(0.975, len(numbers) - 1))
-        half_width = np.where(differ, np.maximum(half_width, wide), half_width)
+        by_flight_width = np.sqrt(variance) * float(student.ppf(0.975, len(flight_numbers) - 1))
+        half_width = np.where(differ, np.maximum(half_width, by_flight_width), half_width)
     return Intervals(half_width, by_stretch, inverse)

@@ -1,7 +1,8 @@
 """The parameters of all effects as one vector, and the candidates that a diagnosis may name.
 
 A number is one scalar of the vector, such as the x component of a drag coefficient. A candidate is
-an effect of the catalogue, or a part of one, that may explain how flights differ from the model.
+an effect of the catalogue that may explain how flights differ from the model. It may also be one
+component of an effect, such as one motor, or several effects as one hypothesis (a composite).
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from tracks.geometry.scene import Array
 
 JOIN = " + "
-"""Separator between the names of effects that are one hypothesis."""
+"""Separator between the names of the effects of a composite."""
 ParameterLayout = tuple[tuple[str, str, int | None], ...]
-"""Effect, parameter and component of each number."""
+"""Name of the effect, name of the parameter, and component, for each number of the vector."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +33,15 @@ class FittedNumber:
     effect: str
     parameter: str
     component: int | None
-    """Place in the parameter, if that is a vector; None for a scalar."""
+    """Place of the number in its parameter, from 0; None if the parameter is a scalar."""
     low: float
     """Lower bound of the fit, in the parameter's unit."""
     high: float
-    """Upper bound of the fit."""
+    """Upper bound of the fit, in the parameter's unit."""
     start: float
-    """The vehicle file's value."""
+    """Value in the vehicle file, with which a fit starts."""
     step: float
-    """Usual magnitude, which scales the equations."""
+    """Usual magnitude of the number, which scales the equations of a fit."""
 
 
 @dataclass(frozen=True)
@@ -48,23 +49,23 @@ class Candidate:
     """Numbers that are fitted together, to explain how flights differ from the model."""
 
     name: str
-    """Name of the effect; for several effects as one hypothesis, their names joined. An effect of
-    single components (such as one motor) has one candidate for each, of the same name."""
+    """Name of the effect; of a composite, the names of its effects joined by `JOIN`. If each
+    component is a candidate of its own (such as one weak motor), all have the same name."""
     indices: tuple[int, ...]
-    """Places of its numbers in the vector."""
+    """Places of the candidate's numbers in the vector."""
     label: str
-    """For people: the name, and the component (from 1) where there is one candidate for each."""
+    """Name for people, with the component (from 1) where each component is a candidate."""
     parts: tuple[Candidate, ...] = ()
-    """Its effects as candidates, where several are one hypothesis (a composite)."""
+    """The effects of a composite as candidates; () for a single effect."""
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of its effects."""
+        """Names of the candidate's effects."""
         return effects_in(self.name)
 
     @property
     def singles(self) -> tuple[Candidate, ...]:
-        """One candidate for each of its effects."""
+        """One candidate for each effect: the parts of a composite, or the candidate itself."""
         return self.parts or (self,)
 
 
@@ -77,7 +78,7 @@ class ParameterSpace:
     """The vehicle file's values of every effect."""
 
     def array(self, field: str) -> np.ndarray:
-        """Return `field` of all entries, (P,)."""
+        """Return the values of one `field` of all P entries, (P,)."""
         return np.array([getattr(entry, field) for entry in self.entries])
 
     def effects(self, theta: Array) -> dict[str, Any]:
@@ -91,30 +92,33 @@ class ParameterSpace:
 
 
 def effects_at(layout: ParameterLayout, base: Mapping[str, Any], theta: Array) -> dict[str, Any]:
-    """Return the effects `base` with the values of `theta` (P,), numpy or JAX (also traced)."""
+    """Return the effects `base` with the values of `theta` (P,), numpy or JAX (also traced).
+
+    `layout` says which number of `theta` belongs to which component of which parameter.
+    """
     xp = theta.__array_namespace__()
     values = {name: value._asdict() for name, value in base.items()}
     place = {entry: i for i, entry in enumerate(layout)}
     for (name, parameter, component), i in place.items():
         if component is None:
             values[name][parameter] = theta[i]
-        elif component == 0:
-            old = xp.asarray(getattr(base[name], parameter))
+        elif component == 0:  # all components of a vector at once, when its first one comes
+            base_value = xp.asarray(getattr(base[name], parameter))
             parts = [
-                theta[place[name, parameter, k]] if (name, parameter, k) in place else old[k]
-                for k in range(old.shape[0])
+                theta[place[name, parameter, k]] if (name, parameter, k) in place else base_value[k]
+                for k in range(base_value.shape[0])
             ]
             values[name][parameter] = xp.stack(parts)
     return {name: type(base[name])(**fields) for name, fields in values.items()}
 
 
 def refuse_own_motion(vehicle: Vehicle) -> None:
-    """Refuse a vehicle with an effect that has a state of its own, as a swinging load.
+    """Refuse a vehicle with an effect that has a state of its own, such as a swinging load.
 
     No log holds that state, so no stretch of a flight can be simulated.
 
     Raises:
-        ValueError: for such an effect, with what to do.
+        ValueError: if there is such an effect. The message says what to do.
     """
     for name in vehicle.effects:
         if EFFECTS[name].start is not None:
@@ -125,7 +129,10 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 
 
 def make_space(vehicle: Vehicle) -> ParameterSpace:
-    """Return the vector of `vehicle`, without random effects and what is not identifiable.
+    """Return the space of all numbers that flights of `vehicle` can identify.
+
+    Without effects that the state does not determine (random ones), without known constants, and
+    without components that no flight shows.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -163,9 +170,9 @@ def with_fitted(
     names: Collection[str],
     further: Mapping[str, Any] | None = None,
 ) -> Vehicle:
-    """Return `vehicle` with the effects `names` replaced by their values in `theta` (P,).
+    """Return `vehicle` whose effects `names` have their values in `theta` (P,).
 
-    `further` holds values of other effects by name.
+    `further` holds values of other effects, by name, which the result has as well.
     """
     fitted, effects = space.effects(theta), dict(vehicle.effects)
     for name in set(names):
@@ -182,10 +189,10 @@ def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> li
     """Return the candidates that can be identified from the signals of the logs.
 
     Args:
-        space: of the vehicle.
+        space: all numbers of the vehicle.
         voltage: whether the logs have a battery voltage.
-        has: which other signals they have that effects need: `acc_b`, an accelerometer; `command`,
-            commands as the model's input.
+        has: names of the other signals that the logs have and some effects need: `acc_b` for an
+            accelerometer, `command` for commands as the model's input.
     """
     chosen = []
     for name, effect in EFFECTS.items():
@@ -203,12 +210,12 @@ def candidates(space: ParameterSpace, voltage: bool, has: Collection[str]) -> li
 
 
 def effects_in(name: str) -> tuple[str, ...]:
-    """Return the effects of a candidate's `name`: several where they are one hypothesis."""
+    """Return the names of the effects in a candidate's `name`; a composite has several."""
     return tuple(name.split(JOIN))
 
 
 def indices_of(chosen: Sequence[Candidate]) -> list[int]:
-    """Return the places of all numbers of the `chosen` candidates, sorted, each once."""
+    """Return the places of all numbers of the `chosen` candidates, sorted, without repetition."""
     return sorted({i for candidate in chosen for i in candidate.indices})
 
 
@@ -218,27 +225,30 @@ def implausible(
     candidate: Candidate,
     limits: Thresholds = THRESHOLDS,
 ) -> list[str]:
-    """Return the implausible numbers of `candidate` at `theta` (P,), in words.
+    """Return a phrase for each implausible number of `candidate`, with its value in `theta` (P,).
 
-    A number is implausible beyond three times the upper usual magnitude in the catalogue.
+    A number is implausible if it is a few times larger than the upper end of its usual range in the
+    catalogue (see `Thresholds.implausible_times`).
     """
-    words = []
+    phrases = []
     for index in candidate.indices:
         entry = space.entries[index]
         parameter = _parameter(entry)
+        # The usual range is one of values (`whole`), or of differences from no effect.
         size = abs(theta[index] - (0.0 if parameter.whole else _neutral(entry)))
         if size > limits.implausible_times * parameter.typical[1]:
-            place = "" if entry.component is None else f" {entry.component + 1}"
-            words.append(
-                f"{entry.effect} {entry.parameter}{place} = {theta[index]:.3g} {parameter.unit}"
+            suffix = "" if entry.component is None else f" {entry.component + 1}"
+            phrases.append(
+                f"{entry.effect} {entry.parameter}{suffix} = {theta[index]:.3g} {parameter.unit}"
             )
-    return words
+    return phrases
 
 
 def at_bound(space: ParameterSpace, theta: np.ndarray, candidate: Candidate) -> bool:
-    """Return whether a number of `candidate` is at a physical bound at `theta` (P,).
+    """Return whether a number of `candidate` has a value in `theta` (P,) at a physical bound.
 
-    A bound without any effect is allowed: a drag of the vehicle file may turn out to be zero.
+    Bounds at which the effect is absent, or at which the vehicle file is, do not count: a drag of
+    the vehicle file may turn out to be zero.
     """
     for index in candidate.indices:
         entry, value = space.entries[index], theta[index]
@@ -264,10 +274,11 @@ def usual_first(
 
 
 def _parameter(entry: FittedNumber) -> Parameter:
+    """Return the parameter in the catalogue to which a number belongs."""
     return next(p for p in EFFECTS[entry.effect].parameters if p.name == entry.parameter)
 
 
 def _neutral(entry: FittedNumber) -> float:
-    """Return the value without any effect; the file's value where that depends on the vehicle."""
+    """Return the value at which the effect is absent; the file's value if the vehicle sets it."""
     neutral = _parameter(entry).neutral
     return entry.start if callable(neutral) else float(neutral)

@@ -1,6 +1,8 @@
 """Cross-validated gain of each candidate effect, and its p-value by a permutation test.
 
-The gain is the fall of the squared error on stretches of flights that were left out of the fit.
+The gain is the fall of the squared error on windows (1 s of a flight) that the fit left out. The
+p-value is the probability of such a gain under the null hypothesis, that no effect is missing. The
+distribution of gains under this hypothesis is called the null below.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
 class CandidateScore(NamedTuple):
-    """How much a candidate explains in addition to the effects that are already named."""
+    """How much a candidate (effect) explains in addition to the effects that are already named."""
 
     candidate: Candidate
     gain: float
@@ -24,14 +26,15 @@ class CandidateScore(NamedTuple):
     p_value: float
     """Probability that the best of all candidates gains as much under the null hypothesis."""
     chance: float
-    """Gain that the best of all candidates reaches with 1 % probability under the null."""
+    """Gain that the best of all candidates reaches by chance with a probability of 1 %."""
 
 
 def folds_of(flight: np.ndarray, start_s: np.ndarray, folds: int = THRESHOLDS.folds) -> np.ndarray:
-    """Return the cross-validation fold (W,) of each window, in turn along every flight.
+    """Return the cross-validation fold (W,) of each window: 0, 1, 2 and so on along every flight.
 
-    Whole flights are not left out: one flight alone may identify a parameter, as a chirp does a
-    rate loop's gain. `flight` (W,) is the number of each window's flight, `start_s` (W,) its start.
+    A fold is not a flight, because a single flight may be the only one that identifies a parameter,
+    as a chirp (a command of rising frequency) identifies the gain of a rate loop. `flight` (W,) is
+    the number of each window's flight, `start_s` (W,) the start of the window in it [s].
     """
     order = np.lexsort((start_s, flight))
     fold = np.empty(len(flight), int)
@@ -52,14 +55,14 @@ def score_candidates(
     """Return the scores of candidates, each fitted with the `named` parameters, best first.
 
     Args:
-        equations: along all parameters.
-        theta: (P,) parameters at which they were computed.
+        equations: normal equations along all parameters.
+        theta: (P,) parameters at which the equations were computed.
         space: bounds of the parameters.
         named: places of the parameters that are always fitted.
         among: the candidates; those without any effect on the flights get no score.
         fold: (W,) cross-validation fold of each window.
-        seed: of the draws.
-        limits: numbers of draws.
+        seed: seed of the draws.
+        limits: number of draws.
     """
     along = list(equations.numbers)
     scale = space.array("step")[along]
@@ -71,7 +74,9 @@ def score_candidates(
     gains, p_values, chance = permutation_test(
         hessian, gradient, groups, tuple(named), fold, seed, (low, high), limits
     )
-    scores = [CandidateScore(*item, chance) for item in zip(acting, gains, p_values, strict=True)]
+    scores = [
+        CandidateScore(*values, chance) for values in zip(acting, gains, p_values, strict=True)
+    ]
     return sorted(scores, key=lambda s: -s.gain)
 
 
@@ -85,23 +90,24 @@ def permutation_test(
     room: tuple[np.ndarray, np.ndarray] | None = None,
     limits: Thresholds = THRESHOLDS,
 ) -> tuple[list[float], list[float], float]:
-    """Return for each group of columns its gain and p-value, and one gain that chance reaches.
+    """Return gains and p-values of groups of columns, and the 99 % quantile of the null.
 
-    The null is the distribution of the largest gain of all groups under random signs of whole
-    windows, which keep the correlation within a window. What the best group explains (and groups
-    nearly as good, if it explains much) is subtracted first (Freedman and Lane 1983): otherwise a
-    real effect in a few windows would be part of the null. With too few windows the null is drawn
-    from the measured noise instead. The last value is the 99 % quantile of the null.
+    The null is the distribution of the largest gain of all groups if each window's residual gets a
+    random sign. A sign for a whole window keeps the correlation within it. First the part that the
+    best group explains is subtracted (Freedman and Lane 1983), since otherwise a real effect in a
+    few windows would be part of the null. If the best group explains much, the part of groups
+    nearly as good is subtracted, too. With too few windows the null is drawn from the measured
+    noise instead.
 
     Args:
-        hessian: (W, K, K) of the normal equations, columns of similar size.
-        gradient: (W, K).
+        hessian: (W, K, K) of the normal equations, with columns scaled to similar size.
+        gradient: (W, K) of the normal equations.
         groups: columns that are fitted together, including those of `always`.
-        always: columns that are always fitted; gains are relative to these alone.
+        always: columns that are always fitted; gains are relative to a fit of these alone.
         fold: (W,) cross-validation fold of each window.
-        seed: of the draws.
-        room: (K,) lowest and highest change of each column; no bounds if not given.
-        limits: numbers of draws, and thresholds.
+        seed: seed of the draws.
+        room: lowest (K,) and highest (K,) change of each column; no bounds if not given.
+        limits: number of draws, and thresholds.
     """
     if not groups:
         return [], [], 0.0
@@ -111,39 +117,52 @@ def permutation_test(
     unbounded = (np.full(len(gradient.T), -np.inf), np.full(len(gradient.T), np.inf))
     low, high = unbounded if room is None else room
 
-    def fitted_change(hessian: np.ndarray, gradient: np.ndarray, at: list[int]) -> np.ndarray:
-        return solve(hessian[np.ix_(at, at)], gradient[at], low[at], high[at], np.ones(len(at)))
+    def fitted_change(hessian: np.ndarray, gradient: np.ndarray, places: list[int]) -> np.ndarray:
+        return solve(
+            hessian[np.ix_(places, places)],
+            gradient[places],
+            low[places],
+            high[places],
+            np.ones(len(places)),
+        )
 
+    # In the loops below, one part of the windows is fitted and the other part (a fold) is tested.
     def gain(columns: tuple[int, ...]) -> float:
-        total, at = 0.0, list(columns)
-        for (known, test), (inside, outside) in zip(hessians, folds, strict=True):
-            change = fitted_change(known, gradient[inside].sum(0), at)
-            slope = gradient[outside].sum(0)[at]
-            total += float(2 * slope @ change - change @ test[np.ix_(at, at)] @ change)
+        total, places = 0.0, list(columns)
+        for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, folds, strict=True):
+            change = fitted_change(fit_hessian, gradient[fit_part].sum(0), places)
+            slope = gradient[test_part].sum(0)[places]
+            total += float(
+                2 * slope @ change - change @ test_hessian[np.ix_(places, places)] @ change
+            )
         return total
 
     def gain_by_chance(columns: tuple[int, ...]) -> np.ndarray:
-        total, at = np.zeros(draws), list(columns)
-        if not at:
+        total, places = np.zeros(draws), list(columns)
+        if not places:
             return total
-        for (known, test), (inside, outside) in zip(hessians, drawn, strict=True):
-            known, test = known[np.ix_(at, at)], test[np.ix_(at, at)]
-            damping = 1e-9 * np.diag(np.diag(known)) + 1e-30 * np.eye(len(at))
-            change = np.linalg.solve(known + damping, inside[:, at].T).T
-            slope = outside[:, at]
-            total += 2 * (slope * change).sum(1) - ((change @ test) * change).sum(1)
+        for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, drawn, strict=True):
+            fit_hessian, test_hessian = (
+                fit_hessian[np.ix_(places, places)],
+                test_hessian[np.ix_(places, places)],
+            )
+            damping = 1e-9 * np.diag(np.diag(fit_hessian)) + 1e-30 * np.eye(len(places))
+            change = np.linalg.solve(fit_hessian + damping, fit_part[:, places].T).T
+            slope = test_part[:, places]
+            total += 2 * (slope * change).sum(1) - ((change @ test_hessian) * change).sum(1)
         return total
 
     without = gain(always)
     falls = [gain(group) - without for group in groups]
     rng = np.random.default_rng(seed)
+    # Draws of the null: the gradient over the fitted and over the tested part of the windows.
     if len(fold) >= limits.few_windows:
         best = max(falls)
         share = limits.alike_share if best > limits.strong_gain else 1.0
         close = [g for g, fall in zip(groups, falls, strict=True) if fall >= share * best]
-        at = sorted({column for group in close for column in group})
-        change = fitted_change(hessian.sum(0), gradient.sum(0), at)
-        unexplained = gradient - hessian[:, :, at] @ change
+        places = sorted({column for group in close for column in group})
+        change = fitted_change(hessian.sum(0), gradient.sum(0), places)
+        unexplained = gradient - hessian[:, :, places] @ change
         signs = rng.choice([-1.0, 1.0], (draws, len(fold)))
         drawn = [(signs[:, i] @ unexplained[i], signs[:, o] @ unexplained[o]) for i, o in folds]
     else:
@@ -155,7 +174,7 @@ def permutation_test(
 
 
 def _noise_gradients(hessian: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Return draws (D, W, K) of the gradient by noise alone."""
+    """Return draws (D, W, K) of the gradient by noise alone: its covariance is `hessian`."""
     values, vectors = np.linalg.eigh(hessian)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     normal = rng.standard_normal((draws, *hessian.shape[:2], 1))

@@ -1,1 +1,1 @@
-"""Flights as evidence on the model: rollouts of a second, force and torque."""
+"""Differences of flights and simulation: by rollouts (simulated 1 s), by force and by torque."""
