@@ -1,1 +1,1 @@
-"""Identifies the numbers of a vehicle file from flights, each with its interval."""
+"""Estimates the parameters of a vehicle file from flights, each with its interval."""

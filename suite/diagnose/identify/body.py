@@ -1,10 +1,14 @@
 """Fits thrust and drag to the body's translation, and inertia, lag and delay to its rotation.
 
-Force: the measured acceleration, given the measured attitude. Where no flight has an attitude, the
-thrust points along the path's acceleration minus gravity, and only its size is compared
-(differential flatness; Mellinger and Kumar 2011).
+The lag is the time constant with which the rotors follow their commands. The fitted parameters are
+called numbers here; they have names such as `thrust` and `drag_x`.
 
-Torque: changes of the measured body rates, given what drives the rotors. `identify.py` calls both.
+Force fit: the model is compared with the measured acceleration, given the measured attitude. If no
+flight has an attitude, the thrust is assumed to point along the path's acceleration minus gravity,
+and only its size is compared (differential flatness; Mellinger and Kumar 2011).
+
+Torque fit: the model is compared with changes of the measured body rates, given the signals that
+drive the rotors. `identify.py` calls both fits.
 """
 
 from __future__ import annotations
@@ -24,28 +28,29 @@ from suite.diagnose.identify.grid import IMU_ACC, LEANING, ROTOR_NOISE, FlightGr
 FORCE_WIDTH_S = 0.4
 """Width of the windows over which forces are averaged [s]."""
 BLOCK_S = 2.0
-"""Errors this far apart count as independent [s]."""
+"""Length of a block of time; errors of different blocks count as independent [s]."""
 THRUST_SIGNALS = {"pwm": "pwm", "rotors": "rotor_speed"}
-"""By drive, the signal that determines the thrust; for other drives the commanded thrust."""
+"""Signal that determines the thrust, by drive (`DRIVES`); for other drives the commanded thrust."""
 TORQUE_SIGNALS = {**THRUST_SIGNALS, "torques": "torque_cmd_b"}
-"""By drive, the signal that determines the torque."""
+"""Signal that determines the torque, by drive."""
 SLOW_M_S = 2.0
-"""Without an attitude, faster windows are left out: a drag across the thrust would add to its size,
-by 0.3 % at this speed and 0.4 1/s [m/s]."""
+"""Largest speed of the windows that are used without an attitude. A drag across the thrust would
+add to the thrust's size, by 0.3 % at this speed and a drag of 0.4 1/s [m/s]."""
 FORCE_OFFSETS = np.array([True, True, False])
-"""Body axes along which each flight has a free constant, its trim of attitude. Along z a constant
-would be the thrust."""
+"""Body axes along which each flight has a free constant, for its trim (error of the attitude).
+Along z a constant would be mistaken for thrust."""
 
 
 def force_unknowns(
     driven: DrivenVehicle, voltage: bool, leaning: bool = False, scale: float = 0.0
 ) -> list[Unknown]:
-    """Return the numbers that forces identify, from their values in the vehicle file.
+    """Return the numbers that the force fit estimates, with their start in the vehicle file.
 
     Args:
-        driven: the start.
+        driven: vehicle from which the fit starts, with the drive of its flights.
         voltage: whether all flights have a battery voltage.
-        leaning: whether no flight has an attitude; drag is then fitted along body z only.
+        leaning: whether no flight has an attitude, so that it follows from how the vehicle must
+            lean to fly its path. Drag is then fitted along body z only.
         scale: logarithm of the thrust's scale in the vehicle file.
     """
     method_error = 0.004 if leaning else 0.001
@@ -68,10 +73,10 @@ def fit_force(
     """Fit the numbers of thrust and drag.
 
     Args:
-        flights: on their grids, with positions; all with an attitude, or none.
-        driven: the start.
-        unknowns: from `force_unknowns`.
-        fixed: numbers that are not fitted, `lag` and `late` among them.
+        flights: flights with positions; either all have an attitude, or none has one.
+        driven: vehicle from which the fit starts, with the drive of its flights.
+        unknowns: result of `force_unknowns`.
+        fixed: values of numbers that are not fitted, `lag` and `late` (total delay) among them.
 
     Raises:
         NoWholeWindow: if no window has all signals.
@@ -81,7 +86,7 @@ def fit_force(
 
 
 Model = TypeVar("Model")
-"""Input of the residuals of each flight: a trial vehicle, or the numbers by name."""
+"""What the residuals of a flight are computed from: a trial vehicle, or the numbers by name."""
 ForceResiduals = Callable[[TrialVehicle], Rows]
 """Function from a trial vehicle to the residuals of one flight."""
 
@@ -95,10 +100,10 @@ def stacked_residuals(
     """Return a function from the values of `unknowns` to the residuals of all flights.
 
     Args:
-        residuals: one function a flight.
-        unknowns: names of the values.
-        fixed: further numbers, by name.
-        model_at: makes of all numbers what each of `residuals` takes, once an evaluation.
+        residuals: a function for each flight, from the model to the flight's residuals.
+        unknowns: the numbers that are fitted.
+        fixed: values of the other numbers, by name.
+        model_at: function from all numbers to the model. It is called once for all flights.
     """
     names = [unknown.name for unknown in unknowns]
 
@@ -110,12 +115,14 @@ def stacked_residuals(
 
 
 def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResiduals:
-    """Return measured minus modelled accelerations of `flight` in body axes."""
+    """Return a function to measured minus modelled accelerations of `flight` in body axes."""
     thrust = THRUST_SIGNALS.get(driven.drive, "thrust_cmd")
+    # The measured acceleration is that of the accelerometer, or follows from velocity or position.
     motion = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
     needs = (motion, thrust, LEANING if leaning else "rot_w")
     form, rows = flight.form(FORCE_WIDTH_S, needs), flight.rows(attitude_of_path=True)
+    # A position is differentiated twice, which needs other weights than a velocity.
     path = flight.form(FORCE_WIDTH_S, needs, slope=True) if motion == "pos_w" else form
     if leaning:
         slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW_M_S
@@ -123,7 +130,7 @@ def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResidual
     to_acceleration = path.mean if motion == IMU_ACC else path.change
     measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
-    axes = slice(2 if leaning else 0, 3)
+    axes = slice(2 if leaning else 0, 3)  # without an attitude only body z, along the thrust
 
     def residuals(vehicle: TrialVehicle) -> Rows:
         acc_w, _ = vehicle.accelerations(flight, rows)
@@ -141,33 +148,35 @@ def block_of(form: WeakForm) -> np.ndarray:
 TORQUE_WIDTH_S = 0.2
 """Width of the windows in which changes of rate are compared [s]."""
 TO_RATE_S = TORQUE_WIDTH_S / (2.0 * np.pi)
-"""Factor from an angular acceleration to the change of rate in a window. The mean over a window is
-removed: the slow part of the motors' torque balances trim and flapping and rotates nothing [s]."""
+"""Factor from an angular acceleration to the change of rate that is compared in a window. The mean
+over the window is removed: the slow part of the motors' torque only balances trim and blade
+flapping, and does not turn the body [s]."""
 NO_OFFSETS = np.array([False, False, False])
-"""No axis has a free constant."""
+"""Body axes along which each flight has a free constant: none."""
 NOISE_BIASED = ("inertia_x", "inertia_y", "yaw")
-"""Numbers that noise of the rotor speeds biases, by axis."""
+"""For each body axis, the number that noise of the rotor speeds biases."""
 FORCE_NUMBERS = ("thrust", "curve", "battery")
 """Numbers of the force fit on which the torque depends."""
 LATEST_S, LATE_STEP_S = 0.13, 0.012
-"""Largest total delay that is tried before a fit, and the step between trials [s]."""
+"""Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
 
 
 def lag_unknowns(lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the total delay `late` from command to thrust, and the rotors' `lag` in it [s].
+    """Return the numbers `late` and `lag` [s].
 
-    Slow flights identify the total, but not the lag's share.
+    `late` is the total delay from a command to its thrust: the sum of the rotors' `lag` and a pure
+    delay. Slow flights identify the sum, but not the lag's share.
     """
     late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
     return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
 
 
 def torque_unknowns(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the numbers that torques identify; all but lag and delay are logarithms of ratios.
+    """Return the numbers that the torque fit estimates.
 
-    `inertia_z` is relative to the mean of the other two, and keeps that ratio where it is not
-    identifiable. `yaw` is the yaw torque over the inertia about z; a drive by commanded torques
-    has none.
+    All but lag and delay are logarithms of ratios to the start. `inertia_z` is relative to the mean
+    of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
+    the inertia about z. It is missing if torques are commanded.
     """
     lags = lag_unknowns(lag_s, delay_s)
     inertia = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
@@ -189,23 +198,26 @@ def fit_torque(
 ) -> Fitted:
     """Fit inertia, lag and delay by `dw/dt = J^-1 (tau - w x J w)`.
 
-    Noise in measured rotor speeds lowers every slope by its share in the driving torque's variance
-    (errors in variables; Fuller 1987, Sec. 1.1): the inertia would seem larger and the yaw torque
-    smaller. The model is therefore multiplied by the share that is not noise (the reliability
-    ratio); half of this correction counts as its uncertainty. A number that reaches its limit is
-    reset to its start and held.
+    Here w are the body rates, tau is the torque and J the inertia.
+
+    Noise in measured rotor speeds makes the modelled torque noisy, and a fit to a noisy input gives
+    too small a slope (errors in variables; Fuller 1987, Sec. 1.1). The inertia would seem larger
+    and the yaw torque smaller. The modelled torque is therefore multiplied by the share of its
+    variance that is not noise (the reliability ratio). Half of this correction counts as its
+    uncertainty. A number that reaches its limit is reset to its start and held.
 
     Args:
-        flights: on their grids, with body rates.
-        driven: the start.
-        unknowns: from `torque_unknowns`.
-        fixed: numbers that are not fitted, `lag` and `late` among them.
-        held: numbers that keep their start, with their uncertainty.
-        known: numbers of the force among `fixed`, with their covariance.
+        flights: flights with body rates.
+        driven: vehicle from which the fit starts, with the drive of its flights.
+        unknowns: result of `torque_unknowns`.
+        fixed: values of numbers that are not in `unknowns`, `lag` and `late` among them.
+        held: names of numbers that keep their start, with their uncertainty.
+        known: names and covariance of those of `fixed` that the force fit has identified.
 
     Raises:
         NoWholeWindow: if no window has all signals.
     """
+    # The known numbers join the unknowns, so that their uncertainty widens the intervals.
     known, steps = known or KnownNumbers(), {"thrust": 1e-3}
     unknowns = [
         *unknowns,
@@ -216,6 +228,7 @@ def fit_torque(
         flight.form(TORQUE_WIDTH_S, ("rate_b", TORQUE_SIGNALS[driven.drive]), slope=True)
         for flight in flights
     ]
+    # Correct the bias by noise of the rotor speeds.
     start = driven.at({**fixed, **{unknown.name: unknown.start for unknown in unknowns}})
     reliability = _reliability(flights, forms, start)
     correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
@@ -228,6 +241,7 @@ def fit_torque(
         _torque_residuals(*part, reliability) for part in zip(flights, forms, measured, strict=True)
     ]
     residuals = stacked_residuals(flight_residuals, unknowns, fixed, driven.at)
+    # The fit is linearised, so it needs a start near the right delay.
     if any(unknown.name == "late" for unknown in unknowns):
         late_s = _best_correlated_delay(unknowns, residuals, measured)
         unknowns = [u._replace(start=late_s) if u.name == "late" else u for u in unknowns]
@@ -246,11 +260,15 @@ def fit_torque(
 def _torque_residuals(
     flight: FlightGrid, form: WeakForm, measured: np.ndarray, reliability: np.ndarray
 ) -> ForceResiduals:
-    """Return measured minus modelled changes of the body rates of `flight`."""
+    """Return a function to measured minus modelled changes of the body rates of `flight`.
+
+    `measured` (M, 3) are the measured changes, and `reliability` (3,) is from `_reliability`.
+    """
     rows = flight.rows(attitude_of_path=False)
 
     def residuals(vehicle: TrialVehicle) -> Rows:
         _, turn_b = vehicle.accelerations(flight, rows)
+        # Only the part that the rotors cause is noisy.
         if (reliability < 1.0).any():
             _, unpowered_b = vehicle.accelerations(flight, rows, powered=False)
             turn_b = unpowered_b + reliability * (turn_b - unpowered_b)
@@ -268,7 +286,10 @@ def _rate_change(flight: FlightGrid, form: WeakForm) -> np.ndarray:
 def _reliability(
     flights: Sequence[FlightGrid], forms: Sequence[WeakForm], vehicle: TrialVehicle
 ) -> np.ndarray:
-    """Return the share (3,) of the modelled torque's variance that rotor-speed noise is not."""
+    """Return the share (3,) of the modelled torque's variance that is not rotor-speed noise.
+
+    Further noise of the same size is added to the rotor speeds, to see how much it changes.
+    """
     if vehicle.driven.drive != "rotors":
         return np.ones(3)
     noise_power, power = np.zeros(3), np.zeros(3)
@@ -293,8 +314,8 @@ def _best_correlated_delay(
 
     Args:
         unknowns: the numbers, `late` among them.
-        residuals: of all flights, by their values.
-        measured: (M, 3) changes of the body rates of each flight.
+        residuals: function from the values of the numbers to the residuals of all flights.
+        measured: for each flight, the changes of its body rates (M, 3).
     """
     value = np.array([unknown.start for unknown in unknowns])
     late = [unknown.name for unknown in unknowns].index("late")
@@ -304,6 +325,7 @@ def _best_correlated_delay(
         value[late] = max(trial, 0.0)
         for rows, turned in zip(residuals(value), measured, strict=True):
             if len(turned):
+                # Measured minus residual is the modelled change.
                 model, data = (v - np.median(v, axis=0) for v in (turned - rows.value, turned))
                 size = np.sqrt((model**2).sum(axis=0) * (data**2).sum(axis=0))
                 scores[k] += ((model * data).sum(axis=0) / np.maximum(size, TINY))[:2].sum()

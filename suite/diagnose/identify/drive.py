@@ -2,7 +2,8 @@
 
 The drive is what determines the rotors' thrust: measured rotor speeds, motor commands, or commanded
 torques, rates and thrust. The equations are those of the simulated vehicle in `eval/`. The fits of
-`suite identify` change the vehicle's numbers and compare the accelerations with the measured ones.
+`suite identify` change the vehicle's numbers (parameters, by name) and compare the accelerations
+with the measured ones. G is the number of times on the grid of a flight (`grid.py`).
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ DRIVES = {
     "rates": ("thrust_cmd", "rate_cmd_b"),
     "thrust": ("thrust_cmd",),
 }
-"""Required signals by drive. The first drive whose signals all flights have is used."""
+"""Signals that each drive needs. The first drive whose signals all flights have is used."""
 KNOWN_MOTORS = ("rotors", "pwm")
 """Drives that determine each rotor's thrust; the others give commands to a controller."""
 LEAST_LAG_S = 1e-4
-"""A shorter lag of the rotors counts as none [s]."""
+"""A shorter lag (time constant) of the rotors counts as none [s]."""
 LEAST_VOLTS = 0.1
 """Lower measured voltages are raised to this, so that a power of them is finite [V]."""
 
@@ -57,8 +58,8 @@ def common_drive(flights: Sequence[FlightGrid]) -> str:
 def with_known_thrust(flights: Sequence[FlightGrid], drive: str) -> list[FlightGrid]:
     """Return the flights in which the motors' thrust is known best.
 
-    Under motor commands it depends on the battery. Flights without a voltage are then left out if
-    others have one.
+    The thrust of a motor command depends on the battery. For this drive, flights without a voltage
+    are therefore left out if other flights have one.
     """
     with_voltage = [flight for flight in flights if flight.has("voltage")]
     return with_voltage if with_voltage and drive == "pwm" else list(flights)
@@ -88,11 +89,12 @@ def _median_volts(flights: Sequence[FlightGrid], default: float) -> float:
 
 @dataclass(frozen=True)
 class DrivenVehicle:
-    """The start vehicle of a fit, and the drive of its flights.
+    """The start of a fit (the vehicle before it), and the drive of its flights.
 
-    Methods take `numbers`, the fitted numbers by name. A missing one keeps the start's value.
-    `thrust` is the logarithm of a ratio to the start. For motors it is taken at the usual command
-    and voltage, and `curve` is the quadratic term's share of the thrust there.
+    Methods take `numbers`, the values of fitted numbers by name. A number that is missing keeps its
+    value in the start. `thrust` is the logarithm of the ratio of the thrust to the start's. With
+    motor commands, this is the thrust at the usual command and voltage, and `curve` is the share of
+    the quadratic term in it.
     """
 
     start: Vehicle
@@ -105,7 +107,7 @@ class DrivenVehicle:
 
     @property
     def motors(self) -> MotorMap:
-        """The start's motors; a placeholder under drives other than motor commands."""
+        """The start's motors; a placeholder for drives other than motor commands."""
         return self.start.motors or MotorMap((0.0, 1.0), 1.0, 0.0)
 
     @property
@@ -126,7 +128,7 @@ class DrivenVehicle:
         return self.motors.voltage_exponent
 
     def motor_map(self, numbers: Mapping[str, float]) -> MotorMap:
-        """Return the table `[motors]` at `numbers`."""
+        """Return the table `[motors]` of a vehicle file with these `numbers`."""
         curve, battery = numbers.get("curve", self.curve), numbers.get("battery", self.battery)
         thrust = sum(self.usual_thrust) * float(np.exp(numbers.get("thrust", 0.0)))
         per_applied = (self.motors.voltage / self.usual_volts) ** battery / self.usual_command
@@ -134,14 +136,17 @@ class DrivenVehicle:
         return MotorMap((float(first), float(second)), self.motors.voltage, float(battery))
 
     def thrust_coefficient(self, numbers: Mapping[str, float]) -> float:
-        """Return the rotors' thrust coefficient; only measured rotor speeds identify it."""
+        """Return the rotors' thrust coefficient.
+
+        Only measured rotor speeds identify it; with other drives it is the start's.
+        """
         scale = float(np.exp(numbers.get("thrust", 0.0))) if self.drive == "rotors" else 1.0
         return self.start.rotors.thrust_coefficient * scale
 
     def torque_coefficient(self, numbers: Mapping[str, float]) -> float:
         """Return the rotors' torque coefficient.
 
-        `yaw` is the logarithm of the ratio of yaw torque to inertia about z.
+        The number `yaw` is the logarithm of yaw torque over inertia about z, relative to the start.
         """
         thrust = numbers.get("thrust", 0.0) if self.drive == "rotors" else 0.0
         log_ratio = numbers.get("yaw", 0.0) + log_inertia_ratio(numbers)[2] + thrust
@@ -154,7 +159,10 @@ class DrivenVehicle:
         return tuple(float(numbers.get(f"drag_{a}", d)) for a, d in zip("xyz", start, strict=True))
 
     def at(self, numbers: Mapping[str, float]) -> TrialVehicle:
-        """Return the vehicle at `numbers`, with all effects of the start that depend on state."""
+        """Return the vehicle with these `numbers`.
+
+        It keeps those effects of the start that only depend on the state (`by_state`).
+        """
         effects = {n: v for n, v in self.start.effects.items() if EFFECTS[n].by_state}
         effects["linear_drag"] = EFFECTS["linear_drag"].values(self.drag(numbers))
         if self.drive not in KNOWN_MOTORS:
@@ -170,7 +178,7 @@ class DrivenVehicle:
         return TrialVehicle(self, numbers, make_plant(vehicle, LONGEST_S))
 
     def rotor_speed(self, flight: FlightGrid, numbers: Mapping[str, float]) -> np.ndarray:
-        """Return the rotor speeds (G, 4) [rad/s]: measured, or from their commands.
+        """Return the rotor speeds (G, 4) of a flight [rad/s]: measured, or from their commands.
 
         Commands act after a delay and a first-order lag, see `after_delay_and_lag`.
         """
@@ -186,24 +194,31 @@ class DrivenVehicle:
         else:
             thrust = 0.25 * self.start.mass * np.maximum(signals["thrust_cmd"], 0.0)
             speed = np.sqrt(thrust / self.start.rotors.thrust_coefficient)
-            commanded = speed[:, None] * np.ones(4)
+            commanded = speed[:, None] * np.ones(4)  # a thrust command is equal for all rotors
         return after_delay_and_lag(commanded, numbers)
 
 
 @dataclass(frozen=True)
 class TrialVehicle:
-    """A vehicle with trial numbers; its equations are set up once for all flights."""
+    """A vehicle with trial values of the numbers; its equations are set up once for all flights."""
 
     driven: DrivenVehicle
     numbers: Mapping[str, float]
     plant: Plant
+    """The vehicle with its effects, prepared for the equations of motion."""
 
     def accelerations(
         self, flight: FlightGrid, rows: FlightRows, powered: bool = True
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return dv/dt in the world and dw/dt in body axes (G, 3) on the `rows` of `flight`.
+        """Return the linear and the angular acceleration of the vehicle on each row.
 
-        The rotors' speed is 0 where it is unknown, and everywhere if not `powered`.
+        Args:
+            flight: the flight, with the signals that drive it.
+            rows: its state on the grid.
+            powered: whether the rotors turn. Otherwise, and where it is unknown, their speed is 0.
+
+        Returns:
+            dv/dt in world axes and dw/dt in body axes, (G, 3) each.
         """
         if powered:
             speed = self.driven.rotor_speed(flight, self.numbers)
@@ -228,33 +243,34 @@ def driven_vehicle(flights: Sequence[FlightGrid], vehicle: Vehicle, drive: str) 
 
 
 def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the logarithms (3,) of the inertia over the start's.
+    """Return the logarithms (3,) of the ratios of the inertia to the start's.
 
-    `inertia_z` is relative to the mean of the other two.
+    The number `inertia_z` is relative to the mean of the other two.
     """
     x, y, z = (numbers.get(f"inertia_{axis}", 0.0) for axis in "xyz")
     return np.array([x, y, 0.5 * (x + y) + z])
 
 
 def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return held `commands` (G, C) as the rotors follow them.
+    """Return `commands` (G, C) as the rotors follow them: delayed, then with a first-order lag.
 
-    `numbers["lag"]` is the rotors' time constant, `numbers["late"]` its sum with the delay [s].
+    `numbers["lag"]` is the rotors' time constant, and `numbers["late"]` the sum of time constant
+    and delay [s].
     """
     lag_s = numbers["lag"]
     return lagged(delayed(commands, numbers["late"] - lag_s), lag_s)
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return held `values` (G, ...) as they were `delay_s` ago; before the first row, the first.
+    """Return `values` (G, ...) as they were `delay_s` ago; the first value counts before it too.
 
     A value is a mean over one step of the grid, so its time is the middle of the step.
     """
     count = len(values)
     place = np.clip(np.arange(count) - delay_s / STEP_S - 0.5, 0.0, count - 1.0)
     row = np.minimum(place.astype(int), max(count - 2, 0))
-    part = (place - row).reshape(-1, *[1] * (values.ndim - 1))
-    return (1.0 - part) * values[row] + part * values[np.minimum(row + 1, count - 1)]
+    fraction = (place - row).reshape(-1, *[1] * (values.ndim - 1))
+    return (1.0 - fraction) * values[row] + fraction * values[np.minimum(row + 1, count - 1)]
 
 
 def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
@@ -278,21 +294,21 @@ def filled(values: np.ndarray) -> np.ndarray:
 MERGED = ("motor_lag", "inertia_scale", "rate_gain")
 """Effects that scale or replace a fitted number."""
 FITTED = ("linear_drag", "blade_flapping", "command_delay", "thrust_scale")
-"""Effects whose own parameters are fitted, from their values in the start's file."""
+"""Effects whose parameters are fitted themselves, starting from their values in the file."""
 
 
 def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
     """Return `vehicle` with its effects that scale a fitted number merged into that number.
 
-    It flies as before. Otherwise the effect would act a second time on the fitted number.
+    It flies as before. If such an effect stayed, it would scale the fitted number once more.
 
     Args:
         vehicle: the start of the fit.
         known_motors: whether the motors' thrust is fitted; `thrust_scale` is then merged as well.
 
     Raises:
-        ValueError: if a merged number is not allowed in a vehicle file, as of rotors that are too
-            weak to hover.
+        ValueError: if a merged number is not allowed in a vehicle file, such as the thrust of
+            rotors that are too weak to hover.
     """
     names = (*MERGED, "thrust_scale") if known_motors else MERGED
     merged = {name: values for name, values in vehicle.effects.items() if name in names}
@@ -322,9 +338,9 @@ def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
 
 
 def unmodelled_effects(vehicle: Vehicle) -> list[str]:
-    """Return the vehicle's effects that no fit models; they stay in its file.
+    """Return the names of the vehicle's effects that no fit models; they stay in its file.
 
-    Force and torque model all effects that depend on the state.
+    The fits of force and torque model the effects that only depend on the state (`by_state`).
     """
     return [
         name

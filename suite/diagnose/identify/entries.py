@@ -1,4 +1,8 @@
-"""Converts fitted numbers into entries of a vehicle file, and makes the vehicle that has them."""
+"""Converts fitted numbers into entries of a vehicle file, and makes the vehicle that has them.
+
+A fitted number is a parameter of a fit, such as `thrust` or `lag` (`body.py`). An entry (`Number`)
+has the key, unit and values of the vehicle file, such as `rotors.time_constant`, with intervals.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +27,23 @@ EFFECTS_TABLE = "effects."
 
 
 def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the inertia (3,) at fitted `numbers` [kg m^2].
+    """Return the inertia (3,) for the fitted `numbers` [kg m^2].
 
-    Where `inertia_z` is missing, it changes by the mean of the other two's changes. The largest is
-    limited to the sum of the others, as in every rigid body.
+    If `inertia_z` is not among them, the inertia about z changes by the mean ratio of the other
+    two. The largest inertia is limited to the sum of the others, as in every rigid body.
     """
     inertia = np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers))
     return np.minimum(inertia, inertia.sum() - inertia)
 
 
 def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
-    """Return the entries that the force identifies: motors or rotors, and drag."""
+    """Return the entries that the force fit estimates: motors or rotors, and drag.
+
+    Args:
+        driven: vehicle from which the fit started, with the drive of its flights.
+        fitted: result of the force fit.
+    """
+    # For each entry: key, unit, formula, and the number that each value needs.
     rows: list[tuple[str, str, Formula, Sequence[str]]] = []
     if "thrust" in fitted.names and driven.drive == "pwm":
         motor_map = driven.motor_map
@@ -55,13 +65,13 @@ def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
 def torque_entries(
     driven: DrivenVehicle, fitted: Fitted, log_thrust: float, lag_s: float
 ) -> list[Number]:
-    """Return the entries that the torque identifies: inertia, yaw torque, lag and delay.
+    """Return the entries that the torque fit estimates: inertia, yaw torque, lag and delay.
 
     Args:
-        driven: the start.
-        fitted: result of the torque's fit.
-        log_thrust: logarithm of the thrust's scale, from the force's fit.
-        lag_s: lag of the rotors, where this fit has none [s].
+        driven: vehicle from which the fit started, with the drive of its flights.
+        fitted: result of the torque fit.
+        log_thrust: logarithm of the scale of the thrust, from the force fit.
+        lag_s: lag (time constant) of the rotors, used if this fit has not estimated it [s].
     """
     entries, vehicle = list[Number](), driven.start
     if "inertia_x" in fitted.names:
@@ -70,8 +80,8 @@ def torque_entries(
         )
         entries.append(inertia)
     if "yaw" in fitted.names:
-        # Flights show the ratio of torque to inertia about z. The inertia's uncertainty counts as
-        # far as the inertia is identified; otherwise it is held fixed.
+        # Flights show the ratio of torque to inertia about z. The uncertainty of the inertia counts
+        # if the inertia is identified; otherwise the inertia is held fixed.
         identified = [name for name in INERTIAS if fitted.identifies(name)]
 
         def torque_coefficient(n: Mapping[str, float]) -> float:
@@ -84,17 +94,17 @@ def torque_entries(
 
 
 def loop_entries(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
-    """Return the entries of lag, delay and rate gains that the fit has.
+    """Return the entries of lag, delay and gains of the rate loop, as far as the fit has them.
 
-    `lag_s` is the rotors' lag where the fit has none [s].
+    `lag_s` is the rotors' lag, used if the fit has not estimated it [s].
     """
     entries = []
     if "lag" in fitted.names:
         lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
         entries.append(lag)
     if "late" in fitted.names:
-        # The delay is at least as uncertain as the lag, however exact their sum is. The file has a
-        # delay that keeps the sum.
+        # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
+        # exact the sum is. The delay in the file keeps the sum.
         widest = fitted.unknowns[fitted.index("late")].max_half_width
         delay_s: Formula = lambda n: n["late"] - n.get("lag", lag_s)  # noqa: E731
         entries.append(number_from(fitted, DELAY, "s", delay_s, ("late",), widest))
@@ -112,7 +122,7 @@ def with_entries(
 
     Returns:
         The vehicle, the entries with the values that its file has, and a line for people for each
-        value that had to differ from the fitted one. A delay of 0 is no entry.
+        value that had to differ from the fitted one. A delay of 0 is removed from the entries.
     """
     numbers, notes = [], []
     for entry in entries:
@@ -125,17 +135,20 @@ def with_entries(
             fitted, allowed = entry.value[k], clipped.value[k]
             if span is None or fitted == allowed:
                 continue
-            part = f"[{k}]" if len(entry.value) > 1 else ""
+            component = f"[{k}]" if len(entry.value) > 1 else ""
             given = f"{fitted:.4g} ({span[0]:.4g} to {span[1]:.4g}) {entry.unit}"
             then = f"the file has {allowed:.4g}, the nearest allowed value"
             if removed:
                 then = "the file has none"
-            notes.append(f"{entry.key}{part}: these flights give {given}; {then}")
+            notes.append(f"{entry.key}{component}: these flights give {given}; {then}")
     return vehicle, numbers, notes
 
 
 def _clipped(vehicle: Vehicle, entry: Number) -> Number:
-    """Return an entry with the nearest values that a file may hold; its intervals stay."""
+    """Return an entry with the nearest values that a file may have; its intervals stay.
+
+    Only the parameters of effects have limits.
+    """
     table, _, _ = entry.key.rpartition(".")
     if not table.startswith(EFFECTS_TABLE):
         return entry
@@ -145,9 +158,9 @@ def _clipped(vehicle: Vehicle, entry: Number) -> Number:
 
 
 def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
-    """Return the vehicle with the values of `entry` if these flights determine it.
+    """Return the vehicle with the values of `entry`, if these flights determine them.
 
-    The inertia is not entered here: `identify` sets it from all its numbers.
+    The inertia is not entered here, since `identify.py` sets all three components together.
     """
     if not entry.is_entered:
         return vehicle
@@ -159,7 +172,7 @@ def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
         if entry.key == DELAY and value == 0.0:
             del effects[name]
         return replace(vehicle, effects=MappingProxyType(effects))
-    if not table:
+    if not table:  # the inertia
         return vehicle
     return replace(vehicle, **{table: replace(getattr(vehicle, table), **{key: value})})
 
@@ -167,12 +180,13 @@ def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
 def with_reachable_speed(vehicle: Vehicle, speeds: Sequence[np.ndarray]) -> Vehicle:
     """Return a vehicle whose rotors are fast enough to hover.
 
-    If its `speed_max` is too low for that, the 99th percentile of the flights' measured `speeds`
-    (G, 4) [rad/s] replaces it: the highest speed of a log may be an outlier.
+    If its `speed_max` is too low for that, it is replaced by the 99th percentile of the measured
+    rotor speeds; the highest speed of a log may be an outlier. `speeds` has one array (G, 4) for
+    each flight [rad/s].
     """
     try:
         check_vehicle(vehicle)
-    except ValueError:
+    except ValueError:  # with the identified thrust, the largest speed does not suffice to hover
         fastest = float(np.nanpercentile(np.concatenate(speeds), 99.0))
         if fastest > vehicle.rotors.speed_max:
             return replace(vehicle, rotors=replace(vehicle.rotors, speed_max=fastest))

@@ -1,9 +1,10 @@
 """Robust least squares for `suite identify`; numbers that are not identifiable keep their start.
 
-Gauss-Newton with Huber's weights fits the residuals of flights. Intervals come from how blocks and
-flights disagree. Numbers from an earlier fit are held fixed, with that fit's covariance (Murphy and
-Topel 1985). If an interval is too wide, the least identifiable number is reset to its start, and
-the others are fitted again.
+A number is a parameter of the vehicle that is fitted; P is the count of all. Gauss-Newton steps
+with Huber's weights minimise the residuals of flights. Intervals come from the disagreement between
+flights, and between blocks (pieces of a flight). Numbers from an earlier fit are held fixed, with
+the covariance of that fit (Murphy and Topel 1985). If an interval is too wide, the least
+identifiable number is reset to its start, and the others are fitted again.
 """
 
 from __future__ import annotations
@@ -21,19 +22,20 @@ from suite.diagnose.estimate.parameters import FittedNumber, ParameterSpace
 from suite.diagnose.thresholds import THRESHOLDS
 
 HUBER = 2.5
-"""Residuals beyond this many standard deviations get a lower weight [1]."""
+"""Residuals beyond this many standard deviations get a lower weight."""
 LEAST_NOISE_SHARE = 0.3
-"""Least width of an interval, as a share of the width for independent windows [1]."""
+"""Least width of an interval, as a share of its width if all windows were independent."""
 LIMITS = replace(THRESHOLDS, converged=1e-3)
-"""A step below 0.03 standard deviations is the last."""
+"""Thresholds of the fit. It ends with a step below 0.03 standard deviations."""
 ROUNDS = 6
 """Largest number of rounds; each computes new weights and takes some Gauss-Newton steps."""
 DIFFER_P = 0.05
-"""Flights count as different below this p-value [1]."""
+"""P-value below which flights differ more than their blocks explain. Intervals are then wider."""
 LEAST_SIGMA, LEAST_ERROR, LEAST_WEIGHT = 1e-9, 1e-9, 1e-12
-"""Lower limits that avoid a division by zero: noise, error in units of it, sum of weights."""
+"""Lower limits that avoid a division by zero: of the noise, of an error divided by the noise, and
+of a sum of weights."""
 LEAST_VARIANCE = 1e-30
-"""The same for a product of two standard deviations."""
+"""Lower limit of a product of two standard deviations, for the same reason."""
 
 
 class NoWholeWindow(ValueError):
@@ -52,17 +54,17 @@ class Unknown(NamedTuple):
     step: float
     """Step of the finite differences."""
     method_error: float = 0.0
-    """Error of the method on flights without noise, by simulation; added to the half-width in
-    squares."""
+    """Half-width of the method's own error, from simulated flights without noise. Its square is
+    added to that of the interval's half-width."""
 
 
 class Rows(NamedTuple):
     """Residuals of one flight in N windows and C channels."""
 
     value: np.ndarray
-    """(N, C) measured minus modelled."""
+    """(N, C) measured minus modelled value."""
     block: np.ndarray
-    """(N,) number of the block; errors of different blocks are independent."""
+    """(N,) number of the window's block; errors of different blocks are independent."""
     offset: np.ndarray
     """(C,) bool: channels in which the flight has a free constant, such as a trim."""
 
@@ -76,7 +78,7 @@ class KnownNumbers(NamedTuple):
 
     names: tuple[str, ...] = ()
     covariance: np.ndarray = np.zeros((0, 0))
-    """(K, K) by the earlier fit."""
+    """(K, K) covariance of these numbers in the earlier fit."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class Fitted:
     half_width: np.ndarray
     """(P,) half-widths of the 95 % intervals; NaN for a number that was not fitted."""
     covariance: np.ndarray
-    """(P, P) covariance; a number that was not fitted has its prior variance."""
+    """(P, P) covariance; for a number that was not fitted, the square of `max_half_width`."""
     not_identified: tuple[str, ...] = ()
     """Names of numbers that these flights do not identify; they keep their start."""
     residual_rms: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -102,7 +104,7 @@ class Fitted:
         return name in self.names and name not in (*self.not_identified, *self.known)
 
     def known_numbers(self, *names: str) -> KnownNumbers:
-        """Return those of `names` that this fit has, for a fit that depends on them."""
+        """Return those of `names` that this fit has, for another fit that depends on them."""
         indices = [k for k, unknown in enumerate(self.unknowns) if unknown.name in names]
         present = tuple(self.unknowns[k].name for k in indices)
         return KnownNumbers(present, self.covariance[np.ix_(indices, indices)])
@@ -143,7 +145,11 @@ class ResidualEvidence:
         return Estimate(value, np.zeros((0, 0)))
 
     def weighed(self, at: Estimate) -> ResidualEvidence:
-        """Return this with weights by each channel's noise, lower for outliers (Huber 1964)."""
+        """Return this evidence with weights of the residuals at the estimate `at`.
+
+        A weight is one over the variance of the channel's noise, and lower for an outlier (Huber
+        1964).
+        """
         errors = [np.abs(_without_median(row)) for row in self.residuals(at.theta)]
         # 1.4826 times the median absolute deviation is a normal variable's standard deviation.
         sigma = np.maximum(1.4826 * np.median(np.concatenate(errors), axis=0), LEAST_SIGMA)
@@ -156,6 +162,7 @@ class ResidualEvidence:
 
         Slopes are finite differences, with a step away from an upper limit.
         """
+        # Differentiate the residuals along each number.
         along = range(len(self.unknowns)) if indices is None else indices
         rows, differences = self.residuals(at.theta), []
         for k in along:
@@ -165,6 +172,7 @@ class ResidualEvidence:
             moved[k] += step
             pairs = zip(self.residuals(moved), rows, strict=True)
             differences.append([(a.value - b.value) / step for a, b in pairs])
+        # Remove the free constants of each flight, and scale by the root of the weights (whiten).
         values, slopes, blocks = [], [], []
         for flight, (row, weight) in enumerate(zip(rows, self.weights, strict=True)):
             columns = [row.value, *(-difference[flight] for difference in differences)]
@@ -173,6 +181,7 @@ class ResidualEvidence:
             values.append(white[..., 0])
             slopes.append(white[..., 1:])
             blocks.append(np.stack([np.full(len(row.block), flight), row.block]))
+        # Number the blocks of all flights.
         places, stretch = np.unique(np.concatenate(blocks, axis=1), axis=1, return_inverse=True)
         residual, slope = np.concatenate(values), np.concatenate(slopes)
         flight_of, block = places
@@ -193,10 +202,10 @@ def fit(
     others include the effect of that.
 
     Args:
-        residuals: the residuals of all flights.
+        residuals: function from the values of the numbers to the residuals of all flights.
         unknowns: the numbers.
         held: names of numbers that are not fitted and keep their start.
-        known: those of `unknowns` that another fit has identified.
+        known: those of `unknowns` that another fit has identified; they keep their start, too.
 
     Raises:
         NoWholeWindow: if the residuals have no window.
@@ -209,11 +218,13 @@ def fit(
     while True:
         not_fitted = (*not_identified, *known.names)
         free = [k for k, unknown in enumerate(unknowns) if unknown.name not in not_fitted]
+        # Fit the free numbers; each round has new weights.
         for _ in range(ROUNDS if free else 0):
             before, evidence = at, evidence.weighed(at)
             at, _ = fit_numbers(evidence, at, free, limits=LIMITS)
             if (at.theta == before.theta).all():
                 break
+        # Reset the number with the widest interval to its start, until all intervals are narrow.
         covariance, half = _errors(evidence.weighed(at), at, free, known)
         ratio = [half[k] / unknowns[k].max_half_width for k in free]
         if not free or max(ratio) <= 1.0:
@@ -245,7 +256,10 @@ def _without_mean(values: np.ndarray, weight: np.ndarray, offset: np.ndarray) ->
 def _errors(
     evidence: ResidualEvidence, at: Estimate, free: Sequence[int], known: KnownNumbers
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance (P, P), and the half-widths (P,) of the numbers at `free`."""
+    """Return the covariance (P, P) and the half-widths (P,) of the 95 % intervals.
+
+    `free` are the indices of the fitted numbers; the half-widths of the others are NaN.
+    """
     unknowns = evidence.unknowns
     total, names = len(unknowns), [unknown.name for unknown in unknowns]
     half = np.full(total, np.nan)
@@ -256,9 +270,10 @@ def _errors(
     equations = evidence.linearise(at).equations
     prior = np.array([0.0 if k in free else 1.0 / unknowns[k].max_half_width ** 2 for k in others])
     intervals = intervals95(equations.take(others), DIFFER_P, True, LEAST_NOISE_SHARE, prior)
+    # A number that is not fitted has at most its prior uncertainty.
     most = np.array([np.inf if k in free else Z95 * unknowns[k].max_half_width for k in others])
     noise_half = np.minimum(intervals.half_width, most)
-    # Errors of the method are not correlated between numbers, as those by noise are.
+    # Errors of the method are not correlated between numbers; errors by noise are.
     method = np.array([unknowns[k].method_error for k in others])
     method = np.minimum(method, np.sqrt(most**2 - noise_half**2))
     sd = np.sqrt(np.diag(intervals.by_stretch))
@@ -266,9 +281,9 @@ def _errors(
     np.fill_diagonal(correlation, 1.0)
     # How far the fitted numbers move with each number that is held fixed.
     response = intervals.inverse @ equations.sums()[0][np.ix_(others, fixed)]
-    own = (correlation * np.outer(noise_half, noise_half) + np.diag(method**2)) / Z95**2
+    own_covariance = (correlation * np.outer(noise_half, noise_half) + np.diag(method**2)) / Z95**2
     covariance = np.zeros((total, total))
-    covariance[np.ix_(others, others)] = own + response @ known.covariance @ response.T
+    covariance[np.ix_(others, others)] = own_covariance + response @ known.covariance @ response.T
     covariance[np.ix_(fixed, fixed)] = known.covariance
     half[list(free)] = Z95 * np.sqrt(np.diag(covariance)[list(free)])
     return covariance, half

@@ -1,8 +1,9 @@
-"""Identifies the blade flapping coefficient, the torque of moving air on the rotors.
+"""Identifies the coefficient of blade flapping, a torque of moving air on the rotors.
 
-Inertia and lags come from fast changes of the rates alone (`body.py`), since the motors balance
-slow disturbances. Once these are known, the motors' balance shows flapping. The uncertainty of
-motors and inertia widens its interval. `identify.py` calls this after the other fits.
+The motors balance slow torques such as flapping. The fits of inertia and lag therefore use fast
+changes of the rates alone (`body.py`). Once inertia and motors are known, the slow part of the
+motors' torque shows the flapping that it balances. The uncertainty of motors and inertia widens the
+interval. `identify.py` calls this after the other fits.
 """
 
 from __future__ import annotations
@@ -29,21 +30,23 @@ from suite.diagnose.search.evaluation import SearchResult
 from suite.diagnose.search.search import search
 
 FLAPPING, KEY = "blade_flapping", "coefficient"
+"""Name of the effect and of its parameter."""
 UNIT = "N s^2/rad"
+"""Unit of the coefficient."""
 
 
 def flapping_of(
     logs: Sequence[FlightLog], vehicle: Vehicle, perturbed: Sequence[Vehicle] = ()
 ) -> Number | None:
-    """Return the flapping coefficient of `vehicle` by `logs`, or None if none is significant.
+    """Return the flapping coefficient that `logs` show, or None if it is not significant.
 
     Only complete logs are used. The significance test is that of a diagnosis.
 
     Args:
         logs: flights.
-        vehicle: the vehicle with all other identified numbers.
-        perturbed: vehicles one standard deviation off, from `perturbed_vehicles`. The change of
-            the coefficient under each widens the interval.
+        vehicle: the vehicle with all other identified numbers (parameters).
+        perturbed: vehicles with one error of one standard deviation each, from
+            `perturbed_vehicles`. The change of the coefficient with each error widens the interval.
     """
     complete = [log for log in logs if not log.partial]
     try:
@@ -54,14 +57,16 @@ def flapping_of(
         return None
     voltage = all(log.voltage is not None for log in complete)
     evidence = _torque_evidence(flights, vehicle, voltage)
-    every = candidates(evidence.model.space, voltage, ())
-    flapping = [candidate for candidate in every if candidate.name == FLAPPING]
+    # Search for flapping alone, as a diagnosis searches for an effect.
+    all_candidates = candidates(evidence.model.space, voltage, ())
+    flapping = [candidate for candidate in all_candidates if candidate.name == FLAPPING]
     weighed, block = evidence.estimate_noise(evidence.start)
     allowed = view_candidates(flapping, block)
     result = search(weighed, evidence.start, allowed, known=(weighed, block))
     if not result.named:
         return None
     value = float(result.estimate.theta[result.indices[0]])
+    # Errors of motors and inertia are independent, so their squares are added.
     others = (_torque_evidence(ready(complete, other), other, voltage) for other in perturbed)
     steps = [_coefficient_step(other, result) for other in others]
     half = float(np.hypot(result.half_widths()[0], Z95 * np.linalg.norm(steps)))
@@ -69,12 +74,16 @@ def flapping_of(
 
 
 def _torque_evidence(flights: ViewFlights, vehicle: Vehicle, voltage: bool) -> ViewEvidence:
+    """Return the torques of `flights` compared with those of `vehicle`."""
     model = ForceModel(vehicle, make_space(vehicle), voltage)
     return ViewEvidence(TORQUE, model, flights.smoothed[TORQUE.name])
 
 
 def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
-    """Return the Gauss-Newton step of the coefficient of `result` under another vehicle."""
+    """Return how far the coefficient of `result` moves if the flights are those of another vehicle.
+
+    It is one Gauss-Newton step; `evidence` compares the flights with that vehicle.
+    """
     theta, (index,) = evidence.model.space.array("start"), result.indices
     theta[index] = result.estimate.theta[index]
     last = result.last.evidence
@@ -85,9 +94,9 @@ def _coefficient_step(evidence: ViewEvidence, result: SearchResult) -> float:
 
 
 def one_sigma_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
-    """Return the fit with the numbers `names` moved by one standard deviation.
+    """Return copies of a fit whose numbers `names` are moved by one standard deviation.
 
-    One result for each principal axis of their covariance; these errors are independent.
+    There is one copy for each principal axis of the covariance; these errors are independent.
     """
     known = fitted.known_numbers(*names)
     if not known.names:
@@ -105,13 +114,15 @@ def one_sigma_off(fitted: Fitted, names: tuple[str, ...]) -> list[Fitted]:
 def perturbed_vehicles(
     vehicle: Vehicle, driven: DrivenVehicle, force: Fitted, torque: Fitted
 ) -> list[Vehicle]:
-    """Return `vehicle` with motors or inertia one standard deviation off, one error each.
+    """Return copies of `vehicle` with one error of one standard deviation each.
+
+    The errors are those of motors and inertia.
 
     Args:
-        vehicle: with the identified numbers.
-        driven: the start of the fits.
-        force: result of the force's fit.
-        torque: result of the torque's fit.
+        vehicle: the vehicle with the identified numbers.
+        driven: vehicle from which the fits started, with the drive of its flights.
+        force: result of the force fit.
+        torque: result of the torque fit.
     """
     vehicles = []
     for fitted in one_sigma_off(force, FORCE_NUMBERS):

@@ -2,6 +2,8 @@
 
 On so fine a grid, a command can be delayed by a fraction of a log row. The fits compare measured
 and modelled accelerations as weighted means over short windows (`data/view.py`, the weak form).
+
+T is the number of rows of a log, G the number of grid points, and C the number of columns.
 """
 
 from __future__ import annotations
@@ -28,16 +30,16 @@ MEMORY_S = 0.4
 HOLE_STEPS = 4.0
 """Rows further apart than this many median steps are a hole; no window reaches across it."""
 ROTOR_NOISE = "rotor_noise"
-"""Signal: random noise as large as that of the measured rotor speeds, to see its effect on a
-window."""
+"""Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
+them, to see how such noise changes the model."""
 LEANING = "leaning"
-"""Signal: the attitude that the path's acceleration requires, where none was measured."""
+"""Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
-"""Signal: the acceleration by the accelerometer, where no position was measured."""
+"""Name of a signal: acceleration by the accelerometer, if no position was measured."""
 PATH_VELOCITY = "path_velocity"
-"""Signal: the velocity by differences of the position, where none was measured."""
+"""Name of a signal: velocity by differences of the position, if none was measured."""
 PATH_SLOPE_S = 0.05
-"""The path's velocity is the difference of positions this long before and after [s]."""
+"""For this velocity, positions this long before and after a time are compared [s]."""
 VOLTAGE_S = 0.04
 """The voltage is averaged over about this time, to reduce its noise [s]."""
 
@@ -47,11 +49,12 @@ class FlightGrid(NamedTuple):
 
     name: str
     time_s: np.ndarray
-    """(G,) since the flight's first row."""
+    """(G,) time from the first row of the flight [s]."""
     signals: dict[str, np.ndarray]
-    """(G, ...) by name: rot_w, vel_w, pos_w, rate_b, commands and rotor speeds."""
+    """Signals (G, ...) by name: rot_w, vel_w, pos_w, rate_b, commands and rotor speeds."""
     in_turn: tuple[str, ...] = ()
-    """Signals of which each row has some columns only, as of motors polled one after another."""
+    """Names of signals of which each row has only some columns, such as the speeds of motors that
+    are read one after another."""
 
     def has(self, *names: str) -> bool:
         """Return whether the flight has all of these signals."""
@@ -60,8 +63,8 @@ class FlightGrid(NamedTuple):
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
         """Return the windows of `width_s` in which all signals of `needs` are present.
 
-        `slope` is as in `weak_form`. No window begins in the first `MEMORY_S`, where commands from
-        before the first row still act.
+        With `slope`, the windows are for slopes of the signals, see `weak_form`. No window begins
+        in the first `MEMORY_S`, where commands from before the first row still act.
         """
         good = self.time_s >= MEMORY_S
         for name in needs:
@@ -70,10 +73,11 @@ class FlightGrid(NamedTuple):
         return weak_form(self.time_s, good, width_s, np.inf, slope)
 
     def rows(self, attitude_of_path: bool) -> FlightRows:
-        """Return the grid as rows of a view, without rotor speeds and with zeros for NaN.
+        """Return the grid as rows of a view, with zeros for rotor speeds and for missing values.
 
         Args:
-            attitude_of_path: use the path's attitude where none was measured; its yaw is arbitrary.
+            attitude_of_path: use the attitude that the path requires (`LEANING`) if none was
+                measured. Its yaw is arbitrary.
         """
         attitude = self.signals.get(
             "rot_w", self.signals.get(LEANING) if attitude_of_path else None
@@ -95,6 +99,7 @@ class FlightGrid(NamedTuple):
 
 def grid_of(log: FlightLog) -> FlightGrid:
     """Return `log` on the grid: measurements interpolated, commands held from row to row."""
+    # Collect the signals that the log has.
     time_s = log.time_s - log.time_s[0]
     grid_s = np.arange(0.0, time_s[-1], STEP_S)
     measured = {
@@ -113,6 +118,7 @@ def grid_of(log: FlightLog) -> FlightGrid:
     }
     logged = {name: v for name, v in (measured | commanded).items() if v is not None and _enough(v)}
     in_turn = tuple(name for name, values in logged.items() if _complete_rows(values) < 2)
+    # Resample them, and derive those that were not measured.
     signals: dict[str, np.ndarray] = {}
     for name, values in logged.items():
         signals[name] = (interpolated if name in measured else _held)(time_s, values, grid_s)
@@ -145,9 +151,10 @@ def _complete_rows(values: np.ndarray) -> int:
 
 
 def interpolated(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) at `time_s` (T,), interpolated linearly to `grid_s`, as (G, C).
+    """Return `values` (T, C) at times `time_s` (T,) interpolated linearly to `grid_s`, (G, C).
 
-    Each column uses its own rows. It is NaN in holes and outside these rows.
+    Each column is interpolated between the rows in which it is present. It is NaN in holes, and
+    before the first and after the last of these rows.
     """
     out = np.empty((len(grid_s), values.shape[1]))
     for k, column in enumerate(values.T):
@@ -158,7 +165,7 @@ def interpolated(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> 
 
 
 def attitude_at(time_s: np.ndarray, quat_wxyz: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return rotations (G, 3, 3), body to world, of quaternions (T, 4); NaN as `interpolated`."""
+    """Return the attitudes (G, 3, 3) of quaternions (T, 4) on the grid; NaN as `interpolated`."""
     mixed = interpolated(time_s, sign_continuous(quat_wxyz), grid_s)
     return quat_to_rot(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
 
@@ -174,7 +181,8 @@ def _path_velocity(pos_w: np.ndarray) -> np.ndarray:
 def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
     """Return commands held from row to row, as means (G, ...) over each step of the grid.
 
-    A row's time is usually between two grid points. Sampling at the points would delay it.
+    A command changes at the time of a row, usually between two grid points. Its values at the grid
+    points would show the change too late.
     """
     flat = np.asarray(values.reshape(len(values), -1), dtype=float)
     ends_s, out = np.append(grid_s, grid_s[-1] + STEP_S), np.empty((len(grid_s), flat.shape[1]))
@@ -187,7 +195,7 @@ def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndar
 
 
 def _in_hole(time_s: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return which grid points (G,) are between distant rows, or outside all rows."""
+    """Return whether each grid point (G,) is in a hole between two rows, or outside all rows."""
     is_hole = np.diff(time_s) > HOLE_STEPS * float(np.median(np.diff(time_s)))
     row = np.clip(np.searchsorted(time_s, grid_s, side="right") - 1, 0, len(time_s) - 2)
     return is_hole[row] | (grid_s < time_s[0]) | (grid_s > time_s[-1])
@@ -195,6 +203,6 @@ def _in_hole(time_s: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
 
 def _averaged(values: np.ndarray, count: int) -> np.ndarray:
     """Return the moving average of `values` (G,) over about `count` points, an odd number."""
-    count = max(1, min(count, len(values) // 4)) | 1
+    count = max(1, min(count, len(values) // 4)) | 1  # "| 1" makes an even number odd
     padded = np.pad(values, count // 2, mode="edge")
     return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")

@@ -1,7 +1,12 @@
-"""Estimates the numbers of a vehicle file that flights identify (`suite identify`).
+"""Estimates the parameters of a vehicle file that flights identify (`suite identify`).
 
-Force and torque are fitted alternately, each with the other's result, since the rotors' lag acts on
-both. The mass is never fitted: scaling it together with inertia and thrust changes no flight.
+These parameters are called numbers here. There are four fits: force (thrust and drag), torque
+(inertia, lag and delay), rotors (lag and delay of measured rotor speeds), and loop (gains of the
+rate loop). The lag is the time constant with which the rotors follow their commands.
+
+Force and torque are fitted alternately, each with the result of the other, since the rotors' lag
+acts on both. The mass is never fitted: scaling it together with inertia and thrust changes no
+flight.
 """
 
 from __future__ import annotations
@@ -69,11 +74,11 @@ class Identified:
     drive: str
     """Drive of the flights: pwm, rotors, torques, rates or thrust."""
     residual_rms: dict[str, list[float]]
-    """RMS of the residual along each body axis, of force per mass and angular acceleration."""
+    """RMS of the residual along each body axis, by fit: `force` (per mass) and `torque`."""
     flights: tuple[str, ...]
     """Names of the flights that were used."""
     notes: tuple[str, ...] = ()
-    """Lines for people on what was done with these flights beyond the numbers."""
+    """Lines for people on what was done with flights and vehicle beyond the fitted numbers."""
 
 
 def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] = ()) -> Identified:
@@ -81,15 +86,18 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
 
     Args:
         logs: flights of one vehicle; incomplete ones are used for the numbers that they allow.
-        vehicle: the start; a number that is not identifiable keeps its value.
+        vehicle: vehicle from which the fits start; a number that is not identifiable keeps its
+            value.
         leave: parts not to fit: any of drag, motors, inertia, lag, loop.
 
     Returns:
         The vehicle with the identified numbers, and their intervals.
 
     Raises:
-        ValueError: if the flights share no drive, or no fit has a complete window.
+        ValueError: if no signal drives the model in all flights, or no fit has a complete window.
     """
+    # Run the fits. If the motors' thrust is known, the loop comes last and may use the lag of the
+    # torque fit, which is better than its own. Otherwise it comes first: the others use its lag.
     flights = [grid_of(log) for log in posed(logs)]
     drive = common_drive(flights)
     fits = _Fits(flights, with_merged_effects(vehicle, drive in KNOWN_MOTORS), drive, tuple(leave))
@@ -110,6 +118,7 @@ def identify(logs: Sequence[FlightLog], vehicle: Vehicle, leave: Sequence[str] =
         lacking = "; ".join(fits.lacking()) or "no stretch of a second with the needed signals"
         raise ValueError(f"{names}: without {', '.join(leave)} nothing is identifiable: {lacking}")
     identified = fits.identified(vehicle)
+    # Blade flapping needs the results of both fits, and motors whose thrust is known.
     if drive not in KNOWN_MOTORS or "drag" in leave or not {"force", "torque"} <= {*fits.results}:
         return identified
     force, torque = fits.results["force"], fits.results["torque"]
@@ -141,7 +150,7 @@ class _Fits:
         delay, scale = (vehicle.effects.get(name) for name in ("command_delay", "thrust_scale"))
         self.delay_s: float = 0.0 if delay is None else delay.delay
         self.results: dict[str, Fitted] = {}
-        """By the fit's name: force, torque, rotors or loop."""
+        """Results by the name of the fit: force, torque, rotors or loop."""
         self.broken: set[str] = set()
         """Names of fits without a complete window."""
         self.without_voltage: set[str] = set()
@@ -152,7 +161,7 @@ class _Fits:
     def fit_force(self) -> None:
         """Fit thrust and drag to the translation."""
         flights = [f for f in self.flights if f.has("vel_w") or f.has("pos_w")]
-        # If no flight has an attitude, the paths give it.
+        # If no flight has an attitude, it follows from how the vehicle must lean to fly its path.
         leaning = not any(flight.has("rot_w") for flight in flights)
         flights = [flight for flight in flights if leaning or flight.has("rot_w")]
         if not flights:
@@ -174,7 +183,7 @@ class _Fits:
     def fit_torque(self) -> None:
         """Fit inertia, yaw torque, lag and delay to the rotation."""
         flights = [flight for flight in self.flights if flight.has("rate_b")]
-        if self.drive in ("rates", "thrust") or not flights:
+        if self.drive in ("rates", "thrust") or not flights:  # these commands contain no torques
             return
         unknowns = self.wanted(
             torque_unknowns(self.drive, self.lag_s, self.delay_s),
@@ -196,7 +205,8 @@ class _Fits:
             return
         start_lag_s = self.start.rotors.time_constant
         if result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
-            # No rotor follows at once. Commands that are blurred in the log hide its lag.
+            # No rotor follows at once. Commands that are blurred in the log hide its lag, so the
+            # start's lag is held and the other numbers are fitted again.
             self.lag_s = start_lag_s
             unknowns = [u._replace(start=start_lag_s) if u.name == "lag" else u for u in unknowns]
             result = fitted(unknowns, ("lag",))
@@ -206,7 +216,7 @@ class _Fits:
         """Fit the rotors' lag behind commanded speeds, and the nominal rate loop."""
         lags = lag_unknowns(self.lag_s, self.delay_s)
         speeds = ("rotor_speed", "rotor_speed_cmd")
-        # Speeds of motors polled one after another are blurred, which resembles a lag.
+        # Speeds of motors that are read one after another are blurred, which resembles a lag.
         commanded = [f for f in self.flights if f.has(*speeds) and not {*speeds} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
             result = self.attempt("rotors", lambda: fit_rotor_lag(commanded, lags))
@@ -215,7 +225,7 @@ class _Fits:
         flights = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flights or self.start.controller.kind != "p" or "loop" in self.leave:
             return
-        # If the motors are known, their torque identifies lag and delay better than the loop does.
+        # If the motors are known, other fits identify lag and delay better: hold them fixed here.
         separate = "rotors" in self.results or self.drive == "pwm" or "lag" in self.leave
         source = self.results.get("rotors", self.results.get("torque"))
         known = source.known_numbers("late", "lag") if separate and source is not None else None
@@ -232,9 +242,12 @@ class _Fits:
     def wanted(
         self, unknowns: Sequence[Unknown], prefixes: Mapping[str, tuple[str, ...]]
     ) -> list[Unknown]:
-        """Return `unknowns` without the parts to leave; `prefixes` are of their names, by part."""
-        left = tuple(prefix for part in self.leave for prefix in prefixes.get(part, ()))
-        return [u for u in unknowns if not u.name.startswith(left)]
+        """Return `unknowns` without the parts that the user chose not to fit.
+
+        `prefixes` are the first letters of the names of the numbers, by part.
+        """
+        not_wanted = tuple(prefix for part in self.leave for prefix in prefixes.get(part, ()))
+        return [u for u in unknowns if not u.name.startswith(not_wanted)]
 
     def with_known_thrust(self, flights: list[FlightGrid]) -> list[FlightGrid]:
         """Return the flights whose motor thrust is known, and remember those without a voltage."""
@@ -244,7 +257,10 @@ class _Fits:
         return selected
 
     def attempt(self, name: str, fit: Callable[[], Fitted]) -> Fitted | None:
-        """Return the result of `fit`; None without a complete window, which is remembered."""
+        """Return the result of `fit`, or None if it has no complete window.
+
+        In that case its name is added to `broken`.
+        """
         try:
             return fit()
         except NoWholeWindow:
@@ -252,13 +268,13 @@ class _Fits:
             return None
 
     def keep(self, name: str, result: Fitted) -> None:
-        """Store a result, and use its lag and delay from now on."""
+        """Store a result, and use its lag and delay in the following fits."""
         self.results[name] = result
         self.lag_s = result.values().get("lag", self.lag_s)
         self.delay_s = result.values().get("late", self.lag_s + self.delay_s) - self.lag_s
 
     def lags(self) -> dict[str, float]:
-        """Return the current lag, and its sum with the delay [s]."""
+        """Return the current `lag`, and `late`, the sum of lag and delay [s]."""
         return {"lag": self.lag_s, "late": self.lag_s + self.delay_s}
 
     def lacking(self) -> list[str]:
@@ -279,7 +295,7 @@ class _Fits:
                 entries += loop_entries(self.start, results[name], self.lag_s)
         by_key: dict[str, Number] = {}
         for entry in entries:
-            # Later fits observe lag and delay more directly.
+            # Several fits may estimate lag and delay. Later fits observe them more directly.
             if entry.key not in by_key or entry.is_identified:
                 by_key[entry.key] = entry
         vehicle, numbers, notes = with_entries(self.start, by_key.values())

@@ -1,11 +1,15 @@
 """Fits gains, lag and delay of the nominal rate loop, and the rotors' lag behind their commands.
 
-The rate loop is the controller that turns commanded body rates into rotor thrusts. It is simulated
-from its commands alone and compared with the gyro (output error; Ljung 1999, Sec. 4.3). Measured
-rates as an input would turn the gyro's noise into lower gains. Each axis follows
-`lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e`. The disturbance `e` is the
-torque of moving air, and the part of `w x J w` that the controller does not compensate in time,
-since the rotors lag. It is computed from the rates without it (one step of Picard's iteration).
+The rate loop is the controller that turns commanded body rates into rotor thrusts. The lag is the
+time constant with which the rotors follow. The loop is simulated from its commands alone, and its
+rates are compared with the gyro (output error; Ljung 1999, Sec. 4.3). If measured rates were an
+input, noise of the gyro would lower the fitted gains. The rate w about each axis follows
+
+    lag d2w/dt2 + dw/dt + K w = K rate_cmd(t - delay) + lag de/dt + e
+
+with the gain K. The disturbance e (an angular acceleration) has two parts: the torque of moving
+air, and the part of w x J w that the controller compensates too late, since the rotors lag. It is
+computed from the rates that the loop would have without it (one step of Picard's iteration).
 Changes of rotor speed are assumed small.
 """
 
@@ -28,7 +32,7 @@ LOOP_WIDTH_S = 0.08
 SPEED_WIDTH_S = 0.16
 """The same for rotor speeds [s]."""
 NumberResiduals = Callable[[Mapping[str, float]], Rows]
-"""Function from numbers by name to the residuals of one flight."""
+"""Function from numbers (parameters by name) to the residuals of one flight."""
 
 
 def gain_unknowns() -> list[Unknown]:
@@ -37,9 +41,10 @@ def gain_unknowns() -> list[Unknown]:
 
 
 def coupling_unknowns(vehicle: Vehicle) -> list[Unknown]:
-    """Return how strongly the rates about two axes turn the third, `(J_z - J_y) / J_x` and so on.
+    """Return the factors from the rates about two axes to the angular acceleration of the third.
 
-    They are nuisance parameters: the inertia behind them may be wrong.
+    About x the factor is `(J_z - J_y) / J_x`. The factors are nuisance parameters, since the
+    inertia in the vehicle file may be wrong.
     """
     x, y, z = vehicle.inertia
     starts = ((z - y) / x, (x - z) / y, (y - x) / z)
@@ -48,9 +53,9 @@ def coupling_unknowns(vehicle: Vehicle) -> list[Unknown]:
 
 
 def air_torque_unknowns(flights: Sequence[FlightGrid]) -> list[Unknown]:
-    """Return the angular acceleration by moving air (flapping) over the velocity [1/(m s)].
+    """Return the ratios of angular acceleration by moving air (flapping) to velocity [1/(m s)].
 
-    They are nuisance parameters. Flights without a velocity or an attitude have none.
+    They are nuisance parameters. Without a velocity and an attitude in all flights there are none.
     """
     if not all(flight.has("vel_w", "rot_w") for flight in flights):
         return []
@@ -64,13 +69,14 @@ def fit_loop(
     fixed: Mapping[str, float],
     known: KnownNumbers | None = None,
 ) -> Fitted:
-    """Fit gains, lag and delay; a constant rate of each flight is free (bias, trim).
+    """Fit gains, lag and delay; each flight has a free constant rate (bias of the gyro, trim).
 
     Args:
-        flights: with rates and commanded rates.
-        vehicle: its gains are the start; its loop frequency is used.
-        unknowns: `gain_unknowns`, `coupling_unknowns` and `body.lag_unknowns`, or some of them.
-        fixed: the numbers that are not among `unknowns`.
+        flights: flights with measured and commanded rates.
+        vehicle: vehicle whose gains are the start, with the frequency of its rate loop.
+        unknowns: the numbers of `gain_unknowns`, `coupling_unknowns`, `air_torque_unknowns` and
+            `body.lag_unknowns`, or some of them.
+        fixed: values of those numbers that are not in `unknowns`.
         known: those of `unknowns` that another fit has identified.
 
     Raises:
@@ -91,7 +97,7 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
     """Fit lag and delay of measured rotor speeds behind commanded ones.
 
     Raises:
-        NoWholeWindow: if no window has both.
+        NoWholeWindow: if no window has both measured and commanded speeds.
     """
 
     def residuals_of(flight: FlightGrid) -> NumberResiduals:
@@ -111,8 +117,9 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
 
 
 def loop_rates(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the body rates (G, 3) of the loop under its commands alone [rad/s]."""
-    # The loop uses rates that are half a period old on average: exp(-half_s s), to second order.
+    """Return the body rates (G, 3) of the rate loop from its commands alone [rad/s]."""
+    # The loop uses rates that are half a period old on average. This delay, exp(-half_s s) for the
+    # Laplace variable s, is expanded to second order.
     half_s = 0.5 / vehicle.controller.frequency
     lag_s = max(numbers["lag"], LEAST_LAG_S)
     commanded = filled(delayed(flight.signals["rate_cmd_b"], numbers["late"] - numbers["lag"]))
@@ -121,20 +128,21 @@ def loop_rates(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float
 
     def response(inputs: np.ndarray, numerators: Sequence[list[float]]) -> np.ndarray:
         """Return the closed loop's response (G, 3) to `inputs` (G, 3), linear between points."""
-        out = np.empty_like(inputs)
+        rates = np.empty_like(inputs)
         for k, (gain, numerator) in enumerate(zip(gains, numerators, strict=True)):
             denominator = [lag_s + 0.5 * gain * half_s**2, 1.0 - gain * half_s, gain]
             discrete: Any = cont2discrete((numerator, denominator), STEP_S, method="foh")
             top, bottom = np.ravel(discrete[0]), discrete[1]
             state = lfilter_zi(top, bottom) * inputs[0, k]
-            out[:, k] = lfilter(top, bottom, inputs[:, k], zi=state)[0]
-        return out
+            rates[:, k] = lfilter(top, bottom, inputs[:, k], zi=state)[0]
+        return rates
 
     linear = response(commanded, [[gain] for gain in gains])
-    # The controller compensates `w x J w`, but its rotors lag.
+    # The controller compensates w x J w, but its rotors lag: the difference is a disturbance.
     products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]
     coupled = products * [numbers[f"coupling_{axis}"] for axis in "xyz"]
     disturbance = lagged(coupled, numbers["lag"]) - coupled
+    # Moving air tilts the rotor disks, which rolls and pitches the body.
     if "air_x" in numbers:
         vel_b = filled(np.einsum("gji,gj->gi", flight.signals["rot_w"], flight.signals["vel_w"]))
         disturbance[:, 0] += numbers["air_x"] * vel_b[:, 1]

@@ -1,4 +1,8 @@
-"""Makes entries of a vehicle file with intervals, and explains which numbers are not identified."""
+"""Makes entries of a vehicle file with intervals, and explains which numbers are not identified.
+
+A fitted number is a parameter of a fit, such as `late` (`body.py`). An entry of the file, such as
+the delay of commands, may depend on several fitted numbers.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +18,22 @@ from suite.diagnose.identify.fit import Z95, Fitted
 from suite.diagnose.identify.grid import IMU_ACC, FlightGrid
 
 DELAY = "effects.command_delay.delay"
-"""Key of the command delay."""
+"""Key of the command delay in a vehicle file."""
 
 
 class Number(NamedTuple):
     """One entry of a vehicle file, with its intervals."""
 
     key: str
-    """Key in the file, after its table and a dot."""
+    """Key in the vehicle file, with its table: `table.key`."""
     unit: str
     value: list[float]
     """Value of each component."""
     ci95: list[tuple[float, float] | None]
     """95 % interval of each component; None for one that is not identified."""
     follows: bool = False
-    """Whether a component is not identified but in the file, as the difference between an
-    identified sum and another number."""
+    """Whether a component is not identified but still written into the file. It is the difference
+    between an identified sum and another number, such as the delay."""
 
     @property
     def is_identified(self) -> bool:
@@ -38,12 +42,12 @@ class Number(NamedTuple):
 
     @property
     def is_entered(self) -> bool:
-        """Whether these flights determine the file's value."""
+        """Whether the value in the file comes from these flights."""
         return self.is_identified or self.follows
 
 
 Formula = Callable[[Mapping[str, float]], ArrayLike]
-"""Function from the fit's numbers by name to an entry's value, or its values (V,)."""
+"""Function from fitted numbers by name to the value of an entry, or to its values (V,)."""
 
 
 def number_from(
@@ -60,12 +64,13 @@ def number_from(
         fitted: result of a fit.
         key: key in the file.
         unit: unit of the values.
-        formula: the values by the fit's numbers; its slopes are finite differences.
-        needs: for each value, the number that must be identified.
-        max_half_width: a value with a wider interval to either side is not identified, and
-            `follows` from the others.
+        formula: function from the fitted numbers to the values.
+        needs: for each value, the name of the fitted number that must be identified.
+        max_half_width: largest half-width of the 95 % interval of an identified value. A value with
+            a wider interval `follows` (see `Number`).
     """
     values = np.atleast_1d(formula(fitted.values()))
+    # Finite differences of the formula turn the covariance of the fit into that of the values.
     slopes = np.zeros((len(values), len(fitted.unknowns)))
     for k, unknown in enumerate(fitted.unknowns):
         up, down = fitted.values(), fitted.values()
@@ -130,16 +135,17 @@ WHY = {
 }
 """Description of each fitted number, by name, with the reason why flights may not identify it."""
 NO_RATES = "no body rates and no attitude in these logs"
+"""Reason if a fit needs body rates and the logs have none."""
 NEVER_BOTH = "these logs have no stretch with both"
-"""Reason if the columns exist, but no window is without holes."""
+"""Reason if the logs have the columns that a fit needs, but never all in one window."""
 
 
 def not_identified(fitted: Mapping[str, Fitted], entries: Mapping[str, Number]) -> list[str]:
     """Return a line for people for each number that was fitted and that no fit has identified.
 
     Args:
-        fitted: results of the fits, by the fit's name.
-        entries: entries of the vehicle file, by their keys.
+        fitted: results of the fits, by the name of the fit.
+        entries: entries of the vehicle file, by key.
     """
     fits = list(fitted.values())
     identified = {name for fit in fits for name in fit.names if fit.identifies(name)}
@@ -166,19 +172,20 @@ def not_attempted(
     """Return a line for people for each number that was not fitted, with the missing signal.
 
     Args:
-        flights: on their grids.
-        vehicle: the start.
-        drive: name of the flights' drive, one of `DRIVES`.
-        fitted: results of the fits, by the fit's name.
+        flights: the flights.
+        vehicle: the vehicle before the fits.
+        drive: what drives the model of these flights, one of `DRIVES`.
+        fitted: results of the fits (force, torque, rotors, loop), by the name of the fit.
         leave: parts that the user chose not to fit.
         broken: names of fits for which the logs have the columns, but no complete window.
     """
     lines = []
 
     def any_has(*names: str) -> bool:
+        """Return whether any flight has all of these signals."""
         return any(flight.has(*names) for flight in flights)
 
-    if any_has(IMU_ACC):
+    if any_has(IMU_ACC):  # some flight has no position
         lines += UNSEEN
     force = fitted.get("force")
     if force is None:
@@ -240,12 +247,12 @@ def notes_on(
     start: Vehicle,
     identified: Vehicle,
 ) -> list[str]:
-    """Return lines for people on treatment of flights and vehicle that the numbers do not show.
+    """Return lines for people on what was done with flights and vehicle beyond the fitted numbers.
 
     Args:
-        flights: on their grids.
+        flights: the flights.
         without_voltage: names of flights without a voltage, if others have one.
-        start: the vehicle before.
+        start: the vehicle before the fits.
         identified: the vehicle with the identified numbers.
     """
     lines = [

@@ -1,4 +1,4 @@
-"""Reads flight logs, identifies the vehicle's numbers, and writes a vehicle file with them."""
+"""Reads flight logs, estimates the vehicle's parameters, and writes a vehicle file with them."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def identify_files(
     console: Console,
     accept: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Identify a vehicle from log files, and write its file.
+    """Estimate the parameters of a vehicle from log files, and write its file.
 
     Args:
         flights: logs or folders of them.
-        vehicle: file or shipped name to start from.
+        vehicle: path or shipped name of the vehicle file to start from.
         out: the vehicle file to write.
         leave: those of `PARTS` that are not fitted.
         console: for progress.
@@ -55,6 +55,7 @@ def identify_files(
             raise ValueError(f"--leave {part!r}: allowed: {', '.join(PARTS)}")
     if set(PARTS) <= set(leave):
         raise ValueError(f"--leave {' '.join(leave)}: nothing remains to estimate")
+    # Read the files, and check the logs for faults of interfaces.
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
@@ -67,6 +68,7 @@ def identify_files(
             f"{start.name} has {', '.join(unmodelled)}: the fits do not model them, so the "
             "estimates include their share, and they stay in the file; start without them"
         )
+    # Fit, and write the file.
     identified = identify(logs, start, leave)
     header = _header(identified, vehicle)
     try:
@@ -88,6 +90,7 @@ def identify_files(
 
 
 def _counted(flights: int) -> str:
+    """Return a number of flights in words."""
     return "1 flight" if flights == 1 else f"{flights} flights"
 
 

@@ -27,7 +27,7 @@ FLOOR = "#1d2430"
 OTHERS = "#c3c8d1"
 """Colour of candidates that were not named."""
 SHOWN = 14
-"""Number of candidates in the chart."""
+"""Largest number of candidates (effects that the search tried) in the chart."""
 
 
 def gains_chart(
@@ -36,7 +36,7 @@ def gains_chart(
     """Draw the gains of the best candidates as a PNG, and the gain that chance reaches.
 
     Args:
-        scores: best first.
+        scores: scores of all candidates, best first. A gain is the fall of the squared error.
         threshold: gain that the best of all candidates reaches by chance with 1 % probability.
         named: labels of the named effects.
     """
@@ -60,10 +60,10 @@ def gains_chart(
 
 
 def gap_chart(rows: Sequence[tuple[str, Gap, str]], speed: np.ndarray | None, seed: int) -> bytes:
-    """Draw gaps with their intervals as a PNG, and each rollout's error by its speed.
+    """Draw gaps with their intervals as a PNG, and next to them each rollout's error by its speed.
 
     Args:
-        rows: label, gap and colour, from top to bottom.
+        rows: label, gap and colour of each bar, from top to bottom.
         speed: (W,) speeds of the held-out rollouts at their starts [m/s]; None without rollouts.
         seed: seed of the intervals' draws.
     """
@@ -114,21 +114,24 @@ def labelled_gaps(side: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any],
 def _gap_bars(
     axes: Axes, rows: Sequence[tuple[str, float, tuple[float, float], str]], floor: float
 ) -> None:
-    """Draw gaps (label, gap, 95 % interval, colour) from top to bottom, and the noise floor."""
-    for place, (_, gap, between, colour) in enumerate(rows[::-1]):
-        axes.plot(between, [place, place], color=colour, lw=2.5, solid_capstyle="butt")
+    """Draw gaps and the noise floor.
+
+    `rows` are (label, gap, 95 % interval, colour), from top to bottom.
+    """
+    for place, (_, gap, ci95, colour) in enumerate(rows[::-1]):
+        axes.plot(ci95, [place, place], color=colour, lw=2.5, solid_capstyle="butt")
         axes.plot(gap, place, "o", ms=7, color=colour)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows[::-1]])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.axvline(floor, color=FLOOR, lw=0.8, ls=":")
     axes.set_xscale("log")
-    most = max(between[1] for _, _, between, _ in rows)
-    axes.set_xlim(0.8 * floor, 1.25 * max(1.5 * floor, most))
+    highest = max(ci95[1] for _, _, ci95, _ in rows)
+    axes.set_xlim(0.8 * floor, 1.25 * max(1.5 * floor, highest))
     _few_ticks(axes, "x")
 
 
 def _few_ticks(axes: Axes, which: str = "y") -> None:
-    """Label a logarithmic axis with plain numbers."""
+    """Label a logarithmic axis with plain numbers, and with fewer of them over a wide range."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -141,7 +144,7 @@ def _few_ticks(axes: Axes, which: str = "y") -> None:
 
 
 def series_chart(series: Series) -> bytes:
-    """Draw a held-out stretch as measured and as simulated, as a PNG."""
+    """Draw a held-out stretch, measured and simulated, as a PNG."""
     figure = Figure(figsize=(9.0, 3.1), layout="constrained")
     axes = figure.subplots()
     axes.plot(series.time_s, series.measured, color=FLOOR, lw=1.6, label="measured")
@@ -154,11 +157,11 @@ def series_chart(series: Series) -> bytes:
 
 
 def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Path:
-    """Write held-out flights, measured and in rollouts of 1 s, as a recording (.rrd).
+    """Write held-out flights, measured and simulated in rollouts of 1 s, as a recording (.rrd).
 
     Args:
-        path: the file.
-        flown: the simulated flights.
+        path: the file to write.
+        flown: the flights and their rollouts.
         fitted: (P,) parameters with the named effects; None if nothing was named.
 
     Raises:
@@ -171,11 +174,11 @@ def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Pa
         simulations = []
         for label, residual in simulated.items():
             rollouts = [_rollout(take(windows, row), residual[row]) for row in rows]
-            tracks, errors = [], []
-            for track, error in filter(None, rollouts):
-                tracks.append(track)
+            paths, errors = [], []
+            for states, error in filter(None, rollouts):  # without those that diverged
+                paths.append(states)
                 errors.append(error)
-            simulations.append(Simulation(label, tracks, errors))
+            simulations.append(Simulation(label, paths, errors))
         log = flown.logs[int(number)]
         flights.append(ComparedFlight(log.name, _measured(log, flown.since_s), simulations))
     return write_comparison(path, flights, flown.vehicle.body.half_size)
@@ -190,26 +193,27 @@ def _measured(log: FlightLog, first_s: float) -> States:
 
 
 def _rollout(window: FlightWindows, residual: np.ndarray) -> tuple[States, np.ndarray] | None:
-    """Return one rollout at its T rows with a pose, and its errors (T, 4); None if it diverged.
+    """Return the simulated states and the errors of one rollout; None if it diverged.
 
-    The errors are those of position [m], velocity [m/s], attitude [deg] and rates [rad/s].
+    They are at its T rows with a measured pose. The errors (T, 4) are those of position [m],
+    velocity [m/s], attitude [deg] and rates [rad/s]. `residual` is measured minus simulated.
     """
-    seen = np.asarray(window.valid)
-    rows = seen[:, 0] & seen[:, 3]
+    is_logged = np.asarray(window.valid)
+    rows = is_logged[:, 0] & is_logged[:, 3]  # channels of position and attitude
     if rows.sum() < 2 or not np.isfinite(residual[rows]).all():
         return None
-    error = np.where(seen, residual, np.nan)[rows]
+    error = np.where(is_logged, residual, np.nan)[rows]
     pos_w, attitude_b, vel_w, rate_b = np.split(error[:, :12], 4, axis=1)
     # The attitude's error is the rotation axis times the sine of the angle.
     sine = np.linalg.norm(attitude_b, axis=1, keepdims=True)
     angle = np.arcsin(np.clip(sine, 0.0, 1.0))
-    turn = -attitude_b * angle / np.maximum(sine, 1e-12)
-    track = States(
+    rotation_b = -attitude_b * angle / np.maximum(sine, 1e-12)
+    states = States(
         window.start_s + np.asarray(window.row_s)[rows],
         np.asarray(window.row_pos_w)[rows] - pos_w,
-        rot_to_quat(np.asarray(window.row_rot_w)[rows] @ exp_rot(turn)),
+        rot_to_quat(np.asarray(window.row_rot_w)[rows] @ exp_rot(rotation_b)),
         np.asarray(window.row_vel_w)[rows] - vel_w,
         np.asarray(window.row_rate_b)[rows] - rate_b,
     )
     pos, vel, rate = (np.linalg.norm(part, axis=1) for part in (pos_w, vel_w, rate_b))
-    return track, np.stack([pos, vel, np.rad2deg(angle[:, 0]), rate], axis=1)
+    return states, np.stack([pos, vel, np.rad2deg(angle[:, 0]), rate], axis=1)

@@ -19,11 +19,13 @@ from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxCompari
 from suite.diagnose.verdict.gap import EffectSize, Gap
 
 LEAST_SHOWN = 0.001
-"""Smaller gaps are printed as less than this, in units of the noise, m/s^2 or rad/s^2."""
+"""A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
+m/s^2 or rad/s^2)."""
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the entries of diagnosis.json on the named effects and the gap."""
+    # The control is a wrong effect, for comparison; a swing is an oscillating force.
     main, control, limits = diagnosis.main, diagnosis.main.control, diagnosis.limits
     swings = [one.remaining.swing for one in diagnosis.findings if one.remaining.swing]
     swing = swings[0] if swings else None
@@ -92,22 +94,26 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def effects_json(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return the named effects, with one entry for all names of an effect (such as motors)."""
+    """Return an entry for each named effect.
+
+    An effect that was named for several motors has one entry. Effects that separate tests named
+    come last.
+    """
     searched = [
         _effect(finding, name, names)
         for finding in diagnosis.findings
         for name, names in finding.by_effect().items()
     ]
-    shared = ("name", "parameters", "gap_removed", "p_value", "view")
+    keys = ("name", "parameters", "gap_removed", "p_value", "view")
     tested = [
-        {**{key: getattr(effect, key) for key in shared}, "alternatives": [], "size": None}
+        {**{key: getattr(effect, key) for key in keys}, "alternatives": [], "size": None}
         for effect in diagnosis.tested
     ]
     return [{**effect, "relevant": True} for effect in (*searched, *tested)]
 
 
 def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[str, Any]:
-    """Return the entry of the effect `name`, which has `names` in `finding`."""
+    """Return the entry of the effect `name`; `names` are its named effects, one for each motor."""
     indices = sorted(index for named in names for index in named.candidate.indices)
     width, undecided = finding.half_width, _undecided(finding, names)
     size = finding.sizes.get(name)
@@ -125,18 +131,21 @@ def _effect(finding: Finding, name: str, names: Sequence[NamedEffect]) -> dict[s
 
 
 def _undecided(finding: Finding, names: Sequence[NamedEffect]) -> list[int]:
-    """Return the indices of other motors' parameters of an effect that fit as well."""
-    fitted = {index for named in names for index in named.candidate.indices}
-    space, near = finding.source.space, finding.source.limits.rival_chi2
+    """Return the indices of the same effect's parameters for other motors that fit about as well.
 
-    def is_near(index: int) -> bool:
+    The flights then do not decide which motor has the effect.
+    """
+    fitted = {index for named in names for index in named.candidate.indices}
+    space, largest_rise = finding.source.space, finding.source.limits.rival_chi2
+
+    def fits_as_well(index: int) -> bool:
         label = f"{space.entries[index].effect} {_motor_number(space, index)}"
-        return any(named.worse_by.get(label, np.inf) <= near for named in names)
+        return any(named.worse_by.get(label, np.inf) <= largest_rise for named in names)
 
     return [
         index
         for index, entry in enumerate(space.entries)
-        if entry.effect == names[0].candidate.name and index not in fitted and is_near(index)
+        if entry.effect == names[0].candidate.name and index not in fitted and fits_as_well(index)
     ]
 
 
@@ -151,21 +160,25 @@ def parameters_json(
     """Return the parameters of the effect `name` as in diagnosis.json.
 
     Args:
-        space: parameters of the vehicle.
+        space: the parameters of all effects.
         name: name of the effect.
         indices: indices of its fitted parameters, in order.
         theta: (P,) all parameters.
         half_width: half-widths of the 95 % intervals, by index.
-        undecided: indices of other motors' parameters that fit as well, for an effect of one motor.
+        undecided: indices of parameters for other motors that fit as well, for an effect of one
+            motor (see `_undecided`).
     """
 
     def value_and_interval(index: int) -> tuple[float, list[float]]:
+        """Return the value of a parameter and its interval, within the parameter's bounds."""
         entry = space.entries[index]
         value, width = float(theta[index]), half_width[index]
         return value, [max(value - width, entry.low), min(value + width, entry.high)]
 
     entries: dict[str, Any] = {}
     for parameter in EFFECTS[name].parameters:
+        # An effect of single motors: the motors' numbers, and a value for each. If only one motor
+        # was named, the interval of its number covers the other motors that fit as well.
         if parameter.one_at_a_time:
             values, spans = zip(*map(value_and_interval, indices), strict=True)
             motors = [_motor_number(space, index) for index in indices]
@@ -186,6 +199,7 @@ def parameters_json(
         }
         if not by_component:
             continue
+        # A vector has None for components that were not fitted.
         if parameter.size:
             parts = [
                 value_and_interval(by_component[k]) if k in by_component else (None, None)
@@ -199,7 +213,7 @@ def parameters_json(
 
 
 def _motor_number(space: ParameterSpace, index: int) -> int:
-    """Return the number of the motor, from 1, that the parameter at `index` belongs to."""
+    """Return the number (from 1) of the motor to which the parameter at `index` belongs."""
     return (space.entries[index].component or 0) + 1
 
 
@@ -219,7 +233,7 @@ def headline(diagnosis: Diagnosis, entries: Mapping[str, Any]) -> str:
 
 
 def _figure(value: float) -> str:
-    """Return a gap for people; logs without noise give values such as 1e-10."""
+    """Return a gap as text; logs without noise give values such as 1e-10."""
     return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
 
 
@@ -229,7 +243,7 @@ def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any
 
 
 def black_box_json(comparisons: BlackBoxComparisons, seed: int) -> dict[str, Any]:
-    """Return the entry `black_box`; `seed` is of the intervals' draws."""
+    """Return the entry `black_box`, with intervals by draws from `seed`."""
     outside = comparisons.outside
     return {
         "held_out": _comparison(comparisons.held_out, seed),
@@ -240,7 +254,10 @@ def black_box_json(comparisons: BlackBoxComparisons, seed: int) -> dict[str, Any
 
 
 def _comparison(comparison: BlackBoxComparison, seed: int) -> dict[str, Any]:
-    """Return the gaps of given vehicle, named effects and black box on the same stretches."""
+    """Return the gaps of the given vehicle, the named effects and the black box.
+
+    All are computed on the same stretches.
+    """
     return {
         "judged_on": comparison.judged_on,
         "stretches": {"fitted": comparison.fitted, "judged": comparison.judged},

@@ -40,7 +40,7 @@ FILES = (
 )
 """Files next to the report, and their description."""
 LEAST_FLOOR = 1e-9
-"""A smaller noise floor, in any unit, is that of a channel that no log measured."""
+"""Least noise floor, in any unit, of a channel that a log measured."""
 NOTHING_NAMED = "Nothing was named: the vehicle file is unchanged."
 TOTALS = (
     "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
@@ -61,9 +61,9 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
 
     Args:
         diagnosis: the diagnosis.
-        result: its JSON, which has all sentences.
+        result: content of its diagnosis.json, which has the sentences of the report.
         toml: text of the vehicle file that was written.
-        files: those of `FILES` that exist.
+        files: paths of those of `FILES` that exist.
     """
     gap, flown = result["gap"], diagnosis.main.source.rollouts
     after = f" → {gap['after']:.3g}" if result["effects"] else ""
@@ -104,12 +104,16 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
 
 
 def _few(names: list[str]) -> str:
+    """Return up to three names, and the number of the others."""
     short = [short_name(name) for name in names]
     return ", ".join(short[:3]) + (f" and {len(short) - 3} more" if len(short) > 3 else "")
 
 
 def _measured(diagnosis: Diagnosis) -> list[Section]:
-    """Return a chart of a held-out stretch: measured, simulated, and with the named effects."""
+    """Return a section with a chart of a held-out stretch, if there is one.
+
+    The chart has the measured values, and those simulated without and with the named effects.
+    """
     main = diagnosis.main
     series = main.source.series(main.search)
     if series is None:
@@ -118,7 +122,7 @@ def _measured(diagnosis: Diagnosis) -> list[Section]:
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[Section]:
-    """Return a table of faults of the logs (such as wrong units), corrected or suspected."""
+    """Return a section on faults of the logs (such as wrong units), corrected or suspected."""
     keys = ("flight", "signal", "status", "fault", "evidence", "fix")
     rows = [
         [str(finding[key] or "") for key in keys]
@@ -142,6 +146,7 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
                 continue
             unit = f" [{UNITS[channel]}]" if channel in UNITS else ""
             tone = "good" if error["after"] < 1.2 * floor else ""
+            # The channel, then errors (green if about as small as the noise), then the shares.
             row = cells(group, f"{channel}{unit}", f"{error['before']:.4g}")
             row += [Cell(f"{error['after']:.4g}", tone), *cells(f"{floor:.4g}")]
             texts = ["" if error.get(k) is None else format(error[k], optional[k]) for k in shown]

@@ -28,21 +28,26 @@ from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid
 
 SHOWN = 12
-"""Largest number of logs in the table."""
+"""Largest number of logs in the table of logs."""
 RIVALS = 6
-"""Largest number of alternatives to an effect in the table."""
+"""Largest number of alternatives ("rivals") to each effect in the table of alternatives."""
 
 
 def logs_section(logs: Sequence[FlightLog]) -> Section:
     """Return a table of the logs."""
     headers = ["log", "lasts", "rows", "rate", "longest step", "incomplete", "top speed", "others"]
-    more = len(logs) - SHOWN
+    others = len(logs) - SHOWN
     rows = [_facts(log) for log in logs[:SHOWN]]
-    return Section("The logs", [grid("", headers, rows, f"And {more} more." if more > 0 else "")])
+    return Section(
+        "The logs", [grid("", headers, rows, f"And {others} more." if others > 0 else "")]
+    )
 
 
 def _facts(log: FlightLog) -> tuple[str, ...]:
-    """Return a table row on a log; a log's row is incomplete if it lacks state or command."""
+    """Return the table row of a log.
+
+    The row has the share of the log's rows that are incomplete: they lack a state or a command.
+    """
     optional = {
         "commands": log.thrust_cmd is not None,
         "velocity": not log.velocity_derived,
@@ -81,7 +86,10 @@ def noise_section(diagnosis: Diagnosis) -> Section:
 
 
 def actuators_section(result: Mapping[str, Any]) -> list[Section]:
-    """Return a comparison of measured and commanded rotor speeds; empty without measured ones."""
+    """Return a section that compares measured and commanded rotor speeds.
+
+    The list is empty if the logs have no measured speeds.
+    """
     if not result.get("actuators"):
         return []
     words = (
@@ -94,9 +102,10 @@ def actuators_section(result: Mapping[str, Any]) -> list[Section]:
 
 
 def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
-    """Return a table on the rotor speeds by one kind of command."""
+    """Return a table that compares measured rotor speeds with one kind of command."""
 
     def spread(pair: Sequence[float]) -> str:
+        """Return a mean and a standard deviation as text."""
         return f"{pair[0]:.2f} ± {pair[1]:.2f}"
 
     explained = f"{100 * max(mismatch['followed'], 0.0):.0f} % of the variance is explained"
@@ -125,11 +134,12 @@ BLACK_BOX = (
 )
 """Explanation of the black box."""
 LEAST_P = 0.0005
-"""P-values up to this are left out: they are the least that the null's draws give."""
+"""P-values up to this are not printed. The null distribution (without any effect) has about two
+thousand draws, so smaller values are not resolved."""
 
 
 def candidates_section(diagnosis: Diagnosis) -> Section:
-    """Return the gain of each candidate alone, by source."""
+    """Return the gain of each candidate when it is fitted alone, for each source of evidence."""
     parts: list[Part] = []
     for finding in diagnosis.findings:
         scores, limits = finding.search.first, finding.source.limits
@@ -159,12 +169,12 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
 
 
 def rivals_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
-    """Return a table of other effects that were fitted instead of each named one (rivals)."""
+    """Return a table of other effects that were fitted in place of each named one."""
     rows = []
     for _, named in diagnosis.named:
         ordered = sorted(named.worse_by.items(), key=lambda item: item[1])
         for label, worse_by in ordered[:RIVALS]:
-            is_rival = label.rstrip(" 1234") in named.rivals
+            is_rival = label.rstrip(" 1234") in named.rivals  # a label may end in a motor's number
             verdict = Cell("not separable", "bad") if is_rival else Cell("ruled out")
             rows.append([*cells(named.candidate.label, label, f"{worse_by:.1f}"), verdict])
     headers = ["named", "alternative", "worse by", ""]
@@ -203,7 +213,10 @@ def residual_section(result: Mapping[str, Any]) -> Section:
 
 
 def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
-    """Return the gap on held-out flights: as given, with the named effects, with a wrong one."""
+    """Return the gaps on held-out flights, in a chart and a table.
+
+    They are those of the vehicle as given, with the named effects, and with a wrong effect.
+    """
     seed, main = diagnosis.seed, diagnosis.main
     gaps = [("as given", main.before, BEFORE)]
     if main.control is not None:
@@ -222,12 +235,12 @@ def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section
         "95 %: bootstrap over blocks of neighbouring stretches. Wrong: the best effect that is "
         "neither named nor an alternative, fitted to the same flights in the same way."
     )
-    flown, speed = main.source.rollouts, None
+    flown, start_speed = main.source.rollouts, None
     if flown is not None:
-        speed = np.linalg.norm(np.asarray(flown.held.vel_w), axis=1)
+        start_speed = np.linalg.norm(np.asarray(flown.held.vel_w), axis=1)
     parts: list[Part] = [
         words,
-        Picture(gap_chart(gaps, speed, seed), "Bars are 95 %; dots are rollouts."),
+        Picture(gap_chart(gaps, start_speed, seed), "Bars are 95 %; dots are rollouts."),
         grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
     ]
     if flown is not None:
@@ -258,7 +271,7 @@ AGREEMENT = (
 
 
 def agreement_section(diagnosis: Diagnosis) -> Section:
-    """Return the compared quantity of each source, and each flight's support of the effects."""
+    """Return what each source compares, and how much each flight supports the named effects."""
     parts: list[Part] = [
         f"{finding.source.name}: {finding.source.about}, in means or stretches of "
         f"{finding.source.horizon_s:g} s; driven by {diagnosis.flights.driven_by}."
@@ -273,7 +286,10 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
 
 
 def _comparison(side: Mapping[str, Any]) -> Grid:
-    """Return a table of the black box, the named effects and the given vehicle on a side."""
+    """Return a table of the gaps of the given vehicle, the named effects and the black box.
+
+    `side` is one of the two comparisons in `black_box` of diagnosis.json.
+    """
     before = side["before"]["gap"]
     rows = [
         (
@@ -296,7 +312,10 @@ def _comparison(side: Mapping[str, Any]) -> Grid:
 def _gap_cells(
     gap: float, ci95: Sequence[float], before: float, floor: float, digits: int
 ) -> tuple[str, str, str]:
-    """Return as texts a gap, its interval, and the removed share of `before` above the floor."""
+    """Return as texts a gap, its interval, and the share of the gap that was removed.
+
+    The share is that of the gap `before` minus the noise floor.
+    """
     removed = ""
     if gap != before and before > floor:
         removed = f"{100 * (before - gap) / (before - floor):.0f} %"

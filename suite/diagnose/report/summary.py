@@ -1,6 +1,7 @@
 """Writes a diagnosis in words: the answer, its size on these flights, and what to do next.
 
-All functions take the JSON of a diagnosis, so that the console and the report say the same.
+All functions take the content of diagnosis.json, so that the console and the report use the same
+words.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ CHANGES = {
     "unknown": "Something has changed since the reference flights, and no effect of the catalogue "
     "explains it.",
 }
-"""The same if a change since reference flights was searched for."""
+"""A sentence for each verdict, if a change since reference flights was searched for."""
 USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loop (--vehicle)."
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
@@ -76,6 +77,7 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
 
 
 def _no_gap(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the advice for the verdict `no_gap`."""
     yield "Use the vehicle file as it is."
     if result.get("not_examined"):
         yield f"These logs do not show: {', '.join(result['not_examined'])}. Log that as well."
@@ -83,6 +85,7 @@ def _no_gap(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _separate(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield advice for each named effect that has alternatives."""
     for effect in result["effects"]:
         if effect["alternatives"]:
             names = ", ".join([effect["name"], *effect["alternatives"]])
@@ -96,12 +99,14 @@ def _separate(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _explained(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the advice for the verdict `named`."""
     yield USE
     yield from _separate(result)
     yield "Or remove the cause on the vehicle, fly again and repeat this: expect no_gap."
 
 
 def _partly(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the advice for the verdict `partly`."""
     yield f"{USE} Its values are approximate; on held-out flights it is closer than your file."
     yield from _separate(result)
     yield CHECK
@@ -109,6 +114,7 @@ def _partly(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _unknown(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the advice for the verdict `unknown`."""
     yield CHECK
     if result.get("identified"):
         yield "suite identify wrote this vehicle file: repeat it if the vehicle has changed since."
@@ -119,12 +125,13 @@ def _unknown(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield advice on the remaining error: what it depends on, and an oscillating force."""
     if result["unexplained"]["where"]:
         yield (
             "Search for the cause of the unexplained error; the report's section Remaining error "
             "shows the quantity that it depends on."
         )
-    swing = result["unexplained"].get("swing")
+    swing = result["unexplained"].get("swing")  # an oscillating force, as of a load on a line
     if swing:
         yield (
             "If the vehicle carries a load on a line, weigh it and write mass and length = "
@@ -133,16 +140,16 @@ def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
 
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
-"""Generators of the advice, by verdict."""
+"""Functions that yield the advice, by verdict."""
 NOT_IDENTIFIABLE = "not identifiable"
-"""Text in place of a value that no flight identifies."""
+"""Text in place of a value that these flights do not identify."""
 
 
 class Component(NamedTuple):
-    """One number of a named effect, for people."""
+    """One value of a named effect, for people: a parameter, or one axis of it."""
 
     label: str
-    """Parameter, axis and unit."""
+    """Name of the parameter, axis and unit."""
     value: float | None
     """Value, or None if it is not identifiable."""
     ci95: tuple[float, float] | None
@@ -158,7 +165,7 @@ class Component(NamedTuple):
         return not self.ci95[0] <= self.neutral <= self.ci95[1]
 
     def texts(self) -> tuple[str, str]:
-        """Return value and interval as texts, in as many digits as the interval supports."""
+        """Return value and interval as texts, with as many digits as the interval supports."""
         if self.value is None:
             return NOT_IDENTIFIABLE, ""
         if self.ci95 is None:
@@ -171,7 +178,7 @@ class Component(NamedTuple):
 
 
 def in_digits(number: float, interval: Sequence[float]) -> str:
-    """Return `number` rounded to two significant digits of the interval's half-width.
+    """Return `number` rounded to the second significant digit of its interval's half-width.
 
     `interval` is (value, low, high). Small numbers, and those with no digit behind the point, are
     written with an exponent.
@@ -187,14 +194,14 @@ def in_digits(number: float, interval: Sequence[float]) -> str:
 
 
 def components(effect: Mapping[str, Any]) -> Iterator[Component]:
-    """Yield every number of a named `effect`, an entry of diagnosis.json."""
+    """Yield the components of a named `effect`, an entry of `effects` in diagnosis.json."""
     parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
     neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
     by_motor = {p.name for p in parameters if p.one_at_a_time}
     for name, entry in effect["parameters"].items():
         value, span, unit = entry["value"], entry["ci95"], entry["unit"]
         if name == "index" and by_motor:
-            # The labels below contain the numbers of several motors.
+            # The numbers of the motors. Those of several motors are in the labels below instead.
             if not isinstance(value, list):
                 is_certain = span is None or span[0] == span[1]
                 yield Component(name, value, None if is_certain else _pair(span), None)
@@ -212,11 +219,12 @@ def components(effect: Mapping[str, Any]) -> Iterator[Component]:
 
 
 def _pair(span: Sequence[float] | None) -> tuple[float, float] | None:
+    """Return an interval of diagnosis.json, a list or None, as a tuple or None."""
     return None if span is None else (float(span[0]), float(span[1]))
 
 
 def cells(*texts: str) -> list[Cell]:
-    """Return a row of cells without a tone."""
+    """Return a table row of cells without a colour."""
     return [Cell(text) for text in texts]
 
 

@@ -1,9 +1,12 @@
-"""The reference's clock against the gyro's, and the reference at the gyro's times.
+"""Finds the time shift between the reference and the gyro, and moves the reference to gyro times.
 
-Motion capture and telemetry have clocks of their own, and telemetry arrives with a varying delay.
-The shift between them is modelled as a random walk in time. It is the most probable path over a
-grid of shifts (Viterbi 1967) that makes the rates of the reference's attitude match the gyro's. The
-on-board estimate is not used. A shift that is not significant, or smaller than a row, is set to 0.
+The reference is a pose such as that of motion capture, in the same log as the gyro. It has its own
+clock, and it may arrive with a varying delay. The shift between the two is modelled as a random
+walk in time. The fit compares body rates by the reference's attitude with those of the gyro, and
+finds the most probable path over a grid of shifts (Viterbi 1967). The on-board estimate is not
+used. A shift that is not significant, or smaller than the time between two rows, is set to 0.
+
+A flight has M blocks of time with a constant shift each, and S shifts are tried.
 """
 
 from __future__ import annotations
@@ -19,72 +22,88 @@ from suite.diagnose.sensors.errors import rotation_between
 from tracks.geometry.rotation import rot_to_quat
 
 STEP_S = 0.01
-"""Of the grid of times [s]."""
+"""Step of the grid of times on which rates are compared [s]."""
 LARGEST_S, FINE_S = 0.25, 0.005
-"""Largest shift that is tried, and the steps between shifts [s]."""
+"""Largest shift that is tried, and the step between shifts [s]."""
 BLOCK_S = 0.25
-"""A shift is constant over this time [s]."""
+"""Length of a block; the shift is constant in it [s]."""
 SPAN_ROWS = 6
-"""Rates are means over so many grid steps before and after."""
+"""Rates are means from this many grid steps before a time to as many after it."""
 WANDERS = 0.03
-"""Standard deviation of the shift's change in a second [s]."""
+"""Standard deviation of the change of the shift in one second [s]."""
 ROUNDS = 3
-"""Of the path, each with the noise of the one before."""
+"""Number of searches for the path; each uses the noise that the path before it leaves."""
 
 
 class Clock(NamedTuple):
-    """How far the gyro's times are behind the reference's in one flight."""
+    """Shift between gyro and reference in one flight: by how much the gyro is later."""
 
     time_s: np.ndarray
-    """(M,)."""
+    """(M,) times of the gyro [s]."""
     shift_s: np.ndarray
-    """(M,) all zeros where no shift is significant."""
+    """(M,) shift at these times [s]; all zeros if it is not significant."""
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the shift [s] at the gyro's times (T,)."""
+        """Return the shift at times of the gyro (T,) [s]."""
         return np.interp(time_s, self.time_s, self.shift_s)
 
 
 def clock_of(log: FlightLog) -> Clock:
-    """Return the shift between the gyro's times and the reference's in a flight."""
-    none = Clock(np.zeros(1), np.zeros(1))
+    """Return the shift between the times of gyro and reference in a flight."""
+    # Compute how badly the rates match, for each block and shift.
+    no_shift = Clock(np.zeros(1), np.zeros(1))
     grid = np.arange(log.time_s[0], log.time_s[-1], STEP_S)
     size = round(BLOCK_S / STEP_S)
     blocks = len(grid) // size
-    quat_there = np.isfinite(log.quat_wxyz).all(axis=1).sum() > 1
-    if not blocks or not quat_there or not (np.isfinite(log.rate_b).sum(axis=0) > 1).all():
-        return none
+    has_attitude = np.isfinite(log.quat_wxyz).all(axis=1).sum() > 1
+    if not blocks or not has_attitude or not (np.isfinite(log.rate_b).sum(axis=0) > 1).all():
+        return no_shift
     shifts_s = np.arange(-LARGEST_S, LARGEST_S + 0.5 * FINE_S, FINE_S)
     misfit, rows = _misfits(log, grid[: blocks * size], shifts_s, size)
     if not rows.any():
-        return none
-    still = len(shifts_s) // 2
-    path, every = np.full(blocks, still), np.arange(blocks)
+        return no_shift
+    # Search for the most probable path. Costs are negative log-likelihoods: `cost` of a shift in a
+    # block, and `change` from one shift to another in the next block.
+    zero = len(shifts_s) // 2  # index of the shift 0
+    path, every = np.full(blocks, zero), np.arange(blocks)
     change = (shifts_s[:, None] - shifts_s) ** 2 / (2.0 * WANDERS**2 * BLOCK_S)
     cost = misfit
     for _ in range(ROUNDS):
         variance = max(misfit[every, path].sum() / (3.0 * rows.sum()), 1e-12)
-        # Rates that are means over several rows are independent that far apart only.
+        # A rate is a mean over 2 * SPAN_ROWS grid steps, so only one of so many is independent.
         cost = misfit / (2.0 * variance * 2 * SPAN_ROWS)
         path = _most_probable(cost, change)
-    gain = (cost[:, still] - cost[every, path]).sum()
+    # Keep the path if it is significant.
+    gain = (cost[:, zero] - cost[every, path]).sum()
     shift_s = shifts_s[path]
     row_s = float(np.median(np.diff(log.time_s)))
-    # Chance gives a gain of the log-likelihood below 1 a block.
+    # By chance the log-likelihood rises by less than 1 for each block.
     if gain < blocks or np.sqrt((shift_s**2).mean()) < row_s:
-        return none
+        return no_shift
     return Clock(grid[: blocks * size].reshape(blocks, size).mean(axis=1), shift_s)
 
 
 def _misfits(
     log: FlightLog, grid: np.ndarray, shifts_s: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return squared rate differences (M, S) of blocks at shifts, and the blocks' rows (M,)."""
+    """Compare the rates of gyro and reference at each shift.
+
+    Args:
+        log: the flight.
+        grid: times on which the rates are compared, M * `size` of them [s].
+        shifts_s: (S,) shifts that are tried [s].
+        size: number of grid times in a block.
+
+    Returns:
+        The sum of squared differences (M, S) in each block at each shift, and the number of grid
+        times (M,) of each block that are compared.
+    """
     half_s = SPAN_ROWS * STEP_S
     rot_w = attitude_at(log.time_s, log.quat_wxyz, grid)
     turn = rotation_between(rot_w[: -2 * SPAN_ROWS], rot_w[2 * SPAN_ROWS :])
     reference = np.full((len(grid), 3), np.nan)
     reference[SPAN_ROWS:-SPAN_ROWS] = turn / (2.0 * half_s)
+    # The mean rate of the gyro over the same span is a difference of its integral.
     gyro = interpolated(log.time_s, log.rate_b, grid)
     angle = np.cumsum(np.nan_to_num(gyro), axis=0) * STEP_S
     # The trapezoidal rule; half of the first row, which is too much, cancels in differences.
@@ -105,26 +124,33 @@ def _misfits(
 
 
 def _most_probable(cost: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the path (M,) of least cost: `cost` (M, S) of each state, `change` (S, S) between."""
-    total, before = cost[0], list[np.ndarray]()
-    for own in cost[1:]:
+    """Return the path of least cost: the index of the shift in each block, (M,).
+
+    Args:
+        cost: (M, S) cost of each shift in each block.
+        change: (S, S) cost of the change from one shift to another in the next block.
+    """
+    # Forward: the least cost of a path to each shift, and the shift in the block before it.
+    total, origins = cost[0], list[np.ndarray]()
+    for block_cost in cost[1:]:
         reached = total[:, None] + change
-        before.append(reached.argmin(axis=0))
-        total = reached.min(axis=0) + own
+        origins.append(reached.argmin(axis=0))
+        total = reached.min(axis=0) + block_cost
+    # Backward: from the best last shift through the shifts before it.
     path = [int(total.argmin())]
-    for origin in reversed(before):
+    for origin in reversed(origins):
         path.append(int(origin[path[-1]]))
     return np.array(path[::-1])
 
 
 def on_gyro_clock(log: FlightLog, clock: Clock) -> FlightLog:
-    """Return the flight with the reference's pose and velocity at the gyro's times."""
+    """Return the flight with pose and velocity of the reference moved to the gyro's times."""
     if not clock.shift_s.any():
         return log
-    then = log.time_s - clock.at(log.time_s)
+    reference_s = log.time_s - clock.at(log.time_s)
     return replace(
         log,
-        pos_w=interpolated(log.time_s, log.pos_w, then),
-        quat_wxyz=rot_to_quat(attitude_at(log.time_s, log.quat_wxyz, then)),
-        vel_w=interpolated(log.time_s, log.vel_w, then),
+        pos_w=interpolated(log.time_s, log.pos_w, reference_s),
+        quat_wxyz=rot_to_quat(attitude_at(log.time_s, log.quat_wxyz, reference_s)),
+        vel_w=interpolated(log.time_s, log.vel_w, reference_s),
     )

@@ -1,16 +1,18 @@
 """Fits size, autocorrelation and drift of a state estimate's errors to their variogram.
 
-The variogram g(l) is half the mean squared difference of errors at times a lag l apart. A constant
-bias does not change it (Cressie 1993, "Statistics for spatial data", section 2.4). The model has
-two first-order Gauss-Markov processes: a fast one with the share f of the variance v, and a slow
-one. A random walk with the distance adds to them, of variance c^2 per metre at the speed s:
+The variogram g(l) is half the mean squared difference of two errors whose times differ by l, the
+lag. A constant bias does not change it (Cressie 1993, "Statistics for spatial data", section 2.4).
+The model is coloured noise (correlated in time) and a drift (a random walk with the distance). The
+noise, with the variance v, is the sum of two first-order Gauss-Markov processes: a fast one with
+the share f of v and the correlation time T_f, and a slow one with the correlation time T. The drift
+has the variance c^2 for each metre; s is the speed:
 
     g(l) = v (1 - f exp(-l / T_f) - (1 - f) exp(-l / T)) + c^2 s l / 2
 
-The drift c is fitted first, at lags of seconds. The other parameters are fitted at lags up to one
-second, and at the variance about each flight's mean, v (1 - m) + c^2 s D / 6. There D is the
-flight's duration, and m the variance of its mean over v. Each stretch of 5 s has its own variogram;
-their disagreement gives the intervals.
+The drift c is fitted first, at lags of seconds. The other parameters are fitted to the variogram at
+lags up to one second, and to the variance about the mean of each flight, v (1 - m) + c^2 s D / 6.
+Here D is the duration of the flight, and m is the variance of the noise's mean divided by v. Each
+stretch of 5 s has its own variogram; the disagreement between stretches gives the intervals.
 """
 
 from __future__ import annotations
@@ -30,18 +32,20 @@ from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, significant
 SHORT_S = 1.0
 """The autocorrelation is fitted up to this lag [s]."""
 SHORT_LAGS, LONG_LAGS = 40, 8
-"""Number of lags up to `SHORT_S`, and of those that show a drift."""
+"""Number of lags up to `SHORT_S`, and number of lags for the fit of a drift."""
 LONG_S, LONGEST = 2.0, 1.0 / 3.0
-"""A drift is fitted from this lag on [s], up to this share of the shortest flight."""
+"""Lags for the fit of a drift: the shortest [s], and the longest as a share of a flight."""
 LEAST_S = 0.01
-"""Least correlation time in the fit [s]; the largest is that of a drift's lags."""
+"""Least correlation time in the fit [s]; the largest is the longest lag for a drift."""
 TINY_S = 1e-6
-"""Correlation times are at least this in divisions [s]."""
+"""Lower limit of a correlation time in a division [s]."""
 LOG_RATIO = (-7.0, -0.7)
 """Bounds of log T_f / T, the fast correlation time over the slow one."""
 LONGEST_NEW = 0.3
-"""A fast correlation time below this share of a row's step counts as 0: no row shows it [1]."""
+"""A fast correlation time below this share of the time between rows counts as 0: rows do not
+show it."""
 ZERO = Interval(0.0, 0.0, 0.0)
+"""A parameter that is not in the model."""
 
 
 class Series(NamedTuple):
@@ -52,6 +56,7 @@ class Series(NamedTuple):
     speed: np.ndarray
     """(T,) speed of the vehicle [m/s]; zeros for an error without drift."""
     step_s: float
+    """Time between rows [s]."""
 
     @property
     def duration_s(self) -> float:
@@ -63,9 +68,9 @@ class Coloured(NamedTuple):
     """Parameters of one error; coloured means correlated in time."""
 
     noise: Interval
-    """Standard deviation without bias and drift, in the error's unit."""
+    """Standard deviation of the noise (without bias and drift), in the unit of the error."""
     fast: Interval
-    """Share of the variance in the fast process [1]."""
+    """Share of the fast process in the variance of the noise."""
     fast_s: Interval
     """Correlation time of the fast process; 0 if its values are independent from row to row [s]."""
     lasts_s: Interval
@@ -73,12 +78,12 @@ class Coloured(NamedTuple):
     drift: Interval
     """Random walk with the distance [unit/sqrt(m)]."""
     bias: Interval
-    """Standard deviation over flights of the part that is constant in a flight."""
+    """Standard deviation, over flights, of the part of the error that is constant in a flight."""
 
     def correlation(self, lag_s: np.ndarray, duration_s: float) -> np.ndarray:
         """Return the autocorrelation (L,) that a flight of `duration_s` shows on average.
 
-        The flight's mean is subtracted, which removes a share of a slow error.
+        The mean of the flight is subtracted from its errors, which removes a part of slow errors.
         """
         colour = Colour(self.fast.value, self.fast_s.value, self.lasts_s.value)
         mean_share = colour.mean_variance(duration_s)
@@ -89,25 +94,28 @@ class Colour(NamedTuple):
     """Correlation of noise in time."""
 
     fast: float
-    """Share of the variance in the fast process [1]."""
+    """Share of the fast process in the variance."""
     fast_s: float
     """Correlation time of the fast process [s]."""
     lasts_s: float
     """Correlation time of the slow process [s]."""
 
     def correlation(self, lag_s: np.ndarray) -> np.ndarray:
-        """Return the autocorrelation (L,) at lags [s]."""
+        """Return the autocorrelation at the lags `lag_s` (L,) [s]."""
         fast, slow = (np.exp(-lag_s / max(t, TINY_S)) for t in (self.fast_s, self.lasts_s))
         return self.fast * fast + (1.0 - self.fast) * slow
 
     def mean_variance(self, duration_s: float) -> float:
-        """Return the variance of the mean over `duration_s`, relative to the noise's variance."""
+        """Return the variance of the mean over `duration_s`, divided by that of the noise."""
         processes = ((self.fast, self.fast_s), (1.0 - self.fast, self.lasts_s))
         return sum(share * _mean_variance(max(t, TINY_S) / duration_s) for share, t in processes)
 
 
 def _mean_variance(ratio: float) -> float:
-    """Return the same for one process of a correlation time of `ratio` durations."""
+    """Return the variance of the mean of one process, divided by that of the process.
+
+    `ratio` is the correlation time of the process divided by the duration.
+    """
     return 2.0 * ratio * (1.0 - ratio * (1.0 - float(np.exp(-1.0 / ratio))))
 
 
@@ -115,13 +123,13 @@ class _Variograms(NamedTuple):
     """Variograms of B stretches at L lags."""
 
     value: np.ndarray
-    """(B, L) half the mean squared difference."""
+    """(B, L) half the mean squared difference of errors at each lag."""
     weight: np.ndarray
-    """(B, L) share of the pairs of rows at that lag."""
+    """(B, L) share of each stretch in the pairs of rows at a lag."""
     speed: np.ndarray
-    """(B, 1) mean speed [m/s]."""
+    """(B, 1) mean speed of each stretch [m/s]."""
     flight: np.ndarray
-    """(B,) number of the flight."""
+    """(B,) number of the flight of each stretch."""
 
 
 def fit_colour(flights: Sequence[Series]) -> Coloured | None:
@@ -139,6 +147,7 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
             best = _noise(flights, variograms, lag_s, drift.value**2)
         else:
             drift = drift._replace(value=0.0, low=0.0)
+    # Convert the logarithms of the fit into parameters with intervals.
     log_variance, share, _, _ = best.theta
     half, colour, sd = best.half, best.colour, float(np.exp(0.5 * log_variance))
     low, high = np.clip([share - half[1], share + half[1]], 0.0, 1.0)
@@ -157,7 +166,7 @@ def fit_colour(flights: Sequence[Series]) -> Coloured | None:
 
 
 def _from_log(value: float, half: float) -> Interval:
-    """Return the interval of `value`; its logarithm has the half-width `half`."""
+    """Return the interval of `value`, whose logarithm has an interval of half-width `half`."""
     factor = float(np.exp(half))
     return Interval(value, value / factor, value * factor)
 
@@ -166,27 +175,35 @@ class _Noise(NamedTuple):
     """Fitted noise."""
 
     theta: np.ndarray
-    """(4,) log v, f, log T_f / T, log T."""
+    """(4,) parameters: log v, f, log (T_f / T) and log T."""
     half: np.ndarray
-    """(4,) half-widths of their intervals."""
+    """(4,) half-widths of the parameters' intervals."""
     cost: float
+    """Sum of the squared residuals of the fit, halved."""
 
     @property
     def colour(self) -> Colour:
-        """Its correlation in time."""
+        """Correlation of the noise in time."""
         return _colour(self.theta)
 
 
 def _colour(theta: np.ndarray) -> Colour:
+    """Return the correlation in time for the parameters of a `_Noise`."""
     return Colour(float(theta[1]), float(np.exp(theta[2] + theta[3])), float(np.exp(theta[3])))
 
 
 def _noise(
     flights: Sequence[Series], variograms: _Variograms, lag_s: np.ndarray, walk: float
 ) -> _Noise:
-    """Fit the noise in addition to a random walk of variance `walk` per metre.
+    """Fit the noise in addition to a given random walk.
 
-    The fast process is used only if its share is significant. `lag_s` (L,) is of `variograms`.
+    The fast process is used only if its share is significant.
+
+    Args:
+        flights: the errors.
+        variograms: variograms of all stretches.
+        lag_s: (L,) lags of the variograms [s].
+        walk: variance of the random walk for each metre.
     """
     duration_s = float(np.mean([flight.duration_s for flight in flights]))
     about_mean = _variograms(flights, None)
@@ -197,6 +214,7 @@ def _noise(
     size = float((about_mean.weight * about_mean.value).sum()) + 1e-300
 
     def model(theta: np.ndarray) -> np.ndarray:
+        """Return the modelled variogram (B, L), then the variance about the flight's mean."""
         variance, colour = np.exp(theta[0]), _colour(theta)
         at_lags = variance * (1.0 - colour.correlation(lag_s))
         about_mean = variance * (1.0 - colour.mean_variance(duration_s))
@@ -204,6 +222,7 @@ def _noise(
         return np.append(at_lags, about_mean) + drifted
 
     def residual(theta: np.ndarray) -> np.ndarray:
+        """Return the weighted residuals as one array."""
         return (np.sqrt(weight) * (measured - model(theta)) / size).ravel()
 
     longest = max(LONGEST * duration_s, 2.0 * LONG_S)
@@ -214,6 +233,7 @@ def _noise(
         """Fit the entries of theta at `free`; the others keep their start."""
 
         def complete(values: np.ndarray) -> np.ndarray:
+            """Return all entries of theta for the values of the free ones."""
             theta = start.copy()
             theta[free] = values
             return theta
@@ -226,6 +246,7 @@ def _noise(
         half[free] = np.minimum(_half_widths(slope, best.fun, variograms.flight), 20.0)
         return _Noise(complete(best.x), half, float(best.cost))
 
+    # Fit the slow process alone, then both; keep both only if the fast share is significant.
     slow = fitted([0, 3], np.array([np.log(size), 0.0, -1.5, np.log(0.3)]))
     starts = [np.array([np.log(size), 0.3, ratio, np.log(0.5)]) for ratio in (-1.5, -4.0)]
     mixed = min((fitted([0, 1, 2, 3], start) for start in starts), key=lambda noise: noise.cost)
@@ -241,6 +262,7 @@ def _drift(flights: Sequence[Series]) -> Interval:
     variograms = _variograms(flights, lag_s)
     if variograms is None:
         return ZERO
+    # A line in the lag: a constant for the noise, and a slope for the drift.
     root = np.sqrt(variograms.weight)
     columns = [np.ones_like(root), 0.5 * variograms.speed * lag_s]
     slope = np.stack(columns, axis=-1) * root[..., None]
@@ -252,9 +274,10 @@ def _drift(flights: Sequence[Series]) -> Interval:
 
 
 def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variograms | None:
-    """Return the variograms of all stretches at lags (L,), or None for less than two stretches.
+    """Return the variograms of all stretches at the lags (L,); None for less than two stretches.
 
-    Without lags the value is the mean square about each flight's mean, and L is 1.
+    If `lag_s` is None, the value of a stretch is the mean square of its errors about the mean of
+    its flight, and L is 1.
     """
     values, counts, speeds, flight_of = [], [], [], []
     for number, flight in enumerate(flights):
@@ -265,6 +288,7 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
         else:
             lags = np.rint(lag_s / flight.step_s).astype(int)
             squares = [0.5 * (flight.value[k:] - flight.value[:-k]) ** 2 for k in lags]
+        # Sum the squares and count them, by stretch, for each lag.
         totals, pairs = [], []
         for square in squares:
             good = np.isfinite(square)
@@ -278,24 +302,26 @@ def _variograms(flights: Sequence[Series], lag_s: np.ndarray | None) -> _Variogr
         speed = np.bincount(stretch, np.nan_to_num(flight.speed)) / np.bincount(stretch)
         speeds.append(speed[used, None])
         flight_of.append(np.full(used.sum(), number))
-    every = np.concatenate(counts)
-    if len(every) < 2 or not every.any(axis=0).all():
+    all_counts = np.concatenate(counts)
+    if len(all_counts) < 2 or not all_counts.any(axis=0).all():
         return None
     return _Variograms(
         np.concatenate(values),
-        every / every.sum(axis=0),
+        all_counts / all_counts.sum(axis=0),
         np.concatenate(speeds),
         np.concatenate(flight_of),
     )
 
 
 def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the half-widths (K,) of the 95 % intervals, by how stretches and flights disagree.
+    """Return the half-widths (K,) of the 95 % intervals of K parameters.
+
+    They follow from the disagreement between stretches and between flights.
 
     Args:
-        slope: (B, L, K) of the model.
-        residual: (B * L,) of the fit.
-        flight: (B,) number of each stretch's flight.
+        slope: (B, L, K) slopes of the model along the parameters.
+        residual: (B * L,) residuals of the fit.
+        flight: (B,) number of the flight of each stretch.
     """
     residual = residual.reshape(*slope.shape[:2], 1)
     chi2 = (residual[..., 0] ** 2).sum(axis=1)
@@ -304,7 +330,10 @@ def _half_widths(slope: np.ndarray, residual: np.ndarray, flight: np.ndarray) ->
 
 
 def _bias(flights: Sequence[Series], variance: float, colour: Colour) -> Interval:
-    """Return the standard deviation of a flight's constant error, without the noise's mean."""
+    """Return the standard deviation of the constant error of a flight.
+
+    The mean of a flight's errors also contains the mean of the noise, whose variance is subtracted.
+    """
     flights = [flight for flight in flights if np.isfinite(flight.value).any()]
     means, count = np.array([np.nanmean(flight.value) for flight in flights]), len(flights)
     noise = variance * np.mean([colour.mean_variance(f.duration_s) for f in flights])

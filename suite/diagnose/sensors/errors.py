@@ -1,10 +1,11 @@
 """Errors of an on-board state estimate relative to the log's reference pose, and their delay.
 
-To first order a delay d causes the error -d times the derivative of the truth, and a scale error k
-of the velocity causes k v. Both are fitted by least squares to the errors of all flights, after
-subtracting each flight's mean. Axes are weighted by their variance. Errors are correlated in time,
-so intervals come from the disagreement between stretches of 5 s. Rows are not whitened: that would
-give fast motion a high weight, in which the estimator's own dynamics dominate.
+To first order, an estimate that is late by d has the error -d times the derivative of the truth. A
+scale error k of the velocity v causes the error k v. Delay and scale are fitted by least squares to
+the errors of all flights, after subtracting the mean of each flight. Each axis is divided by the
+RMS of its errors. Errors are correlated in time, so intervals come from the disagreement between
+stretches of 5 s. Rows are not whitened (made uncorrelated in time): whitening would give a high
+weight to fast motion, in which the dynamics of the estimator dominate.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from suite.diagnose.identify.grid import attitude_at, interpolated
 from tracks.geometry.rotation import cross, to_local
 
 PARTS = {"position": "pos", "velocity": "vel", "attitude": "quat"}
-"""Parts of the state, three axes each, and the columns that hold them."""
+"""Parts of the state, three axes each, and the group of columns that has each part."""
 SLOPE_ROWS = 15
-"""Rows over which the reference is differentiated."""
+"""Number of rows over which the reference is differentiated."""
 SETTLES_S = 2.0
 """Time left out after the first row and before the last: the vehicle is near the ground [s]."""
 LEAST_S = 8.0
@@ -39,22 +40,29 @@ class Errors(NamedTuple):
     """Errors of the estimate in one flight at T evenly spaced times; NaN for missing signals."""
 
     name: str
+    """Name of the flight."""
     step_s: float
+    """Time between rows [s]."""
     value: np.ndarray
-    """(T, 9) estimate - reference: position in the world [m], velocity [m/s] and attitude [rad] in
-    the body."""
+    """(T, 9) estimate minus reference: position in world axes [m], velocity [m/s] and attitude
+    [rad] in body axes."""
     slope: np.ndarray
     """(T, 9) time derivative of the reference, in the same axes."""
     vel_b: np.ndarray
-    """(T, 3) velocity of the reference [m/s]."""
+    """(T, 3) velocity of the reference in body axes [m/s]."""
     rot_w: np.ndarray
     """(T, 3, 3) attitude of the reference, body to world."""
     lean_w: np.ndarray
-    """(L + T, 3) velocity x body z over gravity, also of L rows before the first error [s]."""
+    """(L + T, 3) cross product of velocity and body z axis, divided by gravity [s]: the tilt for a
+    drag of 1/s that an estimator neglects. It begins L rows before the first error."""
 
 
 def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
-    """Return the errors of the estimate in `log` relative to the reference `late_s` earlier [s].
+    """Return the errors of the estimate in `log` relative to the reference.
+
+    Args:
+        log: the flight.
+        late_s: delay of the estimate [s]; it is compared with the reference so much earlier.
 
     Raises:
         FlightLogError: if the log has no estimate, no reference for it, or is too short.
@@ -71,20 +79,22 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         if not np.isfinite(values).any():
             reason = f"no reference for the estimate: {GROUPS[group][0]} is missing in every row"
             raise FlightLogError(log.name, GROUPS[group][0], None, reason)
+    # Times without take-off and landing. The velocity is also needed before `grid`, see `lean_w`.
     step_s = float(np.median(np.diff(log.time_s)))
-    whole = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
-    whole = whole[whole <= whole[-1] - SETTLES_S]
-    grid = whole[whole >= whole[0] + SETTLES_S]
+    from_start = np.arange(log.time_s[0], log.time_s[-1] + 0.5 * step_s, step_s)
+    from_start = from_start[from_start <= from_start[-1] - SETTLES_S]
+    grid = from_start[from_start >= from_start[0] + SETTLES_S]
     if len(grid) < LEAST_S / step_s:
         reason = (
             f"{log.duration_s:.1f} s of flight; allowed are {LEAST_S + 2 * SETTLES_S:g} s or more"
         )
         raise FlightLogError(log.name, None, None, reason)
-    vel_w = interpolated(log.time_s, log.vel_w, whole - late_s)
-    rot_w = attitude_at(log.time_s, log.quat_wxyz, whole - late_s)
+    vel_w = interpolated(log.time_s, log.vel_w, from_start - late_s)
+    rot_w = attitude_at(log.time_s, log.quat_wxyz, from_start - late_s)
     lean_w = cross(vel_w, rot_w[..., 2]) / GRAVITY
     vel_w, rot_w = vel_w[-len(grid) :], rot_w[-len(grid) :]
-    then = grid - late_s
+    # Estimate minus reference, part by part.
+    then_s = grid - late_s
     value, rate_b = np.full((len(grid), 9), np.nan), np.full((len(grid), 3), np.nan)
     for k, (part, estimate) in enumerate(estimates.items()):
         if estimate is None:
@@ -92,13 +102,14 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         if part == "attitude":
             error = rotation_between(rot_w, attitude_at(log.time_s, estimate, grid))
         else:
-            reference = interpolated(log.time_s, log.pos_w, then) if part == "position" else vel_w
+            reference = interpolated(log.time_s, log.pos_w, then_s) if part == "position" else vel_w
             error = interpolated(log.time_s, estimate, grid) - reference
             error = to_local(rot_w, error) if part == "velocity" else error
         value[:, 3 * k : 3 * k + 3] = error
+    # The time derivative of the reference is velocity, acceleration and body rates.
     acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
     if np.isfinite(log.rate_b).any():
-        rate_b = interpolated(log.time_s, log.rate_b, then)
+        rate_b = interpolated(log.time_s, log.rate_b, then_s)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
     return Errors(log.name, step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
 
@@ -110,10 +121,10 @@ def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
     """
     relative = np.matmul(np.swapaxes(rot_w, -1, -2), other_w)
     good = np.isfinite(relative).all(axis=(1, 2))
-    out = np.full((len(relative), 3), np.nan)
+    rotation_b = np.full((len(relative), 3), np.nan)
     if good.any():
-        out[good] = Rotation.from_matrix(relative[good]).as_rotvec()
-    return out
+        rotation_b[good] = Rotation.from_matrix(relative[good]).as_rotvec()
+    return rotation_b
 
 
 def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
@@ -126,7 +137,10 @@ def _estimate(log: FlightLog, group: str) -> np.ndarray | None:
 
 
 def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
-    """Return the slope (T, C) of a parabola over `SLOPE_ROWS` rows; NaN near holes."""
+    """Return the time derivative of `values` (T, C); NaN near missing values.
+
+    It is the slope of a parabola that is fitted to `SLOPE_ROWS` rows.
+    """
     if len(values) < SLOPE_ROWS:
         return np.full_like(values, np.nan)
     slope = savgol_filter(values, SLOPE_ROWS, 2, deriv=1, delta=step_s, axis=0, mode="nearest")
@@ -136,11 +150,12 @@ def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
 STRETCH_S = 5.0
 """Errors further apart than this count as independent [s]."""
 DIFFER_P = 0.05
-"""Flights count as different below this p-value [1]."""
+"""P-value below which flights differ more than their stretches explain. Intervals are then
+wider."""
 ROUNDS = 3
-"""Rounds of the fit, each linearised at the delay of the round before."""
+"""Number of rounds of the fit; each is linearised at the delay of the round before."""
 LEAST_INFORMATION = 1e-9
-"""A number with less information in the errors is not fitted [1]."""
+"""A parameter (delay or scale) with less information in the errors is not fitted."""
 
 
 class Lateness(NamedTuple):
@@ -149,17 +164,17 @@ class Lateness(NamedTuple):
     delay_s: Interval
     """Delay of the estimate [s]."""
     velocity_scale: Interval
-    """Relative scale error of the velocity [1]."""
+    """Relative scale error of the velocity."""
     by_part: dict[str, Interval]
-    """Delay by each part of the state alone [s]."""
+    """Delay that each part of the state alone gives, by the part's name [s]."""
 
 
 def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
-    """Fit the delay and the velocity's scale to the flights in `logs`.
+    """Fit the delay and the scale of the velocity to the flights in `logs`.
 
     Returns:
-        The systematic part, and each flight's errors at the fitted delay. A delay whose interval
-        contains 0 counts as 0.
+        The delay and the scale, and the errors of each flight at the fitted delay. A delay whose
+        interval contains 0 counts as 0.
     """
     lateness = _fitted([errors_of(log) for log in logs], 0.0)
     for _ in range(ROUNDS - 1):
@@ -169,7 +184,8 @@ def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
 
 
 def _fitted(flights: Sequence[Errors], delay_s: float) -> Lateness:
-    """Return delay and scale by errors that were taken at `delay_s`."""
+    """Return delay and scale, from errors that were computed with the delay `delay_s`."""
+    # Parameter 0 is the delay, parameter 1 the scale.
     numbers, scale = (0, 1), Interval(0.0, 0.0, 0.0)
     equations = _equations(flights, slice(0, 9))
     value, half = _solved(equations, numbers)
@@ -193,42 +209,44 @@ def significant(interval: Interval) -> float:
 
 
 def _interval(value: float, half: float) -> Interval:
+    """Return the interval of `value` with the half-width `half`."""
     return Interval(float(value), float(value - half), float(value + half))
 
 
 def without_scale(flight: Errors, scale: float) -> np.ndarray:
-    """Return the errors (T, 9) without those by a relative `scale` error of the velocity [1]."""
+    """Return the errors (T, 9) without those by a relative `scale` error of the velocity."""
     return flight.value - scale * _scale_slope(flight)
 
 
 def _scale_slope(flight: Errors) -> np.ndarray:
-    """Return the errors (T, 9) that a scale error of 1 causes."""
+    """Return the errors (T, 9) that a relative scale error of 1 of the velocity causes."""
     zeros = np.zeros_like(flight.vel_b)
     return np.concatenate([zeros, flight.vel_b, zeros], axis=1)
 
 
 def _equations(flights: Sequence[Errors], channels: slice) -> NormalEquations:
-    """Return the normal equations of delay and scale on the errors of `channels`, by stretch."""
+    """Return the normal equations of delay and scale for the errors of `channels`, by stretch."""
     columns = [np.stack([one.value, -one.slope, _scale_slope(one)], axis=-1) for one in flights]
     return equations_of(flights, [values[:, channels] for values in columns])
 
 
 def equations_of(flights: Sequence[Errors], columns: Sequence[np.ndarray]) -> NormalEquations:
-    """Return the normal equations, by stretch, of two numbers.
+    """Return the normal equations of two parameters, by stretch.
 
     Args:
-        flights: the errors.
-        columns: for each flight C errors and their slopes along the numbers, (T, C, 3).
+        flights: the flights.
+        columns: for each flight (T, C, 3): its errors in C channels, and their slopes along the two
+            parameters.
     """
     rows, stretch, flight_of = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for number, (flight, values) in enumerate(zip(flights, columns, strict=True)):
+    for index, (flight, values) in enumerate(zip(flights, columns, strict=True)):
         complete = np.isfinite(values).all(axis=-1, keepdims=True)
         values = np.where(complete, values, 0.0)
         mean = values.sum(axis=0) / np.maximum(complete.sum(axis=0), 1)
         rows.append(np.where(complete, values - mean, 0.0))
         stretch.append((np.arange(len(values)) * flight.step_s / STRETCH_S).astype(int))
-        flight_of.append(np.full(len(values), number))
-    places, number = np.unique(
+        flight_of.append(np.full(len(values), index))
+    flight_and_stretch, index = np.unique(
         np.stack([np.concatenate(flight_of), np.concatenate(stretch)]), axis=1, return_inverse=True
     )
     table = np.concatenate(rows)
@@ -236,14 +254,17 @@ def equations_of(flights: Sequence[Errors], columns: Sequence[np.ndarray]) -> No
     count = np.maximum(np.count_nonzero(table[..., 0], axis=0), 1)
     noise = np.sqrt(np.maximum((table[..., 0] ** 2).sum(axis=0) / count, 1e-300))
     white = table / noise[:, None]
-    start_s = places[1] * STRETCH_S
+    start_s = flight_and_stretch[1] * STRETCH_S
     return without_nuisance(
-        white[..., 0], white[..., 1:], (0, 1), number.ravel(), places[0], start_s
+        white[..., 0], white[..., 1:], (0, 1), index.ravel(), flight_and_stretch[0], start_s
     ).equations
 
 
 def _solved(equations: NormalEquations, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return delay and scale (2,) and their intervals' half-widths (2,); 0 if not in `numbers`."""
+    """Return delay and scale (2,), and the half-widths (2,) of their intervals.
+
+    Only the parameters in `numbers` are fitted; 0 is the delay and 1 the scale. The others are 0.
+    """
     hessian, gradient = equations.sums()
     fitted = [k for k in numbers if hessian[k, k] > LEAST_INFORMATION]
     value, half = np.zeros(2), np.zeros(2)

@@ -37,18 +37,21 @@ from suite.diagnose.sensors.tilt import Tilt, fit_tilt
 SCHEMA = 1
 """Version of the JSON that `suite identify --sensors` prints."""
 WITHIN = 0.2
-"""A model fits if its autocorrelation is within this of the measured one at every lag."""
+"""A model fits if its autocorrelation differs by at most this from the measured one, at every lag
+(time difference)."""
 LEAST_RELATIVE = 0.2
-"""Least measured autocorrelation for a relative comparison as well."""
+"""Least measured autocorrelation at lags where the relative difference is computed as well."""
 ZERO = Interval(0.0, 0.0, 0.0)
+"""A parameter that is not in the model."""
 
 
 class Fitted(NamedTuple):
     """Model of an estimate's errors, fitted to flights."""
 
     lateness: Lateness
+    """Delay of the estimate, and scale error of its velocity."""
     axes: Mapping[str, Coloured]
-    """Parameters of each axis that has enough data."""
+    """Noise parameters by axis (such as `position_x`), of each axis with enough data."""
     drift: Interval
     """Random walk of the position, averaged over its axes [m/sqrt(m)]."""
     tilt: Tilt
@@ -61,15 +64,16 @@ class HeldOut(NamedTuple):
     lag_s: float
     """Lag at which they differ most [s]."""
     measured: float
-    """Autocorrelation of the held-out flights there."""
+    """Autocorrelation of the held-out flights at that lag."""
     fitted: float
-    """Autocorrelation of the model there."""
+    """Autocorrelation of the model at that lag."""
     largest: float
-    """Largest difference, in units of the autocorrelation at lag 0."""
+    """Largest difference; an autocorrelation is 1 at lag 0."""
     relative: float
-    """Largest difference over the measured value, where that is at least `LEAST_RELATIVE`."""
+    """Largest relative difference, among lags with a measured value of at least
+    `LEAST_RELATIVE`."""
     size_ratio: float
-    """Fitted standard deviation over the held-out one."""
+    """Standard deviation of the model divided by that of the held-out flights."""
 
     @property
     def fits(self) -> bool:
@@ -89,16 +93,16 @@ def fit_sensors(logs: Sequence[FlightLog]) -> Fitted:
         coloured = fit_colour(_series(flights, lateness, tilt, channel))
         if coloured is not None:
             axes[axis] = coloured
-    drifts = [axes[axis].drift for axis in AXES[:3] if axis in axes]
+    drifts = [axes[axis].drift for axis in AXES[:3] if axis in axes]  # those of the position
     rms = (float(np.sqrt(np.mean(np.square(ends)))) for ends in zip(*drifts, strict=True))
     return Fitted(lateness, axes, Interval(*rms) if drifts else ZERO, tilt)
 
 
 def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
-    """Compare a model that was fitted to half of the flights with the other half, by axis.
+    """Compare a model that was fitted to half of the flights with the other half.
 
-    Both halves are held out in turn, and the larger difference counts. One flight gives no
-    comparison.
+    Both halves are held out in turn. The result has the larger difference, by axis. It is empty for
+    a single flight.
     """
     worst: dict[str, HeldOut] = {}
     for half in (0, 1) if len(logs) > 1 else ():
@@ -116,7 +120,7 @@ def held_out(logs: Sequence[FlightLog]) -> dict[str, HeldOut]:
 
 
 def _compare(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
-    """Compare a model's autocorrelation with that of held-out flights, up to `SHORT_S`."""
+    """Compare the autocorrelation of a model with that of held-out flights, up to `SHORT_S`."""
     step_s = max(flight.step_s for flight in series)
     lags = np.arange(round(SHORT_S / step_s) + 1)
     duration_s = float(np.mean([flight.duration_s for flight in series]))
@@ -135,7 +139,7 @@ def _compare(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
 
 
 def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the variance of all flights and the autocorrelation (L,) at `lags` steps."""
+    """Return the variance of all flights, and the autocorrelation (L,) at `lags` (L,) in steps."""
     total, pairs = np.zeros(len(lags)), np.zeros(len(lags))
     for flight in series:
         centred = flight.value - np.nanmean(flight.value)
@@ -150,7 +154,10 @@ def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float,
 def _series(
     flights: Sequence[Errors], lateness: Lateness, tilt: Tilt, channel: int
 ) -> list[Series]:
-    """Return one error of every flight, without the parts by the velocity's scale and by drag."""
+    """Return the errors of one channel in each flight, for the fit of their noise.
+
+    The parts that the scale of the velocity and a neglected drag cause are subtracted.
+    """
     series, can_drift = [], AXES[channel].startswith("position")
     for flight in flights:
         values = without_scale(flight, significant(lateness.velocity_scale))
@@ -195,6 +202,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     Raises:
         ValueError: if no log has both an estimate and a reference, or no axis has enough data.
     """
+    # Read the logs, and leave out those that have no estimate or no reference.
     logs, warnings = read_flights(flight_files(flights), partial=True)
     used, seconds, refused = [], 0.0, []
     for log in logs:
@@ -208,6 +216,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
         raise ValueError("no flight can be used:\n" + "\n".join(refused))
     warnings += [f"not used: {text}" for text in refused]
     console.say(f"{len(used)} flights with an estimate and a reference, {seconds:.0f} s in all")
+    # Fit, and check on held-out flights.
     used, clocks_s = _on_gyro_clock(used)
     fitted, checked = fit_sensors(used), held_out(used)
     if not fitted.axes:
@@ -215,6 +224,7 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
             "no axis of the estimate has two stretches of 5 s without a hole; fly longer, or log "
             "the estimate and the reference in the same rows"
         )
+    # Write the file, with a header that states all intervals.
     parameters = parameters_of(fitted)
     header = [f"An on-board estimate against a reference in {len(used)} flights; 95 % intervals:"]
     if clocks_s:
@@ -248,7 +258,11 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
 
 
 def _on_gyro_clock(logs: Sequence[FlightLog]) -> tuple[list[FlightLog], dict[str, list[float]]]:
-    """Return flights on the gyro's clock, and by flight the least and largest nonzero shift."""
+    """Move the reference of each flight to the gyro's clock.
+
+    Returns:
+        The flights, and the least and largest shift [s] by the name of each flight that has one.
+    """
     clocks = [clock_of(log) for log in logs]
     moved = [on_gyro_clock(log, clock) for log, clock in zip(logs, clocks, strict=True)]
     shifts_s = {
@@ -273,7 +287,10 @@ def say_held_out(result: Mapping[str, Any], console: Console) -> None:
 
 
 def _file_values(parameters: Mapping[str, tuple[Interval, str]]) -> dict[str, dict[str, float]]:
-    """Return the entries of the file, without a delay, scale or drift that may be zero."""
+    """Return the entries of the sensors file: parameters by model, then by name.
+
+    A delay, scale or drift whose interval contains 0 is left out.
+    """
     models: dict[str, dict[str, float]] = {}
     for key, (interval, _) in parameters.items():
         model, name = key.split(".")
