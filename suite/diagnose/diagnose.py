@@ -26,7 +26,7 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import integrator_of
 
 SourceMaker = Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]
-"""Makes sources from the input and the sources before it; None if it adds none."""
+"""Function that makes sources from the input and the sources made before; None if it makes none."""
 SOURCES: dict[str, SourceMaker] = {"rollouts": by_rollouts, "views": by_views}
 """Functions that make the sources of evidence, by name, in the order in which they are called."""
 

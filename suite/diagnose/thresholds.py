@@ -20,7 +20,7 @@ class Thresholds:
     """Thresholds of every step, in the order of the steps."""
 
     most_windows: int = 200
-    """Largest number of windows; more take longer and add little."""
+    """Largest number of windows that are fitted; more take longer and add little."""
     most_rotor_windows: int = 100
     """Largest number of windows if measured rotor speeds are the input. Their errors within a
     window are estimated too, which takes twice as long."""
@@ -55,9 +55,9 @@ class Thresholds:
     actuator_flight_s: float = 60.0
     """Longest flight time for the comparison of rotor speeds [s]."""
     held_out_share: float = 0.2
-    """Share of the flights that is held out, at least one [1]."""
+    """Share of the flights that is held out; at least one flight is."""
     lone_fitted_share: float = 0.7
-    """Share of a single flight that is fitted; its end is held out [1]."""
+    """Share of a single flight that is fitted; its end is held out."""
     noise_rows: int = 20
     """Number of neighbouring rows to which a polynomial is fitted, to estimate the noise. The
     residual of the polynomial is noise, since a model's error is smooth."""
@@ -71,9 +71,10 @@ class Thresholds:
     colour_gain: float = 3.0
     """Least rise of the log-likelihood to model noise as coloured, not white."""
     drift_gain: float = 3.0
-    """Least rise of the log-likelihood to model an error of the model in addition to the noise."""
+    """Least rise of the log-likelihood to include a drift (error of the model) in the noise."""
     colour_aside: float = 3.0
-    """Largest difference between the row times of stretches that are compared, in rows."""
+    """Largest difference between the row times of a window and the median row times of all windows,
+    in rows. Windows with a larger one are left out of the noise model."""
     least_noise: tuple[float, ...] = (1e-5, 1e-5, 1e-4, 1e-4, 1e-3, 1e-2)
     """Lower limit of the noise of position [m], attitude [rad], velocity [m/s], rates [rad/s],
     accelerometer [m/s^2] and rotor speed [rad/s]. Rounding and the model's steps cause as much."""
@@ -172,8 +173,8 @@ class Thresholds:
     implausible_times: float = 3.0
     """An effect larger than this many times its usual size is implausible."""
     hopeless_chi2: float = 10.0
-    """Largest mean squared error of a row, in noise variances, after a fit of all effects together.
-    If it is exceeded, force and torque are used instead of rollouts of 1 s."""
+    """Largest mean squared error, in noise variances, after a fit of all effects together. If it is
+    exceeded, force and torque are used instead of rollouts of 1 s."""
     hopeless_windows: int = 16
     """Number of windows of that fit with the nonlinear model, which follows if the linear fit
     exceeds the limit."""
@@ -189,8 +190,8 @@ class Thresholds:
     """Upper limit of that threshold: an attitude error of 3 degrees, or 5 % of the weight
     [m/s^2]."""
     least_rotor_gain: float = 0.01
-    """Smallest influence of a rotor's thrust along an axis that counts, as a share of the largest
-    influence there."""
+    """Smallest influence of the rotors along an axis that counts, as a share of their largest
+    influence along any axis."""
     carried_ridge: float = 0.01
     """Ridge weight, for each mean, of the regression that predicts the reference flights' residual
     in the flights after the change."""
@@ -241,10 +242,10 @@ class Thresholds:
     colours_s: tuple[float, ...] = (0.3, 0.03)
     """Correlation times of the tested random disturbances, as of gusts and of rotors [s]."""
     disturbance_quantiles: tuple[float, ...] = (0.9, 0.5, 0.1)
-    """Quantiles of the information over all disturbance shapes. They set the sizes of disturbance
-    that are tested."""
+    """Quantiles of the information over all independent directions of a disturbance. They set the
+    sizes of disturbance that are tested."""
     informed_share: float = 1e-9
-    """Shapes with less than this share of the largest information are left out."""
+    """Directions with less than this share of the largest information are left out."""
     noise_error: float = 0.02
     """Relative uncertainty of the measured noise power."""
     shape_p_value: float = 0.001

@@ -121,6 +121,8 @@ def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResidual
     motion = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
     leaning = not flight.has("rot_w")
     needs = (motion, thrust, LEANING if leaning else "rot_w")
+    # `form` holds the weights of the windows: `form.mean @ values` are means over the windows, and
+    # `form.change @ values` are mean slopes.
     form, rows = flight.form(FORCE_WIDTH_S, needs), flight.rows(attitude_of_path=True)
     # A position is differentiated twice, which needs other weights than a velocity.
     path = flight.form(FORCE_WIDTH_S, needs, slope=True) if motion == "pos_w" else form

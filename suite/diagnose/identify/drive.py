@@ -262,9 +262,10 @@ def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> n
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return `values` (G, ...) as they were `delay_s` ago; the first value counts before it too.
+    """Return `values` (G, ...) as they were `delay_s` ago.
 
-    A value is a mean over one step of the grid, so its time is the middle of the step.
+    Before the first row, the first value is used. A value is a mean over one step of the grid, so
+    its time is the middle of the step.
     """
     count = len(values)
     place = np.clip(np.arange(count) - delay_s / STEP_S - 0.5, 0.0, count - 1.0)

@@ -61,7 +61,7 @@ class FlightGrid(NamedTuple):
         return all(name in self.signals for name in names)
 
     def form(self, width_s: float, needs: Sequence[str], slope: bool = False) -> WeakForm:
-        """Return the windows of `width_s` in which all signals of `needs` are present.
+        """Return the weights of the windows of `width_s` with all signals of `needs`.
 
         With `slope`, the windows are for slopes of the signals, see `weak_form`. No window begins
         in the first `MEMORY_S`, where commands from before the first row still act.

@@ -30,13 +30,16 @@ from suite.diagnose.identify.grid import STEP_S, FlightGrid
 LOOP_WIDTH_S = 0.08
 """Width of the windows over which rates are averaged [s]."""
 SPEED_WIDTH_S = 0.16
-"""The same for rotor speeds [s]."""
+"""Width of the windows over which rotor speeds are averaged [s]."""
 NumberResiduals = Callable[[Mapping[str, float]], Rows]
 """Function from numbers (parameters by name) to the residuals of one flight."""
 
 
 def gain_unknowns() -> list[Unknown]:
-    """Return the loop's gains, as logarithms of their ratios to the start's."""
+    """Return the gains of the rate loop, as logarithms of their ratios to those of the start.
+
+    (The start is the vehicle file from which the fit starts.)
+    """
     return [Unknown(f"gain_{axis}", 0.0, -3.0, 3.0, 0.35, 1e-2, 0.02) for axis in "xyz"]
 
 
@@ -84,6 +87,7 @@ def fit_loop(
     """
 
     def residuals_of(flight: FlightGrid) -> NumberResiduals:
+        """Return the function from the numbers to measured minus modelled rates of a flight."""
         form = flight.form(LOOP_WIDTH_S, ("rate_b", "rate_cmd_b"))
         rates = form.mean @ np.nan_to_num(flight.signals["rate_b"])
         block, offset = block_of(form), np.ones(3, dtype=bool)
@@ -101,6 +105,7 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
     """
 
     def residuals_of(flight: FlightGrid) -> NumberResiduals:
+        """Return the function from the numbers to measured minus modelled speeds of a flight."""
         form = flight.form(SPEED_WIDTH_S, ("rotor_speed", "rotor_speed_cmd"))
         measured = form.mean @ np.nan_to_num(flight.signals["rotor_speed"])
         commanded = flight.signals["rotor_speed_cmd"]
@@ -137,6 +142,7 @@ def loop_rates(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float
             rates[:, k] = lfilter(top, bottom, inputs[:, k], zi=state)[0]
         return rates
 
+    # First the rates without a disturbance, then the disturbance that follows from these rates.
     linear = response(commanded, [[gain] for gain in gains])
     # The controller compensates w x J w, but its rotors lag: the difference is a disturbance.
     products = linear[:, [1, 2, 0]] * linear[:, [2, 0, 1]]

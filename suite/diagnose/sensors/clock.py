@@ -39,9 +39,9 @@ class Clock(NamedTuple):
     """Shift between gyro and reference in one flight: by how much the gyro is later."""
 
     time_s: np.ndarray
-    """(M,) times of the gyro [s]."""
+    """(M,) middle of each block, on the gyro's clock [s]."""
     shift_s: np.ndarray
-    """(M,) shift at these times [s]; all zeros if it is not significant."""
+    """(M,) shift in each block [s]; all zeros if it is not significant."""
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
         """Return the shift at times of the gyro (T,) [s]."""
@@ -65,16 +65,16 @@ def clock_of(log: FlightLog) -> Clock:
     # Search for the most probable path. Costs are negative log-likelihoods: `cost` of a shift in a
     # block, and `change` from one shift to another in the next block.
     zero = len(shifts_s) // 2  # index of the shift 0
-    path, every = np.full(blocks, zero), np.arange(blocks)
+    path, all_blocks = np.full(blocks, zero), np.arange(blocks)
     change = (shifts_s[:, None] - shifts_s) ** 2 / (2.0 * WANDERS**2 * BLOCK_S)
     cost = misfit
     for _ in range(ROUNDS):
-        variance = max(misfit[every, path].sum() / (3.0 * rows.sum()), 1e-12)
+        variance = max(misfit[all_blocks, path].sum() / (3.0 * rows.sum()), 1e-12)
         # A rate is a mean over 2 * SPAN_ROWS grid steps, so only one of so many is independent.
         cost = misfit / (2.0 * variance * 2 * SPAN_ROWS)
         path = _most_probable(cost, change)
     # Keep the path if it is significant.
-    gain = (cost[:, zero] - cost[every, path]).sum()
+    gain = (cost[:, zero] - cost[all_blocks, path]).sum()
     shift_s = shifts_s[path]
     row_s = float(np.median(np.diff(log.time_s)))
     # By chance the log-likelihood rises by less than 1 for each block.

@@ -246,6 +246,7 @@ def equations_of(flights: Sequence[Errors], columns: Sequence[np.ndarray]) -> No
         rows.append(np.where(complete, values - mean, 0.0))
         stretch.append((np.arange(len(values)) * flight.step_s / STRETCH_S).astype(int))
         flight_of.append(np.full(len(values), index))
+    # Give each stretch of each flight a number; `index` is then the stretch of each row.
     flight_and_stretch, index = np.unique(
         np.stack([np.concatenate(flight_of), np.concatenate(stretch)]), axis=1, return_inverse=True
     )

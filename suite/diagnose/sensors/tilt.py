@@ -1,8 +1,8 @@
 """Tilt error of an estimator that neglects drag: the sensor model `drag_tilt`, fitted to errors.
 
-Such an estimator takes the acceleration by drag for a tilt of the vehicle. The tilt follows the
-velocity with a first-order lag of the correlation time. The drag is fitted to errors of the
-attitude by least squares at each correlation time, and the best correlation time is searched.
+Such an estimator takes the deceleration by drag for a tilt of the vehicle. The tilt follows the
+velocity with a first-order lag, whose time constant is called correlation time. The drag is fitted
+to errors of the attitude by least squares for each correlation time, and the best time is searched.
 """
 
 from __future__ import annotations

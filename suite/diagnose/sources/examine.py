@@ -46,11 +46,11 @@ def examine(
     # (Not if a change since reference flights is searched for, as `names_small` shows.)
     found, warnings = source.search(say, seed), list[str]()
     if earlier and not source.names_small:
-        first = earlier[0]
-        refused = contradicted(first.search, found)
+        first_finding = earlier[0]
+        refused = contradicted(first_finding.search, found)
         warnings += [
-            f"{source.name}: {candidate.label} is contradicted by {first.source.name} ({words}): "
-            "left out"
+            f"{source.name}: {candidate.label} is contradicted by "
+            f"{first_finding.source.name} ({words}): left out"
             for candidate, words in refused
         ]
         if refused:
@@ -76,8 +76,8 @@ def examine(
     # Leave out effects that are too small. Depending on the source, the remaining error is still
     # computed with them (`small_explains`).
     explained = found, (before, after)
-    found, after, sizes, small = relevant_part(source, found, (before, after))
-    for name, size in small:
+    found, after, sizes, too_small = relevant_part(source, found, (before, after))
+    for name, size in too_small:
         is_relevant = size.relevant(source.limits)
         reason = "no larger than the model's own error" if is_relevant else "too small to matter"
         warnings.append(f"{name}: left out, {reason}: {size.words()}")
@@ -86,7 +86,8 @@ def examine(
     # Analyse the remaining error.
     remaining = source.remaining(*explained, seed)
     if remaining.wind and found.named and not source.is_worse(after, before):
-        # Several constant effects can imitate a wind that is correlated over seconds.
+        # Several constant effects together can imitate a wind that is correlated over seconds. If
+        # held-out flights are no worse without these effects, the wind is the simpler cause.
         found, after, sizes = found.refitted(()), before, {}
         remaining = source.remaining(found, (before, before), seed)
     labels = ", ".join(one.label for one in found.candidates) or "nothing"
@@ -100,7 +101,7 @@ def examine(
         without={one.label: without[one.label] for one in found.candidates},
         half_width=dict(zip(found.indices, map(float, found.half_widths()), strict=True)),
         sizes=sizes,
-        negligible=tuple(small),
+        negligible=tuple(too_small),
         remaining=remaining,
         control=control(source, found) if found.named else None,
     ), warnings
@@ -114,7 +115,7 @@ def without_names(finding: Finding, seed: int) -> Finding:
     bare, with_names = finding.search.refitted(()), finding.remaining
     remaining = finding.source.remaining(bare, (finding.before, finding.before), seed)
     # Without the names an error of the model may oscillate. A swing (an oscillating force) counts
-    # only if it was there with the names, too.
+    # only if it also remained with the names.
     swing = remaining.swing if with_names.swing else None
     where = remaining.where or with_names.where
     remaining = remaining._replace(structured=True, share=1.0, where=where, wind=None, swing=swing)
@@ -130,7 +131,7 @@ def confirmed(
     """Withdraw the effects that do not lower the gap on held-out flights, one at a time.
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
-    to lower the squared error by a share of the remaining one. An effect is kept if the held-out
+    to lower the squared error by a share of the remaining error. An effect is kept if the held-out
     flights are not sensitive to it, such as the ground effect in high flights. `gaps` are the gap
     without any named effect and the gap with all of them.
 
@@ -188,16 +189,16 @@ def relevant_part(
     while found.named:
         ranges = source.sizes(found)
         sizes = {name: size for name, (size, _) in ranges.items()}
-        small = [
+        too_small = [
             name
             for name, (_, upper) in ranges.items()
             if not source.names_small
             and ((gap_is_small and not EFFECTS[name].of_log) or not upper.relevant(source.limits))
         ]
-        if not small:
+        if not too_small:
             return found, after, sizes, left_out
-        left_out += [(name, sizes[name]) for name in small]
-        kept = tuple(named for named in found.named if named.candidate.name not in small)
+        left_out += [(name, sizes[name]) for name in too_small]
+        kept = tuple(named for named in found.named if named.candidate.name not in too_small)
         if not kept:
             return found.refitted(()), before, {}, left_out
         found = found.refitted(kept)
@@ -293,13 +294,13 @@ def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[st
         The findings with the remaining names, and a warning for each removed name.
     """
     kept, warnings = list(findings), list[str]()
-    for i, finding in enumerate(kept):
+    for index, finding in enumerate(kept):
         for j, other in enumerate(kept):
-            if i == j:
+            if index == j:
                 continue
             other_names = {named.candidate.name for named in other.names}
             remaining = []
-            for named in kept[i].names:
+            for named in kept[index].names:
                 label, source = named.candidate.label, finding.source.name
                 shared_alternatives = set(named.rivals) & other_names
                 is_same = any(one.candidate == named.candidate for one in other.names)
@@ -312,7 +313,7 @@ def one_cause(findings: Sequence[Finding]) -> tuple[tuple[Finding, ...], list[st
                     )
                 else:
                     remaining.append(named)
-            kept[i] = replace(kept[i], names=tuple(remaining))
+            kept[index] = replace(kept[index], names=tuple(remaining))
     return tuple(kept), warnings
 
 

@@ -74,6 +74,7 @@ class RolloutSource(Source):
     """Rollouts of 1 s as a source; its gap is the error of rollouts on held-out flights."""
 
     flown: Rollouts
+    """The flights, the model that simulates them, and their held-out windows."""
     coarser: FlightWindows | None = None
     """The fitted windows, but with every second rotor speed only; None if commands are the input.
     The difference in the result shows how much the time between rotor speeds matters."""
@@ -171,6 +172,7 @@ class RolloutSource(Source):
         share = remaining_share(*gaps) if found.named else 0.0
         if not self.is_relevant(gaps[1]):
             return Remaining(False, share, details=details)
+        # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
         where = structure_where(slow, structure, self.flown.rotor_input, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None

@@ -97,7 +97,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         diverged = int((~is_finite).sum())
         warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
     # Estimate the model's numerical error from the same stretches with steps of twice the length.
-    # The simulator's own Euler steps, driven by commands, have no such error.
+    # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
     coarser = None
     if integrator != "euler" or rotor_input:
         coarser = cut(logs, vehicle, rotor_input, LENGTH_S, limits, integrator, windows)[0]
@@ -105,7 +105,7 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     if coarser is not None:
         coarser = take(coarser, is_finite)
         limits = with_model_error(model, start, windows, linear, coarser, limits)
-    # Give up if rollouts stay far from the flights whatever the effects.
+    # Do not use rollouts if even all effects together leave them far from the flights.
     most = limits.hopeless_chi2
     if not given.chosen and best_fit_error(model, windows, linear, limits, most) > most:
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")

@@ -75,7 +75,7 @@ class ViewSource(Source):
         shares = self._shares(found)
         by_axis = shares.beyond if found.named else shares.explainable
         share, beyond = shares.total(by_axis), shares.total(shares.beyond)
-        # Structure remains if the black box finds more than a small and irrelevant error.
+        # The error has structure if a black box explains a relevant part of it.
         rms = float(np.sqrt(share * shares.variance.sum()))
         size = EffectSize(rms, 0.0, None) if self.view.in_world else EffectSize(0.0, rms, None)
         structured = size.relevant(self.limits) and share > self.limits.view_left_share
@@ -84,6 +84,8 @@ class ViewSource(Source):
             f"{self.name} along body {'xyz'[axis]}, of which a regression without physics explains "
             f"a further {100 * max(float(shares.beyond[axis]), 0.0):.0f} %"
         )
+        # A force view is also tested for an oscillating force (swing), and for a force that even
+        # the black box does not explain.
         swing = None
         if self.all_flights is not None:
             swing = residual_swing(self.all_flights, found.estimate.theta)
@@ -113,8 +115,8 @@ class ViewSource(Source):
     def _unexplained_force(self, theta: np.ndarray, gap: Gap, seed: int) -> float:
         """Return the force [m/s^2] that remains within held-out flights, or 0 if insignificant.
 
-        With a force below two limits, the error has to exceed the noise significantly. The limits
-        are the threshold of relevance, and a multiple of the flights' constant offsets (trims),
+        The error has to exceed the noise and a least force significantly. The least force is the
+        threshold of relevance or, if larger, a multiple of the flights' constant offsets (trims),
         which show the accuracy of attitude and thrust in the logs. The torque has no such test,
         since noise of the rotor speeds dominates its remaining error. `gap` is the gap at the
         parameters `theta` (P,).
