@@ -47,8 +47,11 @@ class Unknown(NamedTuple):
 
     name: str
     start: float
+    """Value from which the fit starts; a number that is not identifiable keeps it."""
     low: float
+    """Lower bound."""
     high: float
+    """Upper bound."""
     max_half_width: float
     """Largest half-width of the 95 % interval with which the number counts as identified."""
     step: float
@@ -130,7 +133,7 @@ class ResidualEvidence:
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
     weights: tuple[np.ndarray, ...] = ()
-    """(N, C) weight of each residual, one array a flight."""
+    """Weights (N, C) of the residuals, one array for each flight."""
 
     @property
     def space(self) -> ParameterSpace:

@@ -198,6 +198,7 @@ class _Fits:
             known = self.results["force"].known_numbers(*FORCE_NUMBERS)
 
         def fitted(unknowns: Sequence[Unknown], held: Sequence[str] = ()) -> Fitted:
+            """Fit the torque; the numbers `held` keep their start."""
             return fit_torque(flights, self.driven, unknowns, fixed, held, known)
 
         result = self.attempt("torque", lambda: fitted(unknowns))

@@ -53,6 +53,7 @@ def lean(flight: Errors, lasts_s: float) -> np.ndarray:
 
     `lasts_s` is the correlation time [s].
     """
+    # A first-order lag of the tilt in steady flight; `kept` is what remains of it after a row.
     steady_w, kept = np.nan_to_num(flight.lean_w), np.exp(-flight.step_s / lasts_s)
     lean_w, _ = lfilter([1.0 - kept], [1.0, -kept], steady_w, axis=0, zi=kept * steady_w[:1])
     return to_local(flight.rot_w, lean_w[-len(flight.value) :])
@@ -82,6 +83,7 @@ def fit_tilt(flights: Sequence[Errors]) -> Tilt:
         best_drag = float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
         return best_drag, best_drag * float(gradient[0])
 
+    # Search the correlation time, then fit both parameters once more for the intervals.
     log_s = float(np.squeeze(fminbound(lambda at: -drag_at(at)[1], *np.log(LASTS_S))))
     drag = max(drag_at(log_s)[0], 0.0)
     if not drag:
