@@ -1,8 +1,9 @@
 """Cuts flight logs into windows of 1 s, in which rollouts (simulated stretches) are compared.
 
 A window starts at a row of the log. It holds the start state, the model's inputs (commands or
-measured rotor speeds) on the model's time steps (`data/steps.py`), and the measured rows, which are
-compared at their own times. All windows have arrays of a few fixed shapes, for few compilations.
+measured rotor speeds) on its time steps (`data/steps.py`), and the measured rows, which are
+compared at their own times. In the burn-in, a short time before the window, the rotors follow the
+commands, so that their speeds at the start are known. Arrays have few shapes, for few compilations.
 """
 
 from __future__ import annotations
@@ -39,32 +40,31 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Array
 
 LENGTH_S = 1.0
-"""A window's length [s]."""
+"""Length of a window [s]."""
 HISTORY_S = 0.1
 """Time before the burn-in from which commands are used, since they act with a delay [s]."""
 BURN_IN_S = 0.2
-"""Time before a window in which the rotors follow the commands at the measured rates [s]."""
+"""Length of the burn-in, in which the rates are as measured [s]."""
 STEPS = (512, 704)
-"""Numbers of steps of a window: 1 s of 2 ms steps, and more where rows need shorter ones. Windows
-are padded to one of them, so that few array shapes are compiled."""
+"""Numbers of time steps to which windows are padded: for 1 s of 2 ms steps, and for shorter ones."""
 BURN_IN_STEPS = (144,)
-"""The same for the burn-in."""
+"""Numbers of time steps to which burn-ins are padded."""
 COMMANDS = (192, 1536)
-"""The same for the commands: rows of 100 Hz, and of 1,000 Hz."""
+"""Numbers of commands to which windows are padded: for commands at 100 Hz, and at 1,000 Hz."""
 ROWS = 101
-"""Measured rows in a window; a log that has more of them is thinned."""
+"""Largest number of measured rows in a window; a log with more rows is thinned."""
 STATE = 12
-"""Numbers of the state at a window's start: pos_w, rotation vector, vel_w, rate_b."""
+"""Size of the state at a window's start: pos_w 3, rotation vector 3, vel_w 3, rate_b 3."""
 KNOTS = 11
-"""Number of knots of a window: functions of time that are fitted in it are linear between knots."""
+"""Number of knots of a window. A fitted function of time is linear between two knots."""
 CHANNELS = 19
 """Number of measured channels: pos_w 3, attitude 3, vel_w 3, rate_b 3, acc_b 3, rotor speeds 4."""
 LEAST_ROWS = 12
-"""Least number of a log's rows in a window."""
+"""Smallest number of rows of the log in a window."""
 RETRY_S = 0.1
-"""Where no window can start, this much later is tried next [s]."""
+"""If no window can start at a row, a start this much later is tried [s]."""
 STATE_GROUPS = ("position", "attitude", "velocity", "rates")
-"""Groups of the state's channels, three each, in their order."""
+"""Groups of the channels of the state, three channels each, in their order."""
 SLICES = {
     "position": slice(0, 3),
     "attitude": slice(3, 6),
@@ -80,60 +80,61 @@ UNITS = {
 
 
 class FlightWindows(NamedTuple):
-    """W windows of S steps, after Q steps of burn-in, with N measured rows each.
+    """W windows of S time steps, after Q steps of burn-in, with N measured rows each.
 
-    All times but `start_s` are relative to a window's start.
+    All times except `start_s` are relative to the start of the window.
     """
 
     flight: Array
     """(W,) number of the flight."""
     start_s: Array
-    """(W,) since the first row of the flight [s]."""
+    """(W,) start of the window, from the first row of the flight [s]."""
     edge_s: Array
-    """(W, Q + S + 1) ends of steps; edge Q is the window's start [s]."""
+    """(W, Q + S + 1) ends of the steps; edge Q is the start of the window [s]."""
     sample_s: Array
-    """(W, Q + S); it and `lead_s` are as `StepGrid` has them [s]."""
+    """(W, Q + S) time until the rate loop's next sample [s], see `StepGrid`."""
     lead_s: Array
+    """(W, Q + S) mean delay of the vehicle's samples [s], see `StepGrid`."""
     command_s: Array
     """(W, K) times from which commands act, before any delay [s]."""
     command: Array
-    """(W, K, 4) thrust over mass [m/s^2] and body rates [rad/s]."""
+    """(W, K, 4) commanded thrust over mass [m/s^2] and body rates [rad/s]."""
     command_sum: Array
     """(W, K, 4) integral of the commands over time, from the first command to each one."""
     burn_in_rate_b: Array
-    """(W, Q, 3) measured rates where the loop samples [rad/s]."""
+    """(W, Q, 3) measured body rates at the samples of the rate loop in the burn-in [rad/s]."""
     rotor_speed: Array
-    """(W, S, 4) measured speeds in the middle of each step [rad/s]; zeros without any."""
+    """(W, S, 4) measured rotor speeds in the middle of each step [rad/s]; zeros without any."""
     voltage_drop: Array
-    """(W, S) battery voltage at the log's start less the present one [V]; zeros without any."""
+    """(W, S) fall of the battery voltage since the log's start [V]; zeros without a voltage."""
     pos_w: Array
-    """(W, 3) measured at the start [m]."""
+    """(W, 3) measured position at the start [m]."""
     rot_w: Array
-    """(W, 3, 3) body to world, measured at the start."""
+    """(W, 3, 3) measured attitude at the start, body to world."""
     vel_w: Array
-    """(W, 3) measured at the start [m/s]."""
+    """(W, 3) measured velocity at the start [m/s]."""
     rate_b: Array
-    """(W, 3) measured at the start [rad/s]."""
+    """(W, 3) measured body rates at the start [rad/s]."""
     row_s: Array
     """(W, N) times of the measured rows [s]."""
     row_pos_w: Array
-    """(W, N, 3) [m]; this and the next fields are zero where nothing was measured."""
+    """(W, N, 3) measured position [m]; like the next fields, 0 where nothing was measured."""
     row_rot_w: Array
-    """(W, N, 3, 3) body to world."""
+    """(W, N, 3, 3) measured attitude, body to world."""
     row_vel_w: Array
-    """(W, N, 3) [m/s]."""
+    """(W, N, 3) measured velocity [m/s]."""
     row_rate_b: Array
-    """(W, N, 3) [rad/s]."""
+    """(W, N, 3) measured body rates [rad/s]."""
     row_acc_b: Array
-    """(W, N, 3) specific force [m/s^2]."""
+    """(W, N, 3) measured specific force (acceleration minus gravity) [m/s^2]."""
     row_rotor_speed: Array
-    """(W, N, 4) [rad/s]."""
+    """(W, N, 4) measured rotor speeds [rad/s]."""
     valid: Array
-    """(W, N, 19) bool: which channels have a measured value that is compared."""
+    """(W, N, 19) bool, whether a channel has a measured value that is compared."""
     rotor_valid: Array
-    """(W, N, 4) bool: which rotor speeds were measured, for comparison or as the input."""
+    """(W, N, 4) bool, whether a rotor speed was measured, for comparison or as the input."""
     start_rotor_error: Array
-    """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 where they are the input."""
+    """(W,) error of the rotor speeds after the burn-in [rad/s]; 0 if they are the input."""
 
 
 def cut(
@@ -146,19 +147,19 @@ def cut(
     coarser: FlightWindows | None = None,
     only: Collection[int] | None = None,
 ) -> tuple[FlightWindows | None, list[str]]:
-    """Return the windows of `logs` and warnings; None where no flight has one.
+    """Return the windows of `logs` (None if no flight has one) and warnings.
 
-    Above the limits' number, an even selection of windows is used.
+    If there are more windows than `limits` allow, an even selection of them is used.
 
     Args:
         logs: F flights, numbered in their order.
-        vehicle: whose rate loop's frequency and rotor lag are used.
-        rotor_input: measured rotor speeds are the input, and are not compared.
-        stride_s: from the start of a window to that of the next [s]; by default none overlap.
-        limits: longest hole in a window, and numbers of windows.
-        integrator: of the model; with "euler" its steps are the rate loop's periods.
-        coarser: the same windows as returned before. If given, they are cut with steps of twice the
-            length, from every second rotor speed with what `with_hidden_torque` adds.
+        vehicle: the vehicle; its rotor lag and the frequency of its rate loop are used.
+        rotor_input: whether measured rotor speeds are the input; then they are not compared.
+        stride_s: time between the starts of two windows [s]; by default windows do not overlap.
+        limits: longest hole in a window, and largest numbers of windows.
+        integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
+        coarser: the windows that an earlier call returned. If given, the same ones are cut with
+            steps of twice the length, and every second rotor speed and `with_hidden_torque`.
         only: numbers of the flights that are cut; all if not given.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
@@ -190,18 +191,18 @@ def cut(
 
 
 def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
-    """Return the windows at `chosen` (indices, or bool of all W)."""
+    """Return the windows that are `chosen`, as indices or as (W,) bool."""
     return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
 
 
 def trusted(
     windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
 ) -> FlightWindows:
-    """Return `windows`, each shortened to where the model is still near the flight.
+    """Return `windows`, each shortened to the time in which the model stays near the flight.
 
     Further away the linearisation does not hold: the model may have tipped over or be below the
-    ground. With the named effects it stays near for longer, so the next evaluation is longer.
-    `residual` is (W, N, 19), measured - simulated.
+    ground. With the named effects it stays near for longer, and so windows become longer.
+    `residual` (W, N, 19) is measured - simulated.
     """
     error = np.abs(residual)
     height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
@@ -212,8 +213,8 @@ def trusted(
     row_s = np.asarray(windows.row_s)
     until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
     for horizon_s in reversed(limits.trusted_horizons_s):
-        near = ~(far & (row_s <= horizon_s)).any(axis=1)
-        until_s = np.where(near, horizon_s, until_s)
+        stays_near = ~(far & (row_s <= horizon_s)).any(axis=1)
+        until_s = np.where(stays_near, horizon_s, until_s)
     in_time = (row_s <= until_s[:, None] + 1e-9)[..., None]
     return windows._replace(valid=np.asarray(windows.valid) & in_time)
 
@@ -221,15 +222,15 @@ def trusted(
 def _start_rows(
     log: FlightLog, complete: np.ndarray, rotor_input: bool, stride_s: float, hole_s: float
 ) -> list[int]:
-    """Return rows at which windows start, of those whose state is `complete` (T,) bool."""
+    """Return the rows at which windows start, among rows with a `complete` state, (T,) bool."""
     time_s = log.time_s
     inputs_s = [time_s[rows] for rows in _input_rows(log, rotor_input)]
     next_s, starts = time_s[0] + BURN_IN_S + HISTORY_S, []
     while True:
-        later = np.flatnonzero((time_s >= next_s - 1e-9) & complete)
-        if not len(later) or time_s[later[0]] + LENGTH_S > time_s[-1] + 1e-6:
+        candidates = np.flatnonzero((time_s >= next_s - 1e-9) & complete)
+        if not len(candidates) or time_s[candidates[0]] + LENGTH_S > time_s[-1] + 1e-6:
             return starts
-        row = int(later[0])
+        row = int(candidates[0])
         begin_s, end_s = time_s[row], time_s[row] + LENGTH_S
         inside_s = time_s[(time_s >= begin_s - 1e-9) & (time_s <= end_s + 1e-9)]
         # Inputs are used before the start, too: by the burn-in, and by a delay.
@@ -246,7 +247,7 @@ def _start_rows(
 
 
 def _input_rows(log: FlightLog, rotor_input: bool) -> list[np.ndarray]:
-    """Return (T,) bool for each input, and for the rates that the loop samples: its own rows."""
+    """Return for each input, and for the rates of the loop, the rows with a value, (T,) bool."""
     if rotor_input:
         assert log.rotor_speed is not None
         return [np.isfinite(column) for column in log.rotor_speed.T]
@@ -265,7 +266,7 @@ class _Input(NamedTuple):
 
 
 def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _Input:
-    """Return the input of the window that starts at `row`; without commands, those of a hover."""
+    """Return the inputs of the window at `row`; if there are no commands, those of a hover."""
     begin_s, period_s = log.time_s[row], 1.0 / vehicle.controller.frequency
     length_s = log.time_s[_rows(log, begin_s)[-1]] - begin_s
     time_s, command = log.time_s, np.tile([GRAVITY, 0.0, 0.0, 0.0], (len(log.time_s), 1))
@@ -274,11 +275,11 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _
         finite = np.isfinite(logged).all(axis=1)
         if finite.any():
             time_s, command = time_s[finite], logged[finite]
-    near = slice(
+    used = slice(
         max(np.searchsorted(time_s, begin_s - BURN_IN_S - HISTORY_S - 1e-9) - 1, 0),
         np.searchsorted(time_s, begin_s + length_s + 1e-9) + 1,
     )
-    time_s, command = with_lost_rows(time_s[near] - begin_s, command[near])
+    time_s, command = with_lost_rows(time_s[used] - begin_s, command[used])
 
     def grid(since_s: float, until_s: float) -> StepGrid:
         inside_s = time_s[(time_s > since_s + 1e-6) & (time_s < until_s - 1e-6)]
@@ -288,15 +289,15 @@ def _input_of(log: FlightLog, row: int, vehicle: Vehicle, longest_s: float) -> _
 
 
 def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[_Input]:
-    """Return `inputs` padded to equal numbers of steps and commands, so that few are compiled.
+    """Return `inputs` padded to equal numbers of steps and commands, for few compilations.
 
-    The numbers are those of `like` where it is given.
+    If `like` is given, the numbers are those of its windows.
     """
 
     def padded_size(counts: Iterable[int], sizes: Sequence[int]) -> int:
         count = max(counts)
-        fitting = [size for size in sizes if size >= count]
-        return fitting[0] if fitting else -(-count // sizes[0]) * sizes[0]
+        large_enough = [size for size in sizes if size >= count]
+        return large_enough[0] if large_enough else -(-count // sizes[0]) * sizes[0]
 
     if like is None:
         burn_in = padded_size((len(one.burn_in.sample_s) for one in inputs), BURN_IN_STEPS)
@@ -317,7 +318,7 @@ def _of_one_shape(inputs: Sequence[_Input], like: FlightWindows | None) -> list[
 
 
 def _rows(log: FlightLog, begin_s: float) -> np.ndarray:
-    """Return the rows of the window from `begin_s` [s] on, thinned to `ROWS` at most."""
+    """Return the rows of the window that starts at `begin_s` [s], at most `ROWS` of them."""
     time_s = log.time_s
     rows = np.flatnonzero((time_s >= begin_s - 1e-9) & (time_s <= begin_s + LENGTH_S + 1e-9))
     missing = np.full((len(time_s), 1), np.nan)
@@ -339,7 +340,7 @@ def _window(
 ) -> FlightWindows:
     """Return the window (without the axis W) that starts at `row` of `log`.
 
-    `state` is the log with its state on every row; every `stride` rotor speeds one is used.
+    `state` is the log with a state in every row; every `stride`-th rotor speed is used.
     """
     time_s, begin_s = log.time_s, log.time_s[row]
     before, window = inputs.burn_in, inputs.window
@@ -365,7 +366,7 @@ def _window(
     rotor_valid = valid[5]
     if rotor_input:
         valid[5] = np.zeros_like(rotor_valid)  # the model's input is not compared
-    valid[4][0] = False  # the force before the window is not simulated
+    valid[4][0] = False  # the accelerometer shows the time before its row, here not simulated
 
     def padded(values: np.ndarray) -> np.ndarray:
         padding = np.zeros((ROWS - len(rows), *values.shape[1:]), values.dtype)

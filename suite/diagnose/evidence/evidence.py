@@ -1,9 +1,10 @@
 """Base class of evidence: the interface between residuals of flights and the search for effects.
 
-Each kind of residual is one subclass, such as the errors of rollouts (simulated stretches of 1 s)
-or of forces. It linearises its residuals along the model's parameters and estimates their noise;
-the other methods have defaults. A block is the result of a linearisation (`estimate/block.py`), and
-a stretch is a piece of a flight whose residuals may be correlated.
+Evidence is the differences between simulation and flights, divided by their noise. Each kind of it
+is one subclass: the errors of rollouts (simulated stretches of 1 s), or those of force or torque. A
+subclass linearises its residuals along the model's parameters and estimates their noise; the other
+methods have defaults. A block is the result of a linearisation (`estimate/block.py`), and a stretch
+is a piece of a flight whose residuals may be correlated.
 """
 
 from __future__ import annotations
@@ -19,53 +20,54 @@ from suite.diagnose.estimate.permutation import CandidateScore, folds_of, score_
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 LEAST_ERROR = 1e-9
-"""Lower limit of a squared error that is divided by, in units of the noise variance."""
+"""Lower limit of a squared error in a denominator, in units of the noise variance."""
 
 
 class Evidence(ABC):
-    """A source of whitened residuals, with information on the parameters of a space."""
+    """Whitened residuals (in units of independent noise), and how the parameters change them."""
 
     limits: Thresholds = THRESHOLDS
     """Thresholds of all steps of the diagnosis."""
     misfit_is_noise: bool = False
-    """Whether the model is wrong, so that its whole residual counts as noise."""
+    """Whether even the best model is wrong, so that its whole residual counts as noise."""
 
     @property
     @abstractmethod
     def space(self) -> ParameterSpace:
-        """The parameters, with their starts and bounds."""
+        """The parameters, with their values in the vehicle file and their bounds."""
 
     @abstractmethod
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return residuals and slopes at `at`, along the parameters `indices` or along all."""
+        """Return the block at the estimate `at`, with slopes along `indices` or all parameters."""
 
     @abstractmethod
     def estimate_noise(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this with its noise estimated from the residuals at `at`, and its block there.
+        """Return this evidence with noise estimated from its residuals at `at`, and its block.
 
         The block has slopes along all parameters.
         """
 
     def relinearise(self, at: Estimate) -> tuple[Evidence, Block]:
-        """Return this with its noise unchanged, and its block at `at` along all parameters."""
+        """Return this evidence, noise unchanged, and its block at `at` along all parameters."""
         return self, self.linearise(at)
 
     def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[Evidence, Block] | None:
-        """Return this with the whole residual of the best model as its noise, and its block.
+        """Return this evidence with the best model's whole residual as its noise, and its block.
 
-        None if that residual is measurement noise only. `at` and `block` are of the best model.
+        None if that residual is measurement noise only. `at` and `block` are those of the best
+        model.
         """
         del at, block
         return None
 
     @property
     def flights_differ_p(self) -> float:
-        """`differ_p` of `intervals95`: 1 if each flight is one random draw, 0 if not."""
+        """Argument `differ_p` of `intervals95`: 1 if each flight is one random draw, else 0."""
         return 1.0
 
     @property
     def name_p_value(self) -> float:
-        """Probability that a step of the search names an effect falsely."""
+        """Probability that a step of the search names an effect although there is none."""
         return self.limits.name_p_value
 
     def scores(
@@ -80,12 +82,12 @@ class Evidence(ABC):
         """Return the scores of candidate effects, best first.
 
         Args:
-            block: with slopes along all parameters.
+            block: block with slopes along all parameters.
             equations: normal equations of `block`.
             theta: (P,) parameters at which `block` was computed.
-            named: parameters that are fitted with every candidate.
+            named: places of the parameters that are fitted together with every candidate.
             among: the candidates.
-            seed: of random draws.
+            seed: seed of random draws.
         """
         fold = self.folds(block)
         return score_candidates(equations, theta, self.space, named, among, fold, seed, self.limits)
@@ -110,8 +112,8 @@ class Evidence(ABC):
             before: block without the candidate.
             at: estimate with the candidate.
             after: block with the candidate.
-            candidate: the fitted one.
-            gains: (G,) fall of the squared error of each group, fitted on the other groups.
+            candidate: the candidate that was fitted.
+            gains: (G,) fall of the squared error of each group, fitted to the other groups.
         """
         del at, candidate, gains
         return 1.0 - float((after.residual**2).sum() / max((before.residual**2).sum(), LEAST_ERROR))

@@ -1,11 +1,12 @@
-"""Residuals of force and torque: mean measured accelerations less those of the model.
+"""Residuals of force and torque: measured mean accelerations minus those of the model.
 
 A moment is one mean over a short smooth window (`data/view.py`). The noise is estimated from the
-residual itself. An unchanged vehicle flies each time with a slightly different trim (constant
-force or torque), so each flight's mean residual along each axis is a random effect (Laird and Ware
-1982). Subtracting a share of that mean makes the rows of a flight independent (quasi-demeaning;
-Fuller and Battese 1973). Where flights are compared with reference flights, the trim of these is an
-error that all flights share: there a share of the mean of all flights is subtracted as well.
+residual itself. An unchanged vehicle has a slightly different trim (constant force or torque) in
+each flight. So the mean residual of a flight along each axis contains a random error that all its
+rows share (a random effect; Laird and Ware 1982). After a share of that mean is subtracted, the
+rows of a flight are independent (quasi-demeaning; Fuller and Battese 1973). If flights are compared
+with reference flights, the mean of the latter has an error that all flights share. Then a share of
+the mean of all flights is subtracted, too.
 """
 
 from __future__ import annotations
@@ -38,29 +39,30 @@ from suite.diagnose.evidence.rollouts import VehicleArrays, direction_groups
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 CHUNK = 1024
-"""Rows of one call: a fixed shape, compiled once."""
+"""Number of rows in one call of the compiled model, which is fixed so that it is compiled once."""
 IMU_ACC = FlightRows._fields.index("imu_acc_w")
-"""Number of the first field of rows that is not an input of the model."""
+"""Place of the first field of `FlightRows` that is not an input of the model."""
 LEAST_CORRELATION = 0.05
-"""Smaller autocorrelations count as none."""
+"""Smaller autocorrelations count as 0."""
 
 
 class RowAccelerations(NamedTuple):
     """Accelerations of the model on N rows."""
 
     value: np.ndarray
-    """(N, 6) dv/dt in the world [m/s^2] and dw/dt in body axes [rad/s^2]."""
+    """(N, 6) linear acceleration in world axes [m/s^2], and angular acceleration in body axes
+    [rad/s^2]."""
     slope: np.ndarray
-    """(N, 6, K) along K parameters."""
+    """(N, 6, K) derivative by K parameters."""
 
 
 class ForceModel:
-    """A vehicle's accelerations under measured attitude, velocity, rates and rotor speeds."""
+    """Model of a vehicle's accelerations at measured attitude, velocity, rates and rotor speeds."""
 
     def __init__(self, vehicle: Vehicle, space: ParameterSpace, voltage: bool) -> None:
         """Prepare `vehicle` with the parameters of `space`.
 
-        `voltage` is whether the rows have a battery voltage.
+        `voltage` says whether the rows have a battery voltage.
         """
         self.space = space
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
@@ -90,9 +92,10 @@ class ForceModel:
 
 
 def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Array, Array]:
-    """Return dv/dt (N, 3) in the world [m/s^2] and dw/dt (N, 3) in body axes [rad/s^2] on `rows`.
+    """Return linear (N, 3) and angular (N, 3) acceleration of the vehicle model `plant` on `rows`.
 
-    For numpy and JAX. `voltage` is whether the rows have a battery voltage.
+    The first is in world axes [m/s^2], the second in body axes [rad/s^2]. `voltage` says whether
+    the rows have a battery voltage. For numpy and JAX.
     """
     motion, rotors = motion_of(plant, rows), steady(rows.rotor_speed)
     voltage_drop = rows.voltage_drop if voltage else None
@@ -108,7 +111,7 @@ def motion_of(plant: Plant, rows: FlightRows) -> Motion:
 
 @cache
 def _accelerations(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
-    """Return the compiled accelerations and their slopes, the same for every vehicle."""
+    """Return a compiled function that computes accelerations and their slopes for any vehicle."""
 
     def accelerations_at(vehicle: VehicleArrays, theta: Any, rows: FlightRows) -> Any:
         values = effects_at(layout, vehicle.base, theta)
@@ -130,30 +133,30 @@ class ViewData(NamedTuple):
     flight: np.ndarray
     """(M,) number of the flight."""
     middle_s: np.ndarray
-    """(M,) since the first row of the flight [s]."""
+    """(M,) middle of each moment, from the first row of the flight [s]."""
     value: np.ndarray
-    """(M, 3) of the model, body axes."""
+    """(M, 3) mean accelerations of the model, in body axes."""
     residual: np.ndarray
-    """(M, 3) measured - model, body axes."""
+    """(M, 3) measured - model, in body axes."""
     slope: np.ndarray
-    """(M, 3, K) of the model along parameters."""
+    """(M, 3, K) derivative of the model's values by K parameters."""
     pose_slope: np.ndarray
-    """(M, 3, L) change of the model by one standard deviation of each uncertainty of the pose; L is
-    0 where the pose was measured."""
+    """(M, 3, L) change of the model's values by one standard deviation of each of L unknown numbers
+    of the pose; L is 0 if the pose was measured."""
 
 
 class Weights(NamedTuple):
     """Noise of a view's residuals, by which its rows are weighted."""
 
     scatter: np.ndarray
-    """(3,) RMS of the residual within flights, by axis."""
+    """(3,) RMS of the residual about the flights' means, by axis."""
     memory: np.ndarray
-    """(3,) autocorrelation time, in moments."""
+    """(3,) autocorrelation time of the residual, as a number of moments, by axis."""
     trim: np.ndarray
-    """(3,) standard deviation of flights' means; infinite with too few flights."""
+    """(3,) standard deviation of the flights' means, by axis; infinite with too few flights."""
     base: np.ndarray | None = None
-    """(3,) standard deviation of the error that all flights share, as the mean of the reference
-    flights; None without any."""
+    """(3,) standard deviation of an error that all flights share, by axis; None if there is none.
+    The mean of reference flights has such an error."""
 
 
 def compare(
@@ -196,7 +199,7 @@ def compare(
 
 
 def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
-    """Return `series` (M, 3, ...), deviations from its mean multiplied by `reliability` (3,)."""
+    """Return `series` (M, 3, ...) with deviations from its mean scaled by `reliability` (3,)."""
     if not len(series) or (reliability == 1.0).all():
         return series
     mean = series.mean(axis=0)
@@ -204,25 +207,31 @@ def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
 
 
 def means_of(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the means (F, ...) of `values` (M, ...) by flight; `flight` (M,) is their number."""
+    """Return the means (F, ...) of `values` (M, ...) over each flight.
+
+    `flight` (M,) is the number of the flight of each value.
+    """
     return np.array([values[flight == number].mean(axis=0) for number in np.unique(flight)])
 
 
 def centred(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return `values` (M, ...) less their flights' means; `flight` (M,) is their number."""
-    _, place = np.unique(flight, return_inverse=True)
-    return values - means_of(values, flight)[place.ravel()]
+    """Return `values` (M, ...) minus the mean of their flight; `flight` (M,) is its number."""
+    _, flight_place = np.unique(flight, return_inverse=True)
+    return values - means_of(values, flight)[flight_place.ravel()]
 
 
 def validation_groups(flight: np.ndarray) -> np.ndarray:
-    """Return the cross-validation group (M,) of each row: its `flight`; thirds of a single one."""
+    """Return the cross-validation group (M,) of each row: its flight, or its third of a single one.
+
+    `flight` (M,) is the number of each row's flight.
+    """
     if len(np.unique(flight)) > 1:
         return flight
     return np.arange(len(flight)) * 3 // len(flight)
 
 
 def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
-    """Return the weights estimated from the residuals `data` of the best model."""
+    """Return the weights, estimated from the residuals `data`."""
     flights = [data.residual[data.flight == n] for n in np.unique(data.flight)]
     deviations = [f - f.mean(axis=0) for f in flights]
     count = sum(len(f) for f in flights)
@@ -238,11 +247,16 @@ def weights_of(data: ViewData, limits: Thresholds = THRESHOLDS) -> Weights:
 
 
 def _autocorrelation_time(deviations: list[np.ndarray], limits: Thresholds) -> np.ndarray:
-    """Return the autocorrelation time (3,), summed up to the first lag without correlation."""
-    power = np.sum([(f**2).sum(axis=0) for f in deviations], axis=0)
+    """Return the autocorrelation time (3,): a sum up to the first lag without correlation.
+
+    A lag is a distance in moments, and `deviations` are those of each flight from its mean.
+    """
+    power = np.sum([(deviation**2).sum(axis=0) for deviation in deviations], axis=0)
     total, correlated = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
-        product = np.sum([(f[lag:] * f[:-lag]).sum(axis=0) for f in deviations], axis=0)
+        product = np.sum(
+            [(deviation[lag:] * deviation[:-lag]).sum(axis=0) for deviation in deviations], axis=0
+        )
         correlation = product / np.maximum(power, 1e-300)
         correlated &= correlation > LEAST_CORRELATION
         total += np.where(correlated, 2.0 * correlation, 0.0)
@@ -254,6 +268,7 @@ def _autocorrelation_time(deviations: list[np.ndarray], limits: Thresholds) -> n
 def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
     """Return residual (M, 3) and slope (M, 3, P) of `data` in units of independent noise."""
     residual, slope = data.residual.copy(), data.slope.copy()
+    # Standard deviation of independent noise with the same effect as the autocorrelated one.
     unit = weights.scatter * np.sqrt(weights.memory)
     for number in np.unique(data.flight):
         rows = data.flight == number
@@ -266,7 +281,7 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
                 residual[rows], slope[rows], data.pose_slope[rows], unit
             )
     if weights.base is not None:
-        # The share is 0 where the trim is infinite, so that flights' means hold no information.
+        # With an infinite trim the flights' means hold no information, and the share is 0.
         variance = weights.scatter**2 * weights.memory + weights.trim**2
         share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / variance)
         residual -= share * residual.mean(axis=0)
@@ -277,11 +292,11 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
 def _pose_whitened(
     residual: np.ndarray, slope: np.ndarray, pose_slope: np.ndarray, unit: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return residual (M, 3) and slope (M, 3, P) of one flight, whitened by its pose's errors.
+    """Return residual (M, 3) and slope (M, 3, P) of one flight, whitened by errors of its pose.
 
-    These errors are random effects: directions along which `pose_slope` (M, 3, L) is large count
-    less. Multiplied is the inverse root of `1 + pose_slope pose_slope'`, in units (3,) of the
-    noise.
+    These errors add the covariance `pose_slope pose_slope'` to the noise, so directions in which
+    `pose_slope` (M, 3, L) is large count less. The values are multiplied by the inverse root of
+    `1 + pose_slope pose_slope'`, in units of the noise `unit` (3,).
     """
     count = residual.size
     basis, size, _ = np.linalg.svd(
@@ -299,16 +314,20 @@ def _pose_whitened(
 
 
 def stretch_numbers(data: ViewData, limits: Thresholds = THRESHOLDS) -> np.ndarray:
-    """Return the number (M,) of each moment's stretch; stretches count as independent."""
-    place = (data.middle_s / limits.view_block_s).astype(int)
-    _, stretch = np.unique(np.stack([data.flight, place]), axis=1, return_inverse=True)
+    """Return the number (M,) of the stretch of each moment.
+
+    A stretch is a piece of a flight so long that two stretches count as independent.
+    """
+    time_block = (data.middle_s / limits.view_block_s).astype(int)
+    _, stretch = np.unique(np.stack([data.flight, time_block]), axis=1, return_inverse=True)
     return stretch.ravel()
 
 
 def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Sequence[int]) -> Block:
     """Return the block (whitened stretches) of `data`.
 
-    Its slopes are `along` these parameters; `stretch` (M,) is the number of each moment's stretch.
+    `along` are the parameters of its slopes, and `stretch` (M,) is the number of the stretch of
+    each moment.
     """
     residual, slope = whitened(data, weights)
     first = np.unique(stretch, return_index=True)[1]
@@ -320,7 +339,8 @@ def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Seque
 def error_share_removed(before: ViewData, after: ViewData, limits: Thresholds) -> float:
     """Return the share of the squared error of `before` that the model of `after` removes.
 
-    Both are weighted by the noise of `after`; in `before` a slow effect would count as noise.
+    Both are weighted by the noise estimated from `after`. In an estimate from `before`, a slow
+    effect would count as noise.
     """
     noise = weights_of(after, limits)
     chi2_after, chi2_before = (
@@ -330,35 +350,38 @@ def error_share_removed(before: ViewData, after: ViewData, limits: Thresholds) -
 
 
 def successive_changes(data: ViewData) -> ViewData:
-    """Return the changes in `data` from each moment to the next one of its flight."""
+    """Return the changes of all values in `data` from each moment to the next of its flight."""
     step = np.diff(data.middle_s)
-    usual = np.median(step[step > 0.0])
-    near = (np.diff(data.flight) == 0) & (step < 1.5 * usual)
+    usual_step = np.median(step[step > 0.0])
+    neighbours = (np.diff(data.flight) == 0) & (step < 1.5 * usual_step)
     flight, middle_s, *series = data
     return ViewData(
-        flight[1:][near], middle_s[1:][near], *(np.diff(one, axis=0)[near] for one in series)
+        flight[1:][neighbours],
+        middle_s[1:][neighbours],
+        *(np.diff(one, axis=0)[neighbours] for one in series),
     )
 
 
 def fast_share(
     data: ViewData, columns: Sequence[int], change: np.ndarray, limits: Thresholds
 ) -> tuple[float, float]:
-    """Return the share of a fitted effect that fast changes confirm, and that share's uncertainty.
+    """Return the share of a fitted effect that fast changes confirm, and its uncertainty.
 
-    Motors compensate disturbances of the body. Where a controller balances a slow torque, the
-    motors' torque causes no rotation, as with a larger inertia or less thrust. Where the equations
-    are right, changes from one moment to the next give the same parameters as all moments do (a
-    specification test; Hausman 1978, doi 10.2307/1913827).
+    A controller makes the motors compensate a disturbance of the body. If it balances a slow torque
+    that the model lacks, the motors' torque causes no rotation. That looks like a larger inertia or
+    less thrust, but only in slow changes. If the model is right, changes from one moment to the
+    next give the same parameters as all moments do (a specification test; Hausman 1978, doi
+    10.2307/1913827).
 
     Args:
         data: residuals with the effect in the model.
-        columns: of the effect's K parameters in the slopes.
-        change: (K,) fitted parameters less those of the vehicle file.
+        columns: columns of the effect's K parameters in the slopes.
+        change: (K,) fitted parameters minus those of the vehicle file.
         limits: length of independent stretches.
 
     Returns:
-        The share, 1 where fast changes show the full effect and 0 where they show none of it, to
-        first order; and the half-width of its 95 % interval.
+        The share to first order, 1 if fast changes show the full effect and 0 if they show none of
+        it; and the half-width of its 95 % interval.
     """
     fast = successive_changes(data)
     fast = fast._replace(slope=(fast.slope[..., list(columns)] @ change)[..., None])

@@ -1,7 +1,9 @@
 """Simulates windows (1 s stretches of flights) with the model, and compares them with the logs.
 
-Each window starts from its measured state. Its inputs are the logged commands, through the rate
-loop, or the measured rotor speeds. All functions are JAX, for many windows at a time.
+Each window starts from its measured state. Its inputs are the logged commands, which pass through
+the rate loop, or the measured rotor speeds. A window has S time steps, after Q steps of burn-in, in
+which the rotors follow the commands; then their speeds at the start are known. All functions are
+JAX and take many windows at a time.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ class Flown(NamedTuple):
     track: Motion
     """(B, S + 1, ...) position, attitude, velocity and rates."""
     rotor_speed: Any
-    """(B, S + 1, 4) [rad/s]."""
+    """(B, S + 1, 4) rotor speeds [rad/s]."""
     force_b: Any
-    """(B, S + 1, 3) specific force at the end of the step before [m/s^2]."""
+    """(B, S + 1, 3) specific force (acceleration minus gravity) [m/s^2]; at the start, that at the
+    end of the first step."""
 
 
 def fly_windows(
@@ -54,22 +57,23 @@ def fly_windows(
     """Simulate B windows from their measured start states.
 
     Args:
-        plant: with the effects `values`.
-        values: of all effects; faults of the log are read from them.
-        rotor_input: measured rotor speeds are the input, not the commands.
-        voltage: the windows have a voltage.
+        plant: model of the vehicle (rotors, delays and rate loop), with the effects `values`.
+        values: values of all effects by name; faults of the log are taken from them.
+        rotor_input: whether measured rotor speeds are the input, not the commands.
+        voltage: whether the windows have a battery voltage.
         integrator: one of `eval.quadrotor.continuous.INTEGRATORS`.
-        offset: (B, F) corrections: 12 of the measured start state, and then of the rotor speeds:
-            at the knots where these are the input, else at the start.
-        windows: B of them.
-        push: (B, KNOTS, 6) additional force and torque at the knots, as `Inputs.push_b` has it.
+        offset: (B, F) corrections of the start numbers: 12 of the measured start state, then those
+            of the rotor speeds, at the knots if these are the input, else at the start.
+        windows: B windows.
+        push: (B, KNOTS, 6) additional force and torque at the knots, see `Inputs.push_b`.
         feedback: a function that computes such forces from the state, in place of `push`.
     """
     burn_in = windows.burn_in_rate_b.shape[1]
     edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
     spans = Steps(jnp.diff(edge_s), sample_s > 0.0, jnp.asarray(windows.lead_s))
     spans, command = jax.tree.map(
-        lambda field: jnp.swapaxes(field, 0, 1), (spans, _acting(windows, plant.constants.delay))
+        lambda field: jnp.swapaxes(field, 0, 1),
+        (spans, _acting_commands(windows, plant.constants.delay)),
     )
     start = to_true(values, _sample(windows.rate_b, windows.pos_w, windows.rot_w, windows.vel_w))
     motion = Motion(
@@ -78,6 +82,7 @@ def fly_windows(
         start.vel_w + offset[:, 6:9],
         start.rate_b + offset[:, 9:STATE],
     )
+    # Rotor speeds: as measured, or those in which the burn-in ends.
     middle_s = 0.5 * (edge_s[:, burn_in:-1] + edge_s[:, burn_in + 1 :])
     rotor_speed = None
     if rotor_input:
@@ -87,7 +92,7 @@ def fly_windows(
         begin_speed = rotor_speed[0]
     else:
         before = jax.tree.map(lambda field: field[:burn_in], spans)
-        begin_speed = _burned_in(plant, values, before, command[:burn_in], windows)
+        begin_speed = _speeds_after_burn_in(plant, values, before, command[:burn_in], windows)
         begin_speed = begin_speed + offset[:, STATE:]
     inputs = Inputs(
         unpack_command(command[burn_in:]),
@@ -108,20 +113,21 @@ def difference(
 ) -> Any:
     """Return simulated - measured (B, N, 19), zero where nothing was measured.
 
-    The arguments `values` and `integrator` are those of `fly_windows`, and `flown` is its result.
+    `values` and `integrator` are the arguments of `fly_windows`, and `flown` is its result.
     """
     track, speeds, forces = flown
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
-    pose = _at(windows.row_s - pose_delay(values), edge_s)
-    now = _at(jnp.asarray(windows.row_s), edge_s)
-    rate_b, force_b = _pick(track.rate_b, now), _pick(forces, now)
+    pose = _places(windows.row_s - pose_delay(values), edge_s)
+    now = _places(jnp.asarray(windows.row_s), edge_s)
+    rate_b, force_b = _interpolated(track.rate_b, now), _interpolated(forces, now)
     logged = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
-    turn = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), logged.rot_w)
+    rotation = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), logged.rot_w)
+    # Vector of the rotation between both attitudes, for small angles.
     attitude = 0.5 * jnp.stack(
         [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
         ],
         axis=-1,
     )
@@ -131,7 +137,7 @@ def difference(
         logged.vel_w - windows.row_vel_w,
         logged.rate_b - windows.row_rate_b,
         logged.acc_b - windows.row_acc_b,
-        _pick(speeds, now) - windows.row_rotor_speed,
+        _interpolated(speeds, now) - windows.row_rotor_speed,
     ]
     error = jnp.concatenate(errors, axis=-1)
     assert error.shape[-1] == CHANNELS
@@ -139,7 +145,7 @@ def difference(
 
 
 def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
-    """Return `flown` at the ends of steps nearest to the knots, (B, KNOTS, ...)."""
+    """Return the state `flown` at the knots (at the nearest ends of steps), (B, KNOTS, ...)."""
     edge_s = jnp.asarray(windows.edge_s)[:, windows.burn_in_rate_b.shape[1] :]
     knot_s = jnp.linspace(0.0, LENGTH_S, KNOTS)
     ends = jnp.abs(edge_s[:, None] - knot_s[:, None]).argmin(axis=-1)
@@ -147,14 +153,15 @@ def at_knots(flown: Flown, windows: FlightWindows) -> Flown:
     return jax.tree.map(lambda field: field[rows, ends], flown)
 
 
-def _burned_in(
+def _speeds_after_burn_in(
     plant: Plant, values: Mapping[str, Any], spans: Steps, command: Any, windows: FlightWindows
 ) -> Any:
-    """Return the rotor speeds (B, 4) at the starts, by the commands (Q, B, 4) before them.
+    """Return the rotor speeds (B, 4) at the windows' starts, by a simulation of the burn-in.
 
-    The rate loop must have no state of its own (no integrators and filters).
+    `spans` are the Q steps of the burn-in and `command` (Q, B, 4) their commands. The rate loop
+    must not have a state of its own (integrators or filters).
     """
-    # Before the start only rates are known.
+    # Of the motion in the burn-in only the rates are needed.
     rates_b = to_true(values, _sample(jnp.swapaxes(windows.burn_in_rate_b, 0, 1))).rate_b
     speed = wanted_speed(plant, unpack_command(command[0]), rates_b[0])
 
@@ -171,7 +178,7 @@ def _burned_in(
 
 
 def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
-    """Return a sample (..., 3) without an accelerometer; without a pose at rest in the origin."""
+    """Return a sample (..., 3) with specific force 0; without a pose it is at rest in the origin."""
     rate_b = jnp.asarray(rate_b)
     zeros = jnp.zeros_like(rate_b)
     if pos_w is None:
@@ -179,18 +186,18 @@ def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None
     return Sample(pos_w, rot_w, vel_w, rate_b, zeros)
 
 
-def _acting(windows: FlightWindows, delay: Any) -> Any:
-    """Return the mean commands (B, Q + S, 4) between samples of the loop.
+def _acting_commands(windows: FlightWindows, delay: Any) -> Any:
+    """Return the mean command (B, Q + S, 4) from each sample of the rate loop to the next.
 
-    A command acts `delay` (...,) [s] after its row, which may be within a step.
+    A command acts `delay` [s] after the time of its row, so it may change within a step.
     """
     since_s = jnp.asarray(windows.edge_s)[:, :-1] - delay
-    # Without a sample of the loop the command is not used, but for the first: rotors start there.
+    # In a step without a sample the command is not used, except in the first: rotors start with it.
     sample_s = jnp.asarray(windows.sample_s)
     held_s = jnp.where(sample_s > 0.0, sample_s, LONGEST_S)
 
     def integral(at_s: Any, time_s: Any, command: Any, total: Any) -> Any:
-        # At a row's own time the command before it is used, since a delay is never negative.
+        # At the time of a row, the command before that row is used, as a delay is never negative.
         row = jnp.maximum(jnp.searchsorted(time_s, at_s - 1e-9, side="right") - 1, 0)
         return total[row] + (at_s - time_s[row])[:, None] * command[row]
 
@@ -201,26 +208,30 @@ def _acting(windows: FlightWindows, delay: Any) -> Any:
 
 
 def _hats(time_s: Any) -> Any:
-    """Return the hat function (B, S, KNOTS) of each knot at times (B, S) [s]."""
+    """Return the hat function of each knot at the times `time_s` (B, S) [s], (B, S, KNOTS).
+
+    It is 1 at its knot, 0 at the neighbouring knots, and linear between them.
+    """
     place = time_s / LENGTH_S * (KNOTS - 1)
     return jnp.maximum(0.0, 1.0 - jnp.abs(place[..., None] - jnp.arange(KNOTS)))
 
 
-def _at(time_s: Any, edge_s: Any) -> Any:
-    """Return the places of times (B, N) [s] among the ends of steps (B, S + 1) [s].
+def _places(time_s: Any, edge_s: Any) -> Any:
+    """Return the places of times `time_s` (B, N) among the ends `edge_s` (B, S + 1) of the steps.
 
-    A place is (number of the step, time since its start [s], its length [s]), each (B, N).
+    A place consists of the number of the step, the time since the start of that step [s], and the
+    length of that step [s], each (B, N).
     """
     ends = edge_s.shape[1] - 1
-    index = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1
-    index = jnp.clip(index, 0, ends - 1)
-    begin_s = jnp.take_along_axis(edge_s, index, axis=1)
-    length = jnp.take_along_axis(edge_s, index + 1, axis=1) - begin_s
-    return index, time_s - begin_s, jnp.maximum(length, 1e-9)
+    step = jax.vmap(partial(jnp.searchsorted, side="right"))(edge_s, time_s + 1e-9) - 1
+    step = jnp.clip(step, 0, ends - 1)
+    begin_s = jnp.take_along_axis(edge_s, step, axis=1)
+    length = jnp.take_along_axis(edge_s, step + 1, axis=1) - begin_s
+    return step, time_s - begin_s, jnp.maximum(length, 1e-9)
 
 
-def _pick(series: Any, place: Any) -> Any:
-    """Return `series` (B, S + 1, K) at `place`, linear between ends of steps."""
+def _interpolated(series: Any, place: Any) -> Any:
+    """Return `series` (B, S + 1, K) at `place` (see `_places`), linear between ends of steps."""
     index, since_s, length_s = place
     start = jnp.take_along_axis(series, index[..., None], axis=1)
     end = jnp.take_along_axis(series, index[..., None] + 1, axis=1)
@@ -228,7 +239,10 @@ def _pick(series: Any, place: Any) -> Any:
 
 
 def _pose(track: Motion, place: Any, integrator: str) -> tuple[Any, Any, Any]:
-    """Return position, attitude and velocity at `place`, extrapolated before the start."""
+    """Return position, attitude and velocity at `place`, see `_places`.
+
+    They follow the integrator within a step, and are extrapolated before the start.
+    """
     index, since_s, length_s = place
     since_s, length_s = since_s[..., None], length_s[..., None]
 

@@ -1,7 +1,9 @@
 """Rollouts (simulated stretches of 1 s) as evidence on the model's parameters.
 
 `RolloutModel` computes the errors of rollouts and their Jacobian, compiled once for all vehicles.
-`RolloutEvidence` whitens them by the measurement noise and projects out the unknown start states.
+`RolloutEvidence` divides both by the measurement noise, and removes what a change of the unknown
+start states could explain. A window is the data of one stretch. Start numbers are what is unknown
+at its start: 12 numbers of the state, and errors of the rotor speeds.
 """
 
 from __future__ import annotations
@@ -31,13 +33,7 @@ from suite.diagnose.data.whitening import (
     whiten,
     whitened_residual,
 )
-from suite.diagnose.data.windows import (
-    KNOTS,
-    STATE,
-    FlightWindows,
-    take,
-    trusted,
-)
+from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, take, trusted
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -53,13 +49,13 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 @dataclass(frozen=True)
 class RolloutEvidence(Evidence):
-    """Rollouts of W stretches, weighted by their noise."""
+    """Errors of the rollouts of W windows, in units of their noise."""
 
     model: RolloutModel
     windows: FlightWindows
-    """The stretches at full length."""
+    """The windows at full length."""
     trusted: FlightWindows
-    """The same, each as long as the linearisation holds."""
+    """The same windows, each shortened to the time in which the linearisation holds."""
     noise: Noise
     whitening: Whitening
     limits: Thresholds = THRESHOLDS
@@ -72,28 +68,28 @@ class RolloutEvidence(Evidence):
 
     @property
     def flights_differ_p(self) -> float:
-        """1 where the model is wrong, as its error is the same all along a flight; else 0."""
+        """1 if the model is wrong, as its error is the same all along a flight; else 0."""
         return 1.0 if self.misfit_is_noise else 0.0
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
-        """Return the block along these parameters, see `Evidence`."""
+        """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         linear = self.model.linearise(at.theta, at.free, self.trusted, indices)
         along = range(self.model.size) if indices is None else indices
         return block_of(self.whitening, linear, along, self.windows)
 
     def estimate_noise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this with its noise estimated at `at`, see `Evidence`."""
-        # The noise estimate is best where the model fits best; the linearisation holds for longer.
+        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
+        # The trusted windows are chosen again, as a better model stays near the flight for longer.
         return rollout_evidence(self.model, self.windows, self._linear(at), self.limits)
 
     def relinearise(self, at: Estimate) -> tuple[RolloutEvidence, Block]:
-        """Return this with its noise unchanged, see `Evidence`."""
+        """Return this evidence with its noise unchanged; see `Evidence`."""
         linear = self._linear(at)
         new, block = rollout_evidence(self.model, self.windows, linear, self.limits, self.noise)
         return replace(new, misfit_is_noise=self.misfit_is_noise), block
 
     def misfit_as_noise(self, at: Estimate, block: Block) -> tuple[RolloutEvidence, Block] | None:
-        """Return this with the whole residual as its noise, see `Evidence`."""
+        """Return this evidence with its whole residual as noise; see `Evidence`."""
         slow, expected = self.slow_errors(block)
         if slow.sum() <= self.limits.structure_rotor_input * expected.sum():
             return None
@@ -106,17 +102,18 @@ class RolloutEvidence(Evidence):
     def explained_share(
         self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return the share that a candidate explains, see `Evidence`."""
+        """Return the share of the error that a candidate explains; see `Evidence`."""
         if self.misfit_is_noise and not flights_agree(gains):
             return None
         return super().explained_share(before, at, after, candidate, gains)
 
     def slow_errors(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        """Return the energy (W, 12) of slow errors of the state, and that expected by noise."""
+        """Return the energy (W, 12) of slow errors of the state, and that by noise alone."""
         energy = slow_energy(self.whitening, block.residual)
         return energy[:, :STATE], self.whitening.slow_freedom[:, :STATE]
 
     def _linear(self, at: Estimate) -> Linearisation:
+        """Return the full windows, linearised at `at` along all parameters and start numbers."""
         return self.model.linearise(at.theta, at.free, self.windows, None)
 
 
@@ -136,12 +133,12 @@ def rollout_evidence(
     """Return the evidence of `windows`, and its block where it was linearised.
 
     Args:
-        model: the rollout.
-        windows: W stretches.
+        model: the model that simulates the windows.
+        windows: W windows.
         linear: their residuals, with slopes along parameters and then along the start numbers.
         limits: thresholds of all steps.
-        noise: of the channels; by default it is estimated from `linear`.
-        along: the parameters of the first slopes; all parameters if not given.
+        noise: noise of the channels; by default it is estimated from `linear`.
+        along: parameters of the first slopes; all parameters if not given.
     """
     near = trusted(windows, linear.residual, limits)
     noise = noise or measured_noise(linear.residual, linear.start_slope, near, limits)
@@ -154,7 +151,7 @@ def rollout_evidence(
 def block_of(
     whitening: Whitening, linear: Linearisation, along: Sequence[int], windows: FlightWindows
 ) -> Block:
-    """Return the block of `linear`, whose first slopes are `along` these parameters."""
+    """Return the block of `linear`; `along` are the parameters of its first slopes."""
     residual = whitened_residual(whitening, linear)
     slope = whiten(whitening, linear.slope[..., : len(along)])
     rows = np.concatenate([residual, slope], axis=2)
@@ -188,10 +185,10 @@ def best_fit_error(
     limits: Thresholds,
     enough: float = 0.0,
 ) -> float:
-    """Return the mean squared error after a fit of all parameters; 1 is noise alone.
+    """Return the mean squared error after a fit of all parameters; with noise alone it is 1.
 
-    The fit is linear about `linear`, with slopes along all parameters. Large effects are not
-    linear: where the error exceeds `enough`, some windows are fitted with the full model.
+    The fit uses `linear`, which has slopes along all parameters. It is inexact for large effects,
+    so if its error exceeds `enough`, some windows are fitted with the full model.
     """
     evidence, block = rollout_evidence(model, windows, linear, limits)
 
@@ -214,19 +211,19 @@ def best_fit_error(
 
 
 BATCH = 12
-"""Windows of one call: a fixed shape, compiled once."""
+"""Number of windows in one call, which is fixed so that the model is compiled once."""
 DIRECTIONS = 8
-"""Slopes of one call, compiled once. A second, wider program would take longer to compile than it
-saves below some 150 stretches."""
+"""Number of slopes in one call, fixed for the same reason. To compile a second, wider program takes
+longer than it saves, unless there are more than some 150 windows."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
-"""XLA's options for the model: its newer code for loops is no faster, and compiles half as fast."""
+"""Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 
 
 class KnotResponse(NamedTuple):
-    """Response of W windows to a disturbance at each knot, and the model's state there."""
+    """Response of W windows to a disturbance (force and torque) at each knot, and states there."""
 
     slope: np.ndarray
-    """(W, N, 19, KNOTS * 6) of the simulated values, per m/s^2 and rad/s^2 in body axes."""
+    """(W, N, 19, KNOTS * 6) change of the simulated values per m/s^2 and rad/s^2 in body axes."""
     knot: Flown
     """(W, KNOTS, ...) simulated state at the knots."""
 
@@ -243,7 +240,7 @@ class VehicleArrays(NamedTuple):
 
 
 class RolloutModel:
-    """A vehicle's compiled rollout: residuals of windows and their slopes."""
+    """Simulation of windows with one vehicle: their residuals and slopes, compiled."""
 
     def __init__(
         self,
@@ -260,8 +257,8 @@ class RolloutModel:
         self.space = space
         self.size = len(space.entries)
         self.free = STATE + 4 * (KNOTS if rotor_input else 1)
-        """Number F of start numbers of each window, which are fitted, too: its state, and the
-        errors of the rotor speeds (at all knots where these are the input)."""
+        """Number F of start numbers of each window, which are fitted, too: 12 of its state, and 4
+        errors of rotor speeds (4 at each knot if measured speeds are the input)."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the start numbers among all directions, after the parameters."""
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
@@ -272,17 +269,17 @@ class RolloutModel:
         self._kind = (space.layout, rotor_input, voltage, integrator)
         self._linear = _slopes(*self._kind)
         self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
-        """(theta, offset, windows, push, feedback) -> (simulated - measured, the flight), which
-        the caller compiles."""
+        """Takes (theta, offset, windows, push, feedback) to (simulated - measured, the simulated
+        states); the caller compiles it."""
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
-        """Return measured - simulated (W, N, 19) with starts corrected by `offset` (W, F)."""
+        """Return measured - simulated (W, N, 19), with start numbers changed by `offset` (W, F)."""
         return self.linearise(theta, offset, windows, []).residual
 
     def respond(
         self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
     ) -> KnotResponse:
-        """Return the response of each window's rows to additional forces and torques in it."""
+        """Return the response of the rows of each window to forces and torques at its knots."""
         respond = _responses(*self._kind)
         with jax.enable_x64(True):
             parts = [
@@ -298,10 +295,10 @@ class RolloutModel:
         windows: FlightWindows,
         indices: Sequence[int] | None,
     ) -> Linearisation:
-        """Return residuals and slopes at `theta` (P,), with starts corrected by `offset` (W, F).
+        """Return residuals and slopes at `theta` (P,), with starts changed by `offset` (W, F).
 
-        The slopes are along the directions at `indices`: parameters, or start numbers at the places
-        `starts`. With None they are along all parameters and then all start numbers.
+        The slopes are along the parameters at `indices`; places in `starts` mean start numbers.
+        With None they are along all parameters and then all start numbers.
         """
         directions = np.eye(self.size + self.free)
         count = len(directions if indices is None else indices)
@@ -317,7 +314,7 @@ class RolloutModel:
 
 
 def direction_groups(directions: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
-    """Return the rows of `directions` (at `indices`) by `DIRECTIONS`, padded with zeros."""
+    """Return rows of `directions` (all or those at `indices`) by `DIRECTIONS`, zero-padded."""
     rows = directions if indices is None else directions[list(indices)]
     groups = [rows[k : k + DIRECTIONS] for k in range(0, max(len(rows), 1), DIRECTIONS)]
     return [np.pad(group, ((0, DIRECTIONS - len(group)), (0, 0))) for group in groups]
@@ -326,7 +323,7 @@ def direction_groups(directions: np.ndarray, indices: Sequence[int] | None) -> l
 def batches(
     offset: np.ndarray, windows: FlightWindows
 ) -> Iterator[tuple[np.ndarray, FlightWindows, int]]:
-    """Yield (offsets, windows, number) by `BATCH`; beyond `number` the last one is repeated."""
+    """Yield (offsets, windows, number) by `BATCH`; windows after `number` repeat the last one."""
     count = len(windows.flight)
     for first in range(0, count, BATCH):
         rows = np.minimum(np.arange(first, first + BATCH), count - 1)
@@ -337,7 +334,7 @@ def batches(
 def _slopes(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., Any]:
-    """Return the compiled residuals and slopes; compiling takes longer than a diagnosis."""
+    """Return the compiled function for residuals and slopes; it is kept, as compiling is slow."""
     fly = _flight(layout, rotor_input, voltage, integrator)
 
     def linear(
@@ -359,6 +356,7 @@ def _slopes(
 def _responses(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., Any]:
+    """Return the compiled function that gives the response to disturbances at the knots."""
     fly = _flight(layout, rotor_input, voltage, integrator)
 
     def respond(
@@ -380,7 +378,7 @@ def _responses(
 def _flight(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
 ) -> Callable[..., tuple[Any, Flown]]:
-    """Return the function that simulates windows: simulated - measured, and the flight itself."""
+    """Return a function that gives simulated - measured of windows, and the simulated states."""
 
     def fly(
         given: VehicleArrays,

@@ -1,6 +1,6 @@
 """Force and torque as evidence on the model's parameters.
 
-A view is one part of the dynamics, force or torque, whose mean accelerations are compared with
+A view is one part of the dynamics, force or torque. Measured mean accelerations are compared with
 those of the model. The noise of the residuals is estimated from the residuals themselves.
 """
 
@@ -41,25 +41,26 @@ from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 @dataclass(frozen=True)
 class ViewBlock(Block):
-    """A block (linearised residuals), with the mean accelerations that it is made of."""
+    """A block (linearised residuals), with the mean accelerations from which it is computed."""
 
     data: ViewData
 
 
 @dataclass(frozen=True)
 class ViewEvidence(Evidence):
-    """The flights of one view; its noise is estimated by `estimate_noise`."""
+    """Flights in one view as evidence; `estimate_noise` adds the noise."""
 
     view: View
     model: ForceModel
     flights: Sequence[SmoothedFlight]
     limits: Thresholds = THRESHOLDS
     carried: np.ndarray | None = None
-    """(M, 3) known residual of reference flights, subtracted from the residual."""
+    """(M, 3) residual that follows from reference flights (is carried over from them); it is
+    subtracted."""
     means: bool = False
     """Whether only the mean of each flight is compared."""
     weights: Weights | None = None
-    """Noise of the rows; None before it is estimated."""
+    """Noise of the residuals; None before it is estimated."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -68,7 +69,7 @@ class ViewEvidence(Evidence):
 
     @property
     def repeatability(self) -> np.ndarray:
-        """(3,) standard deviation of flights' means; infinite with too few flights."""
+        """(3,) standard deviation of the flights' means; infinite with too few flights."""
         return np.full(3, np.inf) if self.weights is None else self.weights.trim
 
     @property
@@ -90,29 +91,33 @@ class ViewEvidence(Evidence):
         return ViewData(flight.astype(int), *others)
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> ViewBlock:
-        """Return the block along these parameters, see `Evidence`."""
+        """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
         return self._block(self.residuals(at.theta, indices), indices)
 
     def estimate_noise(self, at: Estimate) -> tuple[ViewEvidence, ViewBlock]:
-        """Return this with its noise estimated at `at`, see `Evidence`."""
+        """Return this evidence with its noise estimated at `at`; see `Evidence`."""
         data = self.residuals(at.theta, None)
         evidence = replace(self, weights=weights_of(data, self.limits))
         return evidence, evidence._block(data)
 
     def folds(self, block: Block) -> np.ndarray:
-        """Return the fold of each stretch: its flight, with three flights or more."""
+        """Return the fold of each stretch: its flight, or parts of all flights if they are few."""
         if len(np.unique(block.flight)) >= 3:
             return block.flight
         return folds_of(block.flight, np.arange(len(block.flight), dtype=float))
 
     def groups(self, block: Block) -> np.ndarray:
-        """Return the flight of each stretch, or its third of a single flight."""
+        """Return the group of each stretch: its flight, or its third of a single flight."""
         return validation_groups(block.flight)
 
     def explained_share(
         self, before: Block, at: Estimate, after: Block, candidate: Candidate, gains: np.ndarray
     ) -> float | None:
-        """Return the share that a candidate explains, see `Evidence`."""
+        """Return the share of the error that a candidate explains; see `Evidence`.
+
+        None if a value is at a physical bound, if flights disagree, if fast changes contradict the
+        candidate, or if the share is too small.
+        """
         assert isinstance(before, ViewBlock) and isinstance(after, ViewBlock)
         if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
             return None
@@ -122,10 +127,11 @@ class ViewEvidence(Evidence):
         return share if share >= self.limits.least_view_share and consistent else None
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
-        """Return a sort key by which usual effects come first."""
+        """Return a sort key: plausible values first, then single effects, then the catalogue."""
         return usual_first(self.space, at.theta, candidate)
 
     def _block(self, data: ViewData, indices: Sequence[int] | None = None) -> ViewBlock:
+        """Return the block of `data`, whose slopes are along `indices` or all parameters."""
         assert self.weights is not None
         rows = np.arange(len(data.flight))
         stretch = rows if self.means else stretch_numbers(data, self.limits)
@@ -138,14 +144,14 @@ def fast_changes_agree(
 ) -> bool:
     """Return whether fast changes are consistent with fitted parameters (see `fast_share`).
 
-    They are not if they give less than a share of the fitted values and significantly less than
-    all. Means of flights have no fast changes and are always consistent.
+    They are not consistent if they give less than a certain share of the fitted change, and
+    significantly less than all of it. Means of flights have no fast changes: always consistent.
 
     Args:
-        block: at the fit.
-        indices: the fitted parameters.
-        change: (P,) all parameters less those of the vehicle file.
-        limits: least share.
+        block: block at the fit.
+        indices: places of the fitted parameters.
+        change: (P,) all fitted parameters minus those of the vehicle file.
+        limits: smallest share.
     """
     if len(np.unique(block.data.flight)) == len(block.data.flight):
         return True
@@ -157,8 +163,8 @@ def fast_changes_agree(
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:
     """Return the candidates that change a view's accelerations, without faults of sensors.
 
-    Each effect of a composite (several effects as one hypothesis) has to change them, if only
-    through another one.
+    Of a composite (several effects as one hypothesis), each effect has to change them, alone or
+    through another effect.
     """
     acts, acting_through_others = block.acts(), carried(among)
 
