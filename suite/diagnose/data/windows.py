@@ -46,7 +46,7 @@ HISTORY_S = 0.1
 BURN_IN_S = 0.2
 """Length of the burn-in, in which the rates are as measured [s]."""
 STEPS = (512, 704)
-"""Numbers of time steps to which windows are padded: for 1 s of 2 ms steps, and for shorter ones."""
+"""Numbers of time steps to which windows are padded: for 1 s of 2 ms steps, and for short steps."""
 BURN_IN_STEPS = (144,)
 """Numbers of time steps to which burn-ins are padded."""
 COMMANDS = (192, 1536)

@@ -178,7 +178,7 @@ def _speeds_after_burn_in(
 
 
 def _sample(rate_b: Any, pos_w: Any = None, rot_w: Any = None, vel_w: Any = None) -> Sample:
-    """Return a sample (..., 3) with specific force 0; without a pose it is at rest in the origin."""
+    """Return a sample (..., 3) with specific force 0; without a pose, at rest in the origin."""
     rate_b = jnp.asarray(rate_b)
     zeros = jnp.zeros_like(rate_b)
     if pos_w is None:
