@@ -1,8 +1,9 @@
 """Check a policy's interface and that of flight logs, and name probable faults (`suite check`).
 
-A policy's contract lists names, units, frames and rate of its inputs and outputs. A fault is an
-error of interface or log, such as a wrong unit, sign, scale, order, delay or rate; a finding is a
-record of one.
+The contract of a policy lists names, units, frames and rate of its inputs and outputs. A fault is
+an error of an interface or a log, such as a wrong unit, sign, scale, order, delay or rate. A
+finding is a record of a probable fault: what it is (`fault`), which signal it is in, the evidence,
+and how to fix it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from suite.common.console import Console
 from tracks.common.files import check_no_input
 
 TIME_LIMIT_S = 5.0
-"""Time limit of a flight [s]."""
+"""Time limit of the short flights that show a policy's actions [s]."""
 
 
 def check_policy(
@@ -27,8 +28,8 @@ def check_policy(
 
     Args:
         name: a shipped name, a checkpoint's folder or a policy file.
-        trust: as in `load_policy`.
-        trials: number of short flights that show its actions; may be 0.
+        trust: whether files that can run code may be loaded.
+        trials: number of short flights that show the policy's actions; may be 0.
         console: shows every finding.
 
     Raises:
@@ -50,7 +51,8 @@ def check_flight_files(
     Args:
         flights: logs, or folders of them.
         vehicle: a file or a shipped name; "" for none.
-        policy: its rate and camera are compared with those of the flights; None compares nothing.
+        policy: a policy whose rate and camera are compared with those of the flights; None: no
+            comparison.
         out: folder for the corrected flights; None writes nothing.
         console: shows every finding.
 
@@ -72,6 +74,7 @@ def check_flight_files(
     from eval.quadrotor.vehicle_file import load_vehicle
     from suite.delta.run import flight_files
 
+    # Check the files, then each flight; write the corrected flights.
     spec = None if policy is None else policy.spec
     context = CheckContext(
         load_vehicle(vehicle) if vehicle else None,
@@ -97,6 +100,7 @@ def check_flight_files(
                 written.append(str(write_flight(path, fixed)))
             except FlightLogError as error:
                 console.note(f"warning: not written: {error}")
+    # Print the findings about the files (flight None), then those about each flight.
     for name in (None, *(log.name for log in logs)):
         problems = [
             finding for finding, flight in all_findings if flight == name and finding.status != "ok"
@@ -115,11 +119,11 @@ def check_flight_files(
 
 
 def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[str, Any]]:
-    """Return probable faults of a policy's interface, as records of `suite check`.
+    """Return the findings about a policy's interface, as records of `suite check`.
 
     Args:
         policy: the loaded policy.
-        trials: number of short flights that show its actions; may be 0.
+        trials: number of short flights that show the policy's actions; may be 0.
         console: shows the contract and the share of limited actions.
     """
     from eval.judging.outputs import probable_faults
@@ -127,6 +131,7 @@ def policy_findings(policy: Policy, trials: int, console: Console) -> list[dict[
     console.say(f"{policy.name}: {summary(contract_of(policy.spec))}")
     findings = [_record("contract", *note) for note in getattr(policy, "notes", ())]
     findings += [_record(doubt.fault.split("_")[0], *doubt) for doubt in probable_faults(policy)]
+    # Warnings in flight, without the faults that were found before.
     known = {record["fault"] for record in findings}
     warnings = _warnings_in_flight(policy, trials, console)
     new = [warning for warning in warnings if warning[0] not in known]
@@ -153,5 +158,6 @@ def _warnings_in_flight(
 
 
 def _record(signal: str, fault: str, evidence: str, fix: str) -> dict[str, Any]:
+    """Return a finding about a policy, with the keys of a finding about a flight."""
     return {"fault": fault, "signal": signal, "size": None, "evidence": evidence,
             "confidence": None, "status": "doubt", "fix": fix}  # fmt: skip

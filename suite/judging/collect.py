@@ -1,6 +1,7 @@
 """Record simulated flights as logs (`suite collect`): a Parquet file per flight, and a list.
 
-An interrupted call continues: a journal has a line for each finished flight.
+The same call after an interruption continues it. Finished flights are known from the list of an
+earlier call, and from a journal, a file with a line for each finished flight.
 """
 
 from __future__ import annotations
@@ -53,9 +54,10 @@ def collect(
     """Fly, and write one log per flight into `out`; the same call resumes an interrupted one.
 
     Returns:
-        The contents of flights.json: the stamp, the settings, and the flights as rows of results
-        with their `file`. The file is null for a flight without a log, which is shorter than one
-        second or breaks a rule of flight logs; the latter gives a warning.
+        The contents of flights.json: version and seed, the settings, and a row for each flight with
+        its result and the name of its log, `file`. It is null for a flight without a log. Such a
+        flight is shorter than one second, or its log breaks a rule of flight logs; then there is a
+        warning.
 
     Raises:
         ValueError: if a setting of `collection` cannot be used, or `out` holds the flights of
@@ -71,6 +73,7 @@ def collect(
     policy = load_in_manner(source, collection.trust, manner)
     out = Path(out)
     refuse_other_run(out, collection)
+    # What must be the same for a list or a journal to be continued.
     settings = {
         "collection": collection,
         "policy": policy_record(source, policy),
@@ -79,6 +82,7 @@ def collect(
         "git_commit": git_commit(),
     }
     identity = without_paths(settings)
+    # Rows of flights that exist, then of the missing ones.
     rows = _existing_rows(out, identity)
     with Journal(out / JOURNAL, identity) as journal:
         rows |= {t: row for t, r in journal.done.items() if (row := _row(out, r)) is not None}
@@ -100,7 +104,7 @@ def collect(
 
 
 Row = dict[str, Any]
-"""A flight in the list."""
+"""A flight in the list: its result, and the name of its log as `file`."""
 
 
 def _fly_missing(
@@ -113,7 +117,10 @@ def _fly_missing(
     console: Console,
     workers: Workers | None,
 ) -> None:
-    """Fly the trials that `rows` lacks; write the log and the journal when a flight ends."""
+    """Fly the trials that are missing in `rows`.
+
+    When a flight ends, write its log, its line in the journal and its row.
+    """
     from eval.judging.judge import JudgeOptions, Record, fly
     from eval.worlds.trial import Rules
 
@@ -149,7 +156,7 @@ def _fly_missing(
 
 
 def _row(out: Path, result: TrialResult) -> Row | None:
-    """Return the row of a flight in the journal; None if its log is missing."""
+    """Return the row of a flight in the journal; None if its log is missing, to fly it again."""
     name = None
     if result.time_s >= DURATION_MIN:
         name = log_name(result.track, result.difficulty, result.seed)
@@ -173,9 +180,12 @@ def _write_log(out: Path, result: TrialResult, flight: Flight, console: Console)
 
 
 def _existing_rows(out: Path, identity: dict[str, Any]) -> dict[TrialSpec, Row]:
-    """Return the rows of an earlier call whose logs exist; refuse those of another collection.
+    """Return the rows of an earlier call's list whose logs exist.
 
-    `identity` are the settings of this call, without paths.
+    `identity` are the settings of this call, without paths of files.
+
+    Raises:
+        ValueError: if the list cannot be read, or is that of another collection.
     """
     from eval.worlds.trial import TrialSpec
 

@@ -1,8 +1,8 @@
 """Compare the success rates of separate evaluations on the same trials (`suite compare`).
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. Evaluations on
-different trials or under different conditions are refused. Several training seeds of one method
-are compared as a group.
+An evaluation is one `suite eval`. A trial is one judged flight: a track, its level (difficulty 0 to
+9) and a seed. Evaluations on different trials or under different conditions are refused. Policies
+of one method that differ only in the seed of their training are compared as a group.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from eval.worlds.trial import TrialResult, TrialSpec
 from tracks.input.reading import read_json
 
 CONDITIONS = ("world", "time_limit_s", "deadline_s")
-"""Settings that affect the outcome of a trial, besides the trial itself and the input files."""
+"""Settings that change the result of a trial, besides the trial itself and the input files."""
 
 
 class Run(NamedTuple):
-    """One policy of one evaluation."""
+    """The trials of one policy in one evaluation."""
 
     name: str
-    """Label in messages: the folder, and the policy if the folder holds several."""
+    """Label in messages: the evaluation's folder, with the policy if the folder holds several."""
     rows: dict[TrialSpec, TrialResult]
     """The result of each trial."""
     conditions: dict[str, Any]
@@ -34,7 +34,7 @@ class Run(NamedTuple):
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """Return one run for each policy in an evaluation's folder.
+    """Return one run for each policy in the folder of an evaluation.
 
     Raises:
         ValueError: if the folder has no evaluation, or files that `suite eval` did not write.
@@ -92,19 +92,24 @@ def compare_runs(first: Run, other: Run) -> dict[str, Any]:
     """
     refuse_other_conditions(first, other)
     trials = list(first.rows)
-    a, b = (np.array([run.rows[t].success for t in trials]) for run in (first, other))
+    successes, other_successes = (
+        np.array([run.rows[trial].success for trial in trials]) for run in (first, other)
+    )
     return {
         "first": first.name,
         "second": other.name,
         "trials": len(trials),
-        "success": [float(a.mean()), float(b.mean())],
-        "difference": paired_success(a, b),
-        "sentence": paired_sentence(first.name, other.name, a, b),
+        "success": [float(successes.mean()), float(other_successes.mean())],
+        "difference": paired_success(successes, other_successes),
+        "sentence": paired_sentence(first.name, other.name, successes, other_successes),
     }
 
 
 def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> str:
-    """Return a sentence on the successes a and b, (n,) bool, of two policies on the same trials."""
+    """Return a sentence on the success rates of two policies on the same trials.
+
+    `a` and `b`, (n,) bool, are the successes of the policies `name_a` and `name_b`.
+    """
     difference = paired_success(a, b)
     value, low, high = (100 * number for number in difference[:3])
     return (
@@ -116,11 +121,13 @@ def paired_sentence(name_a: str, name_b: str, a: np.ndarray, b: np.ndarray) -> s
 
 
 def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, Any]:
-    """Return mean, spread and interval of the success rate over training seeds and trials.
+    """Return the success rate of a method, or the difference of two methods, over training seeds.
+
+    It has the mean, its interval over seeds and trials, and the standard deviation over seeds.
 
     Args:
-        runs: the training seeds of a method, all judged on the same trials.
-        others: the training seeds of a second method, whose rate is subtracted; may be empty.
+        runs: a run for each training seed of the method, all on the same trials.
+        others: the same for a second method, whose rate is subtracted; may be empty.
 
     Raises:
         ValueError: if conditions or trials differ, or a method has only one seed.
@@ -128,6 +135,7 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
     for run in (*runs[1:], *others):
         refuse_other_conditions(runs[0], run)
     trials = list(runs[0].rows)
+    # Successes of each method, (seeds, trials).
     groups = [
         np.array([[run.rows[trial].success for trial in trials] for run in group], float)
         for group in (runs, others)
@@ -135,11 +143,12 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
     ]
     interval = over_seeds(groups[0], groups[1] if others else None)
     method = "hierarchical bootstrap"
-    if interval.low == interval.high:  # Equal results give a bootstrap interval of no width.
-        a, *b = (group[0] > 0.5 for group in groups)
-        interval, method = wilson(int(a.sum()), len(a)), "over trials only: Wilson"
-        if b:
-            interval = Interval(*paired_success(a, b[0])[:3])
+    # If all seeds have equal results, the bootstrap interval has no width: use one over trials.
+    if interval.low == interval.high:
+        successes, *others_successes = (group[0] > 0.5 for group in groups)
+        interval, method = wilson(int(successes.sum()), len(successes)), "over trials only: Wilson"
+        if others_successes:
+            interval = Interval(*paired_success(successes, others_successes[0])[:3])
             method = "over trials only: Newcombe"
     rates = [[float(rate) for rate in group.mean(1)] for group in groups]
     return {
@@ -154,7 +163,7 @@ def compare_seeds(runs: Sequence[Run], others: Sequence[Run] = ()) -> dict[str, 
 def _seeds_sentence(
     interval: Interval, rates: Sequence[Sequence[float]], trials: int, method: str
 ) -> str:
-    """Return a sentence on the rates by training seed of one method, or of two."""
+    """Return a sentence on the success rate of one method over seeds, or on that of two methods."""
     value, low, high = (100 * number for number in interval)
     count = " and ".join(str(len(group)) for group in rates)
     means = " and ".join(

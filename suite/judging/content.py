@@ -1,4 +1,7 @@
-"""The files that make up a policy: their SHA-256, and their content for other machines."""
+"""The files of which a policy consists: their SHA-256, and their content for other machines.
+
+A policy is a folder (checkpoint or export in C) or a single file with the files that it refers to.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from policies.policy import Policy, load_policy
 
 
 def policy_files(name_or_path: str | Path) -> dict[str, Path]:
-    """Return the files that make up a policy, by their path within its folder.
+    """Return the files of which a policy consists, by their path within its folder.
 
     Other files of the folder, such as its card, do not belong to the policy.
     """
@@ -30,7 +33,7 @@ def policy_files(name_or_path: str | Path) -> dict[str, Path]:
     if path.suffix == ".onnx":
         from policies.formats.onnx_file import files_of
 
-        # Links are resolved: external data are next to the file and not next to a link.
+        # External data of a model are next to the file itself, and not next to a link to it.
         model, *data = files_of(path)
         folder = model.resolve().parent
         return {path.name: model, **{str(file.relative_to(folder)): file for file in data}}
@@ -38,7 +41,7 @@ def policy_files(name_or_path: str | Path) -> dict[str, Path]:
 
 
 def policy_digest(name_or_path: str | Path) -> str:
-    """Return the SHA-256 of the files that make up a policy, as hex."""
+    """Return the SHA-256 of the files of which a policy consists, in hexadecimal digits."""
     digest = hashlib.sha256()
     for file in policy_files(name_or_path).values():
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -50,17 +53,17 @@ class PolicyContent:
     """The content of a policy's files; a call returns the policy, loaded once in each process."""
 
     name: str
-    """Name of its folder, a possible label."""
+    """Name of the policy's folder, from which its label may be made."""
     file: str
     """Name of the file that is loaded; "" loads the folder."""
     files: tuple[tuple[str, bytes], ...] = field(repr=False)
-    """Path within the folder, and content."""
+    """The files: path within the folder, and content."""
     trust: bool
-    """As in `load_policy`."""
+    """Whether a file that can run code may be loaded."""
 
     @classmethod
     def of(cls, name_or_path: str | Path, trust: bool = False) -> PolicyContent:
-        """Return the content of a policy that can be loaded here."""
+        """Return the content of a policy on this machine."""
         path = shipped.locate(name_or_path).absolute()
         folder, file = (path, "") if path.is_dir() else (path.parent, path.name)
         contents = policy_files(name_or_path).items()
@@ -78,7 +81,10 @@ class PolicyContent:
 
 @functools.lru_cache(maxsize=4)
 def _loaded(content: PolicyContent) -> Policy:
-    """Return the policy; its files stay until the process ends, as some kinds read them again."""
+    """Write the files into a temporary folder and return the policy loaded from it.
+
+    The folder stays until the process ends, because some kinds of policy read their files again.
+    """
     folder = tempfile.mkdtemp(prefix="suite-policy-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, data in content.files:

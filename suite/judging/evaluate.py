@@ -1,7 +1,8 @@
 """Judge policies (`suite eval`): fly the trials in a simulator and write tables of the results.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. Each result is
-saved in a journal as it ends, so an interrupted evaluation continues.
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The result of each
+trial is written to a journal when it ends, so an interrupted evaluation continues. An entry is a
+policy in one manner (commanded speed, with or without safety monitor); each has a journal.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ class Entry(NamedTuple):
     """A policy that flies all trials in one manner, a row of the tables."""
 
     source: str
-    """Its name or path, as the user gave it."""
+    """Name or path of the policy, as the user gave it."""
     policy: Policy
-    """The loaded policy, in its manner."""
+    """The loaded policy, which flies in this manner."""
     label: str
-    """Its label in tables."""
+    """Label of the entry in tables."""
     manner: Manner
-    """Its commanded speed, and whether the safety monitor checks its actions."""
+    """Commanded speed, and whether the safety monitor checks the actions."""
 
 
 def evaluate(
@@ -60,12 +61,13 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fly all trials and write trials.parquet, table.md, summary.json and run.json into `out`.
 
-    The same call after an interruption flies the remaining trials, with any `workers`. The journals
-    are removed when the tables are written.
+    The same call after an interruption flies the remaining trials; `workers`, the processes or
+    cluster that fly them, may differ. The journals are removed when the tables are written.
 
     Returns:
-        The summary: `cells` and `paired` of `eval.judging.tables.summarise`, `over_plan` of
-        `eval.judging.plans.over_plan`, and the settings.
+        The contents of summary.json: the results (`cells` and `paired` of
+        `eval.judging.tables.summarise`, `over_plan` of `eval.judging.plans.over_plan`), the
+        settings, and `out`.
 
     Raises:
         ValueError: for invalid values in `evaluation`, before the first flight.
@@ -74,6 +76,7 @@ def evaluate(
     from eval.judging.results import write_results
     from eval.judging.tables import grids, markdown_table, summarise, with_interval
 
+    # Read the options: trials, and entries.
     trial_set, out = read_trial_set(evaluation), Path(out)
     refuse_other_run(out, evaluation)
     sources = tuple(evaluation.policies or (default_policy(),))
@@ -85,6 +88,7 @@ def evaluate(
         for source, policy, label in zip(sources, policies, labels, strict=True)
     ]
     _refuse_equal_labels([entry.label for entry in entries])
+    # Announce the work, and fly what the journals lack.
     count = len(trial_set.trials)
     workers = workers_for(count, workers, evaluation.simulator)
     if (out / "trials.parquet").is_file():
@@ -99,6 +103,7 @@ def evaluate(
     results: list[TrialResult] = []
     for entry, journal in zip(entries, journals, strict=True):
         results += _fly_entry(evaluation, trial_set, entry, workers, journal, console)
+    # Write the tables; then the journals are no longer needed.
     laps = _laps_over_plan(results, trial_set)
     actions = {entry.label: _actions(entry, results, console) for entry in entries}
     summary = {
@@ -119,10 +124,12 @@ def evaluate(
         seed=evaluation.seed,
     )
     write_run_record(out, evaluation, evaluation.seed)
+    # A journal stays if it has trials that this command does not request.
     unfinished = {journal.path for journal in journals if journal.others(trial_set.trials)}
     for path in out.glob("journal-*.jsonl"):  # also journals of an earlier command
         if path not in unfinished:
             path.unlink()
+    # Print the results.
     for grid in grids(summary):
         console.show(rich_table(grid))
     for sentence in summary["sentences"]:
@@ -141,7 +148,10 @@ def evaluate(
 
 
 def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list[OverPlan]:
-    """Return lap times over planned lap times; none if the plans are of another vehicle."""
+    """Return each policy's lap times divided by planned ones; none for another vehicle.
+
+    The planned laps are shipped, for one vehicle and for families of tracks only.
+    """
     from eval.judging.plans import VEHICLE, over_plan
     from eval.quadrotor.vehicle_file import load_vehicle, vehicle_table
 
@@ -151,7 +161,7 @@ def _laps_over_plan(results: Sequence[TrialResult], trial_set: TrialSet) -> list
 
 
 def _sentences(results: Sequence[TrialResult]) -> list[str]:
-    """Return a sentence for each other policy on its difference to the first one."""
+    """Return a sentence for each policy but the first one, on its difference to the first one."""
     import numpy as np
 
     from suite.judging.comparing import paired_sentence
@@ -168,7 +178,7 @@ def _sentences(results: Sequence[TrialResult]) -> list[str]:
 
 
 def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> dict[str, Any]:
-    """Return and print the share of limited actions of a policy, and warnings."""
+    """Print and return how many actions of an entry exceeded the limits, with warnings."""
     from eval.judging.outputs import action_report
 
     rows = [result for result in results if result.policy == entry.label]
@@ -186,9 +196,9 @@ def _actions(entry: Entry, results: Sequence[TrialResult], console: Console) -> 
 def file_digests(
     vehicle: Vehicle, tracks: Mapping[str, Track], sensors: SensorSet
 ) -> dict[str, str]:
-    """Return the SHA-256 of vehicle, sensors and tracks, by name.
+    """Return the SHA-256 of the vehicle, of the sensors and of tracks from files, by name.
 
-    It is computed from the parsed content: comments in a file do not change it.
+    It is computed from the values in a file, so comments do not change it.
     """
     from eval.quadrotor.vehicle_file import vehicle_table
     from eval.sensors.sensors_file import sensors_table
@@ -201,7 +211,7 @@ def file_digests(
 
 
 def _refuse_equal_labels(labels: list[str]) -> None:
-    """Refuse two entries with one label, which tables would merge."""
+    """Refuse two entries with the same label, which tables would merge."""
     for label in labels:
         if labels.count(label) > 1:
             raise ValueError(
@@ -213,17 +223,17 @@ def _refuse_equal_labels(labels: list[str]) -> None:
 def _open_journals(
     evaluation: Evaluation, trial_set: TrialSet, entries: Sequence[Entry], out: Path
 ) -> list[Journal]:
-    """Return the journal in `out` of each of `entries`.
+    """Return the journal of each entry, in `out`.
 
     Raises:
-        ValueError: if an existing journal has other settings; then no file is made.
+        ValueError: if an existing journal has other settings; then no new journal is made.
     """
     from eval.judging.results import Journal
 
     paths = [out / f"journal-{number}.jsonl" for number in range(len(entries))]
     journals = {}
     pairs = zip(paths, entries, strict=True)
-    # Existing journals first: one of them may be refused.
+    # Existing journals are opened first: one of them may be refused.
     for path, entry in sorted(pairs, key=lambda pair: not pair[0].exists()):
         settings = {
             **stamp(1, None),
@@ -248,7 +258,7 @@ def _fly_entry(
     journal: Journal,
     console: Console,
 ) -> list[TrialResult]:
-    """Fly the trials that the journal lacks; return all results in the trials' order."""
+    """Fly the trials of an entry that its journal lacks; return all results, in order."""
     from eval.judging.guard import ActionLimits
     from eval.judging.judge import JudgeOptions, fly
     from eval.worlds.trial import Rules
@@ -289,5 +299,5 @@ def _fly_entry(
                 keep,
                 tracks=trial_set.tracks,
             )
-        # An earlier run may have had other policies and another label.
+        # An earlier command may have had other policies, and another label for this one.
         return [journal.done[trial]._replace(policy=label) for trial in trials]

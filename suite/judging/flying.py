@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from policies.policy import Policy
 
 TRIALS_A_PROCESS = 128
-"""Least trials for another process, which takes seconds to start."""
+"""Smallest number of trials for another process: the start of a process takes seconds."""
 SECONDS_A_TRIAL = 0.15
-"""Time of one core in MuJoCo for a trial of about 13 s with 70 solids [s]."""
+"""Time that one core needs in MuJoCo for a trial of about 13 s on a track with 70 solids [s]."""
 START_SECONDS = 6.0
-"""Time to import packages and to compile the policy and the first scenes [s]."""
+"""Time to import packages and to compile the policy and the first tracks [s]."""
 PROCESS_BYTES = 1.0e9
 """Memory of a process that flies 128 trials at once [bytes]."""
 
@@ -38,7 +38,7 @@ class Manner:
     monitored: bool = False
     """Whether the safety monitor checks the policy's actions."""
     speed: float | None = None
-    """Commanded speed, 0 to 1 [1]; None: that of the policy's spec."""
+    """Commanded speed, 0 to 1; None: that of the policy's spec."""
 
     def __call__(self, policy: Policy) -> Policy:
         """Return `policy` flown in this manner.
@@ -61,17 +61,19 @@ class Manner:
 
 
 PLAIN = Manner()
-"""The policy's own speed, without monitor."""
+"""The manner without options: the speed of the policy's spec, without monitor."""
 
 
 def manners(speeds: Sequence[float], monitor: bool) -> list[Manner]:
-    """Return all manners: each speed, then each speed with the monitor."""
-    plain = [Manner(speed=speed) for speed in speeds] or [Manner()]
-    return plain + [dataclasses.replace(manner, monitored=True) for manner in plain if monitor]
+    """Return all manners: each speed without the monitor, then each speed with it if `monitor`."""
+    unmonitored = [Manner(speed=speed) for speed in speeds] or [Manner()]
+    return unmonitored + [
+        dataclasses.replace(manner, monitored=True) for manner in unmonitored if monitor
+    ]
 
 
 def _at_speed(policy: Any, speed: float) -> Any:
-    """Return `policy` with a commanded speed; refuse one that does not take it as an input."""
+    """Return `policy` with a commanded speed; refuse a policy without a speed input."""
     if not policy.spec.speed_input:
         raise PolicyError(
             f"--speed {speed:g}: {policy.name} takes no speed as an input; leave --speed out, or "
@@ -95,10 +97,10 @@ def default_policy() -> str:
 
 
 def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
-    """Return the checkpoint's folder of a policy that can be trained further.
+    """Return the folder of a policy's checkpoint, from which it can be trained further.
 
     Raises:
-        ValueError: if the policy is no checkpoint of the suite; the message names `option`.
+        ValueError: if the policy is not a checkpoint of the suite; the message names `option`.
     """
     from policies import shipped
     from policies.formats.checkpoint import CONFIG
@@ -117,12 +119,12 @@ def checkpoint_folder(policy: str, option: str = "--policy") -> Path:
 def policy_labels(
     sources: Sequence[str], names: Sequence[str], option: str = "--policy"
 ) -> list[str]:
-    """Return each policy's label: its name, or its source if several have that name.
+    """Return each policy's label: its name, or its source if several policies have that name.
 
     Args:
         sources: the names or paths that the user gave.
-        names: of the loaded policies, in the same order.
-        option: the option of the sources, for the message.
+        names: the names of the loaded policies, in the same order.
+        option: the option with which the user gave the sources, for the message.
 
     Raises:
         ValueError: if a source is given twice.
@@ -144,7 +146,7 @@ def flying_estimate(trials: float, workers: Workers, simulator: str = "mujoco") 
     """
     processes = worker_count(workers)
     seconds = START_SECONDS + trials * relative_cost(simulator) * SECONDS_A_TRIAL / processes
-    # Memory of this machine only.
+    # The memory is that on this machine; a cluster has its own.
     return Estimate(seconds, PROCESS_BYTES * (workers if isinstance(workers, int) else 1))
 
 
@@ -156,7 +158,10 @@ def relative_cost(simulator: str) -> float:
 
 
 def workers_for(trials: int, workers: Workers | None, simulator: str) -> Workers:
-    """Return `workers`, or for None as many processes as shorten the work."""
+    """Return `workers`; for None, the number of processes that makes `trials` flights fastest.
+
+    It is 1 in a simulator that compiles for each number of trials, as every process would compile.
+    """
     if workers is not None:
         return workers
     from eval.worlds import compiles
@@ -170,12 +175,12 @@ def policy_for_workers(
 ) -> Policy | Callable[[], Policy]:
     """Return the loaded policy, or for several processes a function that loads it.
 
-    Processes of this machine read its files; those of a cluster get their content.
+    Processes of this machine read the policy's files; those of a cluster get the files' content.
 
     Args:
         policy: the loaded policy, in its manner.
-        name_or_path: its source.
-        trust: as in `load_policy`.
+        name_or_path: name or path from which it was loaded.
+        trust: whether files that can run code may be loaded.
         workers: the processes or cluster that fly the trials.
         manner: speed and monitor of the flights.
     """
@@ -187,6 +192,7 @@ def policy_for_workers(
 
 
 def _load_content(content: PolicyContent, manner: Manner) -> Policy:
+    """Return a policy from the content of its files, in its manner."""
     return manner(content())
 
 
@@ -194,7 +200,7 @@ def load_in_manner(name_or_path: str, trust: bool, manner: Manner = PLAIN) -> Po
     """Return a policy to fly, in its manner.
 
     Raises:
-        PolicyError: if it cannot be loaded, or not be flown in this manner.
+        PolicyError: if the policy cannot be loaded, or cannot fly in this manner.
     """
     from policies.policy import load_policy
 
@@ -213,7 +219,7 @@ def policy_record(name_or_path: str, policy: Policy) -> dict[str, Any]:
 def without_paths(settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a journal or a list of flights without paths of files.
 
-    The files' content or digest is included, so that files may be moved.
+    They have the content or the SHA-256 of the files instead, so that files may be moved.
     """
     settings = plain(settings)
     paths = {"policy": ("source",), "collection": ("policy", "vehicle")}

@@ -1,7 +1,8 @@
 """Fly trials of an earlier evaluation again, to show them as a recording or video (`suite view`).
 
-A trial is one judged flight. It repeats to the bit, so an evaluation stores no flights: it is flown
-again with the same policy, vehicle and track, whose SHA-256 must be the same.
+A trial is one judged flight. A repetition of it gives the same flight to the bit, so an evaluation
+stores no flights. To show a trial, it is flown again with the same policy, vehicle, sensors and
+track; their SHA-256 must be the same.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ class Replay(NamedTuple):
     """Trials flown again."""
 
     rollouts: list[Rollout]
-    """Track, flight (with the depth images) and result of each."""
+    """Track, flight (with depth images) and result of each trial."""
     drone: Drone
     """The vehicle and the policy's camera, as a recording shows them."""
 
 
 def read_evaluation(folder: Path) -> Evaluation:
-    """Return the settings of `suite eval --out folder`.
+    """Return the settings of the evaluation in `folder`, from its run.json.
 
     Raises:
-        ValueError: if `folder` has no finished run of suite eval.
+        ValueError: if `folder` has no finished run of `suite eval`, or values of a wrong type.
     """
     path = folder / "run.json"
     try:
@@ -63,26 +64,31 @@ def read_evaluation(folder: Path) -> Evaluation:
     for name, value in vars(evaluation).items():
         default = getattr(Evaluation, name)
         # Fields with default None are numbers; JSON may have a whole number for a float.
-        kind: type | tuple[type, ...] = type(default)
+        allowed_type: type | tuple[type, ...] = type(default)
         if default is None or isinstance(default, float):
-            kind = (int, float, type(default))
-        if not isinstance(value, kind) or (isinstance(value, bool) and default is not False):
+            allowed_type = (int, float, type(default))
+        # In Python a bool is also an int.
+        if not isinstance(value, allowed_type) or (
+            isinstance(value, bool) and default is not False
+        ):
             raise ValueError(f"{path}: {name} is {shown(value)}, expected one like {default!r}")
     check_ranges(evaluation, f"{path}: ")
     return evaluation
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of the first policy and the files of `suite eval --out folder`.
+    """Return the SHA-256 of the inputs of the evaluation in `folder`, by name.
+
+    The inputs are the first policy, vehicle, sensors and tracks; see `evaluate.file_digests`.
 
     Raises:
-        ValueError: if `folder` does not have it.
+        ValueError: if summary.json in `folder` does not have that of the policy.
     """
     path = folder / "summary.json"
     try:
         summary = read_json(path)
         first = summary["policies"][0]["sha256"]
-        # Earlier versions have only that of policies.
+        # Earlier versions of the suite wrote only that of policies.
         return {"policy": str(first), **dict(summary.get("sha256", {}))}
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(
@@ -108,8 +114,8 @@ def fly_again(
     Args:
         evaluation: settings of the trials.
         trials: the trials to fly.
-        policy: one of the evaluation's policies; None: the first.
-        judged: expected SHA-256 by input, from `read_digests`; None compares nothing.
+        policy: one of the evaluation's policies; None: the first one.
+        judged: expected SHA-256 of the inputs, from `read_digests`; None: no comparison.
 
     Raises:
         ValueError: if the policy, vehicle, sensors or a track has changed.
@@ -121,6 +127,7 @@ def fly_again(
     from eval.view.recording import Drone
     from eval.worlds.trial import Rules, track_of
 
+    # Read the inputs as the evaluation did.
     sensors = load_sensors(evaluation.sensors)
     options = JudgeOptions(
         workers=1,
@@ -137,6 +144,7 @@ def fly_again(
         digests = {"policy": policy_digest(name), **file_digests(vehicle, tracks, sensors)}
         sources = {"policy": name, "vehicle": evaluation.vehicle, "sensors": evaluation.sensors}
         _refuse_changed(sources, digests, judged)
+    # Fly, and keep the flights.
     flights: dict[TrialSpec, Flight] = {}
 
     def keep(result: TrialResult, flight: Flight | None) -> None:
@@ -157,7 +165,7 @@ def fly_again(
         (track_of(tracks, trial), flights[trial], result)
         for trial, result in zip(trials, results, strict=True)
     ]
-    # Flights use the policy's camera, not that of the vehicle file.
+    # Flights have the camera of the policy, not that of the vehicle file.
     camera = loaded.spec.camera
     return Replay(rollouts, Drone(vehicle.body.half_size, vehicle.rotors.position, camera))
 
@@ -165,7 +173,10 @@ def fly_again(
 def _refuse_changed(
     sources: Mapping[str, str], digests: Mapping[str, str], judged: Mapping[str, str]
 ) -> None:
-    """Refuse changed inputs, whose flights would differ."""
+    """Refuse inputs that changed since the evaluation, because the flights would differ.
+
+    All arguments are by input: path or name, SHA-256 now, and SHA-256 in the evaluation.
+    """
     for item, digest in digests.items():
         if judged.get(item, digest) != digest:
             label = f"{item} {sources[item]}" if item in sources else item

@@ -25,7 +25,7 @@ class Flights:
     track: str = "all"
     """zigzag, circular, ellipse, all of these, a track file (.toml), or a list with commas."""
     difficulty: str = "0,3"
-    """Level, 0 (easy) to 9 (hard); several as 0,3,9 or 0-3 or all."""
+    """Level from 0 (easy) to 9 (hard); several levels as 0,3,9 or 0-3 or all."""
     trials: Trials = 10
     """Trials of every policy on every track at every level."""
     seed: Seed = 0

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 LEVELS = tuple(range(10))
 """The levels of difficulty, from easy to hard."""
 GATE_MOST_M, TRACK_MOST_M = 50.0, 5000.0
-"""Larger sizes cause a note: the file may be in millimetres [m]."""
+"""Largest plausible width of a gate and size of a track [m]. Above them a note asks whether the
+file is in millimetres."""
 
 
 def parse_levels(text: str) -> list[int]:
@@ -79,10 +80,10 @@ def is_track_file(name: str) -> bool:
 
 
 def custom_tracks(names: Sequence[str]) -> dict[str, Track]:
-    """Return the tracks of those `names` that are files.
+    """Return the tracks of those `names` that are files, by name.
 
     Raises:
-        ValueError: for an invalid file, with its key.
+        ValueError: for an invalid file, with the invalid key.
     """
     from tracks.formats.custom import load_track
 
@@ -111,13 +112,13 @@ class TrialSet(NamedTuple):
     """The trials of a command, with tracks, vehicle and sensors read and checked."""
 
     trials: list[TrialSpec]
-    """In the order of the results."""
+    """The trials, in the order of the results."""
     tracks: dict[str, Track]
-    """Tracks from files, by their name in trials."""
+    """Tracks from files, by their name in the trials."""
     vehicle: Vehicle
     """The flown vehicle."""
     sensors: SensorSet
-    """Errors in what policies see."""
+    """Sensor errors in what policies see."""
     differences: list[str]
     """Differences between the simulator and the vehicle file, as sentences."""
     notes: list[str]
@@ -130,8 +131,8 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
     A track from a file is flown only once if all its flights would be equal.
 
     Args:
-        options: of the command.
-        real_time: whether flights are in real time, where no two are equal.
+        options: the options of the command.
+        real_time: whether flights are in real time. Then no two flights are equal.
 
     Raises:
         ValueError: for an unknown simulator or track, too few trials, or an invalid file.
@@ -148,6 +149,7 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
     vehicle = load_vehicle(options.vehicle)
     sensors = load_sensors(options.sensors)
     levels, tracks, notes = parse_levels(options.difficulty), custom_tracks(names), list[str]()
+    # Without random effects every seed would give the same flight on a track from a file.
     is_random = sensors.models or any(EFFECTS[name].random for name in vehicle.effects)
     once = not (real_time or is_random)
     if once and options.trials > 1:
@@ -165,7 +167,7 @@ def read_trial_set(options: Evaluation | Collection, real_time: bool = False) ->
 
 
 def _in_millimetres(name: str, track: Track) -> list[str]:
-    """Return a note if the size of the gates or the track suggests a file in millimetres."""
+    """Return a note if the size of the gates or of the track suggests a file in millimetres."""
     gates = track.scene.gates
     opening = float((gates.opening_g.max(1) - gates.opening_g.min(1)).max())
     extent = float((gates.center_w.max(0) - gates.center_w.min(0)).max())

@@ -1,10 +1,14 @@
 """Compare policies that a loop judged on the same trials: rates, speeds and their differences.
 
-A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed; the trials of one
-track and level are a cell. `compare` has a row per cell, for the three policies of the loop with a
-Delta Action Model: before, fine-tuned without the model, and fine-tuned with it. Fine-tuning
-without the model has the same number of gradient steps and is the control. `policy_results` has a
-row per policy, for any number of them.
+A trial is one judged flight: a track, its level (difficulty 0 to 9) and a seed. The trials of one
+track and level are a cell.
+
+`compare` returns a row per cell, for the three policies of the loop with a Delta Action Model (a
+network that corrects actions): before fine-tuning, fine-tuned without the model, and fine-tuned
+with it. The fine-tuning without the model has the same number of gradient steps; it is the control.
+`policy_results` returns a row per policy, for any number of policies.
+
+A p-value is that of the exact two-sided McNemar test, which compares the successes on equal trials.
 """
 
 from __future__ import annotations
@@ -34,17 +38,18 @@ OVERALL = "all"
 
 
 class Measure(NamedTuple):
-    """A quantity of the three policies on the same trials."""
+    """A quantity, such as the success rate, of the three policies on the same trials."""
 
     before: Interval
+    """Value of the policy before fine-tuning, with its interval."""
     without: Interval
-    """Fine-tuned without the Delta Action Model, with the same number of gradient steps."""
+    """Value of the policy fine-tuned without the Delta Action Model, the control."""
     with_delta: Interval
-    """Fine-tuned with the Delta Action Model."""
+    """Value of the policy fine-tuned with the Delta Action Model."""
     with_minus_without: Interval
-    """Paired by trial."""
+    """Difference of these two policies, paired by trial."""
     with_minus_before: Interval
-    """Paired by trial."""
+    """Difference of the policies with the model and before fine-tuning, paired by trial."""
 
 
 class CellComparison(NamedTuple):
@@ -52,30 +57,31 @@ class CellComparison(NamedTuple):
 
     track: str
     difficulty: int | None
-    """None over all cells."""
+    """Level of the track; None in the row over all trials."""
     trials: int
     """Number of trials of each policy."""
     success: Measure
-    """Rates, Wilson; differences by Newcombe's paired interval."""
+    """Success rates with Wilson's intervals; their differences have Newcombe's paired intervals."""
     p_value: float
-    """With against without, exact McNemar test, two-sided."""
+    """p-value of the difference with and without the Delta Action Model."""
     gates: Measure
-    """Mean number of gates passed, bootstrap."""
+    """Mean number of passed gates, with bootstrap intervals."""
     v_mean: Measure
-    """Median over trials [m/s], bootstrap; the difference is the median of the pairs'."""
+    """Median over trials of the mean speed, with bootstrap intervals [m/s]. A difference is the
+    median of the differences on equal trials."""
     v_max: Measure
-    """As v_mean [m/s]."""
+    """Median over trials of the largest speed, as `v_mean` [m/s]."""
 
 
 class Difference(NamedTuple):
-    """One policy's success minus another's on the same trials."""
+    """Difference of the success rates of two policies on the same trials."""
 
     against: str
-    """The other's name."""
+    """Name of the policy whose rate is subtracted."""
     success: Interval
-    """Newcombe's paired interval."""
+    """The difference with Newcombe's paired interval."""
     p_value: float
-    """Exact McNemar test, two-sided."""
+    """p-value of the difference."""
 
 
 class PolicyResult(NamedTuple):
@@ -83,22 +89,22 @@ class PolicyResult(NamedTuple):
 
     name: str
     success: Interval
-    """Rate, Wilson."""
+    """Success rate over all trials, with Wilson's interval."""
     by_cell: dict[str, Interval]
-    """The same on every track and level, as "zigzag 3"."""
+    """Success rate in each cell, by track and level such as "zigzag 3"."""
     gates: Interval
-    """Mean number of gates passed, bootstrap."""
+    """Mean number of passed gates, with a bootstrap interval."""
     v_mean: Interval
-    """Median over trials [m/s], bootstrap."""
+    """Median over trials of the mean speed, with a bootstrap interval [m/s]."""
     differences: list[Difference]
-    """Against each other reference."""
+    """Differences to each reference policy, without the policy itself."""
 
 
 def compare(results: Mapping[str, Sequence[TrialResult]]) -> list[CellComparison]:
     """Return a row for every track and level, and one for all trials at the end.
 
     Args:
-        results: of each of `VARIANTS`, on the same trials in the same order.
+        results: results of each of the `VARIANTS`, on the same trials in the same order.
 
     Raises:
         ValueError: if the trials differ.
@@ -117,8 +123,8 @@ def policy_results(
     """Return the results of every policy, in the order of `results`.
 
     Args:
-        results: by policy, of the same trials in the same order.
-        references: policies that the others are compared with.
+        results: results of each policy, on the same trials in the same order.
+        references: names of the policies with which the others are compared.
 
     Raises:
         ValueError: if the trials differ.
@@ -127,6 +133,7 @@ def policy_results(
     successes = {name: np.array([row.success for row in rows]) for name, rows in results.items()}
     summaries = []
     for name, rows in results.items():
+        # The seed of the bootstrap: the same numbers on every machine.
         seed, success = zlib.crc32(name.encode()), successes[name]
         pairs = {
             reference: paired_success(success, successes[reference])
@@ -172,7 +179,7 @@ def success_rate(success: np.ndarray) -> Interval:
 
 
 def _cells(trials: Sequence[TrialSpec]) -> dict[tuple[str, int], list[int]]:
-    """Return the indices of the trials on each track and level."""
+    """Return the indices of the trials in each cell, by track and level."""
     cells: dict[tuple[str, int], list[int]] = {}
     for index, trial in enumerate(trials):
         cells.setdefault((trial.track, trial.difficulty), []).append(index)
@@ -182,7 +189,7 @@ def _cells(trials: Sequence[TrialSpec]) -> dict[tuple[str, int], list[int]]:
 def _compare_cell(
     track: str, level: int | None, rows: Mapping[str, Sequence[TrialResult]]
 ) -> CellComparison:
-    """Return the comparison of the three policies on the trials of `rows`."""
+    """Return the comparison of the three policies on the trials of `rows` (results by policy)."""
     seed = zlib.crc32(repr((track, level)).encode())
     mean, median = partial(bootstrap_mean, seed=seed), partial(bootstrap_median, seed=seed)
     median_difference = partial(paired_bootstrap, seed=seed)

@@ -1,8 +1,9 @@
-"""The settings of a loop, resolved from a recipe (a named training) and the command's options.
+"""The settings of a loop, computed from a recipe (named settings of a training) and the options.
 
 A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The true vehicle is the one that flies; with a hidden vehicle it differs from the
-simulation's vehicle file.
+judges both. The true vehicle produces the flights. In a loop with a hidden vehicle it differs from
+the vehicle file of the simulation; else it is the same. A digest is the SHA-256 of a file's
+content.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ from tracks.common.files import digest_of
 from tracks.input.ranges import SEED_MOST, Iterations, Range, Trials, check_ranges
 
 RECORDED_FROM = 100_000
-"""Difference of the seeds of recorded flights and judged trials, which keeps them separate."""
+"""Seed of the first recorded flight minus that of the first judged trial. It is so large that no
+flight is recorded on the track of a trial."""
 EXACT_SIMULATORS = ("mujoco", "mjx")
 """Simulators that fly a vehicle exactly as its file describes; the first is the default."""
 LOOP_SEEDS = Range(0, SEED_MOST - 10 * RECORDED_FROM)
-"""Range of a loop's seed; those of fine-tunings and recorded flights are larger."""
+"""Allowed seeds of a loop. The seeds of its fine-tunings and recorded flights are larger, and must
+be allowed as well."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,13 @@ class LoopSize:
     fit_iterations: Iterations
     """Gradient steps of the fit of a Delta Action Model."""
     finetune_iterations: Iterations | None = None
-    """Gradient steps of each fine-tuning; None: a share of the training's."""
+    """Gradient steps of each fine-tuning; None: a share of those of the training."""
 
 
 SIZES = {"quick": LoopSize(20, 8, 500), "": LoopSize(50, 20, 1500)}
-"""Sizes by recipe; "" is that of all others."""
+"""Sizes of a loop by recipe; "" is that of all other recipes."""
 HIDDEN_SIZES = {"quick": LoopSize(20, 3, 200, 100), "": LoopSize(25, 3, 200, 60)}
-"""Sizes of a loop with a hidden vehicle."""
+"""Sizes of a loop with a hidden vehicle, by recipe."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +65,15 @@ class LoopConfig:
     """Settings of every loop."""
 
     tuning: TrainConfig
-    """The fine-tunings, which differ only in their dynamics."""
+    """Settings of the fine-tunings, which differ only in their dynamics."""
     fit: FitConfig
-    """The fit of Delta Action Models."""
+    """Settings of the fits of Delta Action Models."""
     policy: str | None
     """The policy to start from: a shipped name or a checkpoint's folder; None trains one."""
     track: str
-    """As in `suite.judging.trials.parse_tracks`, families only."""
+    """Families of tracks, such as "zigzag,circular"; see `suite.judging.trials.parse_tracks`."""
     difficulty: str
-    """As in `suite.judging.trials.parse_levels`."""
+    """Levels, such as "0,3"; see `suite.judging.trials.parse_levels`."""
     trials: Trials
     """Judged trials of each policy on every track at every level."""
     flights: Trials
@@ -78,11 +81,11 @@ class LoopConfig:
     vehicle: str
     """The nominal vehicle of the simulation: a shipped name or a vehicle file."""
     sensors: str
-    """Errors in what policies see, in every flight: a shipped name or a sensors file."""
+    """Sensor errors in what policies see, in every flight: a shipped name or a sensors file."""
     seed: Annotated[int, LOOP_SEEDS]
     """Seed of the trainings and of the first judged trial."""
     digests: dict[str, str]
-    """SHA-256 of vehicles, sensors and the given policy, if there is one."""
+    """SHA-256 of the vehicles, the sensors and the given policy (if there is one), by name."""
 
     @property
     def recorded_from(self) -> int:
@@ -91,12 +94,12 @@ class LoopConfig:
 
     @property
     def cells(self) -> int:
-        """Number of pairs of track and level."""
+        """Number of cells, the pairs of track and level."""
         return len(parse_tracks(self.track)) * len(parse_levels(self.difficulty))
 
     @property
     def true_vehicle(self) -> str:
-        """The vehicle of trials and recorded flights: a shipped name or a vehicle file."""
+        """The vehicle that flies trials and recorded flights: a shipped name or a vehicle file."""
         return self.vehicle
 
     @property
@@ -107,10 +110,11 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class DeltaLoopConfig(LoopConfig):
-    """A loop with the recipe's dynamics: the point mass or a quadrotor."""
+    """A loop without a hidden vehicle, which shows the effect of a Delta Action Model."""
 
     training: TrainConfig
-    """The first training; the Delta Action Model corrects its dynamics."""
+    """Settings of the first training. The Delta Action Model corrects its dynamics: the point mass
+    or a quadrotor."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +124,9 @@ class HiddenLoopConfig(LoopConfig):
     hidden_vehicle: str
     """The true vehicle's file; the loop uses only its flights."""
     simulator: str = EXACT_SIMULATORS[0]
-    """The simulator in which it flies."""
+    """The simulator in which the hidden vehicle flies."""
     delta: bool = True
-    """Whether Delta Action Models are fitted as well, and policies fine-tuned under them."""
+    """Whether Delta Action Models are fitted as well, and policies are fine-tuned with them."""
 
     @property
     def true_vehicle(self) -> str:
@@ -136,10 +140,10 @@ class HiddenLoopConfig(LoopConfig):
 
 
 def loop_by_content(config: LoopConfig) -> LoopConfig:
-    """Return the loop without paths of files, whose content is in `digests`.
+    """Return the settings without paths of files, whose content is in `digests`.
 
-    So a loop can be moved, or continued from another folder or machine. As in loading, a shipped
-    policy's name has priority over a folder of that name, and a file over a shipped vehicle's name.
+    So a loop can be continued from another folder or machine. A name may be that of a file and of
+    something shipped. As in loading, the shipped policy is taken, but the vehicle file.
     """
 
     def without_path(name_or_path: str) -> str:
@@ -156,7 +160,7 @@ def loop_by_content(config: LoopConfig) -> LoopConfig:
 
 
 def default_recipe(policy: str | None) -> str:
-    """Return the recipe for fine-tuning a policy: that of a shipped policy, else `race`."""
+    """Return the recipe for fine-tuning a policy: the recipe of its name, else `race`."""
     return policy if policy in RECIPES else "race"
 
 
@@ -179,11 +183,12 @@ def resolve(
     delta: bool = True,
     changes: Sequence[str] = (),
 ) -> LoopConfig:
-    """Return the loop of a recipe and options; None takes the recipe's size.
+    """Return the settings of a loop from a recipe and options.
 
-    The default recipe is the policy's. With a hidden vehicle or another simulator nothing is
-    trained from scratch, and the default policy is the shipped one. With a policy, `changes` apply
-    to its fine-tuning, else to the recipe.
+    Numbers that are None are those of the recipe's size (`SIZES`). Without `recipe` it is that of
+    the policy. With a hidden vehicle or another simulator nothing is trained from scratch, and the
+    default policy is the shipped one. With a policy, `changes` apply to its fine-tuning, else to
+    the recipe.
 
     Raises:
         ValueError: for an invalid option, with what is allowed.
@@ -195,6 +200,7 @@ def resolve(
     from suite.judging.content import policy_digest
     from suite.judging.flying import checkpoint_folder, default_policy
 
+    # The kind of loop, its recipe and its size.
     hidden = hidden_vehicle is not None or simulator != EXACT_SIMULATORS[0]
     if hidden and policy is None:
         policy = default_policy()
@@ -204,6 +210,7 @@ def resolve(
     size = sizes.get(recipe, sizes[""])
     if iterations is not None:
         training = with_iterations(training, iterations)
+    # The simulation's vehicle, and options that contradict each other.
     simulated = load_vehicle(vehicle)
     digests = {
         "vehicle": digest_of(simulated),
@@ -223,6 +230,7 @@ def resolve(
     if not hidden and policy is None:
         training = with_changes(training, changes)
         check_phases(training)
+    # The true vehicle, which must differ from the simulation's.
     true_vehicle = vehicle if hidden_vehicle is None else hidden_vehicle
     if hidden:
         refuse_own_motion(simulated)
@@ -235,6 +243,7 @@ def resolve(
                 "examples/hidden.toml, or another simulator, such as --simulator rotorpy"
             )
         digests["hidden_vehicle"] = digest_of(true)
+    # The settings of the fine-tuning.
     if policy is not None:
         spec = load_policy_checkpoint(checkpoint_folder(policy)).spec
         last = phase_configs(training)[-1]
@@ -273,7 +282,7 @@ def resolve(
 
 
 def _check_changes(changes: Sequence[str], policy: str | None, iterations: int | None) -> None:
-    """Refuse options of a training if there is none, and settings that the loop sets itself.
+    """Refuse options of a first training if there is none, and settings that the loop itself sets.
 
     Raises:
         ValueError: with the option and what to do instead.
@@ -297,7 +306,8 @@ def check_simulator(name: str) -> None:
     """Refuse a simulator that cannot fly a true vehicle.
 
     Raises:
-        ValueError: for an unknown simulator, a missing package, or one that records no flights.
+        ValueError: for an unknown simulator, a missing package, or a simulator that does not record
+            flights.
     """
     from eval.judging.judge import check_records
     from eval.worlds import world_class
@@ -307,7 +317,7 @@ def check_simulator(name: str) -> None:
 
 
 def _check_seeds(config: LoopConfig) -> None:
-    """Refuse options with which recorded flights and judged trials would be the same, or too few.
+    """Refuse track files, on which recorded flights would equal judged trials, and too few flights.
 
     Raises:
         ValueError: with the option and what is allowed.

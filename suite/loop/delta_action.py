@@ -1,8 +1,8 @@
-"""The loop that shows the effect of a Delta Action Model: a policy is fine-tuned with and without.
+"""The loop that shows the effect of a Delta Action Model ("delta") on the fine-tuning of a policy.
 
-The model is a network that corrects actions so that simulated flights match measured ones. The
-control is fine-tuned without it for the same number of steps, which shows the effect of more
-training.
+The model is a network that corrects actions so that simulated flights match measured ones. One
+policy is fine-tuned with it. Another one, the control, is fine-tuned without it for the same number
+of steps, and shows the effect of more training alone.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ def summarise(
 
 
 def _delta_section(fitted: Mapping) -> Section:
-    """Return the section with the model's errors on held-out flights, from delta.json."""
+    """Return the section with the errors on held-out flights; `fitted` is from delta.json."""
     errors = errors_by_name(fitted)
+    # The first error is that of the uncorrected dynamics.
     base_m = next(iter(errors.values()))["position_m"]
     rows = [errors_row(name, error, base_m) for name, error in errors.items()]
     corrected = f"quadrotor of {fitted['vehicle']['name']}" if "vehicle" in fitted else "point mass"
@@ -73,7 +74,7 @@ def _delta_section(fitted: Mapping) -> Section:
 
 
 def _training_section(out: Path, config: DeltaLoopConfig) -> Section:
-    """Return the section with the curves of the training and the fine-tunings."""
+    """Return the section with the learning curves of the training and the fine-tunings."""
     folders = {BEFORE: "train", WITHOUT: "tuned-without", WITH: "tuned-with"}
     chart = training_chart({name: curve.read(out / folder) for name, folder in folders.items()})
     first = f"{config.training.optimizer.iterations} iterations of training, then "

@@ -1,8 +1,14 @@
 """The loop with a hidden vehicle: its effect is diagnosed, and policies are fine-tuned for it.
 
 The hidden vehicle has a physical effect (such as drag) that the simulation's vehicle file lacks.
-Only the judge, the simulator that scores policies, reads the hidden vehicle's file. The simulation
-is corrected from measured flights only.
+Only the judge, the simulator that scores policies, reads the file of the hidden vehicle. The
+simulation is corrected from measured flights only. A Delta Action Model is a network that corrects
+actions so that simulated flights match measured ones.
+
+Six policies are compared. `NOMINAL` and `BEFORE` are the first policy, with the vehicle of the
+simulation and with the hidden one. The others are fine-tuned and fly the hidden vehicle: `CONTROL`
+in the uncorrected simulation, `DELTA` with a Delta Action Model, `NAMED` with the effect that the
+diagnosis names, `BOTH` with that effect and a Delta Action Model.
 """
 
 from __future__ import annotations
@@ -43,9 +49,10 @@ LABELS = {
 }
 """Labels of the policies in tables."""
 REFERENCES = (BEFORE, CONTROL, NOMINAL)
-"""Policies that the others are compared with."""
+"""Policies with which the others are compared."""
 MODELS = {CONTROL: "simulation's", NAMED: "corrected"}
-"""Variants with a Delta Action Model in delta-NAME/, and the quadrotor that it corrects."""
+"""Delta Action Models: the model in delta-NAME/ is fitted to the dynamics in which the policy NAME
+is fine-tuned. The text names the quadrotor of these dynamics."""
 JUDGED = "judging the one fine-tuned {}, on the same seeds"
 """Description of the judging of a fine-tuned policy."""
 
@@ -85,7 +92,7 @@ def summarise(
 
 
 def vehicle_phrase(config: HiddenLoopConfig) -> str:
-    """Return the name of the hidden vehicle in sentences."""
+    """Return how sentences name what differs from the simulation: the vehicle, or the simulator."""
     if config.simulator in EXACT_SIMULATORS:
         return "the hidden vehicle"
     return f"the simulator {config.simulator}"
@@ -97,7 +104,7 @@ def verdict(
     trials: int,
     vehicle: str = "the hidden vehicle",
 ) -> str:
-    """Return the loop's result in a few sentences; `vehicle` names the judged vehicle."""
+    """Return the loop's result in a few sentences; `vehicle` is how they name the true vehicle."""
     by_name = {policy.name: policy for policy in policies}
     differences = {other.against: other.success for other in by_name[NAMED].differences}
 
@@ -122,7 +129,7 @@ def verdict(
 
 
 def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -> Section:
-    """Return the section with the verdict, the named effects and the true differences."""
+    """Return the section with the result of the diagnosis, and with what is hidden in truth."""
     gap = diagnosis["gap"]
     rows = [
         (effect["name"], ", ".join(effect["alternatives"]), component.label, *component.texts())
@@ -144,7 +151,7 @@ def _diagnosis_section(config: HiddenLoopConfig, diagnosis: Mapping[str, Any]) -
 
 
 def describe_hidden(config: HiddenLoopConfig) -> list[str]:
-    """Return sentences on the differences of the hidden vehicle to the simulation's."""
+    """Return sentences on the differences between the hidden vehicle and that of the simulation."""
     simulated, true = load_vehicle(config.vehicle), load_vehicle(config.hidden_vehicle)
     effects = hidden_effects(simulated, true)
     sentences = [f"Differences of the hidden vehicle's file to the simulation's: {effects}."]
@@ -157,7 +164,10 @@ def describe_hidden(config: HiddenLoopConfig) -> list[str]:
 
 
 def hidden_effects(simulated: Vehicle, true: Vehicle) -> str:
-    """Return the effects of `true` that `simulated` lacks or has with other values, as text."""
+    """Return the differences of the vehicle `true` to the vehicle `simulated`, as text.
+
+    They are effects that one of them lacks or that have other values; then other nominal values.
+    """
     texts = []
     for name, value in true.effects.items():
         if simulated.effects.get(name) != value:
@@ -190,7 +200,7 @@ def _delta_section(out: Path) -> Section:
 
 
 def _training_section(out: Path, config: LoopConfig) -> Section:
-    """Return the section with the curves of the fine-tunings."""
+    """Return the section with the learning curves of the fine-tunings."""
     assert isinstance(config, HiddenLoopConfig)
     tuned = (CONTROL, DELTA, NAMED, BOTH) if config.delta else (CONTROL, NAMED)
     curves = {LABELS[name]: curve.read(out / f"tuned-{name}") for name in tuned}

@@ -1,7 +1,7 @@
-"""Add measurement noise to a loop's recorded flights, and cut each before its first contact.
+"""Add measurement noise to the recorded flights of a loop, and cut each one before a contact.
 
-The simulation's record is exact. The noise of a state estimator prevents the diagnosis from using a
-precision that real logs do not have.
+The records of a simulation are exact. The noise is that of a typical state estimator: without it
+the diagnosis would use a precision that real logs do not have.
 """
 
 from __future__ import annotations
@@ -19,34 +19,35 @@ from tracks.common.files import write_json
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 CONTACT_MARGIN_S = 0.1
-"""Time that is cut off the end of an unfinished flight [s]."""
+"""Time that is cut off the end of a flight that ended by a contact [s]."""
 SHORTEST_S = 1.5
-"""Shorter flights are left out [s]."""
+"""Shortest flight that is used [s]."""
 LEAST_FILES = 5
-"""Smallest number of flights for a diagnosis, which are its independent units."""
+"""Smallest number of flights for a diagnosis: its statistics take whole flights as independent."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of white noise."""
+    """Standard deviations of white measurement noise."""
 
     pos: float = 0.005
-    """Of the position, each axis [m]."""
+    """Noise of the position on each axis [m]."""
     attitude: float = 0.004
-    """Of the rotation about each body axis [rad]."""
+    """Noise of the attitude, as a rotation about each body axis [rad]."""
     vel: float = 0.03
-    """Of the velocity, each axis [m/s]."""
+    """Noise of the velocity on each axis [m/s]."""
     gyro: float = 0.02
-    """Of the body rates, each axis [rad/s]."""
+    """Noise of the body rates on each axis [rad/s]."""
     rotor: float = 5.0
-    """Of the speed of each rotor [rad/s]."""
+    """Noise of the speed of each rotor [rad/s]."""
 
 
 def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
     """Write the flights of `suite collect` in `flights` with measurement noise into `out`.
 
     Returns:
-        The files, in turn from each track and level, so that the first ones cover all of them.
+        The written files: the first of each track and level, then the second of each, and so on.
+        So a number of first files covers all tracks and levels.
 
     Raises:
         ValueError: if no flight is long enough.
@@ -74,7 +75,8 @@ def add_measurement_noise(flights: Path, out: Path, seed: int) -> list[Path]:
 
 
 def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
-    """Return a log without its last `margin_s` [s]."""
+    """Return a log without the last `margin_s` [s]."""
+    # Arrays with one value per row are cut; other fields stay.
     selected, count = log.time_s <= log.time_s[-1] - margin_s, len(log.time_s)
     arrays = {
         name: value[selected]
@@ -86,7 +88,7 @@ def cut_end(log: FlightLog, margin_s: float) -> FlightLog:
 
 
 def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
-    """Return a log with white noise on all measurements, not on commands and actions."""
+    """Return a log with white noise on all measurements, and with exact commands and actions."""
 
     def with_noise(values: np.ndarray, sigma: float) -> np.ndarray:
         return values + sigma * rng.standard_normal(values.shape)
@@ -99,12 +101,13 @@ def noisy(log: FlightLog, noise: Noise, rng: np.random.Generator) -> FlightLog:
         quat_wxyz=rot_to_quat(log.rot_w @ exp_rot(turn_b)),
         vel_w=with_noise(log.vel_w, noise.vel),
         rate_b=with_noise(log.rate_b, noise.gyro),
+        # A rotor speed is never negative.
         rotor_speed=None if rotors is None else np.maximum(with_noise(rotors, noise.rotor), 0.0),
     )
 
 
 def first_files(files: Sequence[Path], duration_s: float) -> list[Path]:
-    """Return the first of `files` with `duration_s` of flight in total, at least `LEAST_FILES`."""
+    """Return as many of the first `files` as last `duration_s` [s] in total, or `LEAST_FILES`."""
     logs, _ = read_flights(list(files))
     durations_s = {Path(log.name).name: log.duration_s for log in logs}
     selected, total_s = [], 0.0

@@ -1,4 +1,8 @@
-"""Write the HTML report of a loop: its findings, pictures of flights, files and configuration."""
+"""Write the HTML report of a loop: its findings, pictures of flights, files and configuration.
+
+The loop (`suite loop`) flies a policy, corrects the simulation from these flights, fine-tunes the
+policy in it and compares the policies. The findings are the results of this comparison.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from tracks.common.provenance import VERSION, git_commit
 def write_loop_report(
     out: Path, loop: Loop, config: LoopConfig, findings: Findings, seconds: Mapping[str, float]
 ) -> None:
-    """Write report.html of the finished loop in `out`; `seconds` are the stages' times."""
+    """Write report.html of the finished loop in `out`; `seconds` are the times of its stages."""
     report = Report(
         title=loop.title,
         lead=findings.verdict,
@@ -41,7 +45,7 @@ def write_loop_report(
 
 
 def _flight_sections(out: Path, loop: Loop) -> list[Section]:
-    """Return a section with the picture of each shown policy's flights."""
+    """Return the sections with the pictures of flights: before the fine-tuning, and after it."""
     vehicle = ", with the hidden vehicle" if loop.hidden else ""
     texts = (
         "The first seed of every track at the easiest and the hardest level, from above"
@@ -76,12 +80,13 @@ def _files_section(
 
 
 def errors_row(name: str, errors: Mapping[str, float], base_m: float | None = None) -> list[str]:
-    """Return a table's row with a Delta Action Model's errors on held-out flights.
+    """Return a row of a table with the errors of a model on held-out flights.
 
     Args:
-        name: of the model.
-        errors: `position_m` [m] and `velocity_m_s` [m/s].
-        base_m: position error of which a share is printed [m]; None prints no share.
+        name: name of the model.
+        errors: `position_m`, the position error [m], and `velocity_m_s`, the velocity error [m/s].
+        base_m: position error of another model [m]; the row then has the ratio to it. None: no
+            ratio.
     """
     texts = [name, f"{errors['position_m']:.3f}", f"{errors['velocity_m_s']:.3f}"]
     if base_m is not None:

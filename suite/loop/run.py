@@ -33,10 +33,10 @@ def run_loop(
     """Run the loop, or its remaining stages, and print its results.
 
     Args:
-        config: the whole loop.
-        out: its folder; an unfinished loop of the same configuration there continues.
+        config: all settings of the loop.
+        out: the folder of the loop; an unfinished loop with the same settings in it continues.
         console: shows progress and results.
-        workers: processes of flights and fine-tunings; may change between calls.
+        workers: number of processes that fly and fine-tune; it may change between calls.
 
     Returns:
         The contents of loop.json, and `out`.
@@ -57,10 +57,12 @@ def run_loop(
 
 def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any]:
     """Write and print the tables and the report; return the contents of loop.json, and `out`."""
+    # The results of all policies, and what follows from them.
     loop, config, out, console = run.loop, run.config, run.out, run.console
     folders = {variant.name: out / f"eval-{variant.name}" for variant in loop.variants}
     results = {name: read_trials(folder / "trials.parquet") for name, folder in folders.items()}
     findings = loop.summarise(config, out, results)
+    # Write table.md, loop.json and report.html.
     header = stamp(1, config.seed)
     comment = "; ".join(f"{key}: {value}" for key, value in header.items())
     tables = map(markdown, findings.tables)
@@ -77,6 +79,7 @@ def _report_results(run: LoopRun, seconds: Mapping[str, float]) -> dict[str, Any
     }
     write_json(out / "loop.json", answer)
     write_loop_report(out, loop, config, findings, seconds)
+    # Print the same tables, the verdict and where the files are.
     for table in findings.tables:
         console.show(rich_table(table))
     errors = [] if loop.hidden else [text.strip("\n") for text in findings.errors]

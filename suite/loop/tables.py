@@ -1,4 +1,8 @@
-"""Tables and sentences on the policies that a loop compares (`compare.py` has the numbers)."""
+"""Tables and sentences on the policies that a loop compares (`compare.py` computes the numbers).
+
+The loop fine-tunes a policy and compares it with the policy before. "delta" in tables is the Delta
+Action Model, a network that corrects actions so that simulated flights match measured ones.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +16,11 @@ CAVEAT = (
     "Intervals are 95 % over trials, for these three policies: another training seed gives other "
     "policies. The intervals of single rows are not corrected for multiple comparisons."
 )
-"""Note below the tables on the intervals."""
+"""Note on the intervals, for the text below the tables."""
 
 
 def comparison_grids(rows: Sequence[CellComparison]) -> list[Grid]:
-    """Return tables of success, gates, mean speed and largest speed, a row per track and level."""
+    """Return tables of success, gates, mean speed and largest speed, each with a row per cell."""
     return [
         _grid("Success, all gates without a collision [%]", rows, "success", 100, 0),
         _grid("Gates passed, mean", rows, "gates", 1, 2),
@@ -28,7 +32,10 @@ def comparison_grids(rows: Sequence[CellComparison]) -> list[Grid]:
 def _grid(
     title: str, rows: Sequence[CellComparison], field: str, scale: float, digits: int
 ) -> Grid:
-    """Return the table of one measure, times `scale`; that of success has the test as well."""
+    """Return the table of the measure `field`; the table of success has p-values as well.
+
+    Numbers are multiplied by `scale` and have `digits` decimals.
+    """
     has_test = field == "success"
     headers = ["track", "level", "trials", "before", "tuned without delta", "tuned with delta"]
     headers += ["with - without", *(["p (McNemar)"] if has_test else []), "with - before"]
@@ -36,6 +43,7 @@ def _grid(
     for row in rows:
         measure: Measure = getattr(row, field)
         level = "all" if row.difficulty is None else str(row.difficulty)
+        # A measure has three values, then two differences.
         to_control, to_before = (difference_cell(d, scale, digits) for d in measure[3:])
         values = [value_text(interval, scale, digits) for interval in measure[:3]]
         p_value = [f"{row.p_value:.2g}"] if has_test else []
@@ -49,7 +57,14 @@ def overall_grid(
     labels: Mapping[str, str],
     trials: int,
 ) -> Grid:
-    """Return a row per policy: success, its differences, gates and speed."""
+    """Return the table over all trials, a row per policy: success, differences, gates and speed.
+
+    Args:
+        results: results of the policies.
+        references: names of the policies with which the others are compared, two columns each.
+        labels: label of each policy in the table.
+        trials: number of trials of each policy.
+    """
     headers = ["policy", "success [%]"]
     for reference in references:
         headers += [f"minus {labels[reference]}", "p"]
@@ -69,7 +84,7 @@ def overall_grid(
 
 
 def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Grid:
-    """Return the success rates, a row per track and level and a column per policy."""
+    """Return the table of success rates, with a row per track and level and a column per policy."""
     headers = ["track and level", *(labels[result.name] for result in results)]
     rows = [
         [cell, *(value_text(result.by_cell[cell], 100, 0) for result in results)]
@@ -79,7 +94,7 @@ def cell_grid(results: Sequence[PolicyResult], labels: Mapping[str, str]) -> Gri
 
 
 def value_text(interval: Interval, scale: float, digits: int) -> str:
-    """Return a number with its interval for a table, times `scale`."""
+    """Return a number with its interval for a table; both are multiplied by `scale`."""
     value, low, high = (f"{scale * x:.{digits}f}" for x in interval)
     return f"{value} [{low}, {high}]"
 
@@ -87,9 +102,9 @@ def value_text(interval: Interval, scale: float, digits: int) -> str:
 def difference_cell(
     interval: Interval | PairedDifference, scale: float = 100, digits: int = 0
 ) -> Cell:
-    """Return a difference with its interval and sign, coloured if it excludes zero.
+    """Return a difference with its sign and interval, coloured if the interval excludes zero.
 
-    By default it is one of rates, in percentage points.
+    By default it is a difference of rates, written in percentage points.
     """
     # Adding zero turns a rounded -0 into +0.
     value, low, high = (f"{round(scale * x, digits) + 0.0:+.{digits}f}" for x in interval[:3])
@@ -98,7 +113,10 @@ def difference_cell(
 
 
 def significance(difference: Interval, above: str = "more than", below: str = "fewer than") -> str:
-    """Return `above`, `below` or "not significantly different from", by the difference's sign."""
+    """Return how a sentence names a difference, by its interval.
+
+    It is `above` or `below` if the interval excludes zero, else "not significantly different from".
+    """
     if difference.low > 0:
         return above
     return below if difference.high < 0 else "not significantly different from"

@@ -1,11 +1,16 @@
-"""Describe a loop as data: its policies, with the dynamics of their fine-tuning and judging.
+"""Describe a loop as data: its policies, and the dynamics in which they are fine-tuned and judged.
 
 A loop flies a policy, corrects the simulation from these flights, fine-tunes the policy in it and
-judges both. The judge is the simulator that scores policies.
+judges both. The judge is the simulator that scores policies. There is one fine-tuned policy for
+each way to correct the simulation; all policies are called variants.
 
-A loop's folder has train/ (or given/), eval-X/ of the first policy, flights/, with a hidden vehicle
-measured/ and diagnosis/, a folder for each Delta Action Model, tuned-X/ and eval-X/ of each
-fine-tuned policy X, and replays/; then table.md, loop.json, report.html and recording.rrd.
+The folder of a loop has, in the order of the stages:
+- train/ or given/: the first policy, trained or copied; eval-X/: its trials, X is its name
+- flights/: the recorded flights; with a hidden vehicle also measured/ (with noise) and diagnosis/
+- a folder for each Delta Action Model
+- tuned-X/ and eval-X/: each fine-tuned policy X and its trials
+- replays/: pictures of flights
+- table.md, loop.json, report.html and recording.rrd: the results
 """
 
 from __future__ import annotations
@@ -23,18 +28,18 @@ from tracks.common.grid import Grid
 
 @dataclass(frozen=True)
 class Variant:
-    """A policy of the loop, judged in eval-NAME/."""
+    """A policy of the loop. The results of its trials are in eval-NAME/."""
 
     name: str
-    """Name of the policy, a part of its folders' names."""
+    """Name of the policy, a part of the names of its folders."""
     judged: str
-    """Description of the judging."""
+    """Description of the judging, for the progress display."""
     tuned: str | None = None
-    """Description of the fine-tuning in tuned-NAME/; None for the first policy."""
+    """Description of the fine-tuning, whose folder is tuned-NAME/; None for the first policy."""
     delta: str | None = None
-    """Folder of the Delta Action Model in the fine-tuning."""
+    """Folder of the Delta Action Model that corrects actions in the fine-tuning; None without."""
     diagnosed: bool = False
-    """Whether the fine-tuning flies the vehicle that the diagnosis corrected."""
+    """Whether the fine-tuning uses the vehicle file that the diagnosis corrected."""
     simulated: bool = False
     """Whether the policy is judged with the simulation's vehicle instead of the true one."""
 
@@ -46,13 +51,14 @@ class DeltaModel:
     folder: str
     """Name of the model's folder."""
     title: str
-    """Description of the fit."""
+    """Description of the fit, for the progress display."""
     diagnosed: bool = False
-    """Whether it corrects the vehicle that the diagnosis corrected."""
+    """Whether the model is fitted to the vehicle file that the diagnosis corrected, instead of the
+    given one."""
 
 
 class ShownPolicy(NamedTuple):
-    """A policy in the recording and the pictures."""
+    """A policy whose flights are in the recording and the pictures."""
 
     variant: str
     """Name of the policy."""
@@ -71,11 +77,11 @@ class Findings:
     tables: Sequence[Grid]
     """Tables of the policies."""
     errors: Sequence[str]
-    """Errors of the Delta Action Models, as Markdown."""
+    """Tables of the Delta Action Models' errors, as Markdown."""
     numbers: Mapping[str, Any]
-    """Numbers for loop.json."""
+    """Results for loop.json, by key."""
     facts: Mapping[str, str]
-    """Conditions by name, for the report."""
+    """Conditions of the trials for the report, by name, such as the tracks."""
     chart: Picture
     """Chart of the policies."""
     sections: Sequence[Section]
@@ -89,20 +95,21 @@ class Loop:
     title: str
     """Title of the report."""
     hidden: bool
-    """Whether the flights get measurement noise and are diagnosed before a fit."""
+    """Whether the loop has a hidden vehicle. Then its flights get measurement noise and are
+    diagnosed before a fit."""
     variants: Sequence[Variant]
     """The policies, in the order of tables and stages."""
     models: Sequence[DeltaModel]
-    """The fits, in the order of stages."""
+    """The fits of Delta Action Models, in the order of the stages."""
     shown: Sequence[ShownPolicy]
-    """The policy before the fine-tuning, and the one after."""
+    """The policy before the fine-tuning, and one after it."""
     summarise: Callable[[LoopConfig, Path, Mapping[str, Sequence[TrialResult]]], Findings]
-    """Returns the findings, from the configuration, the folder and the results by variant."""
+    """(settings, folder of the loop, results by variant) -> the findings."""
     reading: str
-    """Explanation of the tables."""
+    """Explanation of the tables, for the report."""
     caveat: str
     """Note on what the intervals do not include."""
     advice: str
     """Advice if the flights are too short for a fit."""
     files: Sequence[tuple[str, str]]
-    """Paths of the report's links, with descriptions."""
+    """Links of the report: path of a file in the loop's folder, and its description."""

@@ -1,7 +1,8 @@
 """The stages of a loop: train, judge, record, diagnose, fit, fine-tune, judge again, replay.
 
-`plan` lists the stages of a kind of loop; each function below returns one `Stage`, whose work runs
-in its own folder.
+The loop (`suite loop`) flies a policy, corrects the simulation from these flights, fine-tunes the
+policy in it and compares the policies, which are called variants. `plan` lists the stages of a kind
+of loop. Each function below returns one `Stage`, whose work runs in its own folder.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ from tracks.common.files import replacing_folder, write_json
 from tracks.common.work import Workers
 
 DIAGNOSED_S = 80.0
-"""Approximate length of the diagnosed flights, in turn from all tracks and levels [s]."""
+"""Approximate total length of the flights that are diagnosed [s]."""
 INPUT_SOURCE = "commands"
-"""Input of the diagnosed model: the judge's rate loop is that of the vehicle file. With rotor
-speeds as input, a wrong torque diverges within a second."""
+"""What drives the simulation in the diagnosis: the recorded commands, since the rate loop of the
+flights is that of the vehicle file. With the recorded rotor speeds a wrong torque would make the
+simulated flights diverge within a second."""
 DIAGNOSIS = Estimate(90.0, 1.5e9)
 """Time and memory of a diagnosis."""
 PHYSICS_HZ = 200.0
@@ -65,12 +67,12 @@ class LoopRun:
     console: Console
     """Shows progress."""
     workers: Workers | None = None
-    """Processes of flights and fine-tunings; None flies in as many processes as shorten the work
-    and fine-tunes one policy after the other."""
+    """Number of processes (or a cluster) that fly and fine-tune. None: as many processes as shorten
+    the flights, and one fine-tuning after the other."""
 
     @property
     def logs(self) -> Path:
-        """The folder of the flights for fits and diagnosis."""
+        """The folder of the flights that fits and the diagnosis use."""
         return self.out / ("measured" if self.loop.hidden else "flights")
 
     def policy(self, variant: Variant) -> Path:
@@ -79,7 +81,7 @@ class LoopRun:
         return self.out / (f"tuned-{variant.name}" if variant.tuned else first) / "policy"
 
     def tuning(self, diagnosed: bool) -> TrainConfig:
-        """Return the settings of the fine-tuning, with the corrected vehicle if `diagnosed`."""
+        """Return the settings of a fine-tuning; if `diagnosed`, with the corrected vehicle file."""
         tuning = self.config.tuning
         if not diagnosed or tuning.quadrotor is None:
             return tuning
@@ -104,7 +106,7 @@ def plan(run: LoopRun) -> list[Stage]:
 
 
 def _first_policy_stage(run: LoopRun) -> Stage:
-    """Return the stage that trains the first policy, or copies a shipped one or a checkpoint."""
+    """Return the stage that trains the first policy, or copies the given one."""
     config, policy = run.config, run.config.policy
     if policy is None:
         assert isinstance(config, DeltaLoopConfig)
@@ -128,7 +130,7 @@ def _estimate_flights(run: LoopRun, trials: int, simulator: str) -> Estimate:
 
 
 def _evaluation(run: LoopRun, variant: Variant) -> Evaluation:
-    """Return the request to judge a variant's policy."""
+    """Return the settings of the trials of a variant's policy."""
     config = run.config
     return Evaluation(
         policies=(str(run.policy(variant)),),
@@ -242,7 +244,7 @@ def read_diagnosis(out: Path) -> dict[str, Any]:
 
 
 def named_effects(diagnosis: Mapping[str, Any]) -> str:
-    """Return the effects that diagnosis.json names, with their alternatives, as text."""
+    """Return the effects that a diagnosis names as text, with alternatives ("A (or B), C")."""
     texts = []
     for effect in diagnosis["effects"]:
         alternatives = ", ".join(effect["alternatives"])
@@ -276,12 +278,12 @@ def _fit_stage(run: LoopRun, model: DeltaModel) -> Stage:
 
 
 class Tuning(NamedTuple):
-    """A fine-tuning, with the content of its inputs."""
+    """A fine-tuning with its loaded inputs, so that a process on another machine can run it."""
 
     config: TrainConfig
-    """Its settings."""
+    """Settings of the fine-tuning."""
     start: Mapping[str, np.ndarray]
-    """The policy's parameters at its start."""
+    """Parameters of the policy at its start."""
     delta: Mapping[str, np.ndarray] | None
     """Parameters of the Delta Action network that corrects the actions; None without one."""
 
@@ -293,6 +295,7 @@ def _tuning_stage(run: LoopRun, variant: Variant) -> Stage:
     """
 
     def work(folder: Path) -> None:
+        # One process fine-tunes the policy of this stage only; the later stages do the others.
         parallel = run.workers is not None and run.workers != 1
         tuned = [v for v in run.loop.variants if v.tuned is not None] if parallel else [variant]
         jobs = [Job(_tuning(run, each), run.out / f"tuned-{each.name}") for each in tuned]
@@ -314,16 +317,18 @@ def _tuning(run: LoopRun, variant: Variant) -> Tuning:
 
 
 def _tune_policy(job: Job, console: Console) -> None:
+    """Run one fine-tuning in its folder; the work of a process."""
     tuning: Tuning = job.task
     start, delta = jax.tree.map(jnp.asarray, (tuning.start, tuning.delta))
     training.train(tuning.config, job.folder, console, start, delta)
 
 
 def _replay_stage(run: LoopRun) -> Stage:
-    """Return the stage that flies the first seed on every track again, for recording and pictures.
+    """Return the stage that flies a few trials again, for the recording and the pictures.
 
-    It does so at the easiest and the hardest level. Trials are selected by their seed, not by their
-    result; in the recording each is followed by the same trial of the other policy.
+    They are the first trial of every track at the easiest and the hardest level, so they are not
+    selected by their results. In the recording each trial of the first policy is followed by the
+    same trial of the other one.
     """
     by_name = {variant.name: variant for variant in run.loop.variants}
     evaluation = _evaluation(run, by_name[BEFORE])

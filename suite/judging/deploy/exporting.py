@@ -1,7 +1,7 @@
 """Export a policy to other formats (`suite export`).
 
-An export in C is compiled and compared with the original policy (parity); a card, a Markdown page
-next to it, has the largest difference and the time per step.
+An export in C is compiled, and its actions are compared with those of the original policy (parity).
+A card, a Markdown page next to the export, has the largest difference and the time per step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NOTE = "exports.json"
 def export(
     policy: str, out: Path, formats: Sequence[str], dtype: str, console: Console
 ) -> dict[str, Any]:
-    """Export a policy of the suite in `formats`; C with a card of parity and time per step.
+    """Export a policy of the suite in `formats`; an export in C gets a card.
 
     Args:
         policy: a shipped name or a checkpoint's folder.
@@ -40,7 +40,7 @@ def export(
         console: shows progress and the parity.
 
     Returns:
-        `written`, the files; for C also `parity`.
+        `written`, the paths of the files; for C also `parity`, the result of the comparison.
 
     Raises:
         ValueError: if the policy is not the suite's, a format or type is unknown, or an export of
@@ -59,6 +59,7 @@ def export(
         check_no_input(out / CARD, [shipped.locate(policy) / CARD], "--out")
     name, checkpoint = exported_checkpoint(policy)
     _record_source(policy, out, [main_file(name, each) for each in formats], checkpoint.seed)
+    # Inputs in flight set the scales of the activations in 8 bits.
     observed = None
     if dtype == "int8":
         console.note("flying 10 random tracks to measure the activations")
@@ -75,8 +76,8 @@ def export(
 def _record_source(policy: str, out: Path, files: Sequence[str], seed: int | None) -> None:
     """Record `policy` as the source of `files`, or refuse to overwrite those of another policy.
 
-    File names do not show the policy: every training calls its checkpoint policy/, and the names of
-    C files are fixed.
+    The record is needed because file names do not show the policy: every training calls its
+    checkpoint policy/, and the names of C files are fixed.
 
     Raises:
         ValueError: naming the file and what to do.
@@ -96,7 +97,7 @@ def _record_source(policy: str, out: Path, files: Sequence[str], seed: int | Non
 
 
 def _read_sources(path: Path) -> dict[str, dict[str, str]]:
-    """Return source and SHA-256 of each recorded export; none without the file."""
+    """Return the source policy and its SHA-256 for each exported file; {} without a record."""
     if not path.is_file():
         return {}
     try:
@@ -106,6 +107,7 @@ def _read_sources(path: Path) -> dict[str, dict[str, str]]:
 
 
 CARD = "card.md"
+"""Name of the card in the folder of a policy or an export."""
 _LICENCE = "Apache-2.0, as diffracing-suite; the weights may have another licence from their author"
 
 
@@ -115,10 +117,10 @@ def card_text(
     """Return the card of an export as Markdown.
 
     Args:
-        source: the policy as the user named it.
+        source: the name or path of the policy that the user gave.
         name: the name of the export.
         checkpoint: the exported policy.
-        dtype: type of the weights.
+        dtype: type of the weights, float32 or int8.
         result: parity with the checkpoint, and time per step.
     """
     spec = checkpoint.spec
@@ -145,13 +147,14 @@ def card_text(
 
 
 def _success_rates(source: str) -> str:
-    """Return the success rates in the policy's own card, or a line that they are unknown."""
+    """Return the table of success rates in the card of the policy, or a line that has none."""
     path = shipped.locate(source) / "card.md"
     text = Path(path).read_text(encoding="utf-8") if path.is_file() else ""
     lines = text.splitlines()
     headers = [k for k, line in enumerate(lines) if line.startswith("|") and "success" in line]
     if not headers:
         return "Success rate: unknown; `suite eval --policy . --trust` measures it.\n"
+    # The first table with a column of success, to its last line.
     first = headers[0]
     last = next((k for k in range(first, len(lines)) if not lines[k].startswith("|")), len(lines))
     table = "\n".join(lines[first:last])

@@ -1,6 +1,7 @@
 """Measure the time of a policy's single steps on one thread, in C, ONNX Runtime and torch.
 
-The engines run in turn, in blocks of steps, so that all see the same load of the machine.
+A step is one decision of the policy. The three ways to run a policy are called engines. They run in
+turn, in blocks of steps, so that the load of the machine affects all of them alike.
 """
 
 from __future__ import annotations
@@ -17,26 +18,26 @@ from policies.formats.policy_file import PolicyCheckpoint
 from policies.spec import PolicySpec
 
 Step = Callable[[], Any]
-"""Makes one step on fixed inputs, with memory; may return the action (1, 3)."""
+"""Makes one step on fixed inputs, and keeps the policy's memory; may return the action (1, 3)."""
 BLOCK = 100
-"""Steps of one engine before the next engine."""
+"""Number of timed steps of one engine before the next engine runs."""
 WARM = 10
-"""Untimed steps before a block, which load the weights into the processor's cache."""
+"""Number of untimed steps before a block, which load the weights into the processor's cache."""
 
 
 class Timing(NamedTuple):
     """Times of single steps [s]."""
 
     median_s: float
-    """Median."""
+    """Median [s]."""
     p99_s: float
-    """99th percentile."""
+    """99th percentile [s]."""
     max_s: float
-    """Longest step, which includes interruptions by the operating system."""
+    """Longest time [s]; it includes interruptions by the operating system."""
 
 
 def time_in_turn(steps: Mapping[str, Step], rounds: int = 20) -> dict[str, Timing]:
-    """Return the times of every engine, block by block in turn."""
+    """Return the times of the engines `steps`, which run in turn for `rounds` blocks each."""
     times: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(rounds):
         for name, step in steps.items():
@@ -54,7 +55,7 @@ def _timing(seconds: np.ndarray) -> Timing:
 
 
 def c_step(policy: CPolicy) -> Step:
-    """Return a step of a policy.c, called as on a flight controller."""
+    """Return a step of a policy in C, whose functions are called as on a flight controller."""
     state, image = _inputs(policy.spec)
     memory, action = policy.start(1), np.zeros((1, 3), np.float32)
     arrays = (memory, state, image, action)
@@ -65,13 +66,16 @@ def c_step(policy: CPolicy) -> Step:
 
     def step() -> np.ndarray:
         function(*pointers)
-        return arrays[-1]  # keeps all four alive as long as the pointers
+        return arrays[-1]  # this use of `arrays` keeps their memory as long as the pointers
 
     return step
 
 
 def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
-    """Return a step of ONNX Runtime on one thread, as usual and with memory bound beforehand."""
+    """Return two steps of ONNX Runtime on one thread.
+
+    The first is the usual call. The second has all inputs and outputs bound to memory beforehand.
+    """
     import onnxruntime
 
     from policies.formats.export import onnx_file
@@ -89,15 +93,15 @@ def onnx_steps(checkpoint: PolicyCheckpoint) -> tuple[Step, Step]:
     for name, value in (("action", np.zeros((1, 3), np.float32)), ("hidden_next", hidden)):
         binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(value))
 
-    def run() -> Any:
+    def usual_step() -> Any:
         action, feed["hidden"] = session.run(None, feed)
         return action
 
-    return run, lambda: session.run_with_iobinding(binding)
+    return usual_step, lambda: session.run_with_iobinding(binding)
 
 
 def torch_step(checkpoint: PolicyCheckpoint) -> Step:
-    """Return a step of the torch module, eager; the caller sets torch's threads."""
+    """Return a step of the torch module, uncompiled; the caller sets the number of threads."""
     import torch
 
     from policies.formats.torch_twin import torch_twin
@@ -115,7 +119,7 @@ def torch_step(checkpoint: PolicyCheckpoint) -> Step:
 
 
 def _inputs(spec: PolicySpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return a random state (1, state_size) and image (1, height, width)."""
+    """Return random inputs of a policy: a state vector (1, state_size), an image (1, H, W)."""
     rng = np.random.default_rng(0)
     state = rng.normal(size=(1, spec.state_size)).astype(np.float32)
     size = (1, spec.camera.height, spec.camera.width)

@@ -1,7 +1,8 @@
-"""Measure the parity of a C export: the differences of its actions from the original policy's.
+"""Measure the parity of an export in C: how much its actions differ from those of the policy.
 
-Both get the same observations, and keep their recurrent memory over many steps. An int8 export
-needs observations from simulated flights, which also set the scales of its activations.
+Both get the same observations, and keep their recurrent memory over many steps. An export with
+weights of 8 bits (int8) needs observations from simulated flights, which also set the scales of its
+activations.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ STEPS = 1000
 
 
 class Parity(NamedTuple):
-    """Differences of an export and its policy on the same inputs, each with its own memory."""
+    """Differences between the actions of an export and of its policy, on the same inputs."""
 
     steps: int
-    """Number of steps; 0 if there is no compiler and nothing was measured."""
+    """Number of compared steps; 0 if there is no compiler and nothing was measured."""
     given: str
-    """Description of the observations."""
+    """Description of the inputs, the observations."""
     worst: float
-    """Largest difference of an action's component [m/s^2]."""
+    """Largest difference of a component of an action [m/s^2]."""
     median: float
-    """Median difference [m/s^2]."""
+    """Median of these differences [m/s^2]."""
     timing: Timing | None
-    """Times of a step on this machine."""
+    """Times of a step of the export on this machine; None if nothing was measured."""
 
     @property
     def sentence(self) -> str:
@@ -59,10 +60,10 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
     Args:
         folder: has policy.c and policy.h.
         checkpoint: the exported policy.
-        observed: inputs of both; None draws them at random.
+        observed: the inputs of both; None draws them at random.
 
     Raises:
-        PolicyError: if it does not compile.
+        PolicyError: if the export does not compile, or computes numbers that are not finite.
     """
     given = "on flights" if observed else "inputs drawn at random"
     if find_compiler() is None:
@@ -80,16 +81,16 @@ def parity(folder: Path, checkpoint: PolicyCheckpoint, observed: Observed | None
 
 
 TRACK = "random"
-"""Family of the observed flights: that of the training, so that the tracks of the result tables do
-not set an export's scales."""
+"""Family of the flights whose inputs are recorded. It is that of the training, so that the tracks
+of the results tables do not affect an export."""
 LEVELS = tuple(range(10))
-"""Their levels of difficulty, one flight each."""
+"""Levels of difficulty of these flights, one flight each."""
 SEED = 900_000
-"""Seed of the first flight; no result table uses it."""
+"""Seed of the first of these flights; no results table uses it."""
 
 
 class Recorder:
-    """A policy that records its inputs, for all flights that the judge runs at once."""
+    """A policy that records its inputs in all flights, which the judge flies at once as a batch."""
 
     def __init__(self, policy: Policy) -> None:
         """Record the inputs of `policy`."""
@@ -118,7 +119,11 @@ class Recorder:
         return self._policy.act(hidden, state, image, fresh)
 
     def observed(self) -> Observed:
-        """Return all inputs, flight by flight, without those after a flight's end (zeros)."""
+        """Return the recorded inputs, one flight after the other.
+
+        Inputs after the end of a flight are left out; the state vector is then zero.
+        """
+        # (flights, steps, ...)
         state, image, fresh = (np.stack(each, 1) for each in zip(*self._inputs, strict=True))
         is_flying = np.abs(state).max(-1) > 0
         arrays: list[Any] = [x[is_flying] for x in (state, image, fresh)]

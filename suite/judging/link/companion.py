@@ -1,9 +1,9 @@
 """The companion computer of a vehicle: runs the policy on received states and images.
 
-It answers the newest state with a set point (body rates and thrust) at once, after a decision of
-the policy if one is due. It has the track and counts the passed gates itself. If a check of the
-watchdog fails, it hands over: it stops sending set points, and the autopilot takes control. The
-clock is an argument, for tests.
+It answers the newest state at once with a set point, the wanted body rates and thrust. If a
+decision of the policy is due, the policy decides before. The companion knows the track and counts
+the passed gates itself. If a check of the watchdog fails, it hands over: it stops sending set
+points, and the autopilot takes control. The clock is an argument, for tests.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 FINISHED = "all gates passed"
-"""The reason of the hand-over after a complete flight."""
+"""Reason of the handover after a complete flight."""
 _SLACK_S = 1e-3
-"""A decision is due this much earlier, because time stamps are rounded [s]."""
+"""How much too early a decision may be [s], because time stamps are rounded."""
 
 
 class Companion:
-    """One flight of a policy on a track."""
+    """One flight of a policy on a track: receives datagrams, and returns those to send."""
 
     def __init__(
         self,
@@ -70,8 +70,8 @@ class Companion:
         Args:
             policy: the policy.
             track: gates and start, in the frame of the vehicle's states.
-            vehicle: has mass, thrust and attitude gains.
-            wire: this end of the link.
+            vehicle: the vehicle, for its mass, thrust and attitude gains.
+            wire: converts messages to datagrams and back.
             clock: returns monotonic time [s].
             limits: limits of the watchdog; None: the defaults.
 
@@ -99,10 +99,10 @@ class Companion:
         self._start_s, self._next_decision, self._late_in_row = 0.0, 0, 0
         self._last: State | None = None
         self.gate = 0
-        """Number of passed gates, the index of the next one."""
+        """Number of passed gates, which is the index of the next one."""
         self.late_answers = self.bad_actions = self.missed_decisions = 0
         self.over: str | None = None
-        """The reason of the hand-over, once it has happened."""
+        """Reason of the handover; None before it."""
         self.rows: list[Row] = []
         self.events: list[str] = []
 
@@ -113,7 +113,7 @@ class Companion:
 
     @property
     def wrong_image_size(self) -> str:
-        """A message about depth images of another size than the policy's; empty without any."""
+        """A message if depth images have another size than those of the policy, else ""."""
         if self._assembler.other_size is None:
             return ""
         camera, (width, height) = self._policy.spec.camera, self._assembler.other_size
@@ -125,6 +125,7 @@ class Companion:
     def receive(self, datagrams: list[bytes]) -> list[bytes]:
         """Return the datagrams to send after receiving `datagrams` (may be none)."""
         arrival_s = self._clock()
+        # Decode the messages, and record how many were left out.
         broken, foreign = self._wire.broken, self._wire.foreign
         messages = self._wire.decode(datagrams)
         new_counts = {
@@ -137,6 +138,8 @@ class Companion:
         for message in messages:
             if isinstance(message, Packet):
                 self._add_packet(message)
+        # Hand over after a silence, else answer the states. If states were waiting after a silence,
+        # the vehicle sent them in time, and this computer stood still.
         states = [message for message in messages if isinstance(message, State)]
         silent_s = arrival_s - self._state_arrival_s
         if self.flying and silent_s > self._limits.silence_s:
@@ -153,10 +156,11 @@ class Companion:
         return self._wire.encode(Heartbeat())
 
     def end(self, reason: str) -> list[bytes]:
-        """Return the datagrams of a hand-over for `reason`; none after an earlier one."""
+        """Hand over for `reason`; return the datagrams to send, none after an earlier handover."""
         return self._hand_over(reason) if self.over is None else []
 
     def _record_event(self, text: str) -> None:
+        """Add a text with its time to the events, which the flight log has."""
         self.events.append(f"{self._clock():.3f}: {text}")
 
     def _hand_over(self, reason: str) -> list[bytes]:
@@ -166,7 +170,7 @@ class Companion:
         return [self._wire.encode(OperatorText(f"policy hands over: {reason}"))]
 
     def _add_packet(self, packet: Packet) -> None:
-        """Add a packet of an image, and record the first announcement of a wrong image size."""
+        """Add a packet of an image; record when an image with another wrong size is announced."""
         size_before = self._assembler.other_size
         image = self._assembler.add(packet)
         if self._assembler.other_size != size_before:
@@ -176,6 +180,7 @@ class Companion:
 
     def _answer(self, states: list[State]) -> list[bytes]:
         """Check all received states, and answer only the newest one."""
+        # Checks of states, clock and image.
         for state in states:
             fault = state_fault(state, self._box, self._limits)
             if fault:
@@ -189,12 +194,13 @@ class Companion:
             return self._hand_over(f"no image for {self._limits.image_age_s:g} s")
         if self._depth is None or is_image_old:
             return []
+        # The flight begins with the first state for which there is an image.
         if self._last is None:
             states = states[-1:]
             self._start_s = states[0].time_s
             self._heading_w = level_heading(quat_to_rot(states[0].quat_wxyz)[None])
             self._record_event("begun")
-        # States that arrived out of order are left out.
+        # Count gates along all new states; states that arrived out of order are left out.
         new = [s for s in states if self._last is None or s.time_s > self._last.time_s]
         for state in new:
             fault = self._last and jump_fault(self._last, state, self._limits)
@@ -206,7 +212,7 @@ class Companion:
         return self._fly(new[-1]) if new else []
 
     def _count_gates(self, state: State) -> None:
-        """Count the next gate if the path from the last state to this one crosses its opening."""
+        """Count the next gate if the path from the last state to `state` crosses its opening."""
         if self._last is not None:
             center_w, rot_w, opening_g = (x[self.gate] for x in self._gates[:3])
             passed, _ = crossing(center_w, rot_w, opening_g, self._last.pos_w, state.pos_w)
@@ -215,7 +221,8 @@ class Companion:
 
     def _fly(self, state: State) -> list[bytes]:
         """Return the set point for a state, after a decision of the policy if one is due."""
-        # One period of the autopilot at the first state, as in simulated trials.
+        # Time since the last set point. At the first state it is one period of the autopilot, as in
+        # simulated trials.
         since_s = state.time_s - self.rows[-1].state.time_s if self.rows else 1.0 / ATTITUDE_HZ
         decided = self._is_due(state)
         rot_w = quat_to_rot(state.quat_wxyz)[None]
@@ -223,6 +230,7 @@ class Companion:
         fault = self._decide(state, rot_w) if decided else None
         if fault:
             return self._hand_over(fault)
+        # From the action to thrust and body rates; the heading follows the next gate.
         to_gate_w = self._gates.center_w[None, self.gate] - state.pos_w
         self._heading_w = blend_heading(self._heading_w, to_gate_w, since_s)
         command = unpack_command(self._action_b)
@@ -244,9 +252,9 @@ class Companion:
         return [datagram]
 
     def _is_due(self, state: State) -> bool:
-        """Return whether a decision is due at a state; missed decisions are not repeated.
+        """Return whether a decision is due at a state; missed decisions are not made up for.
 
-        The policy's memory assumes a fixed time between decisions: several at once after a gap
+        The memory of the policy assumes a fixed time between decisions. Several decisions at once
         would count as more time than has passed.
         """
         since_s = state.time_s - self._start_s + _SLACK_S
@@ -259,6 +267,7 @@ class Companion:
 
     def _decide(self, state: State, rot_w: np.ndarray) -> str | None:
         """Update the action by a decision of the policy; return a reason to hand over, or None."""
+        # Observe.
         depth = self._depth
         assert depth is not None
         count = len(self._gates.center_w)
@@ -273,6 +282,7 @@ class Companion:
         state_b, image = (
             np.asarray(x, np.float32) for x in observe(self._policy.spec, view, self._action_b)
         )
+        # Decide, and limit the action as the judge does.
         fresh = np.array([self._fresh])
         limits = ActionLimits(deadline_s=self._limits.deadline_s)
         limits = limits_of(limits, self._policy.spec.action, self._vehicle)
@@ -280,7 +290,7 @@ class Companion:
             answer, self._hidden = self._policy.act(self._hidden, state_b, image, fresh)
             duration_s = self._clock() - self._state_arrival_s
             guarded = guard_action(limits, answer, self._action_b, duration_s, self._policy.name)
-        except Exception as error:  # on any error the vehicle must be handed over
+        except Exception as error:  # after any error the autopilot must take control
             return f"the policy failed: {type(error).__name__}: {error}"
         self._action_b, self._fresh = guarded.action_b, False
         late = bool(guarded.late[0])
@@ -303,6 +313,7 @@ class Row(NamedTuple):
     """State, decision and set point of the companion at one time."""
 
     state: State
+    """The vehicle's state that was answered."""
     thrust: float
     """Wanted collective thrust per mass [m/s^2]."""
     rate_b: np.ndarray
@@ -312,10 +323,11 @@ class Row(NamedTuple):
     decided: bool
     """Whether the policy decided on this state."""
     gate: int
-    """Number of the next gate."""
+    """Index of the next gate."""
     answered_s: float
     """Time from the state's arrival to its set point [s]."""
     state_age_s: float
-    """Time from the state's stamp to its set point, if both ends have one clock [s]."""
+    """Time from the state's time stamp to its set point [s]. It is valid only if both ends of the
+    link have the same clock."""
     image_age_s: float
-    """Time from the image's arrival to the decision [s]."""
+    """Time from the arrival of the image to the decision [s]."""

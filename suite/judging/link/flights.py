@@ -1,7 +1,8 @@
-"""Fly over the link in real time: many trials with a simulated vehicle, or one with a real one.
+"""Fly over the link in real time: many trials with a simulated vehicle, or one with a real vehicle.
 
-A trial is one flight on a track that a seed determines. The companion runs the policy and its
-checks; this module exchanges its datagrams, writes its logs and summarises its delays.
+A trial is one flight on a track that a seed determines. The companion (`companion.py`) runs the
+policy and its checks. This module exchanges its datagrams with the vehicle, writes its logs and
+computes statistics of its delays.
 """
 
 from __future__ import annotations
@@ -31,24 +32,24 @@ from suite.judging.link.watchdog import Limits
 from suite.judging.trials import TrialSet, log_name
 
 HEARTBEAT_S = 1.0
-"""Period of the companion's heartbeat [s]."""
+"""Time between heartbeats of the companion [s]."""
 POLL_S = 0.002
-"""Period of the watchdog without messages [s]."""
+"""Longest wait for messages, after which the watchdog checks the times [s]."""
 AFTER_S = 0.5
-"""Time for the vehicle's process to report the end after the last gate [s]."""
+"""Time that the vehicle's process has to report the end of a trial after the last gate [s]."""
 
 
 class Flight(NamedTuple):
     """One flight over the link."""
 
     row: dict[str, Any]
-    """Its result, a row of fly.json."""
+    """Result of the flight, a row of fly.json."""
     rows: list[Row]
-    """Its states and set points."""
+    """States and set points of the flight."""
 
 
 def warm_up(policy: Policy) -> None:
-    """Run a policy a few times, so that nothing is compiled in flight."""
+    """Run a policy a few times before a flight, so that nothing is compiled in flight."""
     spec = policy.spec
     size = (1, spec.camera.height, spec.camera.width)
     observation = Observation(
@@ -62,7 +63,16 @@ def warm_up(policy: Policy) -> None:
 def fly_simulated(
     policy: Policy, trial_set: TrialSet, rules: Rules, limits: Limits, out: Path, console: Console
 ) -> Iterator[Flight]:
-    """Fly every trial with a simulated vehicle on the loopback interface, in real time."""
+    """Fly every trial in real time with a simulated vehicle on this machine, and yield the flights.
+
+    Args:
+        policy: the policy.
+        trial_set: trials, tracks and vehicle.
+        rules: when a trial ends.
+        limits: limits of the companion's watchdog.
+        out: folder of the logs.
+        console: shows progress.
+    """
     warm_up(policy)
     vehicle, successes = VehicleProcess(), 0
     try:
@@ -86,6 +96,7 @@ def _fly_trial(
     vehicle: VehicleProcess,
 ) -> Flight:
     """Fly one trial with the vehicle's process, and write the companion's log into `out`."""
+    # Open both ends of the link.
     wire, track = Wire(COMPANION, VEHICLE), track_of(trial_set.tracks, trial)
     link = UdpLink("udpin:127.0.0.1:0", wire.is_from_peer)
     try:
@@ -97,6 +108,7 @@ def _fly_trial(
                 track, trial, trial_set.vehicle, rules, camera, rate_hz, address, policy.name
             )
         )
+        # Fly until the trial ends or the companion hands over.
         result = None
         with _no_garbage_collection():
             while result is None and companion.over is None:
@@ -134,7 +146,8 @@ def fly_link(
 ) -> None:
     """Fly a vehicle at the other end of `link` until the companion hands over.
 
-    It also ends if no vehicle answers within `wait_s`. After an interrupt no set point is sent.
+    It also ends if no vehicle answers within `wait_s` [s]. After an interrupt (Ctrl-C) no set point
+    is sent.
     """
     begin_s, heartbeat_s = clock(), -math.inf
     with _no_garbage_collection():
@@ -148,7 +161,10 @@ def fly_link(
 
 
 def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | None:
-    """Write a flight's log into `out` and return its name; None if it is too short."""
+    """Write a flight's log into `out` and return its name; None if it is no valid flight log.
+
+    `about` has the track, level and seed, and is stored in the log.
+    """
     log = log_of(companion, about)
     name = log_name(about["track"], about["difficulty"], about["seed"])
     try:
@@ -161,7 +177,7 @@ def write_log(companion: Companion, about: dict[str, Any], out: Path) -> str | N
 
 
 def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
-    """Return the summary of all flights."""
+    """Return the sums over all flights, and statistics of their delays, for fly.json."""
     rows = [row for flight in flights for row in flight.rows]
     return {
         "trials": len(flights),
@@ -176,7 +192,7 @@ def totals(flights: list[Flight], limits: Limits) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, which would stop a flight for milliseconds."""
+    """Disable Python's garbage collector, which would stop the companion for milliseconds."""
     gc.collect()
     gc.disable()
     try:
@@ -216,13 +232,13 @@ def delays(rows: list[Row], deadline_s: float) -> dict[str, Any]:
 
 
 def log_of(companion: Companion, about: dict[str, Any]) -> FlightLog | None:
-    """Return the companion's log of a flight; None with fewer than two states."""
+    """Return the log of the companion's flight; None with fewer than two states."""
     rows = companion.rows
     if len(rows) < 2:
         return None
-    first = rows[0].state.time_s
+    start_s = rows[0].state.time_s
     flight = recorded.Flight(
-        time_s=np.array([row.state.time_s - first for row in rows]),
+        time_s=np.array([row.state.time_s - start_s for row in rows]),
         pos_w=np.stack([row.state.pos_w for row in rows]),
         quat_wxyz=np.stack([row.state.quat_wxyz for row in rows]),
         vel_w=np.stack([row.state.vel_w for row in rows]),

@@ -1,7 +1,8 @@
 """The work of `suite fly`: fly a policy over a MAVLink link, simulated or to a real vehicle.
 
-Simulated flights are compared with the same trials of the judge, which flies policies in MuJoCo
-without a link and scores them.
+The link connects the vehicle with the companion, which runs the policy. Simulated flights are
+compared with the same trials of the judge, which flies policies in MuJoCo without a link and scores
+them. The companion hands over when it stops sending commands; then the autopilot flies alone.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ class LinkFlights:
     """The settings of flights over a link, for run.json."""
 
     evaluation: Evaluation
-    """The trials."""
+    """Settings of the trials."""
     policy: dict[str, Any]
-    """Name, source and digest of the policy."""
+    """Name, source and SHA-256 of the policy."""
     limits: Limits
     """Limits of the watchdog."""
     link: str
-    """The address, or "simulated"."""
+    """Address of the real vehicle, or "simulated"."""
 
 
 def fly_over_link(
@@ -69,7 +70,7 @@ def fly_over_link(
     """Fly, and write logs and fly.json into `out`.
 
     Args:
-        evaluation: the trials.
+        evaluation: settings of the trials.
         policy: a name or path; "" flies the default policy.
         link: address of a real vehicle; "" flies simulated ones.
         limits: limits of the watchdog.
@@ -91,14 +92,15 @@ def fly_over_link(
     # The commanded speed is part of how the policy is loaded; the monitor is added below.
     (plain,) = manners(evaluation.speed, monitor=False)
     loaded = load_in_manner(name, evaluation.trust, plain)
-    # One vehicle needs no block of 64 rows; the judge keeps blocks, for equal rounding.
+    # Some policies compute blocks of 64 rows (drones) at once, so that rounding does not depend on
+    # the number of drones. The judge needs that; one vehicle needs one row only.
     flying = for_one_row(loaded) if isinstance(loaded, BlockPolicy) else loaded
     if evaluation.monitor:
         loaded, flying = Monitored(loaded), Monitored(flying)
     settings = LinkFlights(evaluation, policy_record(name, loaded), limits, link or "simulated")
     refuse_other_run(out, settings)
     rules = Rules(time_limit_s=evaluation.time_limit_s)
-    # Before the flights, since the judge may refuse the policy.
+    # The judge's trials come before the flights, since the judge may refuse the policy.
     judged = [] if link else _judged_successes(loaded, trial_set, rules)
     out.mkdir(parents=True, exist_ok=True)
     interrupt = None
@@ -126,7 +128,7 @@ def fly_over_link(
 
 
 def _judged_successes(policy: Policy, trial_set: TrialSet, rules: Rules) -> list[bool]:
-    """Return whether the judge's flight of each trial succeeds."""
+    """Fly the trials in the judge, without a link; return whether each one succeeds."""
     from eval.judging.judge import JudgeOptions, fly
 
     trials, tracks = trial_set.trials, trial_set.tracks
@@ -197,7 +199,7 @@ def _fly_real_vehicle(
 
 
 def _show_results(results: dict[str, Any], flights: list[Flight], console: Console) -> None:
-    """Print the delays as a table, the successes, and the reasons of hand-overs."""
+    """Print the delays as a table, the number of successes, and the reasons of handovers."""
     headers = ("delay", "median [ms]", "p99 [ms]", "longest [ms]")
     names = {
         "answer_ms": "state's arrival to set point",
@@ -226,6 +228,7 @@ def _show_results(results: dict[str, Any], flights: list[Flight], console: Conso
 
 
 def _warn_of_missed_decisions(count: int, console: Console) -> None:
+    """Print a warning with the probable reasons, if decisions were missed."""
     if count:
         console.note(
             f"warning: {count} decisions were missed: no state arrived in time (send ODOMETRY "

@@ -10,12 +10,13 @@ The link connects the vehicle with the companion computer, which runs the policy
 | text for the operator | STATUSTEXT (253) |
 | heartbeat of the companion | HEARTBEAT (0) |
 
-MAVLink has no message for depth images (OBSTACLE_DISTANCE is 72 distances in a plane). Its image
-transmission is made for small images: 24 x 32 pixels need seven packets. A lost packet loses only
-its image.
+MAVLink has no message for depth images (OBSTACLE_DISTANCE has 72 distances in a plane). So they are
+sent with its transmission of small images, in packets: 24 x 32 pixels need seven. If a packet is
+lost, only its image is lost.
 
-MAVLink's world frame is NED (north, east, down) and its body frame FRD (forward, right, down); ours
-are z up and FLU (forward, left, up). Both conversions are the same half turn about x.
+The world frame of MAVLink is NED (north, east, down) and its body frame is FRD (forward, right,
+down). Those of the suite are z up and FLU (forward, left, up). Both conversions are the same half
+turn about x.
 """
 
 from __future__ import annotations
@@ -35,34 +36,34 @@ from tracks.geometry.rotation import quat_to_rot, to_local, to_world
 from tracks.input.reading import read_bytes, reason
 
 PACKET = 253
-"""Image bytes in one message."""
+"""Number of bytes of an image in one message."""
 MOST_PACKETS = 65535
-"""Most packets of an image."""
+"""Largest number of packets of an image."""
 IGNORE_ATTITUDE = 128
-"""Bit of SET_ATTITUDE_TARGET's type mask."""
+"""Bit in the type mask of SET_ATTITUDE_TARGET: only rates and thrust are commanded."""
 SIGNING_EPOCH_S = 1420070400
 """Beginning of 2015, the epoch of MAVLink's signatures [s]."""
 LOCAL_NED, BODY_FRD = 1, 12
-"""MAVLink's numbers of the frames."""
+"""Numbers of the two frames in MAVLink."""
 _HEAD = b"P5\n%d %d\n65535\n"
 """Header of a 16-bit PGM image: width and height."""
 
 
 class State(NamedTuple):
-    """The vehicle's measured state; arrays in our frames."""
+    """The vehicle's measured state; arrays in the frames of the suite."""
 
     time_s: float
-    """Time of the vehicle's clock [s]."""
+    """Time of the measurement on the vehicle's clock [s]."""
     pos_w: np.ndarray
-    """(3,) [m]."""
+    """(3,) position [m]."""
     quat_wxyz: np.ndarray
-    """(4,) body to world."""
+    """(4,) attitude, body to world."""
     vel_w: np.ndarray
-    """(3,) [m/s]."""
+    """(3,) velocity [m/s]."""
     rate_b: np.ndarray
-    """(3,) [rad/s]."""
+    """(3,) body rates [rad/s]."""
     resets: int = 0
-    """The vehicle's counter of jumps of its estimate."""
+    """How often the vehicle's state estimator has reset its estimate, which then jumps."""
     fault: str = ""
     """Reason for which the message cannot be used, or ""."""
 
@@ -83,28 +84,29 @@ class OperatorText(NamedTuple):
 
 
 class Heartbeat(NamedTuple):
-    """A heartbeat of the companion; a waiting vehicle learns its address from it."""
+    """A heartbeat of the companion, from which a waiting vehicle gets its address."""
 
 
 class Packet(NamedTuple):
-    """A packet of an image, or the announcement of the image."""
+    """A packet of an image, or the announcement before the packets of an image."""
 
     number: int
-    """Number of the packet, from 0; -1 for the announcement."""
+    """Number of the packet, from 0; -1 for an announcement."""
     total: int
-    """Number of packets of the image, in an announcement; else 0."""
+    """Number of packets of the image in an announcement, else 0."""
     data: bytes
-    """Bytes of the image, or its width, height and size as three uint32."""
+    """Bytes of the image. In an announcement: width, height [pixel] and size [byte] of the image as
+    three uint32."""
 
 
 Message = State | SetPoint | OperatorText | Heartbeat | Packet
 
 
 def dialect() -> Any:
-    """Return pymavlink's module of the dialect.
+    """Return the module of pymavlink with the messages of the dialect `common`.
 
     Raises:
-        WorkFailed: where pymavlink is not installed.
+        WorkFailed: if pymavlink is not installed.
     """
     try:
         from pymavlink.dialects.v20 import common
@@ -116,7 +118,9 @@ def dialect() -> Any:
 
 
 def signing_key(path: Path | None) -> bytes | None:
-    """Return the key (32 bytes) of a file with a passphrase, as in ground stations; None without.
+    """Return the key (32 bytes) from a file with a passphrase, as in ground stations.
+
+    Without a file return None.
 
     Raises:
         ValueError: if the file cannot be read or is empty.
@@ -133,19 +137,19 @@ def signing_key(path: Path | None) -> bytes | None:
 
 
 class Wire:
-    """One end of a link: converts our values to bytes and back.
+    """One end of a link: converts messages of this module to datagrams and back.
 
-    Messages of other systems (`foreign`) and damaged ones (`broken`) are left out and counted.
+    Messages of other systems (`foreign`) and damaged ones (`broken`) are counted and left out.
     """
 
     def __init__(self, own: int, other: int, key: bytes | None = None) -> None:
         """Make an end of a link.
 
         Args:
-            own: MAVLink's system number of this end.
-            other: system number of the other end.
-            key: 32 bytes; with it messages are signed (MAVLink 2), and received messages that are
-                unsigned or repeated count as broken.
+            own: the MAVLink system number of this end.
+            other: the system number of the other end.
+            key: 32 bytes that sign the messages (MAVLink 2). With a key, received messages that are
+                unsigned or repeated count as broken. None: no signatures.
         """
         self._dialect = dialect()
         self._out = self._dialect.MAVLink(None, srcSystem=own, srcComponent=1)
@@ -214,43 +218,46 @@ class Wire:
         return decoded
 
     def _parse(self, datagram: bytes, keep: bool = True) -> tuple[list[Any], bool]:
-        """Return a datagram's messages, and whether it is truncated."""
-        # A new parser for each: a truncated message must not affect the next datagram.
+        """Return the MAVLink messages in a datagram, and whether the datagram is truncated.
+
+        With `keep` the time stamps of its signatures are remembered, to detect repeated messages.
+        """
+        # Each datagram has a new parser: a truncated message must not affect the next datagram.
         parser = self._dialect.MAVLink(None)
         parser.robust_parsing = True
         parser.signing = copy.deepcopy(self._signing)
         messages = parser.parse_buffer(datagram) or []
         if keep and not any(message.get_type() == "BAD_DATA" for message in messages):
-            # Time stamps of valid signatures only; a forged one must not change them.
+            # Only time stamps of valid signatures are kept; a forged message must not change them.
             self._signing = parser.signing
         return messages, parser.buf_len() > 0
 
     def _convert(self, message: Any) -> list[Message]:
-        """Return MAVLink's message as one of ours; none if its type is not used."""
-        kind = message.get_type()
-        if kind == "ODOMETRY":
+        """Return a MAVLink message as one of this module; an empty list if its type is not used."""
+        message_type = message.get_type()
+        if message_type == "ODOMETRY":
             return [_state_of(message)]
-        if kind == "SET_ATTITUDE_TARGET":
+        if message_type == "SET_ATTITUDE_TARGET":
             if message.target_system != self._own:
                 self.foreign += 1
                 return []
             rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
             return [SetPoint(flip_axes(rates), float(message.thrust))]
-        if kind == "STATUSTEXT":
+        if message_type == "STATUSTEXT":
             return [OperatorText(message.text)]
-        if kind == "DATA_TRANSMISSION_HANDSHAKE":
+        if message_type == "DATA_TRANSMISSION_HANDSHAKE":
             sizes = np.array([message.width, message.height, message.size], np.uint32)
             return [Packet(-1, message.packets, sizes.tobytes())]
-        if kind == "ENCAPSULATED_DATA":
+        if message_type == "ENCAPSULATED_DATA":
             return [Packet(message.seqnr, 0, bytes(message.data))]
         return []
 
 
 def _state_of(message: Any) -> State:
-    """Return an ODOMETRY as our state.
+    """Return the state in an ODOMETRY message, in the frames of the suite.
 
-    Autopilots differ in the frame of the velocity: PX4 sends LOCAL_NED since its version 1.14 and
-    BODY_FRD before.
+    Autopilots differ in the frame of the velocity. PX4 sends LOCAL_NED since version 1.14, and
+    BODY_FRD in earlier versions.
     """
     quat = flip_quat(message.q)
     norm = float(np.linalg.norm(quat))
@@ -276,7 +283,10 @@ def _state_of(message: Any) -> State:
 
 
 def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
-    """Return a planar depth image (H, W) [m] as packets; depths of `range_m` and more become 0."""
+    """Return a planar depth image (H, W) [m] as packets, the announcement first.
+
+    Depths of `range_m` and more become 0, "no depth".
+    """
     height, width = depth_m.shape
     millimetres = np.where(depth_m < range_m, np.rint(depth_m * 1e3), 0).clip(0, 65535)
     data = _HEAD % (width, height) + millimetres.astype(">u2").tobytes()
@@ -287,7 +297,7 @@ def image_packets(depth_m: np.ndarray, range_m: float) -> list[Packet]:
 
 
 class ImageAssembler:
-    """Assembles received packets to depth images."""
+    """Assembles depth images from received packets."""
 
     def __init__(self, height: int, width: int, range_m: float) -> None:
         """Assemble images of this size; pixels without depth get `range_m`.
@@ -312,12 +322,14 @@ class ImageAssembler:
         """Return the depth image (H, W) [m] that this packet completes, else None."""
         if packet.number < 0:
             width, height, size = (int(x) for x in np.frombuffer(packet.data, np.uint32))
+            # The right number of packets: a division that rounds up.
             fits = size == self._size and packet.total == -(-self._size // PACKET)
             self._received, self._expected = {}, packet.total if fits else 0
             if (height, width) != self._shape:
                 self.other_size = (width, height)
             return None
-        if packet.number in self._received:  # from the next image, whose announcement was lost
+        # A repeated number is from the next image, whose announcement was lost.
+        if packet.number in self._received:
             self._received, self._expected = {}, 0
         if packet.number >= self._expected:
             return None

@@ -1,4 +1,7 @@
-"""Run a simulated vehicle in its own process, which flies in real time at its end of the link."""
+"""Run a simulated vehicle in a separate process, which flies in real time at its end of the link.
+
+The link connects the vehicle with the companion, which runs the policy.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,16 @@ from tracks.geometry.camera import Camera
 from tracks.track import Track
 
 VEHICLE, COMPANION = 1, 2
-"""MAVLink system numbers of the two ends."""
+"""MAVLink system numbers of the two ends of the link."""
 WAIT_S = 30.0
-"""Time after which the vehicle gives up without a first set point [s]."""
+"""Longest time that the vehicle waits for the first set point [s]."""
 SLIP_S = 0.02
-"""A step with a longer delay shifts the later steps, instead of a burst to catch up [s]."""
+"""Longest delay of a step that the following steps make up for [s]. After a longer one (a slip) the
+later steps are shifted in time."""
 
 
 class FlightRequest(NamedTuple):
-    """A flight for the vehicle's process."""
+    """A flight for the vehicle's process: track, trial, vehicle, when it ends, and its camera."""
 
     track: Track
     trial: TrialSpec
@@ -47,11 +51,11 @@ class VehicleResult(NamedTuple):
 
     trial: TrialResult
     slips: int
-    """Number of steps with a delay above `SLIP_S`, on a busy machine."""
+    """Number of steps with a delay above `SLIP_S`, which a busy machine causes."""
 
 
 class VehicleProcess:
-    """The process: `start` a flight, get its `result`, `stop` a running one."""
+    """The vehicle's process: `start` a flight, get its `result`, `stop` a running flight."""
 
     def __init__(self) -> None:
         """Start the process."""
@@ -67,7 +71,7 @@ class VehicleProcess:
         self._pipe.send(request)
 
     def result(self, wait_s: float = 0.0) -> VehicleResult | None:
-        """Return the flight's result after waiting for at most `wait_s`, or None while it runs.
+        """Wait for at most `wait_s` [s]; return the flight's result, or None while it runs.
 
         Raises:
             WorkFailed: if the process has died.
@@ -90,8 +94,8 @@ class VehicleProcess:
 
 
 def serve(pipe: Connection) -> None:
-    """Run in the process: fly all requests until the pipe closes."""
-    # Ctrl-C reaches all processes of the terminal; the companion ends this one.
+    """Fly all requests until the pipe closes; the main function of the vehicle's process."""
+    # Ctrl-C reaches all processes of a terminal. This one ignores it: the companion ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -103,7 +107,7 @@ def serve(pipe: Connection) -> None:
 
 
 def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
-    """Fly one trial in real time, until it ends or the pipe has a message."""
+    """Fly one trial in real time, until it ends or the pipe has a message (to stop)."""
     link = UdpLink(request.address)
     try:
         wire = Wire(VEHICLE, COMPANION)
@@ -113,6 +117,7 @@ def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
         )  # fmt: skip
         begin, due, slips = time.monotonic(), time.monotonic(), 0
         while not vehicle.over and not pipe.poll():
+            # Wait until the step is due; if it is too late, shift the later steps.
             due += vehicle.dt
             now = time.monotonic()
             if now < due:
@@ -122,7 +127,7 @@ def fly_in_real_time(request: FlightRequest, pipe: Connection) -> VehicleResult:
             if not vehicle.begun and now - begin > WAIT_S:
                 break
             link.send(vehicle.step(link.receive(), clock_s=due))
-        # The companion may have handed over during a delay, which ends the loop.
+        # A handover during a delay ends the loop before the delay is counted.
         slips += not vehicle.over and time.monotonic() - due > SLIP_S + vehicle.dt
     finally:
         link.close()

@@ -1,8 +1,8 @@
 """A simulated vehicle at one end of a link, which acts like a flight controller with a camera.
 
-It sends its state and depth images over MAVLink, and flies the received set points; without new
-ones it brakes and hovers. Before the first one it stays at the trial's start. The physics are those
-of the judge, which flies policies in MuJoCo and scores them.
+It sends its state and depth images over MAVLink, and flies the received set points (body rates and
+thrust). Before the first set point it stays at the trial's start. If set points stop, it brakes and
+hovers. The physics are those of the judge, which flies policies in MuJoCo and scores them.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from tracks.track import Track
 LOST_S = 0.2
 """Time without a set point after which the vehicle brakes [s]."""
 BRAKE = 2.0
-"""Deceleration per speed while braking [1/s]."""
+"""Deceleration while braking, divided by the speed [1/s]."""
 BRAKE_MOST = 6.0
-"""Largest deceleration [m/s^2]."""
+"""Largest deceleration while braking, on each axis [m/s^2]."""
 
 
 class SimulatedVehicle:
-    """One trial's vehicle; `step` is one physics step."""
+    """The vehicle of one trial; `step` makes one physics step."""
 
     def __init__(
         self,
@@ -62,17 +62,18 @@ class SimulatedVehicle:
 
         Args:
             track: the track of the trial.
-            trial: its seed determines gusts.
+            trial: the trial; its seed determines the gusts.
             vehicle: the flown vehicle.
             camera: size and field of view of the depth images.
             image_hz: rate of the images [Hz].
-            wire: this end of the link.
-            rules: when the trial ends.
+            wire: converts messages to datagrams and back.
+            rules: when the trial ends; None: the defaults.
         """
         self._vehicle, self._wire, self._trial = vehicle, wire, trial
         self._rules = rules or Rules()
         self._autopilot = make_autopilot(vehicle)
         self.dt = self._autopilot.dt
+        # The scene in MuJoCo.
         self._model = compile_model(track, vehicle, self.dt, layout_of([track]).solids)
         self._data = mujoco.MjData(self._model)
         self._data.qpos[:] = start_state(track)
@@ -83,6 +84,7 @@ class SimulatedVehicle:
         motion = motion_of(self._data)
         first = None if self._draws is None else self._draws[:1]
         self._plant = start_autopilot(self._autopilot, motion, first).plant
+        # The judging, as a batch of one trial.
         gates = track.scene.gates
         count = np.array([len(gates.center_w)], np.int32)
         self._course = Course(Gates(*(x[None] for x in gates)), count)
@@ -104,15 +106,15 @@ class SimulatedVehicle:
 
     @property
     def time_s(self) -> float:
-        """Time of the vehicle's clock since its start [s]."""
+        """Time since the vehicle was started [s]."""
         return self._ticks * self.dt
 
     def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
         """Fly one physics step and return the datagrams sent before it.
 
         Args:
-            datagrams: the received ones.
-            clock_s: time for the stamps; None: the vehicle's clock [s].
+            datagrams: the datagrams that were received since the last step.
+            clock_s: time for the time stamps [s]; None: the time since the start.
         """
         for message in self._wire.decode(datagrams):
             if (
@@ -146,7 +148,7 @@ class SimulatedVehicle:
         return sent
 
     def _fly(self, motion: Motion, command: Command) -> None:
-        """Make one physics step under the command, or braking if it is too old."""
+        """Make one physics step with the command; brake if the command is too old."""
         step = int(self._progress.step[0])
         if (step - self._command_step) * self.dt > LOST_S:
             command = self._brake_command(motion)
@@ -159,6 +161,7 @@ class SimulatedVehicle:
             np.array([step * self.dt]),
         )
         self._plant = plant
+        # An invalid force or torque ends the trial without a step.
         invalid = ~is_wrench(self._rules, wrench)
         if not invalid[0]:
             self._data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]

@@ -1,6 +1,7 @@
 """A UDP socket as one end of the link between the vehicle and the policy's computer.
 
-The address `udpin:HOST:PORT` waits for the other end, `udpout:HOST:PORT` sends first.
+An end with the address `udpin:HOST:PORT` waits for the other end; one with `udpout:HOST:PORT` sends
+first.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ import socket
 from collections.abc import Callable
 
 MOST_BYTES = 2048
-"""Most bytes of a datagram; a MAVLink message has at most 280."""
+"""Largest number of bytes of a datagram; a MAVLink message has at most 280."""
 
 
 class UdpLink:
-    """One end of a link; a waiting end answers only the first valid sender."""
+    """One end of a link; a waiting end exchanges datagrams only with the first valid sender."""
 
     def __init__(
         self, address: str, is_from_peer: Callable[[bytes], bool] = lambda _: True
@@ -23,8 +24,8 @@ class UdpLink:
 
         Args:
             address: udpin:HOST:PORT or udpout:HOST:PORT.
-            is_from_peer: returns whether a datagram comes from the other end; a waiting end ignores
-                all datagrams before the first one that does.
+            is_from_peer: returns whether a datagram comes from the other end. A waiting end ignores
+                all datagrams before the first such one.
 
         Raises:
             ValueError: for an address of another form, a port in use, or an unknown host.

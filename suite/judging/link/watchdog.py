@@ -1,8 +1,8 @@
 """The watchdog of a flight over a link: checks of the received states, with their limits.
 
-Beyond a limit the companion computer, which runs the policy, hands over to the autopilot. The
-policy's actions are checked elsewhere: by the action guard, and with `--monitor` by the safety
-monitor (`eval/judging/monitor.py`).
+Beyond a limit the companion computer, which runs the policy, hands over: it stops sending commands,
+and the autopilot flies alone. The policy's actions are checked elsewhere: by the action guard
+(`eval/judging/guard.py`), and with `--monitor` by the safety monitor (`eval/judging/monitor.py`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.input.ranges import Range
 
 DRIFT = 1e-3
-"""Largest relative drift of two clocks; that of a quartz is a tenth [1]."""
+"""Largest relative drift between two clocks; that of quartz clocks is a tenth of it."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Limits:
     late_most: Annotated[int, Range(1, 1000)] = 5
     """Hand over after this many late answers in a row."""
     clock_jump_s: Annotated[float, Range(0.01, 100.0)] = 0.2
-    """Hand over if the vehicle's clock jumps by more than this relative to ours, or if its states
-    come later than this [s]."""
+    """Hand over if the vehicle's clock jumps by more than this relative to that of the companion,
+    or if its states arrive later than this [s]."""
     jump_m: Annotated[float, Range(0.01, 100.0)] = 0.5
-    """Hand over if the position jumps by more than this beyond what the speed explains [m]."""
+    """Hand over if the position changes by more than the speed explains plus this distance [m]."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ def state_fault(state: State, box: Box, limits: Limits) -> str | None:
 
 
 def jump_fault(last: State, state: State, limits: Limits) -> str | None:
-    """Return the reason for which a state does not continue the last one, or None.
+    """Return the reason for which a state cannot follow the last one, or None.
 
-    A jump of the estimator could count a gate that was not passed, or miss one.
+    If the estimated position jumps, a gate could be counted that was not passed, or missed.
     """
     if state.resets != last.resets:
         return "the vehicle's estimator reset its state"
@@ -95,7 +95,7 @@ def jump_fault(last: State, state: State, limits: Limits) -> str | None:
 
 
 class ClockCheck:
-    """Checks that the vehicle's clock runs like ours, and that states do not arrive later."""
+    """Checks that the clocks of vehicle and companion run alike, and that states are in time."""
 
     def __init__(self, limits: Limits) -> None:
         self._limit_s = limits.clock_jump_s
@@ -105,13 +105,13 @@ class ClockCheck:
     def add(self, stamp_s: float, now_s: float) -> str | None:
         """Return the reason for which a time stamp is wrong, or None.
 
-        The offset of the clocks is compared with the smallest one so far, which the state with the
-        shortest delay had. That may grow by `DRIFT` only, so that a slowly growing delay is found
-        like a jump.
+        The offset of the clocks (arrival minus time stamp) is compared with the smallest one so
+        far, which is that of the shortest delay. The smallest one may grow by `DRIFT` only. So a
+        slowly growing delay is found like a jump.
 
         Args:
-            stamp_s: the vehicle's clock in the state [s].
-            now_s: our clock at the state's arrival [s].
+            stamp_s: time of the vehicle's clock in the state [s].
+            now_s: time of the companion's clock at the arrival of the state [s].
         """
         offset_s = now_s - stamp_s
         if self._offset_s is None:
