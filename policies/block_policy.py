@@ -2,8 +2,8 @@
 
 A row is the observation of one trial (one judged flight), and its output must not depend on other
 rows. Matrix products of different sizes sum in different orders, so the model always gets full
-blocks, padded with zeros. If that is not enough (some kernels treat the last rows of a block
-differently), each block contains one row.
+blocks, padded with zeros. If a row still depends on others (some kernels treat the last rows of a
+block differently), only one row of each block is used.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Model = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndar
 """Maps (state, image, hidden) to (action, hidden) for exactly one block of rows, all float32."""
 
 BLOCK = 64
-"""Rows of a block, unless the model has a fixed batch."""
+"""Number of rows of a block, unless the model has a fixed batch size."""
 ROUNDING = 1e-4
-"""Largest relative difference between a row's outputs among different other rows."""
+"""Largest relative change of a row's output by other rows that counts as rounding."""
 
 
 @final
@@ -32,19 +32,19 @@ class BlockPolicy:
     """A `Policy` around a model that takes a fixed number of rows."""
 
     name: str
-    """Name in tables."""
+    """Name of the policy in tables."""
     spec: PolicySpec
-    """The rate, camera and scaling that it expects."""
+    """The rate, camera and scaling that the policy expects."""
     model: Model
     """The network."""
     hidden_shape: tuple[int, ...]
     """Shape of one row's recurrent state; (0,) for a policy without memory."""
     block: int = BLOCK
-    """Rows of each call of the model."""
+    """Number of rows in each call of the model."""
     rows: int = BLOCK
-    """Number of rows of a block that are used, from the first: `block`, or 1."""
+    """Number of rows of a block that are used, from the first row on: `block`, or 1."""
     notes: tuple[Note, ...] = ()
-    """Assumptions that were made where its file says nothing."""
+    """Assumptions about the policy that its file does not state."""
 
     def start(self, n: int) -> np.ndarray:
         """Return the recurrent state at the start of n trials, (n, *hidden_shape) zeros."""
@@ -66,9 +66,9 @@ class BlockPolicy:
         next_hidden = np.empty_like(inputs[2])
         for low in range(0, len(state), self.rows):
             used = slice(low, min(low + self.rows, len(state)))
-            action, after = self.model(*(self._padded(x[used]) for x in inputs))
+            action, block_hidden = self.model(*(self._padded(x[used]) for x in inputs))
             actions[used] = action[: used.stop - low]
-            next_hidden[used] = after[: used.stop - low]
+            next_hidden[used] = block_hidden[: used.stop - low]
         return _nan_if_overflowed(actions, next_hidden)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def verify_rows(policy: BlockPolicy, where: str) -> BlockPolicy:
 
     Args:
         policy: the policy as it was loaded.
-        where: its file, for messages.
+        where: the policy's file, for messages.
 
     Raises:
         PolicyError: where the outputs have wrong shapes, the same inputs give different outputs, or
@@ -142,8 +142,8 @@ def _refuse_batch_dependence(
 def for_one_row(policy: BlockPolicy) -> BlockPolicy:
     """Return a faster policy for one vehicle, whose blocks have one row.
 
-    The policy is returned unchanged where its model refuses one row or gives different outputs.
-    Rounding differs from that in a block, so the judge does not use this.
+    The policy is returned unchanged if its model refuses one row or gives different outputs for it.
+    Rounding differs from the rounding in a block, so the judge does not use this function.
     """
     inputs = _random_block(policy, np.random.default_rng(0))
     in_block = policy.model(*inputs)
@@ -178,6 +178,6 @@ def _nan_if_overflowed(action: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarr
     return action, hidden
 
 
-def _same(first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...]) -> bool:
+def _same(outputs: tuple[np.ndarray, ...], other_outputs: tuple[np.ndarray, ...]) -> bool:
     """Return whether two outputs are equal to the bit."""
-    return all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
+    return all(a.tobytes() == b.tobytes() for a, b in zip(outputs, other_outputs, strict=True))

@@ -32,7 +32,7 @@ from tracks.input.ranges import shown
 from tracks.input.reading import InputError, parse_json
 
 KEY = "contract"
-"""Name of the contract: as metadata entry in ONNX, extra file in torch, and key in JSON files."""
+"""Name of the contract in files: metadata entry in ONNX, extra file in torch, key in JSON."""
 VERSION = 1
 """Version of the contract's layout."""
 BODY = "body: x forward, y left, z up"
@@ -47,7 +47,7 @@ class Entry:
     unit: str
     frame: str
     scale: float = 1.0
-    """The policy's input times this is in `unit`."""
+    """Factor from the policy's input to `unit`."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Image:
     shape: tuple[int, ...]
     encoding: str
     dtype: str
-    """float32, or uint8, whose values go from 0 at far_m to 255 at near_m."""
+    """Type of a pixel: float32, or uint8 with values from 0 at far_m to 255 at near_m."""
     scale_m: float
     near_m: float
     far_m: float
@@ -65,7 +65,7 @@ class Image:
     pitch_deg: float
     fov_deg: tuple[float, float]
     rays: int
-    """Rays in each direction of a pixel (n x n); the pixel is their smallest depth."""
+    """n: a pixel is the smallest depth of its n x n rays."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Contract:
     memory: tuple[int, ...] | None = None
     """Shape of the hidden state of one policy; None if unknown."""
     speed: float = 1.0
-    """Default of the state entry `speed_input`."""
+    """Default value of the state entry `speed_input` (wanted speed, 0 to 1)."""
     version: int = VERSION
 
     @functools.cached_property
@@ -171,9 +171,9 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
             "height, width)"
         )
     names = [entry.name for entry in contract.state]
-    shares = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
+    motors = "speed" if "speed" in "".join(action.unit) and action.kind == "motors" else "thrust"
     memory = contract.memory or ()
-    hidden: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
+    hidden_size: dict[str, Any] = {"hidden_size": memory[0]} if len(memory) == 1 else {}
     spec = PolicySpec(
         rate_hz=contract.rate_hz,
         camera=Camera(
@@ -185,11 +185,11 @@ def spec_of(contract: Contract, where: str) -> PolicySpec:
             image.dtype == "uint8",
         ),
         action=ActionSpec(
-            action.kind, _short(action.scale), _short(action.offset), shares, action.clip
+            action.kind, _shortened(action.scale), _shortened(action.offset), motors, action.clip
         ),
         speed=contract.speed,
         **{key: key in names for key in EXTRAS},
-        **hidden,
+        **hidden_size,
     )  # fmt: skip
     try:
         check_spec(spec, "")
@@ -265,7 +265,7 @@ def _each(numbers: tuple[float, ...], size: int) -> tuple[float, ...]:
     return tuple(map(float, numbers * size if len(numbers) == 1 else numbers))
 
 
-def _short(numbers: tuple[float, ...]) -> tuple[float, ...]:
+def _shortened(numbers: tuple[float, ...]) -> tuple[float, ...]:
     """Return a single number where all are equal."""
     return numbers[:1] if len(set(numbers)) == 1 else numbers
 

@@ -1,5 +1,6 @@
-"""Assemble the observation of a policy: 12 numbers (Su et al. 2026, Eq. 1), extras, depth image.
+"""Assemble the observation of a policy: a state of 12 or more numbers, and a depth image.
 
+The first 12 numbers are those of Su et al. 2026, Eq. 1; a spec may add optional ones (extras).
 Training, evaluation, simulators and Gymnasium environments all use `observe`. To add a vector, add
 a key to `policies.spec.EXTRAS` and a line to `EXTRA_VECTORS`.
 """
@@ -26,7 +27,7 @@ class View(NamedTuple):
     gate_w: Any
     """(..., 3) centre of the next gate [m]."""
     second_w: Any
-    """(..., 3) centre of the gate after it, or of the last gate [m]."""
+    """(..., 3) centre of the gate after the next, or of the last gate [m]."""
     axis_w: Any
     """(..., 3) unit vector through the next gate, in flight direction."""
     second_axis_w: Any
@@ -41,12 +42,11 @@ class Observation(NamedTuple):
     """The inputs of a policy."""
 
     state: Any
-    """(..., spec.state_size): velocity in body axes [m/s], the third row of R (world z in body
-    axes, free of yaw), the next gate's centre in body axes [m], the last action (SI units of its
-    kind), and the spec's extras."""
+    """(..., spec.state_size) state: velocity in body axes [m/s], the third row of the attitude
+    matrix R (world z in body axes), the next gate's centre in body axes [m], the last action (SI
+    units of its kind), and the spec's extras."""
     image: Any
-    """(..., *spec.image_shape) inverse depth, encoded by the spec [1]; None without a depth
-    image."""
+    """(..., *spec.image_shape) inverse depth, encoded by the spec; None without a depth image."""
 
 
 def view_of(
@@ -59,7 +59,7 @@ def view_of(
         rot_w: (N, 3, 3) attitudes, body to world.
         vel_w: (N, 3) velocities [m/s].
         gate: each drone's next gate, (N, ...).
-        after: the gate after it, (N, ...).
+        after: each drone's gate after the next, (N, ...).
         depth_m: (N, H, W) planar depth images [m], or None.
     """
     axes_w = gate.rot_w[..., 0], after.rot_w[..., 0]
@@ -71,7 +71,7 @@ EXTRA_VECTORS: dict[str, Callable[[View], Array]] = {
     "gate_axis": lambda view: to_local(view.rot_w, view.axis_w),
     "second_axis": lambda view: to_local(view.rot_w, view.second_axis_w),
 }
-"""Key of a `PolicySpec` -> function that returns the vector (..., 3), in body axes, for it."""
+"""Key of a `PolicySpec` -> function that returns the vector (..., 3) of that key, in body axes."""
 
 
 def observe(
@@ -102,7 +102,7 @@ def observe(
 
 
 def encode_depth(encoding: DepthEncoding, depth_m: Array, range_m: float) -> Array:
-    """Return the policy's image input for planar depths [m] of the same shape (inverse depth)."""
+    """Return the policy's image input (encoded inverse depth) for planar depths [m]."""
     xp = depth_m.__array_namespace__()
     encoded = encoding.scale / xp.clip(depth_m, encoding.near, range_m) - encoding.offset
     if not encoding.uint8:

@@ -16,7 +16,7 @@ from policies.spec import PolicyError, PolicySpec
 from tracks.common.names import closest, unknown_name
 
 Hidden = Any
-"""Hidden state of n trials, opaque to the caller."""
+"""Hidden state (memory) of a policy for n trials; only the policy reads it."""
 
 SUFFIXES = {
     ".onnx": "ONNX",
@@ -35,12 +35,12 @@ class Policy(Protocol):
 
     @property
     def name(self) -> str:
-        """Name in tables."""
+        """Name of the policy in tables."""
         ...
 
     @property
     def spec(self) -> PolicySpec:
-        """The rate, camera and scaling that it expects."""
+        """The rate, camera and scaling that the policy expects."""
         ...
 
     def start(self, n: int) -> Hidden:
@@ -53,9 +53,9 @@ class Policy(Protocol):
         """Return the actions for one observation of n trials.
 
         Args:
-            hidden: from `start` or the last `act`.
-            state: (n, spec.state_size) float32, the state of `observation.observe`.
-            image: (n, height, width) float32, its image.
+            hidden: hidden state, from `start` or the last `act`.
+            state: (n, spec.state_size) the state of `observation.observe`, float32.
+            image: (n, height, width) the image of `observation.observe`, float32.
             fresh: (n,) bool, rows in which a new trial starts; their hidden state is reset first.
 
         Returns:
@@ -128,6 +128,6 @@ def _missing(text: str, path: Path) -> PolicyError:
         error = unknown_name("policy", text, shipped.names())
         return PolicyError(f"{error} A checkpoint's folder or a policy file is allowed as well.")
     siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-    guess = closest(path.name, siblings)
-    question = f" Did you mean {path.parent / guess}?" if guess else ""
+    similar = closest(path.name, siblings)
+    question = f" Did you mean {path.parent / similar}?" if similar else ""
     return PolicyError(f"{path}: no such file or folder.{question}")

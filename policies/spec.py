@@ -1,8 +1,8 @@
 """The specification of a policy: its rate, camera, observation, and the scaling of its action.
 
-The observation is that of Su et al. 2026, Eq. 1: 12 numbers and a depth image. A policy may add the
-gate after the next one, the flight direction of either gate, and the wanted speed. This file also
-defines the exceptions that loading and running policies raise.
+The observation is that of Su et al. 2026, Eq. 1: a state of 12 numbers, and a depth image. A policy
+may add the gate after the next one, the flight direction of either gate, and the wanted speed. This
+file also defines the exceptions that loading and running policies raise.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from tracks.geometry.camera import Camera
 from tracks.input.ranges import Range, check_ranges
 
 STATE_SIZE = 12
-"""Numbers in the paper's state: velocity in body axes (3), third row of R (3), gate in body axes
-(3), last action (3). For another kind of action, the last part has its size."""
+"""Number of numbers in the state of Su et al. 2026: velocity in body axes (3), third row of the
+attitude matrix (3), gate in body axes (3), last action (3). Another kind of action has another size
+of the last part."""
 EXTRAS = {"second_gate": 3, "gate_axis": 3, "second_axis": 3, "speed_input": 1}
 """Optional parts of the state: key of a spec -> size, in this order."""
 ACTION_SIZE = 3
-"""Numbers in an action of kind `acceleration`."""
+"""Number of components of an action of kind `acceleration`."""
 ACTIONS = {"acceleration": ACTION_SIZE, "ctbr": 4, "motors": 4}
-"""Kind of action -> size; `ActionSpec.kind` explains them."""
+"""Kind of action -> number of components; `ActionSpec.kind` explains the kinds."""
 
 CHANNEL_BLOCK = 32
-"""Channels of the second and third convolution are multiples of this, for the C export's layout."""
+"""The channels of the second and third convolution are multiples of this, so that the C export can
+store their weights in blocks."""
 RAYS_MOST = 640 * 480
-"""Most rays of an image: the pixels of usual depth cameras. 64 images of this size, with all
-intermediate arrays, fit into 2 GB."""
+"""Largest number of rays of an image: the number of pixels of usual depth cameras. 64 images of
+this size, with all intermediate arrays, fit into 2 GB."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,11 @@ class DepthEncoding:
     scale: Annotated[float, Range(1e-6, 1e6)] = 3.0
     """Numerator of the encoding, scale / depth - offset [m]."""
     near: Annotated[float, Range(1e-3, 100.0)] = 0.3
-    """Smallest depth; smaller ones are set to it [m]."""
+    """Smallest depth [m]; smaller depths are set to it."""
     offset: Annotated[float, Range(-1e6, 1e6)] = 0.6
-    """Subtracted in the encoding, so that distant pixels are near zero [1]."""
+    """Number that is subtracted in the encoding, so that distant pixels are near zero."""
     channel_axis: bool = False
-    """Whether images are (1, height, width) and not (height, width)."""
+    """Whether images have the shape (1, height, width), instead of (height, width)."""
     uint8: bool = False
     """Whether pixels are whole numbers, 0 at the camera's range to 255 at `near` and nearer."""
 
@@ -56,7 +58,7 @@ class DepthEncoding:
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """A policy's output: its kind, and the affine map to SI units."""
+    """A policy's output: its kind, and its conversion to SI units (output * scale + offset)."""
 
     kind: str = "acceleration"
     """acceleration: wanted net acceleration, body axes [m/s^2]; ctbr: collective thrust per mass
@@ -72,7 +74,7 @@ class ActionSpec:
 
     @property
     def size(self) -> int:
-        """Numbers in an action."""
+        """Number of components of an action."""
         return ACTIONS[self.kind]
 
     @property
@@ -81,7 +83,7 @@ class ActionSpec:
         return set(self.scale) == {1.0} and set(self.offset) == {0.0} and not self.clip
 
     def to_si(self, output: Any) -> Any:
-        """Return outputs (..., size) in SI units; plain ones are returned unchanged."""
+        """Return outputs (..., size) in SI units; outputs in SI units are returned unchanged."""
         if self.is_plain:
             return output
         output = np.clip(output, -self.clip, self.clip) if self.clip else output
@@ -95,7 +97,7 @@ class PolicySpec:
     rate_hz: Annotated[float, Range(1.0, 500.0)] = 30.0
     """Actions per second [Hz]."""
     camera: Camera = field(default_factory=Camera)
-    """The camera that the images come from; depths are clipped to its range."""
+    """Camera that takes the images; depths are clipped to its range."""
     depth: DepthEncoding = field(default_factory=DepthEncoding)
     """Conversion of depth to the image input."""
     hidden_size: Annotated[int, Range(1, 4096)] = 192
@@ -107,22 +109,22 @@ class PolicySpec:
     gate_axis: bool = False
     """Whether the state contains the next gate's flight direction, body axes."""
     second_axis: bool = False
-    """Whether the state contains the flight direction of the gate after it, body axes."""
+    """Whether the state contains the flight direction of the gate after the next one, body axes."""
     speed_input: bool = False
     """Whether the state contains the wanted speed, 0 (careful) to 1 (race)."""
     speed: Annotated[float, Range(0.0, 1.0)] = 1.0
-    """Default of the wanted speed [1]."""
+    """Default of the wanted speed, 0 (careful) to 1 (race)."""
     action: ActionSpec = field(default_factory=ActionSpec)
     """The policy's output."""
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state observation."""
+        """Number of numbers in the state observation."""
         return self.base_size + sum(count * getattr(self, key) for key, count in EXTRAS.items())
 
     @property
     def base_size(self) -> int:
-        """Numbers in the state observation before the extras."""
+        """Number of numbers in the state observation without the extras."""
         return STATE_SIZE - ACTION_SIZE + self.action.size
 
     @property

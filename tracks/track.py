@@ -18,25 +18,25 @@ class Track:
     """A race track with its start; its gates are in flight order, from gate 0."""
 
     family: str
-    """Name of the family that made it, or of the file it was read from."""
+    """Name of the family that drew the track, or name of a custom track."""
     level: int
     """Difficulty level, 0 (easy) to 9 (hard); 0 for a custom track."""
     seed: int
     """Seed within the family and level; 0 for a custom track."""
     difficulty: float
-    """d = (level + U(0, 1)) / 10, drawn from the seed; 0 for a custom track."""
+    """d = (level + u) / 10, with u from 0 to 1 drawn from the seed; 0 for a custom track."""
     scene: Scene
     """Gates and solids in the world frame, numpy arrays, float64, not batched."""
     start_pos_w: np.ndarray
     """(3,) the drone's centre at time 0 [m]."""
     start_yaw: float
-    """Heading at the start, about world z, 0 along world x [rad]."""
+    """Heading at the start, about world z; 0 is along world x [rad]."""
     names: tuple[str, ...]
     """Names of the solids (gate frames and obstacles), in the order boxes, cylinders, capsules,
     spheres, meshes. The bars of a gate's frame share a name ("gate 3 frame"); every other name is
     unique."""
     mesh_sizes: tuple[int, ...] = ()
-    """Triangles of each convex mesh; `scene.triangles` holds them one mesh after another."""
+    """Number of triangles of each convex mesh; `scene.triangles` holds them mesh after mesh."""
 
 
 def first_gates(track: Track, count: int) -> Track:

@@ -1,8 +1,8 @@
 """The catalogue of effects: physical causes of a mismatch between a vehicle and its nominal model.
 
-The files of this folder group the effects by cause. To add one, write its `Effect` and list it
-here. Another package adds one with an entry point of the group `diffracing_suite.effects`, a
-program for its own process with `EFFECTS.register(effect.name, effect)`.
+The files of this folder group the effects by cause. To add an effect, write its `Effect` and list
+it here. Another package adds one with an entry point of the group `diffracing_suite.effects`. A
+program adds one for its own process with `EFFECTS.register(effect.name, effect)`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from eval.vehicles.vehicle import Vehicle
 
 
-def _problem(name: str, effect: Any) -> str | None:
+def _registration_error(name: str, effect: Any) -> str | None:
     """Return why `effect` cannot be registered under `name`, or None."""
     if not isinstance(effect, Effect):
         return f"a {type(effect).__name__}; must be an eval.effects.interface.Effect"
@@ -47,7 +47,7 @@ def _problem(name: str, effect: Any) -> str | None:
     return None
 
 
-_OWN = (
+_BUILT_IN = (
     drag.LINEAR_DRAG,
     drag.QUADRATIC_DRAG,
     drag.ROTOR_DRAG,
@@ -77,11 +77,14 @@ _OWN = (
     measurement.CLOCK_OFFSET,
     slung_load.SLUNG_LOAD,
 )
-"""The suite's effects in the order in which they act: an effect that scales a thrust follows those
-that add to it, and random wind follows the steady wind that it is relative to. Effects of other
-packages act last."""
+"""The suite's effects in the order in which they act. An effect that scales a thrust follows the
+effects that add to the thrust. Random wind follows the steady wind that it is added to. Effects of
+other packages act last."""
 EFFECTS: Registry[Effect] = Registry(
-    "effect", "diffracing_suite.effects", {effect.name: effect for effect in _OWN}, _problem
+    "effect",
+    "diffracing_suite.effects",
+    {effect.name: effect for effect in _BUILT_IN},
+    _registration_error,
 )
 """All effects by name, those of other packages included."""
 
@@ -90,7 +93,7 @@ def find_effect(name: str) -> Effect:
     """Return the effect called `name`.
 
     Raises:
-        ValueError: for an unknown name, with the nearest one.
+        ValueError: for an unknown name; the message has the most similar known name.
     """
     return EFFECTS.find(name)
 

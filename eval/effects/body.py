@@ -15,7 +15,7 @@ class MassOffset(NamedTuple):
 
 
 def mass_offset_constants(values: MassOffset, constants: Constants) -> Constants:
-    """Return the constants with the mass added and the same inertia."""
+    """Return the constants with the offset added to the mass; the inertia is unchanged."""
     return constants._replace(mass=constants.mass + values.offset)
 
 
@@ -120,7 +120,7 @@ class InertiaScale(NamedTuple):
     """Values of `inertia_scale`."""
 
     scale: Array
-    """(..., 3) true inertia over nominal inertia, body axes [1]."""
+    """(..., 3) true inertia divided by nominal inertia, about each body axis."""
 
 
 def inertia_scale_constants(values: InertiaScale, constants: Constants) -> Constants:

@@ -1,6 +1,7 @@
 """Effects of drag on airframe and rotors: forces against the airspeed, a torque against rotation.
 
-In each, v_b is the velocity relative to the air in body axes.
+In all equations v_b is the velocity relative to the air in body axes, Omega_i the speed of a rotor,
+and e3 the unit vector along body z.
 """
 
 from __future__ import annotations

@@ -28,23 +28,23 @@ class Constants(NamedTuple):
     """The true constants of a quadrotor; the controller's nominal ones are in `plant.Nominal`."""
 
     mass: Array
-    """(...,) [kg]."""
+    """(...,) mass [kg]."""
     inertia: Array
-    """(..., 3) principal moments, body axes, about the centre of mass [kg m^2]."""
+    """(..., 3) principal moments of inertia, body axes, about the centre of mass [kg m^2]."""
     gravity_w: Array
-    """(..., 3) [m/s^2]."""
+    """(..., 3) acceleration of gravity [m/s^2]."""
     com_offset_b: Array
-    """(..., 3) true centre of mass minus nominal one [m]."""
+    """(..., 3) true minus nominal centre of mass [m]."""
     rotor_position_b: Array
     """(..., 4, 3) rotor hubs relative to the true centre of mass [m]."""
     thrust_coefficient: Array
-    """(..., 4) k_T of each rotor [N/(rad/s)^2]."""
+    """(..., 4) k_T: thrust of each rotor over its squared speed [N/(rad/s)^2]."""
     torque_coefficient: Array
-    """(..., 4) k_Q of each rotor [N m/(rad/s)^2]."""
+    """(..., 4) k_Q: torque of each rotor over its squared speed [N m/(rad/s)^2]."""
     thrust_axis_b: Array
     """(..., 3) unit vector along the total thrust."""
     time_constant: Array
-    """(...,) time constant of the rotors' lag [s]."""
+    """(...,) time constant with which the rotor speeds follow their commands [s]."""
     rate_gain: Array
     """(..., 3) gain of the rate loop [1/s]."""
     delay: Array
@@ -56,26 +56,26 @@ class Flow(NamedTuple):
 
     constants: Constants
     pos_w: Array
-    """(..., 3) centre of mass [m]."""
+    """(..., 3) position of the centre of mass [m]."""
     rot_w: Array
-    """(..., 3, 3) body to world."""
+    """(..., 3, 3) attitude, body to world."""
     air_vel_b: Array
-    """(..., 3) velocity of the centre of mass relative to the air, v_b [m/s]."""
+    """(..., 3) v_b: velocity of the centre of mass relative to the air, body axes [m/s]."""
     rate_b: Array
-    """(..., 3) [rad/s]."""
+    """(..., 3) body rates [rad/s]."""
     rotor_speed: Array
-    """(..., 4) mean over the step [rad/s]."""
+    """(..., 4) Omega_i: mean rotor speeds over the step [rad/s]."""
     spin: Array
-    """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above."""
+    """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above, -1 clockwise."""
     time_s: Array
-    """(...,) since the start of the flight (the first row of its log) [s]."""
+    """(...,) time since the start of the flight (the first row of its log) [s]."""
     voltage_drop: Array | None
-    """(...,) battery voltage at the start minus now [V]; None where the voltage is unknown."""
+    """(...,) battery voltage at the start of the flight minus now [V]; None if unknown."""
     rotor_acc: Array | None = None
-    """(..., 4) mean rate of change of the rotor speeds over the step [rad/s^2]; only where an
-    effect sets `rotor_acc`, and None where it is unknown."""
+    """(..., 4) mean rate of change of the rotor speeds over the step [rad/s^2]. It is computed only
+    if an effect sets `Effect.rotor_acc`; None if it is unknown."""
     memory: Any = None
-    """State of this effect before the step; None for one without `start` and `carry`."""
+    """State of this effect before the step; None for an effect without `start` and `carry`."""
     dt: Any = None
     """Length of the step [s]; only for an effect with a state."""
 
@@ -106,13 +106,13 @@ class Parameter:
     unit: str
     """SI unit."""
     neutral: Bound
-    """Value of each component with which the effect is absent."""
+    """Value of each component with which the effect changes nothing."""
     low: Bound
     """Smallest physical value of each component."""
     high: Bound
     """Largest physical value of each component."""
     typical: tuple[float, float]
-    """Range of usual differences from neutral on a racing quadrotor of 0.5 to 1 kg."""
+    """Smallest and largest usual difference from neutral, on a racing quadrotor of 0.5 to 1 kg."""
     size: int = 0
     """Number of components; 0 for a plain number."""
     required: bool = True
@@ -120,20 +120,23 @@ class Parameter:
     fitted: bool = True
     """Whether it is identifiable from flights; if not, it is a known constant of the vehicle."""
     unseen: tuple[int, ...] = ()
-    """Components that are not identifiable from flights; a diagnosis reports them as null."""
+    """Indices of the components that are not identifiable from flights; a diagnosis reports them as
+    null."""
     voltage: bool | None = None
     """True: acts only if the log has a voltage; False: only if it has none; None: in both cases."""
     one_at_a_time: bool = False
-    """Whether each component is a separate fault, of which a vehicle usually has only one."""
+    """Whether each component is a separate defect (such as one weak motor), of which a vehicle
+    usually has only one."""
     whole: bool = False
-    """Whether `typical` is a range of values instead of differences from neutral."""
+    """Whether `typical` is a range of the values themselves, not of differences from neutral."""
     signs: tuple[int, ...] = (1,)
-    """Usual signs of the difference from neutral; one sign where both are equivalent."""
+    """Usual signs of the difference from neutral; one sign if both signs are equivalent."""
     direction: tuple[float, ...] = ()
-    """Unit vector that divides the usual size among the components; (): each has the full size."""
+    """Unit vector that divides the usual size among the components; (): each component has the full
+    size."""
 
     def upwards(self, vehicle: Vehicle) -> bool:
-        """Return whether its lower bound is the value with which the effect is absent."""
+        """Return whether the values of a present effect are all above those of an absent one."""
         absent = 0.0 if self.whole else bound_value(self.neutral, vehicle)
         return bound_value(self.low, vehicle) >= absent
 
@@ -148,13 +151,13 @@ class Sample(NamedTuple):
     """Signals of a flight log at one or many times, which a fault of the log (a bias) changes."""
 
     pos_w: Array
-    """(..., 3) [m]."""
+    """(..., 3) position [m]."""
     rot_w: Array
-    """(..., 3, 3) body to world."""
+    """(..., 3, 3) attitude, body to world."""
     vel_w: Array
-    """(..., 3) [m/s]."""
+    """(..., 3) velocity [m/s]."""
     rate_b: Array
-    """(..., 3) [rad/s]."""
+    """(..., 3) body rates [rad/s]."""
     acc_b: Array
     """(..., 3) specific force [m/s^2]."""
 
@@ -193,23 +196,23 @@ class Effect:
     """Returns the state after the step, from the acceleration of the centre of mass during the step
     in the world (..., 3) [m/s^2]."""
     measure: Callable[[Values, Sample], Sample] | None = None
-    """For a fault of the log: returns the logged sample for the true one. Values mirrored about
-    neutral must undo it, at least to first order."""
+    """For a fault of the log: returns the logged sample for the true sample. Applied with the
+    values mirrored about neutral, it must undo the fault, at least to first order."""
     late: Callable[[Values], Array] | None = None
     """For a fault of the log: returns the delay with which poses and velocities are logged [s]."""
     of_log: bool = False
-    """Whether it belongs to the log instead of the vehicle, even if it acts in flight (a tilted
-    frame)."""
+    """Whether the effect belongs to the log instead of the vehicle, even if it acts in the
+    simulated flight (a tilted world frame)."""
     needs: tuple[str, ...] = ()
-    """Signals that a log must contain to identify it: `acc_b`, or `command` for an effect between
-    commands and rotor speeds."""
+    """Signals that a log must contain so that the effect is identifiable: `acc_b`, or `command` for
+    an effect between commands and rotor speeds."""
     rotor_acc: bool = False
     """Whether it uses `Flow.rotor_acc`."""
     slow: bool = False
     """Whether it develops over minutes of flight, so that it is hardly visible within seconds."""
     with_voltage: Callable[[Values, float], Values] | None = None
-    """For parameters that depend on the voltage: converts values that act by time to values that
-    act by voltage, for a voltage that falls at the given rate [V/s]."""
+    """For an effect of the battery: converts a loss of thrust per second to an equal loss per volt,
+    for a voltage that falls at the given rate [V/s]."""
     read: Callable[[Mapping[str, Any]], Values] | None = None
     """Reads a vehicle file's table, where its keys are not the parameters' names."""
     write: Callable[[Values], dict[str, Any]] | None = None
@@ -227,7 +230,10 @@ class Effect:
 
     @property
     def by_state(self) -> bool:
-        """Whether it depends on the vehicle's state only, so that a rollout may start anywhere."""
+        """Whether it depends only on the measured state, so that a rollout may start at any row.
+
+        False for an effect with random numbers, or with a state of its own, such as a slung load.
+        """
         return not self.random and self.start is None
 
     @property
@@ -245,7 +251,7 @@ class Effect:
         return tuple(p for p in self.parameters if p.fitted and p.voltage in (None, voltage))
 
     def components(self, voltage: bool) -> tuple[tuple[Parameter, int], ...]:
-        """Return (parameter, component) of all identifiable components; 0 for a plain number."""
+        """Return (parameter, index) of all identifiable components; index 0 for a plain number."""
         return tuple(
             (p, k)
             for p in self.identifiable(voltage)

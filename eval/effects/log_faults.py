@@ -27,7 +27,7 @@ def to_logged(effects: Mapping[str, Values], sample: Sample) -> Sample:
 
 
 def to_true(effects: Mapping[str, Values], sample: Sample) -> Sample:
-    """Return the true sample for the logged `sample`, to first order; the delay is kept."""
+    """Return the true sample for the logged `sample`, to first order; the pose remains delayed."""
     for name, measure in reversed(_hooks(effects, "measure")):
         # Values mirrored about neutral undo a fault; neutral is a number for every fault of a log.
         neutral = (cast(float, parameter.neutral) for parameter in EFFECTS[name].parameters)
@@ -75,12 +75,12 @@ def time_shifted(time_s: Array, series: Array, offset: Array) -> Array:
     xp = time_s.__array_namespace__()
     source_s = time_s - offset
     row = xp.clip(xp.searchsorted(time_s, source_s, side="right") - 1, 0, len(time_s) - 2)
-    share = (source_s - time_s[row]) / (time_s[row + 1] - time_s[row])
-    return series[row] + share[:, None] * (series[row + 1] - series[row])
+    fraction = (source_s - time_s[row]) / (time_s[row + 1] - time_s[row])
+    return series[row] + fraction[:, None] * (series[row + 1] - series[row])
 
 
 def _delayed_poses(log: Mapping[str, Array], delay: Array) -> dict[str, Array]:
-    """Return `pos_w`, `quat_wxyz` and `vel_w` of time t - delay on the rows of t."""
+    """Return `pos_w`, `quat_wxyz` and `vel_w` with the values of time t - delay in the row of t."""
     time_s = log["time_s"]
     xp = time_s.__array_namespace__()
     present = [name for name in ("pos_w", "vel_w") if log.get(name) is not None]

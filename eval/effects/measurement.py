@@ -11,7 +11,7 @@ class GyroBias(NamedTuple):
     """Values of `gyro_bias`."""
 
     bias: Array
-    """(3,) logged minus true rates, body axes [rad/s]."""
+    """(3,) logged minus true body rates [rad/s]."""
 
 
 def gyro_bias_measured(values: GyroBias, sample: Sample) -> Sample:
@@ -99,7 +99,7 @@ class ClockOffset(NamedTuple):
     """Values of `clock_offset`."""
 
     offset: Array
-    """() how much later than measured a pose is logged [s]."""
+    """() time by which poses and velocities are logged later than they were measured [s]."""
 
 
 CLOCK_OFFSET = Effect(

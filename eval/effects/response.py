@@ -1,4 +1,4 @@
-"""Effects of the response to commands: motor lag, command delay, gain of the rate loop."""
+"""Effects of the response to commands: slow rotors (motor lag), command delay, rate-loop gain."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class MotorLag(NamedTuple):
     """Values of `motor_lag`."""
 
     time_constant: Array
-    """(...,) tau_m: time constant of the rotor speeds [s]."""
+    """(...,) tau_m: time constant with which the rotor speeds follow their commands [s]."""
 
 
 def motor_lag_constants(values: MotorLag, constants: Constants) -> Constants:
@@ -69,7 +69,7 @@ class RateGain(NamedTuple):
     """Values of `rate_gain`."""
 
     scale: Array
-    """(..., 3) true gain over nominal gain, body axes [1]."""
+    """(..., 3) true gain divided by nominal gain, about each body axis."""
 
 
 def rate_gain_constants(values: RateGain, constants: Constants) -> Constants:

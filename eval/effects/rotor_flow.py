@@ -1,6 +1,7 @@
 """Effects of the air on the rotors: inflow, forward flight, blade flapping and ground effect.
 
-In each, v_b is the velocity relative to the air in body axes, and Omega_i a rotor's speed.
+In all equations v_b is the velocity relative to the air in body axes, Omega_i the speed of a rotor,
+and e3 the unit vector along body z.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ class Inflow(NamedTuple):
     """Values of `inflow`."""
 
     coefficient: Array
-    """(...,) k: lost thrust per climb speed and rotor speed [N s^2/(m rad)]."""
+    """(...,) k: thrust that a rotor loses, per climb speed and rotor speed [N s^2/(m rad)]."""
 
 
 def inflow_thrust(values: Inflow, flow: Flow, thrust: Array) -> Array:
@@ -47,8 +48,8 @@ class TranslationalLift(NamedTuple):
 
 def translational_lift_force(values: TranslationalLift, flow: Flow) -> Array:
     """Return m k (v_bx^2 + v_by^2) e3 (..., 3) [N], with the true mass."""
-    sideways = flow.air_vel_b[..., 0] ** 2 + flow.air_vel_b[..., 1] ** 2
-    return along_z(flow.constants.mass * values.coefficient * sideways)
+    horizontal_squared = flow.air_vel_b[..., 0] ** 2 + flow.air_vel_b[..., 1] ** 2
+    return along_z(flow.constants.mass * values.coefficient * horizontal_squared)
 
 
 TRANSLATIONAL_LIFT = Effect(
@@ -92,16 +93,16 @@ BLADE_FLAPPING = Effect(
 
 
 SHARE_MOST = 1.0 / 3.0
-"""Largest g (r / 4 z)^2, with which the factor on the thrust is 1.5."""
+"""Largest value of g (r / 4 z)^2 that is used; it gives a factor of 1.5 on the thrust."""
 HEIGHT_LEAST_M = 1e-3
-"""Least height of a rotor above the ground [m]."""
+"""Least height of a rotor above the ground that is used [m]."""
 
 
 class GroundEffect(NamedTuple):
     """Values of `ground_effect`."""
 
     strength: Array
-    """(...,) g: 1 is the rotor of Cheeseman and Bennett 1955 [1]."""
+    """(...,) g: strength of the effect; 1 is the rotor of Cheeseman and Bennett 1955."""
     rotor_radius: Array
     """(...,) r: radius of a rotor [m]."""
 

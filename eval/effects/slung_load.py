@@ -17,7 +17,7 @@ STIFFNESS = 100.0
 """Angular frequency w of the oscillation along the line [rad/s]. The weight of a light load
 stretches the line by g / w^2, which is a millimetre."""
 DAMPING = 0.5
-"""Damping ratio z of that oscillation [1]."""
+"""Damping ratio z of the oscillation along the line."""
 
 
 class SlungLoad(NamedTuple):
@@ -26,7 +26,7 @@ class SlungLoad(NamedTuple):
     mass: Array
     """(...,) m_L: mass of the load [kg]."""
     length: Array
-    """(...,) length of the line at rest, L [m]."""
+    """(...,) L: length of the line at rest [m]."""
 
 
 class LoadState(NamedTuple):
@@ -42,11 +42,11 @@ def start_of(values: SlungLoad, flow: Flow) -> LoadState:
     """Return the state of a load that hangs at rest below the vehicle, along gravity."""
     xp = flow.rate_b.__array_namespace__()
     gravity_w = flow.constants.gravity_w + xp.zeros_like(flow.rate_b)
-    gravity = xp.sqrt(xp.sum(gravity_w**2, axis=-1, keepdims=True))
+    gravity_size = xp.sqrt(xp.sum(gravity_w**2, axis=-1, keepdims=True))
     # In equilibrium the tension is m_L g, that is, a relative acceleration of g / mass share.
-    stretch = gravity / _mass_share(values, flow) * _implicit_factor(flow) / STIFFNESS**2
+    stretch = gravity_size / _mass_share(values, flow) * _implicit_factor(flow) / STIFFNESS**2
     return LoadState(
-        (per_axis(values.length) + stretch) * gravity_w / gravity, xp.zeros_like(flow.rate_b)
+        (per_axis(values.length) + stretch) * gravity_w / gravity_size, xp.zeros_like(flow.rate_b)
     )
 
 
@@ -66,9 +66,10 @@ def carried(values: SlungLoad, flow: Flow, acc_w: Array) -> LoadState:
 
 
 def _tension(values: SlungLoad, flow: Flow) -> tuple[Array, Array]:
-    """Return the unit vector to the load (..., 3), and what the tension T does (..., 1) [m/s^2].
+    """Return the unit vector to the load (..., 3), and an acceleration (..., 1) [m/s^2].
 
-    The latter is the relative acceleration T (1 / m_L + 1 / M) of load and vehicle by the tension.
+    The acceleration is T (1 / m_L + 1 / M): by the line's tension T, load (mass m_L) and vehicle
+    (mass M) accelerate towards each other.
     """
     line_w, vel_w = flow.memory
     xp = line_w.__array_namespace__()
@@ -91,10 +92,10 @@ def _mass_share(values: SlungLoad, flow: Flow) -> Array:
 
 
 def _implicit_factor(flow: Flow) -> Array:
-    """Return the ratio of the explicit tension to the implicit one at the end of a step of h.
+    """Return the ratio of the explicit tension to the implicit tension, for a step of length h.
 
-    With x'' = -a and a = w^2 x + 2 z w x' at the end of the step (backward Euler) it is
-    1 + 2 z w h + w^2 h^2.
+    The implicit tension is that at the end of the step (backward Euler). With x'' = -a and
+    a = w^2 x + 2 z w x', the ratio is 1 + 2 z w h + w^2 h^2.
     """
     return 1.0 + 2.0 * DAMPING * STIFFNESS * flow.dt + (STIFFNESS * flow.dt) ** 2
 

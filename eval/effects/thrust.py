@@ -11,11 +11,11 @@ class ThrustScale(NamedTuple):
     """Values of `thrust_scale`."""
 
     scale: Array
-    """(...,) true k_T over nominal k_T [1]."""
+    """(...,) true thrust coefficient k_T divided by nominal k_T."""
 
 
 def thrust_scale_constants(values: ThrustScale, constants: Constants) -> Constants:
-    """Return the constants with k_T scaled and the same k_Q."""
+    """Return the constants with k_T scaled and the torque coefficient k_Q unchanged."""
     return constants._replace(
         thrust_coefficient=constants.thrust_coefficient * per_axis(values.scale)
     )
@@ -108,7 +108,7 @@ class ThrustTilt(NamedTuple):
 
 
 def thrust_tilt_constants(values: ThrustTilt, constants: Constants) -> Constants:
-    """Return the constants with the thrust's axis tilted and the same torques."""
+    """Return the constants with the thrust's axis tilted; torques are unchanged."""
     return constants._replace(thrust_axis_b=tilted_e3(values.angle))
 
 

@@ -13,7 +13,7 @@ class WeakMotor(NamedTuple):
     """Values of `weak_motor`; the vehicle file has keys `index` (from 1) and `scale` instead."""
 
     scale: Array
-    """(..., 4) thrust and torque of each rotor, relative to nominal [1]."""
+    """(..., 4) thrust and torque of each rotor, relative to nominal."""
 
 
 def constants_of(values: WeakMotor, constants: Constants) -> Constants:
@@ -45,14 +45,14 @@ def read(table: Mapping[str, Any]) -> WeakMotor:
     if len(index) != len(scale) or not index:
         raise ValueError(f"{entries}: needed is one scale for each index")
     scales = [1.0] * 4
-    for number, factor in zip(index, scale, strict=True):
-        if isinstance(number, bool) or number not in (1, 2, 3, 4) or index.count(number) > 1:
+    for rotor, factor in zip(index, scale, strict=True):
+        if isinstance(rotor, bool) or rotor not in (1, 2, 3, 4) or index.count(rotor) > 1:
             raise ValueError(
                 f"index = {shown(index)}: allowed are different whole numbers from 1 to 4"
             )
         if not is_number(factor):
             raise ValueError(f"scale = {shown(factor)}: must be a finite number")
-        scales[int(number) - 1] = float(factor)
+        scales[int(rotor) - 1] = float(factor)
     return WeakMotor(tuple(scales))
 
 

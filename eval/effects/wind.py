@@ -42,7 +42,7 @@ CONSTANT_WIND = Effect(
 
 
 VERTICAL = 0.5
-"""Ratio of the vertical intensity to the horizontal one [1]."""
+"""Ratio of the vertical intensity of gusts to the horizontal intensity."""
 
 
 class Gusts(NamedTuple):
@@ -51,7 +51,7 @@ class Gusts(NamedTuple):
     intensity: Array
     """(...,) standard deviation of the horizontal wind components [m/s]."""
     length: Array
-    """(...,) distance over which the wind changes [m]."""
+    """(...,) distance through the air over which the wind changes [m]."""
 
 
 def gusts_start(values: Gusts, noise: Array) -> Array:

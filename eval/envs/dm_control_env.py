@@ -97,12 +97,12 @@ def load(
         family: name of the track family.
         level: difficulty level, 0 to 9.
         seed: seed of the track.
-        track: a track that is flown instead; the random numbers of gusts depend on its name (in the
-            judge, on the name of its file).
+        track: a track that is flown instead. The random numbers of gusts depend on its name; in the
+            judge they depend on the name of its file.
         vehicle: the vehicle; None: `eval/vehicles/reference.toml`.
         spec: rate, camera and encoding of the observation; the period is rounded to whole physics
             steps.
-        rules: when an episode ends.
+        rules: rules for the end of an episode; None: the judge's.
         environment: further arguments of `dm_control.rl.control.Environment`.
     """
     track = track or make_track(family, level, seed)

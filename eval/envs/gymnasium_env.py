@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ID = "diffracing/Race-v0"
 """Name of the environment in Gymnasium's registry."""
 Observation = dict[str, np.ndarray]
-"""`state` and `image`."""
+"""An observation: arrays `state` and `image`."""
 RENDER_SIZE = 640, 360
 """Width and height of a rendered frame [pixels]."""
 INSET = 4
@@ -33,7 +33,7 @@ INSET = 4
 
 
 def action_space(spec: PolicySpec) -> gymnasium.spaces.Box:
-    """Return the space of actions (spec.action.size,), -1 to 1."""
+    """Return the space of actions (spec.action.size,), with components from -1 to 1."""
     return gymnasium.spaces.Box(-1.0, 1.0, (spec.action.size,), np.float32)
 
 
@@ -53,8 +53,8 @@ class RaceEnv(gymnasium.Env):
     """Fly through the gates of a track in order, by the rules of the judge.
 
     The judge is the part of the suite that flies policies and scores them. Each component of an
-    action is from -1 to 1. Its meaning is in `contract`, the description of inputs and outputs that
-    belongs into the file of a policy trained here. An observation has `state`, 12 numbers in SI
+    action is from -1 to 1. Its meaning is in `contract`, a description of inputs and outputs that
+    the file of a policy trained here must contain. An observation has `state`, 12 numbers in SI
     units (more with the spec's extras), and `image`, the encoded inverse depth. The reward is a
     weighted sum of the terms in `eval.envs.races.REWARDS`. The time limit is `truncated`, every
     other ending is `terminated`; `info["ended_by"]` is the reason. Unless the track is fixed,

@@ -38,13 +38,13 @@ from tracks.geometry.scene import Gates
 from tracks.track import Track
 
 ACTION_LIMIT = 20.0
-"""Largest component of an action [m/s^2]."""
+"""Largest absolute value of a component of an action [m/s^2]."""
 STATE_LIMIT = 1e4
 """Limit to which components of the state are clipped; flights are far below it."""
 GATE_REWARD = 5.0
-"""Reward of a passed gate; the reward of progress along the remaining path is 1 per metre."""
+"""Reward for a passed gate. The reward for progress along the remaining path is 1 per metre."""
 CRASH_REWARD = -1.0
-"""Reward of a failed episode (not of the time limit); with -5, PPO learns to hover."""
+"""Reward for an episode that fails, except by the time limit. With -5, PPO learns to hover."""
 
 
 class Race:
@@ -58,7 +58,8 @@ class Race:
         self.model = compile_model(track, vehicle, self.autopilot.dt, layout.solids)
         self._period = 1 / (spec.rate_hz * self.autopilot.dt)
         self.steps_a_decision = max(1, round(self._period))
-        """Physics steps of a period, rounded; `steps_to_decision` keeps the mean rate instead."""
+        """Number of physics steps between decisions, rounded to a constant; `steps_to_decision`
+        varies instead, and so keeps the mean rate."""
         self._start = start_state(track)
         gates = Gates(*(np.asarray(field)[None] for field in track.scene.gates))
         self._course = Course(gates, np.array([gates.center_w.shape[1]], np.int32))
@@ -98,7 +99,7 @@ class Race:
         """Fly an action for some physics steps, or until the episode ends; return the reward.
 
         Args:
-            data: after `mj_step1`, as `place` and this function leave it.
+            data: state of the simulation after `mj_step1`, as `place` and this function leave it.
             action_b: (3,) wanted acceleration in body axes [m/s^2].
             steps: number of physics steps.
         """
@@ -111,9 +112,9 @@ class Race:
         for _ in range(steps):
             if self.progress.ended[0] != FLYING:
                 break
-            before = self.progress
-            motion, step = motion_of(data), before.step
-            gate_w = next_centre(self._course, before.gates)
+            progress_before = self.progress
+            motion, step = motion_of(data), progress_before.step
+            gate_w = next_centre(self._course, progress_before.gates)
             noise = None if self._noise is None else self._noise[step + 1]
             self._loops, wrench = autopilot_step(
                 self.autopilot, self._loops, motion, self.action_b, gate_w, step, noise
@@ -123,7 +124,7 @@ class Race:
                 data.qfrc_applied[:3] = to_world(motion.rot_w, wrench.force_b)[0]
                 data.qfrc_applied[3:] = wrench.torque_b[0]
                 mujoco.mj_step2(self.model, data)
-            self.progress = before._replace(step=step + np.int32(1))
+            self.progress = progress_before._replace(step=step + np.int32(1))
             if valid and not has_diverged(self.rules, motion_of(data))[0]:
                 mujoco.mj_step1(self.model, data)
                 self._judge(data, bad_wrench=False)
@@ -158,9 +159,9 @@ class Race:
         gate = next_gate(self._course, self.progress.gates)
         if self.ended_by == "diverged":
             pos_w, rot_w, vel_w = self.progress.pos_w, np.eye(3)[None], np.zeros((1, 3))
-        after = next_gate(self._course, self.progress.gates + 1)
+        second_gate = next_gate(self._course, self.progress.gates + 1)
         depth = self._eye.image(self.model, data, pos_w[0], rot_w[0])[None]
-        view = view_of(pos_w, rot_w, vel_w, gate, after, depth)
+        view = view_of(pos_w, rot_w, vel_w, gate, second_gate, depth)
         state, image = (part[0] for part in observe(self.spec, view, self.action_b))
         return {
             "state": np.clip(state, -STATE_LIMIT, STATE_LIMIT).astype(np.float32),
@@ -169,7 +170,7 @@ class Race:
 
 
 def remaining_path(pos_w: np.ndarray, centres_w: np.ndarray, gates: int) -> float:
-    """Return the length of the path to the next gate, and on from centre to centre [m].
+    """Return the length of the path to the next gate, and from there from gate to gate [m].
 
     Args:
         pos_w: (3,) the drone's position [m].

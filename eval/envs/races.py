@@ -42,17 +42,17 @@ class Moments(NamedTuple):
     to_go_before: np.ndarray
     """(N,) length of the remaining path from gate to gate before the decision [m]."""
     to_go: np.ndarray
-    """(N,) the same after the decision [m]."""
+    """(N,) length of the remaining path after the decision [m]."""
     gates: np.ndarray
     """(N,) number of gates passed during the decision."""
     crashed: np.ndarray
-    """(N,) whether it ended for another reason than all gates or the time limit."""
+    """(N,) whether the episode ended by a failure other than the time limit."""
     finished: np.ndarray
-    """(N,) whether it ended with all gates passed."""
+    """(N,) whether the episode ended with all gates passed."""
     period_s: np.ndarray
-    """(N,) time flown [s]."""
+    """(N,) time flown during the decision [s]."""
     action_change: np.ndarray
-    """(N,) Euclidean distance between this action and the last, components from -1 to 1."""
+    """(N,) norm of this action minus the last one, both with components from -1 to 1."""
 
 
 REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
@@ -63,7 +63,7 @@ REWARDS: dict[str, tuple[float, Callable[[Moments], np.ndarray]]] = {
     "time": (0.0, lambda m: m.period_s),
     "action_change": (0.0, lambda m: m.action_change),
 }
-"""Name of a reward term -> default weight, and function."""
+"""Name of a reward term -> its default weight, and the function that computes it."""
 
 
 @dataclass(frozen=True)
@@ -71,28 +71,29 @@ class RaceConfig:
     """Arguments of the environments."""
 
     track: str = "random"
-    """A track family, or a track file (.toml). Policies are evaluated on the other families."""
+    """A track family, or a track file (.toml). The judge evaluates policies on families other than
+    `random`."""
     level: int | tuple[int, int] = 0
-    """Difficulty 0 to 9, or (lowest, highest) for a random one in each episode."""
+    """Difficulty 0 to 9, or (lowest, highest) for a random level in each episode."""
     track_seed: int | None = None
-    """Seed of one track for all episodes; None: a random one for each episode."""
+    """Seed of one track for all episodes; None: a random seed for each episode."""
     vehicle: str | Vehicle | Callable[[np.random.Generator], Vehicle] = "racer5"
-    """A shipped name, a file, a vehicle, or a function that draws one for each episode; all drawn
-    vehicles must have the same effects (`suite.train.recipes.race_settings` has those of the
-    trainer). The judge's vehicle is `reference`; training on it makes a comparison unfair."""
+    """A shipped name, a file, a vehicle, or a function that draws a vehicle for each episode. All
+    drawn vehicles must have the same effects (`suite.train.recipes.race_settings` has those of the
+    trainer). The judge flies the vehicle `reference`; training on it makes a comparison unfair."""
     spec: PolicySpec | str | None = None
-    """Rate, camera, encoding and extras of the observation: a spec, or the name or folder of a
-    policy that has it."""
+    """Rate, camera, encoding and optional inputs of the observation: a spec, or the name or folder
+    of a policy with that spec; None: the default."""
     action: str = "acceleration"
-    """Kind of action: acceleration, ctbr or motors. Its components are -1 to 1."""
+    """Kind of action: acceleration, ctbr or motors. Its components are from -1 to 1."""
     channel_axis: bool = False
-    """Whether images are (1, height, width)."""
+    """Whether images have the shape (1, height, width)."""
     uint8: bool = False
     """Whether pixels are uint8, 0 to 255."""
     rewards: Mapping[str, float] = field(default_factory=dict)
     """Weights of reward terms by name, instead of the defaults in `REWARDS`."""
     rules: Rules = field(default_factory=Rules)
-    """When an episode ends."""
+    """Rules for the end of an episode."""
 
 
 def levels_of(config: RaceConfig) -> tuple[int, int]:
@@ -122,10 +123,10 @@ def resolved_spec(config: RaceConfig, vehicle: Vehicle) -> PolicySpec:
     if not spec.action.is_plain:
         return spec
     kind = config.action if spec.action.kind == "acceleration" else spec.action.kind
-    half = vehicle.full_thrust / 2
+    half_thrust = vehicle.full_thrust / 2
     scales = {
         "acceleration": ((ACTION_LIMIT,), (0.0,)),
-        "ctbr": ((half, *vehicle.controller.rate_max), (half, 0.0, 0.0, 0.0)),
+        "ctbr": ((half_thrust, *vehicle.controller.rate_max), (half_thrust, 0.0, 0.0, 0.0)),
         "motors": ((0.5,), (0.5,)),
     }
     if kind not in scales:
@@ -207,7 +208,7 @@ class Races:
         """Return a random vehicle for an episode.
 
         Raises:
-            ValueError: where it differs from the first one in more than values of effects.
+            ValueError: where it differs from the first vehicle in more than values of effects.
         """
         vehicle = resolved_vehicle(self.config, rng)
         for part in fields(Vehicle):
@@ -242,7 +243,7 @@ class Races:
         """Fly one action in each slot for a period of the policy's rate; return rewards (N,).
 
         Args:
-            output: (N, size) actions, -1 to 1.
+            output: (N, size) actions, with components from -1 to 1.
         """
         output = np.asarray(output, float)
         finite = np.isfinite(output).all(-1)
@@ -280,7 +281,7 @@ class Races:
 
     @property
     def gates(self) -> np.ndarray:
-        """(N,) gates passed."""
+        """(N,) number of passed gates."""
         return self._world.progress.gates
 
     @property
@@ -290,7 +291,7 @@ class Races:
 
     @property
     def to_go(self) -> np.ndarray:
-        """(N,) length of the path to the next gate's centre, and on from centre to centre [m]."""
+        """(N,) length of the path to the next gate, and from there from gate to gate [m]."""
         slots = zip(self._world.progress.pos_w, self._tracks, self.gates, strict=True)
         return np.array(
             [remaining_path(pos_w, t.scene.gates.center_w, gates) for pos_w, t, gates in slots]

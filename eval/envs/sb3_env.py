@@ -1,7 +1,7 @@
 """The race as environments of Stable-Baselines3 (`pip install 'diffracing-suite[sb3]'`).
 
-The library refuses images with two axes, so here the pixels are one vector, row by row; an image
-with `channel_axis=True` is unchanged.
+The library refuses images with two axes. So the pixels of an image are one vector here, row by row;
+an image with `channel_axis=True` is unchanged.
 """
 
 # pyright: reportMissingImports=false, reportMissingModuleSource=false
@@ -37,7 +37,7 @@ def vector_space(space: gymnasium.Space) -> Dict:
 
 
 def as_space(space: Dict, observation: Observation, *rows: int) -> Observation:
-    """Return observations reshaped to `space`, with a first axis of size `rows`, if any."""
+    """Return observations reshaped to `space`; `rows` is the size of a first axis, if any."""
     return {
         key: part.reshape(*rows, *(space[key].shape or ())) for key, part in observation.items()
     }

@@ -24,10 +24,10 @@ FURTHEST_M = 4.0
 LOWEST_M = 0.02
 """Height below which a flight has failed [m]."""
 SUM_MOST = 1.0
-"""Largest component of the integral of the position error [m s]."""
+"""Limit of each component of the integral of the position error [m s]."""
 LIFT_PER_FLAT, LIFT_LEAST = 0.36, 1.0
-"""Least vertical part of the wanted specific force: relative to the horizontal part, which limits
-the tilt to 70 deg, and absolute [m/s^2]."""
+"""Limits of the vertical part of the wanted specific force: it is at least `LIFT_PER_FLAT` times
+the horizontal part, which limits the tilt to 70 deg, and at least `LIFT_LEAST` [m/s^2]."""
 
 
 class Recording(NamedTuple):
@@ -36,7 +36,7 @@ class Recording(NamedTuple):
     dt: float
     """Length of a physics step [s]."""
     period: int
-    """Physics steps for which a command is held; a log has one row for each command."""
+    """Number of physics steps for which a command is held; a log has one row for each command."""
     time_s: np.ndarray
     """(K,) time since the start [s]."""
     motion: Motion
@@ -44,7 +44,7 @@ class Recording(NamedTuple):
     quat_wxyz: np.ndarray
     """(K, 4) attitude at the start of each step."""
     rotor_speed: np.ndarray
-    """(K, 4) at the start of each step [rad/s]."""
+    """(K, 4) rotor speeds at the start of each step [rad/s]."""
     command: Command
     """(K, ...) the pilot's commands."""
     acc_b: np.ndarray
@@ -52,8 +52,8 @@ class Recording(NamedTuple):
     voltage: np.ndarray
     """(K,) battery voltage [V]."""
     acting: Command
-    """(K, ...) `command` as an `eval.flights.simulate.Extra` (physics beyond the vehicle's)
-    changed it, before the vehicle's delay."""
+    """(K, ...) commands that act, before the vehicle's delay: `command`, unless an
+    `eval.flights.simulate.Extra` (physics that no effect describes) changed it."""
     extra: Wrench
     """(K, 3) force and torque that an `Extra` added."""
     integrator: str | None = None
@@ -69,7 +69,7 @@ class Step(NamedTuple):
     """Quantities of N vehicles in the last physics step."""
 
     rotor_speed: np.ndarray
-    """(N, 4) at its start [rad/s]."""
+    """(N, 4) rotor speeds at the start of the step [rad/s]."""
     voltage: np.ndarray
     """(N,) battery voltage [V]."""
     acting: Command
@@ -141,6 +141,7 @@ def follow(
     for step in range(max(steps)):
         motion, quat = bodies.motion()
         if step % period == 0:
+            # Set points of this moment.
             now = Reference(*(part[step // period] for part in wanted))
             check_flights(motion, now, np.full(count, step * dt))
             summed_w = summed_w + period * dt * (now.pos_w - motion.pos_w)
@@ -159,12 +160,15 @@ def follow(
 
 
 def _flight_of(rows: Sequence[Any], index: int) -> Any:
-    """Return flight `index` (K, ...) from K rows, nested tuples of arrays (N, ...)."""
+    """Return the arrays (K, ...) of flight `index` from K rows of N flights.
+
+    Each row is a tuple of arrays (N, ...), or of such tuples; the result has the same structure.
+    """
     if not isinstance(rows[0], tuple):
         return np.array([row[index] for row in rows])
     parts = (_flight_of(field, index) for field in zip(*rows, strict=True))
-    kind = type(rows[0])
-    return kind(*parts) if hasattr(kind, "_fields") else tuple(parts)
+    row_type = type(rows[0])
+    return row_type(*parts) if hasattr(row_type, "_fields") else tuple(parts)
 
 
 def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None:
@@ -176,16 +180,16 @@ def check_flights(motion: Motion, wanted: Reference, time_s: np.ndarray) -> None
         time_s: (N,) current times [s].
 
     Raises:
-        FlightFailed: where one has tipped over, hit the ground or left its trajectory.
+        FlightFailed: where a flight has tipped over, hit the ground or left its trajectory.
     """
     distance = np.sqrt(((motion.pos_w - wanted.pos_w) ** 2).sum(-1))
     # With these comparisons, a state of NaN fails too.
-    upright, high = motion.rot_w[:, 2, 2] > 0.0, motion.pos_w[:, 2] > LOWEST_M
-    valid = (distance < FURTHEST_M) & upright & high
+    upright, above_ground = motion.rot_w[:, 2, 2] > 0.0, motion.pos_w[:, 2] > LOWEST_M
+    valid = (distance < FURTHEST_M) & upright & above_ground
     if not valid.all():
-        bad = int(np.flatnonzero(~valid)[0])
+        first = int(np.flatnonzero(~valid)[0])
         raise FlightFailed(
-            f"flight {bad + 1} failed at {time_s[bad]:.2f} s, {distance[bad]:.1f} m off its "
+            f"flight {first + 1} failed at {time_s[first]:.2f} s, {distance[first]:.1f} m off its "
             "trajectory; make the trajectory gentler or the effect weaker"
         )
 
@@ -233,10 +237,10 @@ def corrected(
 def steer(
     vehicle: Vehicle, gains: PilotGains, wanted: Reference, motion: Motion, summed_w: np.ndarray
 ) -> Command:
-    """Return the command that follows `wanted`; the pilot knows the nominal vehicle only.
+    """Return the command that follows `wanted`, computed for the nominal vehicle.
 
     Args:
-        vehicle: gives the attitude loop's gains and limits.
+        vehicle: the nominal vehicle, of which the attitude loop's gains and limits are used.
         gains: gains of the position loop.
         wanted: (N, ...) current set points.
         motion: (N, ...) true states.
@@ -245,9 +249,9 @@ def steer(
     pos_error_w, vel_error_w = wanted.pos_w - motion.pos_w, wanted.vel_w - motion.vel_w
     acc_w = corrected(gains, wanted.acc_w, pos_error_w, vel_error_w, summed_w)
     force_w = acc_w + np.array([0.0, 0.0, GRAVITY])
-    # The tilt is limited: a commanded free fall would turn the vehicle over.
-    flat = np.sqrt((force_w[:, :2] ** 2).sum(-1))
-    force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(LIFT_PER_FLAT * flat, LIFT_LEAST))
+    # The tilt is limited, because a commanded free fall would turn the vehicle over.
+    level = np.sqrt((force_w[:, :2] ** 2).sum(-1))
+    force_w[:, 2] = np.maximum(force_w[:, 2], np.maximum(LIFT_PER_FLAT * level, LIFT_LEAST))
     heading_w = np.stack(
         [np.cos(wanted.yaw), np.sin(wanted.yaw), np.zeros_like(wanted.yaw)], axis=-1
     )

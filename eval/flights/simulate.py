@@ -19,7 +19,7 @@ from eval.vehicles.vehicle import Vehicle
 from tracks.geometry.rotation import to_world
 
 FULL_V = 16.5
-"""Battery voltage at the start [V]."""
+"""Battery voltage at the start of a flight [V]."""
 FALL_V_PER_S = 0.02
 """Rate at which the voltage falls as the battery discharges [V/s]."""
 SAG_V = 0.35
@@ -30,7 +30,7 @@ INTEGRATOR = "euler"
 
 
 class Extra(Protocol):
-    """Physics that the vehicle's effects do not describe, acting on N flights at once."""
+    """Physics that no effect of the catalogue describes, for N flights at once."""
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return the command that acts instead of `command`; called once a step."""
@@ -58,8 +58,8 @@ def fly(
         truth: the vehicle that flies: the same quadrotor with the true effects.
         trajectories: the N trajectories.
         rate_hz: rate of commands and log rows; the rate loop's frequency must be a multiple of it.
-        extra: further physics that no effect describes.
-        rng: random generator for random wind; without it there is none.
+        extra: physics that no effect describes; None: none.
+        rng: random generator for random wind; None: no random wind.
         has_voltage: whether effects depend on the battery's voltage, as for logs that contain it.
         gains: gains of the position controller; None: the defaults.
 
@@ -156,23 +156,23 @@ class Sensors:
     """Standard deviations of the white noise of a log's signals; 0: the signal is not logged."""
 
     name: str
-    """Name in tables."""
+    """Name of the set of sensors in tables."""
     rate_hz: float
     """Rate of the log [Hz]."""
     pos: float
-    """Position, each axis [m]."""
+    """Noise of the position, each axis [m]."""
     attitude: float
-    """Attitude, about each body axis [rad]."""
+    """Noise of the attitude, about each body axis [rad]."""
     gyro: float
-    """Body rates, each axis [rad/s]."""
+    """Noise of the body rates, each axis [rad/s]."""
     vel: float = 0.0
-    """Velocity, each axis [m/s]."""
+    """Noise of the velocity, each axis [m/s]."""
     acc: float = 0.0
-    """Specific force, each axis [m/s^2]."""
+    """Noise of the specific force, each axis [m/s^2]."""
     rotor: float = 0.0
-    """Speed of each rotor [rad/s]."""
+    """Noise of the speed of each rotor [rad/s]."""
     voltage: float = 0.0
-    """Battery voltage [V]."""
+    """Noise of the battery voltage [V]."""
     lost: float = 0.0
     """Share of rows without a pose; each gap has three rows."""
 
@@ -211,7 +211,7 @@ def log_of(
         recording: the flight at every physics step.
         truth: the vehicle with the log faults (such as a gyro bias), applied at the physics rate.
         sensors: the logged signals and their noise; its rate must be the recording's.
-        rng: random generator of noise and gaps; None: neither.
+        rng: random generator of noise and gaps; None: neither noise nor gaps.
         name: name of the flight.
     """
     motion = recording.motion
@@ -239,9 +239,9 @@ def log_of(
         # The attitude's noise is a small rotation about body axes.
         error = Rotation.from_rotvec(sensors.attitude * rng.standard_normal((len(quat), 3)))
         quat = (Rotation.from_quat(quat, scalar_first=True) * error).as_quat(scalar_first=True)
-        lost = rng.random(len(quat)) < sensors.lost / 3.0
-        lost[:2] = lost[-4:] = False
-        for row in np.flatnonzero(lost):
+        starts_gap = rng.random(len(quat)) < sensors.lost / 3.0
+        starts_gap[:2] = starts_gap[-4:] = False
+        for row in np.flatnonzero(starts_gap):
             pos_w[row : row + 3] = np.nan
             quat[row : row + 3] = np.nan
     return FlightLog(

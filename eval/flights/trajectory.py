@@ -15,7 +15,7 @@ EASE_S = 0.7
 STEP_S = 1e-3
 """Step of the central differences for velocity and acceleration [s]."""
 EIGHT_FACTOR = 1.0 / np.sqrt(2.0)
-"""For a figure eight: angular frequency times size, relative to the largest speed."""
+"""Angular frequency times size of a figure eight, divided by its largest speed."""
 CYCLE_S = 6.0
 """Period of the changing speed of `speed_range` [s]."""
 PUNCH_M, PUNCH_HZ = 0.18, 1.1
@@ -45,7 +45,7 @@ class Trajectory:
     kind: str
     """Kind of path, one of `KINDS`."""
     duration_s: float = 10.0
-    """Duration of the flight."""
+    """Duration of the flight [s]."""
     speed: float = 4.0
     """Approximate largest speed [m/s]."""
     size: float = 3.0
@@ -76,7 +76,11 @@ class Trajectory:
         return Reference(now, vel_w, acc_w, self.direction + _TURNS[self.turn](self, time_s))
 
     def _position(self, time_s: np.ndarray) -> np.ndarray:
-        """Return positions (T, 3) [m]; the path parameter is a time that starts slowly."""
+        """Return positions (T, 3) [m] along the path.
+
+        The path is a function of an eased time, which begins with a rate of 0, so that the flight
+        starts at rest.
+        """
         time_s = np.maximum(time_s, 0.0)
         eased_s = time_s - EASE_S * -np.expm1(-time_s / EASE_S)
         x, y, z = np.broadcast_arrays(*KINDS[self.kind](self, eased_s))
@@ -167,9 +171,9 @@ def ordinary_flights(rng: np.random.Generator, duration_s: float = 10.0) -> list
     """
 
     def random_flight(kind: str, **ranges: tuple[float, float]) -> Trajectory:
-        numbers = {key: float(rng.uniform(*limits)) for key, limits in ranges.items()}
+        values = {key: float(rng.uniform(*limits)) for key, limits in ranges.items()}
         direction = float(rng.uniform(0.0, 2.0 * np.pi))
-        return replace(Trajectory(kind, duration_s), direction=direction, **numbers)
+        return replace(Trajectory(kind, duration_s), direction=direction, **values)
 
     return [
         replace(random_flight("figure_eight", speed=(4, 7), size=(3, 5)), turn="wobble"),

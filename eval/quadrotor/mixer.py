@@ -11,7 +11,7 @@ from tracks.geometry.rotation import cross
 from tracks.geometry.scene import Array
 
 NEGLIGIBLE = 1e-9
-"""Thrusts below this are rounding errors [N]."""
+"""Thrusts below this count as rounding errors [N]."""
 
 
 def largest(values: Array) -> Array:
@@ -58,10 +58,10 @@ def mixer_matrix(position_b: Array, spin: Array, torque_per_thrust: float) -> np
 def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> Array:
     """Return the rotor thrusts (..., 4) [N], each in [0, thrust_max].
 
-    If the exact solution is out of range, roll and pitch are scaled down together until their
-    spread fits, the collective thrust is clamped to the feasible range, and yaw is scaled down to
-    the remaining range. The direction of thrust has priority over its magnitude, and its magnitude
-    over the heading.
+    If the exact solution is out of range, three steps reduce it. Roll and pitch are scaled down
+    together until their spread fits. The collective thrust is clamped to the feasible range. Yaw is
+    scaled down to the remaining range. So the direction of thrust has priority over its magnitude,
+    and the magnitude over the heading.
 
     Args:
         unmixer: (4, 4) inverse of `mixer_matrix`.
@@ -86,9 +86,9 @@ def mix(unmixer: Array, thrust_max: Array, force_z: Array, torque_b: Array) -> A
     force = xp.minimum(xp.maximum(force_z, lowest), highest)
     without_yaw = xp.clip(force[..., None] * per_force + roll_pitch, 0.0, thrust_max)
     margin = xp.where(yaw > 0.0, thrust_max - without_yaw, without_yaw)
-    size = xp.abs(yaw)
+    yaw_size = xp.abs(yaw)
     # An excess over the margin by rounding is left to the clip below.
-    exceeds = size > xp.maximum(margin, NEGLIGIBLE)
-    share = xp.where(exceeds, margin / xp.where(exceeds, size, 1.0), 1.0)
-    limited = without_yaw + least(share)[..., None] * yaw
+    exceeds = yaw_size > xp.maximum(margin, NEGLIGIBLE)
+    feasible_share = xp.where(exceeds, margin / xp.where(exceeds, yaw_size, 1.0), 1.0)
+    limited = without_yaw + least(feasible_share)[..., None] * yaw
     return xp.where(outside, xp.clip(limited, 0.0, thrust_max), exact)

@@ -1,10 +1,10 @@
 """Add the quadrotor to a MuJoCo model as a body with the true mass and inertia.
 
-The suite's simulators leave the actuators at zero. They write the plant's force and torque (those
-of rotors and effects) into `qfrc_applied` of the free joint, as `[R force_b, torque_b]`: forces of
-a free joint are in world axes, torques in body axes, and the body's origin is its centre of mass.
-The rotors' actuators could not apply effects such as drag. A user without the plant may control the
-four actuators, whose control is a rotor's thrust in newton.
+The suite's simulators leave the actuators at zero, because these could not apply effects such as
+drag. The simulators compute the force and torque of rotors and effects by a `Plant`, and write them
+into `qfrc_applied` of the free joint, as `[R force_b, torque_b]`. Forces of a free joint are in
+world axes, torques in body axes, and the body's origin is its centre of mass. A user without the
+`Plant` may control the four actuators, whose control is a rotor's thrust in newton.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ BODY = "quadrotor"
 CAMERA = "depth"
 """Name of the camera."""
 COLLIDES = "quadrotor box"
-"""Name of the only geom of the quadrotor that collides."""
+"""Name of the only geom (MuJoCo's solid) of the quadrotor that collides."""
 VISUAL_GROUP = 2
-"""Geom group of visual geoms, which rays and contacts skip."""
+"""Group of the geoms that are only drawn; rays and contacts skip them."""
 
 
 def rotor_name(index: int) -> str:
@@ -82,7 +82,7 @@ def compile_quadrotor(spec: mujoco.MjSpec, vehicle: Vehicle, dt: float) -> mujoc
 
     MuJoCo's compiler refuses moments of inertia that break the triangle inequality. A fitted
     `inertia_scale` of a flat quadrotor often breaks it by a few percent. MuJoCo's dynamics work
-    with any values, so the true ones are set in the compiled model.
+    with any values, so the true values are set in the compiled model.
     """
     spec.option.timestep = dt
     add_quadrotor(spec, vehicle)

@@ -48,37 +48,37 @@ class Motion(NamedTuple):
     """A rigid body's state at its centre of mass."""
 
     pos_w: Array
-    """(..., 3) [m]."""
+    """(..., 3) position [m]."""
     rot_w: Array
-    """(..., 3, 3) body to world."""
+    """(..., 3, 3) attitude, body to world."""
     vel_w: Array
-    """(..., 3) [m/s]."""
+    """(..., 3) velocity [m/s]."""
     rate_b: Array
-    """(..., 3) [rad/s]."""
+    """(..., 3) body rates [rad/s]."""
 
 
 class Wrench(NamedTuple):
     """Force and torque on the rigid body, without gravity and its own gyroscopic terms."""
 
     force_b: Array
-    """(..., 3) on the centre of mass [N]."""
+    """(..., 3) force on the centre of mass [N]."""
     torque_b: Array
-    """(..., 3) about the centre of mass [N m]."""
+    """(..., 3) torque about the centre of mass [N m]."""
 
 
 class Nominal(NamedTuple):
     """The nominal constants, which the controller uses."""
 
     mass: Array
-    """[kg]."""
+    """Mass [kg]."""
     inertia: Array
-    """(3,) [kg m^2]."""
+    """(3,) principal moments of inertia, body axes [kg m^2]."""
     unmixer: Array
-    """(4, 4) from (force, torque) to rotor thrusts."""
+    """(4, 4) matrix from (force along z, torque) to rotor thrusts."""
     thrust_max: Array
     """Largest thrust of one rotor [N]."""
     thrust_coefficient: Array
-    """k_T [N/(rad/s)^2]."""
+    """k_T: thrust of a rotor over its squared speed [N/(rad/s)^2]."""
     spin: Array
     """(4,) s_i: +1 for a rotor turning counter-clockwise seen from above, -1 clockwise."""
 
@@ -93,7 +93,7 @@ class Plant(NamedTuple):
     effects: dict[str, Any]
     """Values of all effects, as arrays, by name."""
     delay_weight: Array
-    """(..., L) weight of each of the last L commands in the delayed one; L = 0 without a delay."""
+    """(..., L) weights of the last L commands in the delayed command; L = 0 without a delay."""
     dt: Array
     """Length of a step [s]."""
     loop: Loop | None = None
@@ -109,7 +109,7 @@ def make_plant(
     """Return the plant of `vehicle` for steps of `dt` [s].
 
     Args:
-        vehicle: gives the nominal values.
+        vehicle: the vehicle file, with the nominal values.
         dt: length of a step, 1 / controller.frequency [s].
         effects: values by name that replace `vehicle.effects`; they may be traced JAX arrays, and
             have leading batch axes (one vehicle for each trial).
@@ -128,8 +128,9 @@ def fit_plant(vehicle: Vehicle, effects: Mapping[str, Any], dt: float | None = N
     """Return a plant with all effects of the catalogue at once, to fit any of them.
 
     Args:
-        vehicle: gives the nominal values and its effects; other effects are neutral.
-        effects: values by name that replace these; they may be traced.
+        vehicle: the vehicle file, with nominal values and effects; effects that it does not list
+            are neutral (without influence).
+        effects: values by name that replace those; they may be traced JAX arrays.
         dt: length of a step [s]; 1 / controller.frequency if not given.
     """
     values = {**all_values(vehicle), **effects}
@@ -238,8 +239,8 @@ def euler_step(plant: Plant, motion: Motion, wrench: Wrench) -> Motion:
 def euler_move(motion: Motion, acc_w: Array, turn_b: Array, dt: Array) -> Motion:
     """Return the motion after `dt` (..., 1) [s] under accelerations (semi-implicit Euler, order 1).
 
-    The velocities are stepped first. The new ones move the position and the attitude, the latter by
-    the exact rotation of the new body rate.
+    The velocities are stepped first. The new velocities move position and attitude; the attitude
+    turns by the exact rotation of the new body rate.
     """
     xp = motion.rot_w.__array_namespace__()
     vel_w = motion.vel_w + dt * acc_w

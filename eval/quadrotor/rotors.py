@@ -1,4 +1,4 @@
-"""Rotor dynamics: the speed follows its command with a delay and a first-order lag.
+"""Rotor dynamics: the speed follows its command after a delay, with a first-order response (lag).
 
 If the delay is not a multiple of the step, a step's command is the weighted mean of two commands,
 so the delay has a gradient. The diagnosis knows all commands in advance and uses means over its
@@ -15,7 +15,7 @@ import numpy as np
 from tracks.geometry.scene import Array
 
 SHORT_S = 1e-4
-"""Least divisor in the rate of change of a speed [s]."""
+"""Least step length by which a change of speed is divided [s]."""
 NEGLIGIBLE = 1e-6
 """Thrusts below this count as zero [N]."""
 
@@ -40,22 +40,22 @@ def speed_command(thrust: Array, thrust_coefficient: float) -> Array:
 
 
 def follow(speed: Array, command: Array, time_constant: Array, dt: Array) -> RotorStep:
-    """Return the rotors' step under dOmega/dt = (command - Omega) / time_constant.
+    """Return the rotor speeds in a step, under dOmega/dt = (command - Omega) / time_constant.
 
-    Thrust is computed from the mean square speed, so that lags far shorter than a step still have
-    an effect, to first order. With a time constant of 0 there is no lag, but the gradient with
-    respect to it exists.
+    Thrust is computed from the mean square speed, so that time constants far shorter than a step
+    still have an effect, to first order. With a time constant of 0 the speed equals the command,
+    but the gradient with respect to the time constant exists.
 
     Args:
-        speed: (..., 4) at the start of the step [rad/s].
-        command: (..., 4) held during the step [rad/s].
-        time_constant: (...,) [s].
+        speed: (..., 4) rotor speeds at the start of the step [rad/s].
+        command: (..., 4) commanded speeds, constant during the step [rad/s].
+        time_constant: (...,) time constant of the rotors [s].
         dt: length of the step [s].
     """
     xp = speed.__array_namespace__()
     time_constant = xp.asarray(time_constant)
-    lags = time_constant > 0.0
-    decay = xp.where(lags, xp.exp(-dt / xp.where(lags, time_constant, 1.0)), 0.0)
+    has_lag = time_constant > 0.0
+    decay = xp.where(has_lag, xp.exp(-dt / xp.where(has_lag, time_constant, 1.0)), 0.0)
     steps = (time_constant / dt)[..., None]
     decay = decay[..., None]
     # Omega(t) = command + error exp(-t / time_constant); its means over the step are integrals.
@@ -74,14 +74,14 @@ def acceleration(
 ) -> Array:
     """Return the mean rate of change of the rotor speeds (..., 4) over a step [rad/s^2].
 
-    If the lag is longer than the step, it follows from the lag's equation, even for a step of zero
-    length. Otherwise it is the change divided by the step.
+    If the time constant is longer than the step, the equation of `follow` gives the rate, even for
+    a step of zero length. Otherwise the rate is the change of speed divided by the step.
 
     Args:
         start: (..., 4) speeds at the start of the step [rad/s].
         rotors: the step.
         command: (..., 4) commanded speeds [rad/s]; None if the speeds are measured.
-        time_constant: (...,) time constant of the lag [s].
+        time_constant: (...,) time constant of the rotors [s].
         dt: length of the step [s].
     """
     xp = start.__array_namespace__()
@@ -89,9 +89,9 @@ def acceleration(
     if command is None:
         return quotient
     lag = xp.asarray(time_constant)[..., None]
-    lags = lag > dt
-    slope = (command - 0.5 * (start + rotors.end)) / xp.where(lags, lag, 1.0)
-    return xp.where(lags, slope, quotient)
+    is_slow = lag > dt
+    slope = (command - 0.5 * (start + rotors.end)) / xp.where(is_slow, lag, 1.0)
+    return xp.where(is_slow, slope, quotient)
 
 
 def steady(speed: Array) -> RotorStep:
@@ -108,7 +108,7 @@ def whole_steps(delay: Array, dt: Any) -> tuple[Array, Array]:
 
 
 def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
-    """Return the weight (..., L) of each stored command in the delayed one, newest first.
+    """Return the weights (..., L) of the stored commands in the delayed command, newest first.
 
     Args:
         delay: (...,) delay of the commands [s].
@@ -123,10 +123,10 @@ def delay_weight(delay: Array, dt: float, max_delay: float) -> Array:
 
 
 def delayed(weight: Array, past: Array, command: Array) -> tuple[Array, Array]:
-    """Store a command, and return the stored commands (..., C, L) and the delayed one (..., C).
+    """Store a command; return the stored commands (..., C, L) and the delayed command (..., C).
 
     Args:
-        weight: (..., L) from `delay_weight`, L > 0.
+        weight: (..., L) weights from `delay_weight`, L > 0.
         past: (..., C, L) commands of the previous steps, newest first.
         command: (..., C) command of this step.
     """

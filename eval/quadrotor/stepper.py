@@ -1,10 +1,11 @@
 """Simulate a quadrotor step by step, for numpy and JAX arrays of any leading batch shape.
 
 `plant_step` computes the force and torque on the body from command, delay, rate loop, mixer, rotors
-and effects; a simulator passes them to MuJoCo. `step` also moves the rigid body, like MuJoCo's
-Euler integrator. `rollout` is many steps in JAX: the differentiable quadrotor. It can be compiled,
-mapped over flights, and differentiated with respect to its start, its inputs and the values of all
-effects, delay and lag included.
+and effects; a simulator passes them to MuJoCo. A plant holds the constants of a quadrotor with its
+effects. `step` also moves the rigid body, like MuJoCo's Euler integrator. `rollout` is many steps
+in JAX: the differentiable quadrotor. It can be compiled, mapped over flights, and differentiated
+with respect to its start, its inputs and the values of all effects, also those of command delay and
+rotor time constant.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class PlantState(NamedTuple):
     """State of a plant between steps."""
 
     rotor_speed: Array
-    """(..., 4) at the start of the step [rad/s]."""
+    """(..., 4) rotor speeds at the start of the step [rad/s]."""
     past_commands: Array
     """(..., 4, L) thrust and rates of the last L steps, newest first; L = 0 without a delay."""
     wind: dict[str, Array]
@@ -63,7 +64,8 @@ class Inputs(NamedTuple):
     push_b: Array | None = None
     """(..., 6) additional acceleration [m/s^2] and angular acceleration [rad/s^2], body axes."""
     speed_cmd: Array | None = None
-    """(..., 4) commanded rotor speeds instead of a command; delay and lag act on them [rad/s]."""
+    """(..., 4) commanded rotor speeds, instead of a command [rad/s]. The command delay and the
+    rotors' response act on them."""
 
 
 class Feedback(NamedTuple):
@@ -79,13 +81,13 @@ class Rollout(NamedTuple):
     """T simulated steps."""
 
     motion: Motion
-    """(T + 1, ...): the start and the state after each step."""
+    """(T + 1, ...) states: at the start, and after each step."""
     rotor_speed: Array
-    """(T + 1, ..., 4) [rad/s]."""
+    """(T + 1, ..., 4) rotor speeds at the same times [rad/s]."""
     acc_b: Array
     """(T, ..., 3) specific force during each step [m/s^2]."""
     state: PlantState
-    """(...) after the last step, from which a rollout can continue."""
+    """(...) the plant's state after the last step, from which a rollout can continue."""
 
 
 def hover_state(
@@ -100,27 +102,27 @@ def hover_state(
         noise: (*batch_shape, 3) normal random numbers for the random wind at the start; None: no
             wind.
     """
-    still = xp.zeros((*batch_shape, 3))
-    hover = Command(xp.full(batch_shape, GRAVITY), still)
-    past = (*batch_shape, 4, plant.delay_weight.shape[-1])
+    zeros = xp.zeros((*batch_shape, 3))
+    hover = Command(xp.full(batch_shape, GRAVITY), zeros)
+    past_commands = (*batch_shape, 4, plant.delay_weight.shape[-1])
     wind = {}
     for name, value in in_order(plant.effects):
         start = EFFECTS[name].gust
         if start is not None:
-            wind[name] = still if noise is None else start(value, noise) + still
-    speed = wanted_speed(plant, hover, still)
+            wind[name] = zeros if noise is None else start(value, noise) + zeros
+    speed = wanted_speed(plant, hover, zeros)
     memory = loops.start(plant.loop, batch_shape, xp)
-    past = xp.broadcast_to(hover.packed[..., None], past)
-    return PlantState(speed, past, wind, memory, _carried_in_hover(plant, speed, still))
+    past_commands = xp.broadcast_to(hover.packed[..., None], past_commands)
+    return PlantState(speed, past_commands, wind, memory, _carried_in_hover(plant, speed, zeros))
 
 
-def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[str, Memory]:
+def _carried_in_hover(plant: Plant, rotor_speed: Array, zeros: Array) -> dict[str, Memory]:
     """Return the states of effects that have one, for plants that hovered until now."""
     carried = {}
     if uses_memory(plant):
-        level = Motion(still, still[..., None] + np.eye(3), still, still)
+        level = Motion(zeros, zeros[..., None] + np.eye(3), zeros, zeros)
         rotors = steady(rotor_speed)
-        _, flow = wind_and_flow(plant, {}, level, rotors, still[..., 0])
+        _, flow = wind_and_flow(plant, {}, level, rotors, zeros[..., 0])
         for name, value in in_order(plant.effects):
             start = EFFECTS[name].start
             if start is not None:
@@ -131,7 +133,7 @@ def _carried_in_hover(plant: Plant, rotor_speed: Array, still: Array) -> dict[st
 def wanted_speed(plant: Plant, command: Command, rate_b: Array) -> Array:
     """Return the rotor speeds (..., 4) [rad/s] that rate loop and mixer command.
 
-    For a firmware's loop they are those of its first update.
+    For a firmware's loop, which has a state, they are those of its first update.
 
     Args:
         plant: the plant.
@@ -214,7 +216,7 @@ def plant_step(
         inputs: a command or measured rotor speeds, voltage, wind and pushes.
         time_s: (...,) time since the start of the flight [s].
     """
-    before = state.rotor_speed
+    speed_before = state.rotor_speed
     if inputs.rotor_speed is not None:
         rotors = steady(inputs.rotor_speed)
         state = state._replace(rotor_speed=rotors.end)
@@ -224,7 +226,7 @@ def plant_step(
         plant, state.wind, motion, rotors, time_s, inputs.noise, inputs.voltage_drop
     )
     if uses_rotor_acc(plant):
-        flow = flow._replace(rotor_acc=(rotors.end - before) / plant.dt)
+        flow = flow._replace(rotor_acc=(rotors.end - speed_before) / plant.dt)
     wrench = with_push(plant, wrench_on(plant, rotors, flow, state.carried), inputs.push_b)
     carried = _next_states(plant, state.carried, motion, flow, wrench)
     return state._replace(wind=winds, carried=carried), wrench
@@ -283,7 +285,7 @@ def rollout(
 
 
 def prepend_start(start: Any, following: Any) -> Any:
-    """Return pytrees of values at the start (...) and T following ones as one of (T + 1, ...)."""
+    """Return values at the start (...) and T following values as one pytree of (T + 1, ...)."""
     import jax
     import jax.numpy as jnp
 

@@ -47,7 +47,8 @@ def load_vehicle(source: str | os.PathLike[str]) -> Vehicle:
     """Return the vehicle of a file, or a shipped one by its name.
 
     Args:
-        source: a path (it ends in .toml, has a folder or exists) or a shipped name.
+        source: a path, or a shipped name. A text counts as a path if it ends in .toml, has a folder
+            or is an existing file.
 
     Raises:
         VehicleFileError: for a file that cannot be used.
@@ -129,18 +130,18 @@ def vehicle_table(vehicle: Vehicle) -> dict[str, Any]:
 
 def _effects(tables: Table, vehicle: Vehicle) -> dict[str, Any]:
     """Return the values of the tables [effects.NAME], by name, checked against their bounds."""
-    values = {}
+    values_of = {}
     for name in tables.values:
         effect, table = find_effect(name), tables.table(name)
         if effect.read:
             try:
-                values[name] = effect.read(table.values)
+                values_of[name] = effect.read(table.values)
             except ValueError as error:
                 raise ValueError(f"effects.{name}: {error}") from error
         else:
-            values[name] = _effect_values(effect, table, vehicle)
-        check_bounds(effect, values[name], vehicle)
-    return values
+            values_of[name] = _effect_values(effect, table, vehicle)
+        check_bounds(effect, values_of[name], vehicle)
+    return values_of
 
 
 def _effect_values(effect: Effect, table: Table, vehicle: Vehicle) -> Any:

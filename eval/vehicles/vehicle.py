@@ -19,7 +19,7 @@ from typing import Any
 from tracks.geometry.camera import Camera
 
 Vector = tuple[float, float, float]
-"""x, y, z."""
+"""Components along x, y and z."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Rotors:
     spin: tuple[int, int, int, int]
     """s_i: +1 turns counter-clockwise seen from above, -1 clockwise."""
     thrust_coefficient: float
-    """k_T [N/(rad/s)^2]."""
+    """k_T: thrust of a rotor over its squared speed [N/(rad/s)^2]."""
     torque_coefficient: float
-    """k_Q [N m/(rad/s)^2]."""
+    """k_Q: torque of a rotor over its squared speed [N m/(rad/s)^2]."""
     time_constant: float
-    """tau_m of the first-order lag [s]; 0: no lag."""
+    """tau_m: time constant with which rotor speeds follow commands [s]; 0: at once."""
     speed_max: float
-    """Largest commanded speed [rad/s]."""
+    """Largest commanded rotor speed [rad/s]."""
 
     @property
     def thrust_max(self) -> float:
@@ -50,7 +50,7 @@ class Controller:
     """The attitude loop (attitude error to body rates) and the rate loop (body rates to torque)."""
 
     rate_gain: Vector
-    """K of the rate loop [1/s]; a firmware's loop uses its settings instead."""
+    """K: gain of the nominal rate loop [1/s]; a firmware's loop uses its settings instead."""
     frequency: float
     """Frequency of the rate loop, and of the physics [Hz]."""
     attitude_gain: Vector = (8.0, 8.0, 4.0)
@@ -68,11 +68,11 @@ class MotorMap:
     """Thrust of a motor command: the vehicle file's `[motors]`; see `motor_thrust`."""
 
     thrust: tuple[float, float]
-    """t1, t2 of T = t1 u + t2 u^2 [N], u the applied command."""
+    """Coefficients t1, t2 of the thrust T = t1 u + t2 u^2 [N] of an applied command u."""
     voltage: float
-    """V0, the battery's nominal voltage [V]."""
+    """V0: the battery's nominal voltage [V]."""
     voltage_exponent: float = 1.0
-    """n of u = command (V / V0)^n; 0 where the firmware compensates the battery."""
+    """Exponent n of u = command (V / V0)^n; 0 if the firmware compensates the voltage."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Vehicle:
 
     @property
     def full_thrust(self) -> float:
-        """Nominal largest collective thrust per mass [m/s^2], that of full throttle."""
+        """Nominal collective thrust per mass at full throttle [m/s^2]."""
         return 4.0 * self.rotors.thrust_max / self.mass
 
 
@@ -123,7 +123,7 @@ def motor_thrust(motors: MotorMap, command: Any, voltage: Any = None) -> Any:
     """Return the thrusts (..., 4) [N] of motor commands.
 
     Args:
-        motors: the vehicle's map from commands to thrust.
+        motors: thrust of the vehicle's motor commands.
         command: (..., 4) motor commands from 0 to 1.
         voltage: (...,) battery voltage [V]; None: the nominal one.
     """
@@ -152,7 +152,7 @@ def motor_speed(vehicle: Vehicle, command: Any, voltage: Any = None) -> Any:
     """Return the commanded rotor speeds (..., 4) [rad/s] for motor commands.
 
     Args:
-        vehicle: its `[motors]` map commands to thrust.
+        vehicle: a vehicle with `[motors]`, the thrust of its motor commands.
         command: (..., 4) motor commands from 0 to 1.
         voltage: (...,) battery voltage [V]; None: the nominal one.
 

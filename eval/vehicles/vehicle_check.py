@@ -47,7 +47,7 @@ def check_vehicle(vehicle: Vehicle) -> None:
 
 
 def _check_motors(motors: MotorMap) -> None:
-    """Refuse a map whose thrust does not grow with the command."""
+    """Refuse `[motors]` whose thrust does not grow with the command."""
     _between("motors.voltage", motors.voltage, 0.5, 1000.0, "V")
     _between("motors.voltage_exponent", motors.voltage_exponent, 0.0, 4.0, "")
     _between("motors.thrust", motors.thrust, -100000.0, 100000.0, "N")
@@ -84,15 +84,16 @@ def _check_rotors(vehicle: Vehicle) -> None:
         # With a firmware's loop, `[motors]` limits the thrust too.
         full = motor_thrust(vehicle.motors, 1.0)
         limits[f"motors.thrust = {list(vehicle.motors.thrust)}"] = full
-    for entry, most in limits.items():
-        if hover.max() >= most:
+    for entry, limit in limits.items():
+        if hover.max() >= limit:
             raise ValueError(
-                f"{entry}: too weak to hover; a rotor gives {most:.3g} N and {hover.max():.3g} N "
+                f"{entry}: too weak to hover; a rotor gives {limit:.3g} N and {hover.max():.3g} N "
                 "are needed"
             )
 
 
 def _between(key: str, value: Any, low: float, high: float, unit: str) -> None:
+    """Refuse a number, or a component of a vector, that is not from `low` to `high`."""
     if not (np.min(value) >= low and np.max(value) <= high):
         text = list(value) if isinstance(value, tuple) else value
         raise ValueError(f"{key} = {text}: must be from {low:g} to {high:g} {unit}")

@@ -41,9 +41,9 @@ def tabs_blueprint(
 ) -> rrb.Blueprint:
     """Return a layout with a tab for each of `views`, which plays the span `playback_s` [s].
 
-    The viewer has no setting for the initial time, but a loop over a selection begins at its start.
-    Without it a file opens at its last time. (A viewer of 0.41 that loads slowly plays from the
-    start to the end and stops there.)
+    The viewer has no setting for the initial time, and opens a file at its last time. So the layout
+    plays a loop over a selection, which begins at the start of the selection. (If version 0.41 of
+    the viewer loads slowly, it plays from the start to the end and stops there.)
     """
     begin, end = (round(1e9 * time) for time in playback_s)
     return rrb.Blueprint(

@@ -13,7 +13,7 @@ from eval.view.solids import track_solids
 from tracks.track import Track
 
 OVERSAMPLING = 2
-"""Pictures are drawn this many times larger and then reduced, for smooth edges."""
+"""Factor by which pictures are drawn larger before they are reduced, for smooth edges."""
 ARM_M, ROTOR_RADIUS_M = 0.12, 0.0635
 """Distance of the drawn rotors from the drone's centre, and their radius [m]."""
 BODY_HALF_SIZE_M = (0.064, 0.064, 0.025)
@@ -67,7 +67,7 @@ def draw_drone(
 
     Args:
         scenery: triangles of the track.
-        drone: the drone; its number of passed gates sets the gates' colours.
+        drone: the drone; its number of passed gates determines the gates' colours.
         eye_to_w: the camera's position and its target, (3,) each [m].
         fov_deg: horizontal field of view [deg].
         size: width and height [pixels].
@@ -92,11 +92,11 @@ def chase_image(
     Args:
         scenery: triangles of the track.
         drone: the drone.
-        vel_w: (3,) velocity of the drone [m/s], which sets the direction of the view.
+        vel_w: (3,) velocity of the drone [m/s], along which the camera looks.
         size: width and height [pixels].
         fov_deg: horizontal field of view [deg].
     """
-    # The heading sets the direction for a drone at rest.
+    # The heading is added, so that the direction is defined for a drone at rest too.
     direction = vel_w[:2] + 0.5 * drone.rot_w[:2, 0]
     ahead = np.append(direction / max(float(np.linalg.norm(direction)), 1e-6), 0.0)
     eye = drone.pos_w - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M]
@@ -117,14 +117,17 @@ def inset(picture: np.ndarray, depth_m: np.ndarray, range_m: float, share: int) 
     width = picture.shape[1] // share
     height = min(picture.shape[0], max(1, width * depth_m.shape[0] // depth_m.shape[1]))
     size = width, height
-    small = Image.fromarray(colours.depth_colours(depth_m, range_m))
+    depth_picture = Image.fromarray(colours.depth_colours(depth_m, range_m))
     out = picture.copy()
-    out[-height:, -width:] = np.asarray(small.resize(size, Image.Resampling.NEAREST))
+    out[-height:, -width:] = np.asarray(depth_picture.resize(size, Image.Resampling.NEAREST))
     return out
 
 
 def _not_between(corners_w: np.ndarray, eye_w: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
-    """Return which faces (F, 3, 3) reach beyond the drone as seen from the camera, bool (F,)."""
+    """Return which faces (F, 3, 3) reach beyond the drone, as seen from the camera, (F,) bool.
+
+    The other faces lie between camera and drone, or behind the camera.
+    """
     to_drone = pos_w - eye_w
     return ((corners_w - eye_w) @ to_drone).max(axis=1) > to_drone @ to_drone
 

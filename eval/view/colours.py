@@ -7,7 +7,8 @@ from matplotlib import colormaps
 from matplotlib.colors import ListedColormap
 
 AHEAD, PASSED = (217, 130, 43), (42, 143, 91)
-"""Colours of gates ahead and of passed gates; all colours here are red, green and blue, 0-255."""
+"""Colours of gates ahead and of passed gates. All colours of this file are red, green and blue from
+0 to 255."""
 CRASH, START = (208, 47, 47), (31, 59, 115)
 """Colours of the end of a failed flight, and of the start."""
 SOLID, SOLID_EDGE = (201, 206, 214), (138, 147, 160)

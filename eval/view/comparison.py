@@ -1,10 +1,10 @@
 """Write measured flights with their simulations as a recording for the rerun 3D viewer.
 
-Flight k has the entities `/flight_k/world/measured`, and `world/LABEL` for each simulation, each
-with its `path` and a moving `drone`. Its series are `error_position/LABEL`, `error_velocity/LABEL`,
-`error_attitude/LABEL` and `error_rates/LABEL`, and `velocity_x/measured`, `velocity_x/LABEL`, ...
-on the timeline `time` in seconds from the flight's start. A simulation consists of rollouts, which
-start from measured states; lines break between them.
+The entities of flight k are below `/flight_k`: `world/measured`, and `world/LABEL` for each
+simulation, each with a `path` and a moving `drone`. Its curves are `error_position/LABEL`,
+`error_velocity/LABEL`, `error_attitude/LABEL`, `error_rates/LABEL`, and `velocity_x/measured`,
+`velocity_x/LABEL`, ... on the timeline `time` in seconds from the start of the flight. A simulation
+consists of rollouts, which start from measured states; lines break between them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class States(NamedTuple):
     """Measured or simulated states of a drone at T times; NaN where unknown."""
 
     time_s: np.ndarray
-    """(T,) time since the flight's start [s]."""
+    """(T,) time since the start of the flight [s]."""
     pos_w: np.ndarray
     """(T, 3) position [m]."""
     quat_wxyz: np.ndarray
@@ -56,7 +56,7 @@ class Simulation(NamedTuple):
     rollouts: Sequence[States]
     """The simulated states of each rollout, in the order of time."""
     errors: Sequence[np.ndarray]
-    """(T, 4) errors of each rollout: norms of simulated minus measured position [m], velocity
+    """Errors (T, 4) of each rollout: norms of simulated minus measured position [m], velocity
     [m/s], attitude [deg] and body rates [rad/s]."""
 
 
@@ -143,11 +143,11 @@ def _log_drone(
     if not rollouts:
         return
     states = States(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
-    good = np.isfinite(states.pos_w).all(axis=1) & np.isfinite(states.quat_wxyz).all(axis=1)
+    known = np.isfinite(states.pos_w).all(axis=1) & np.isfinite(states.quat_wxyz).all(axis=1)
     columns = rr.Transform3D.columns(
-        translation=states.pos_w[good], quaternion=np.roll(states.quat_wxyz[good], -1, axis=1)
+        translation=states.pos_w[known], quaternion=np.roll(states.quat_wxyz[known], -1, axis=1)
     )
-    recording.send_columns(f"{entity}/drone", time_columns(states.time_s[good]), columns)
+    recording.send_columns(f"{entity}/drone", time_columns(states.time_s[known]), columns)
     body = rr.Boxes3D(half_sizes=[half_size], colors=[colour], labels=[label])
     recording.log(f"{entity}/drone/body", body, static=True)
 

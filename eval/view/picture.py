@@ -33,9 +33,9 @@ Shown = tuple[Track, Flight | None, TrialResult | None]
 """A track, with an optional flight and its outcome."""
 
 TOP, SIDE = (0, 1), (0, 2)
-"""World axes of a view: the horizontal and the vertical one, 0 for x."""
+"""World axes along the width and the height of a view, 0 for x."""
 MARGIN_M = 1.0
-"""Distance that a picture extends beyond track and flight [m]."""
+"""Distance by which a picture extends beyond track and flight [m]."""
 PATH_WIDTH = 2.2
 """Width of the flight's path [points]."""
 PASSED, CRASH, START, GREY = map(
@@ -156,9 +156,9 @@ def _draw(
             alpha=0.75,
         )
     )
-    bars = [solid for solid in solids if solid.gate is not None]
-    colour = [_gate_colour(bar.gate, passed) for bar in bars]
-    frames = [outline(bar.vertices[:, view]) for bar in bars]
+    gate_bars = [solid for solid in solids if solid.gate is not None]
+    colour = [_gate_colour(bar.gate, passed) for bar in gate_bars]
+    frames = [outline(bar.vertices[:, view]) for bar in gate_bars]
     axes.add_collection(
         PolyCollection(frames, facecolor=colour, edgecolor=colour, lw=0.8, zorder=3)
     )

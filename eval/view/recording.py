@@ -35,7 +35,7 @@ SCHEMA = 1
 GROUND = (226, 228, 224)
 """Colour of the ground, 0-255."""
 GROUND_MARGIN_M = 3.0
-"""Distance that the ground extends beyond track and flight [m]."""
+"""Distance by which the ground extends beyond track and flight [m]."""
 BEFORE_GATE_S = 0.6
 """Time before the first gate at which the playback starts [s]."""
 DRONE_HALF_SIZE = (0.064, 0.064, 0.025)
@@ -177,9 +177,9 @@ def _log_path(recording: rr.RecordingStream, world: str, flight: Flight) -> None
     """Log the flight's path, coloured by speed."""
     speed = np.linalg.norm(flight.vel_w, axis=1)
     segments = np.stack([flight.pos_w[:-1], flight.pos_w[1:]], axis=1)
-    good = np.isfinite(segments).all(axis=(1, 2)) & np.isfinite(speed[:-1])
+    finite = np.isfinite(segments).all(axis=(1, 2)) & np.isfinite(speed[:-1])
     colour = colours.speed_colours(speed[:-1], colours.top_speed(speed))
-    path = rr.LineStrips3D(segments[good], colors=colour[good], radii=0.025)
+    path = rr.LineStrips3D(segments[finite], colors=colour[finite], radii=0.025)
     recording.log(f"{world}/path", path, static=True)
 
 
@@ -259,7 +259,7 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
     """Log speed, commands, body rates, actions and rotor speeds as curves."""
     policy_steps = np.asarray(flight.policy_step, dtype=bool)
     axes = list(colours.AXES)
-    pale = [tuple(int(part * 0.5 + 127) for part in colour) for colour in axes]
+    pale_axes = [tuple(int(part * 0.5 + 127) for part in colour) for colour in axes]
     grey = [colours.SOLID_EDGE]
     speed = np.linalg.norm(flight.vel_w, axis=1)
     all_rows = slice(None)
@@ -267,7 +267,7 @@ def _log_series(recording: rr.RecordingStream, root: str, flight: Flight) -> Non
         ("speed", speed[:, None], all_rows, ["|vel_w|"], [colours.AHEAD]),
         ("thrust/command", flight.thrust_cmd[:, None], all_rows, ["c"], [colours.CRASH]),
         ("rates/measured", flight.rate_b, all_rows, ["x", "y", "z"], axes),
-        ("rates/command", flight.rate_cmd_b, all_rows, ["x cmd", "y cmd", "z cmd"], pale),
+        ("rates/command", flight.rate_cmd_b, all_rows, ["x cmd", "y cmd", "z cmd"], pale_axes),
         ("action", flight.action_b, policy_steps, ["x", "y", "z"], axes),
         ("rotors", flight.rotor_speed, all_rows, ["1", "2", "3", "4"], [*axes, *grey]),
     ]

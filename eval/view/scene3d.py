@@ -1,7 +1,7 @@
 """A small renderer of flat-shaded triangles and lines that needs no GPU and no OpenGL.
 
-Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972). The
-result is correct for small faces except for rare overlaps, so large faces are divided first.
+Faces are drawn from the farthest to the nearest (the painter's algorithm; Newell et al. 1972). For
+small faces the result is correct except for rare overlaps. So large faces are divided first.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SKY, GROUND, GRID = (232, 238, 245), (214, 217, 212), (200, 204, 200)
 GRID_REACH_M = 24
 """Distance from the camera to the last grid line [m]; lines are 1 m apart."""
 LONGEST_M = 2.0
-"""Longest side of a face before it is divided [m]."""
+"""A face with a longer side is divided [m]."""
 MOST_FACES = 6000
 """Largest number of faces after division."""
 
@@ -130,12 +130,12 @@ def paint(view: Viewpoint, faces: Faces, lines: Lines) -> Image.Image:
     shapes = [*corners, *ends]
     distance = np.concatenate([_distance(corners), _distance(ends)])
     colour = _fade(np.concatenate([colour, lines.colour]), distance)
-    near = np.concatenate([corners[..., 2].min(axis=1), ends[..., 2].min(axis=1)])
-    far = np.concatenate([corners[..., 2].max(axis=1), ends[..., 2].max(axis=1)])
+    nearest = np.concatenate([corners[..., 2].min(axis=1), ends[..., 2].min(axis=1)])
+    farthest = np.concatenate([corners[..., 2].max(axis=1), ends[..., 2].max(axis=1)])
     for k in np.argsort(-distance):
-        if far[k] <= NEAR_M:
+        if farthest[k] <= NEAR_M:
             continue
-        shape = shapes[k] if near[k] > NEAR_M else _clip(shapes[k])
+        shape = shapes[k] if nearest[k] > NEAR_M else _clip(shapes[k])
         pixels = to_pixels(view, shape)
         fill = (int(colour[k, 0]), int(colour[k, 1]), int(colour[k, 2]))
         if len(shapes[k]) == 2:

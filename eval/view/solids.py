@@ -58,7 +58,10 @@ def outline(points: np.ndarray) -> np.ndarray:
 
 
 def _half_hull(ordered: np.ndarray) -> list[np.ndarray]:
-    """Return the lower half of the hull of points in increasing order, or its upper half."""
+    """Return the lower half of the hull of points (n, 2) in increasing order.
+
+    For points in decreasing order it is the upper half.
+    """
     hull: list[np.ndarray] = []
     for point in ordered:
         while len(hull) >= 2:

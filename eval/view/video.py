@@ -31,9 +31,9 @@ DEPTH_RANGE_M = 10.0
 TRAIL_S = 1.6
 """Duration of the path shown behind the drone [s]."""
 SIDE_SHARE = 1 / 3
-"""Width of the depth image divided by that of a frame, for flights with depth images."""
+"""Width of the depth image divided by the width of a frame, for flights with depth images."""
 HEADING_SMOOTHING_S, POSITION_SMOOTHING_S = 0.25, 0.06
-"""Standard deviations of the filters of the camera's direction and position [s]."""
+"""Standard deviations of the Gaussian filters of the camera's direction and position [s]."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class VideoOptions:
     fps: int = 30
     """Frames per second of the video."""
     slowdown: float = 1.0
-    """Duration of the video divided by that of the flight: 2 plays at half speed."""
+    """Duration of the video divided by the duration of the flight; 2 plays at half speed."""
     fov_deg: float = 78.0
     """Horizontal field of view [deg]."""
     behind_m: float = 1.5
@@ -61,7 +61,7 @@ SMALL = VideoOptions(size=(720, 360), fps=12)
 
 
 def frame_times(flight: Flight, options: VideoOptions) -> np.ndarray:
-    """Return the flight time of each frame (F,) [s], with the repeated last frame."""
+    """Return the time in the flight of each frame (F,) [s]; the last frame is repeated."""
     end = float(flight.time_s[-1])
     times = np.arange(float(flight.time_s[0]), end, 1 / (options.fps * options.slowdown))
     return np.concatenate([times, np.full(max(1, round(options.hold_s * options.fps)), end)])
@@ -83,7 +83,8 @@ def write_video(
         flight: log of the trial, with or without depth images.
         result: outcome of the trial.
         options: size, speed and camera; None: the defaults of `VideoOptions`.
-        on_frame: called with the number of finished frames, of `len(frame_times(...))`.
+        on_frame: called after each frame with the number of finished frames; there are
+            `len(frame_times(...))` in all.
 
     Raises:
         ValueError: for another ending, an odd size, or a flight with fewer than two rows.
@@ -143,7 +144,7 @@ def video_frames(
 
 
 def _swatches() -> np.ndarray:
-    """Return the colours (n, 3) of a video that are rare in its first frame."""
+    """Return colours (n, 3) that a video needs and that are rare in its first frame."""
     gates = np.array([colours.AHEAD, colours.PASSED, colours.CRASH, colours.START])
     shades = [gates * shade for shade in (0.5, 0.65, 0.8, 0.95)]
     depths = colours.depth_colours(np.linspace(0, DEPTH_RANGE_M, 40), DEPTH_RANGE_M)
@@ -153,10 +154,10 @@ def _swatches() -> np.ndarray:
 def _finite_part(flight: Flight) -> Flight:
     """Return the flight up to the first row that is not finite, where the simulation diverged."""
     state = np.concatenate([flight.pos_w, flight.quat_wxyz, flight.vel_w], axis=1)
-    bad = np.flatnonzero(~np.isfinite(state).all(axis=1))
-    if not len(bad):
+    not_finite = np.flatnonzero(~np.isfinite(state).all(axis=1))
+    if not len(not_finite):
         return flight
-    rows = {name: getattr(flight, name)[: bad[0]] for name in Flight._fields[:-2]}
+    rows = {name: getattr(flight, name)[: not_finite[0]] for name in Flight._fields[:-2]}
     return flight._replace(**rows)
 
 
@@ -173,7 +174,7 @@ def _chase_camera(
     def smooth(values: np.ndarray, sd_s: float) -> np.ndarray:
         return gaussian_filter1d(np.nan_to_num(values), sd_s / step_s, axis=0, mode="nearest")
 
-    # The heading sets the direction for a drone at rest.
+    # The heading is added, so that the direction is defined for a drone at rest too.
     direction = smooth(flight.vel_w[:, :2] + 0.5 * rot_w[:, :2, 0], HEADING_SMOOTHING_S)
     direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
     ahead = np.insert(direction, 2, 0.0, axis=1)
@@ -187,21 +188,24 @@ def _chase_camera(
 def _draw_depth(frame: Image.Image, width: int, depth_m: np.ndarray) -> None:
     """Draw the policy's depth image at the right, with its label and the scale of its colours."""
     size = (width, max(1, width * depth_m.shape[0] // depth_m.shape[1]))
-    small = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
+    depth_picture = Image.fromarray(colours.depth_colours(depth_m, DEPTH_RANGE_M))
     corner = (frame.width - width, (frame.height - size[1]) // 2)
-    frame.paste(small.resize(size, Image.Resampling.NEAREST), corner)
+    frame.paste(depth_picture.resize(size, Image.Resampling.NEAREST), corner)
     draw = ImageDraw.Draw(frame)
     font = ImageFont.load_default(size=_font_size(frame))
     draw.line([corner[0] - 1, 0, corner[0] - 1, frame.height], fill=colours.DRONE)
     text = f"depth image, {depth_m.shape[1]} x {depth_m.shape[0]}, to {DEPTH_RANGE_M:g} m"
     middle = corner[0] + width / 2
     draw.text((middle, corner[1] - 6), text, fill=colours.DRONE, font=font, anchor="mb")
-    left, top, wide = int(corner[0] + 0.1 * width), corner[1] + size[1] + 8, int(0.8 * width)
-    scale = colours.depth_colours(np.linspace(0.0, DEPTH_RANGE_M, wide)[None], DEPTH_RANGE_M)
-    high = max(4, frame.height // 60)
-    frame.paste(Image.fromarray(scale).resize((wide, high), Image.Resampling.NEAREST), (left, top))
+    left, top, scale_width = int(corner[0] + 0.1 * width), corner[1] + size[1] + 8, int(0.8 * width)
+    scale = colours.depth_colours(np.linspace(0.0, DEPTH_RANGE_M, scale_width)[None], DEPTH_RANGE_M)
+    scale_height = max(4, frame.height // 60)
+    frame.paste(
+        Image.fromarray(scale).resize((scale_width, scale_height), Image.Resampling.NEAREST),
+        (left, top),
+    )
     for share in (0.0, 0.5, 1.0):
-        label_at = (left + share * wide, top + high + 3)
+        label_at = (left + share * scale_width, top + scale_height + 3)
         label = f"{share * DEPTH_RANGE_M:g}" + (" m" if share == 1.0 else "")
         draw.text(label_at, label, fill=colours.DRONE, font=font, anchor="mt")
 

@@ -30,7 +30,7 @@ def write_mp4(
         frames: the frames in order; only one is in memory at a time.
         size: width and height, even numbers [pixels].
         fps: frames per second.
-        on_frame: called with the number of finished frames.
+        on_frame: called after each frame with the number of finished frames.
 
     Raises:
         OSError: where ffmpeg fails, with its message.
@@ -74,8 +74,9 @@ def write_gif(
         path: file to write, ending in `.gif`.
         frames: the frames in order.
         fps: frames per second.
-        swatches: (n, 3) colours 0-255 that the palette needs in addition to the first frame's.
-        on_frame: called with the number of finished frames.
+        swatches: (n, 3) colours, 0-255, that the palette needs in addition to those of the first
+            frame.
+        on_frame: called after each frame with the number of finished frames.
     """
     indexed: list[Image.Image] = []
     for number, frame in enumerate(frames, start=1):
@@ -91,9 +92,11 @@ def write_gif(
 
 
 def _palette(frame: Image.Image, swatches: np.ndarray | None) -> Image.Image:
-    """Return an image with the palette of `frame` and `swatches`, with equal weight for each."""
+    """Return an image with a palette for `frame` and `swatches`, both with the same weight."""
     pixels = np.asarray(frame, dtype=np.uint8).reshape(-1, 3)
     if swatches is not None:
-        more = np.repeat(swatches.astype(np.uint8), max(1, len(pixels) // len(swatches)), axis=0)
-        pixels = np.concatenate([pixels, more])
+        swatch_pixels = np.repeat(
+            swatches.astype(np.uint8), max(1, len(pixels) // len(swatches)), axis=0
+        )
+        pixels = np.concatenate([pixels, swatch_pixels])
     return Image.fromarray(pixels[None]).quantize(COLOURS)

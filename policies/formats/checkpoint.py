@@ -30,7 +30,7 @@ from tracks.input.reading import (
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
 SCHEMA = 1
-"""Version of the folder's layout; files of a newer one are refused."""
+"""Version of the folder's layout; files of another version are refused."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def save_arrays(
         folder: the checkpoint's folder.
         arrays: numpy or JAX arrays by name, of any shape.
         kind: "policy", "delta" or "training"; loading requires the same kind.
-        seed: the seed of its training or fit, or None.
+        seed: the seed of the training or fit that made the arrays, or None.
         extra: further keys of config.json (see `tracks.common.files.to_json`).
 
     Returns:
@@ -76,9 +76,9 @@ def save_arrays(
     weights = save(contiguous, metadata={"format": "np"})
     config = {"kind": kind, **stamp(SCHEMA, seed)}
     config["weights"] = {"sha256": hashlib.sha256(weights).hexdigest(), "bytes": len(weights)}
-    clash = sorted(config.keys() & (extra or {}).keys())
-    if clash:
-        raise ValueError(f"extra: {clash} are written by the checkpoint itself; use other names")
+    reserved = sorted(config.keys() & (extra or {}).keys())
+    if reserved:
+        raise ValueError(f"extra: {reserved} are written by the checkpoint itself; use other names")
     config |= dict(extra or {})
     with replacing_folder(folder) as temporary:
         (temporary / WEIGHTS).write_bytes(weights)

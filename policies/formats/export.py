@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from policies.formats.c.forward import Observed
 
 MODULE_OPSET = 17
-"""ONNX opset of a module's graph; old enough for the runtimes of companion computers."""
+"""ONNX opset (version of the operators) of a module's graph; the runtimes of companion computers
+support one as old as this."""
 
 
 def export_policy(
@@ -40,7 +41,7 @@ def export_policy(
             that tests them.
         formats: names in `FORMATS`.
         dtype: type of the weights in C, "float32" or "int8".
-        observed: observations of flights, which set the scales of int8 activations.
+        observed: observations of flights, from which the scales of int8 activations are computed.
 
     Returns:
         The files' paths.
@@ -55,15 +56,15 @@ def export_policy(
     name, checkpoint = exported_checkpoint(name_or_folder)
     texts = labels(checkpoint.spec, name, checkpoint.seed)
     written = []
-    for chosen in formats:
-        if chosen == "c":
+    for format_name in formats:
+        if format_name == "c":
             from policies.formats.c.project import c_project
 
             project = c_project(checkpoint, name, dtype, observed).files
             files = {file: text.encode() for file, text in project.items()}
         else:
-            _, write = _WRITERS[chosen]
-            files = {main_file(name, chosen): write(checkpoint, texts)}
+            _, write = _WRITERS[format_name]
+            files = {main_file(name, format_name): write(checkpoint, texts)}
         for file, data in files.items():
             with replacing_file(out / file) as temporary:
                 temporary.write_bytes(data)
@@ -84,11 +85,11 @@ def export_module(
     policies) refuses files that it cannot run, so the new file is loaded once as a test.
 
     Args:
-        module: its forward takes (state, image) or (state, image, hidden), float32 with the batch
-            first, and returns the action, or (action, hidden).
-        path: of the new file; it ends in .onnx.
-        trained_under: its contract (`env.unwrapped.contract`) or its spec.
-        memory: shape of one row's hidden state; None without memory.
+        module: the module. Its `forward` takes (state, image) or (state, image, hidden), float32
+            with the batch first, and returns the action, or (action, hidden).
+        path: path of the new file, ending in .onnx.
+        trained_under: contract of the environment (`env.unwrapped.contract`), or its spec.
+        memory: shape of one row's hidden state; None for a module without memory.
 
     Returns:
         `path`.

@@ -33,11 +33,11 @@ LOAD_S = 60.0
 ANSWER_S = 60.0
 """Time limit for one block of rows [s]; the judge's own deadline is shorter."""
 MEMORY_BYTES = 4 * 2**30
-"""Address space of the process, in addition to that of the engine."""
+"""Largest address space of the process, in addition to that of the engine [bytes]."""
 ANSWER_BYTES = 2**28
-"""Largest answer."""
+"""Size of the largest answer [bytes]."""
 PIPE_BYTES = 2**20
-"""Size of the pipes; the largest that Linux allows every user."""
+"""Size of the pipes, the largest that Linux allows every user [bytes]."""
 GRACE_S = 5.0
 """Time after a limit at which the process ends itself, in case its parent has ended [s]."""
 SERVER = Path(__file__).with_name("model_server.py")
@@ -47,9 +47,9 @@ REMEDIES = {
     "torch": "export it again with this version of torch",
     "ctypes": "it must define policy_reset and policy_step as its policy.h declares them",
 }
-"""Module that runs a model -> advice where it refuses one."""
+"""Python module that runs a model (engine) -> advice if it refuses the model."""
 ENGINE_NAMES = {"ctypes": "compiled C"}
-"""Module that runs a model -> its name in messages, if different."""
+"""Python module that runs a model (engine) -> its name in messages, if different."""
 
 
 class Port(NamedTuple):
@@ -59,7 +59,8 @@ class Port(NamedTuple):
     kind: str
     """Type as named by onnxruntime, such as tensor(float); empty for torch."""
     shape: tuple[int | None, ...]
-    """Size of each axis, None for a free one; empty for TorchScript, where it is unknown."""
+    """Size of each axis, None for an axis of any size; empty for TorchScript, which does not store
+    it."""
 
 
 class ModelProcess:
@@ -72,8 +73,8 @@ class ModelProcess:
         """Start the process and load the model there.
 
         Args:
-            model: a serialised model, or the path of a C library.
-            where: the file that it was read from, for messages.
+            model: bytes of a model file, or the path of a C library.
+            where: the file from which the model was read, for messages.
             kind: one of `model_server.KINDS`.
             labels: names of the texts in a torch file; for a C library one name, for its JSON.
 
@@ -85,9 +86,9 @@ class ModelProcess:
         self._engine = ENGINE_NAMES.get(self._module, self._module)
         description = self._start()
         self.labels: dict[str, str | bytes] = description.get("labels", {})
-        """Texts by name; empty where there is none."""
+        """Texts of the file by name."""
         self.sizes: list[int] = description.get("sizes", [])
-        """For a C library: bytes of its state, then the sizes of its observation."""
+        """For a C library: size of its state [bytes], then the sizes of its observation."""
         self.inputs, self.outputs = (
             [Port(name, kind, tuple(shape)) for name, kind, shape in description[side]]
             for side in ("inputs", "outputs")
@@ -127,7 +128,7 @@ class ModelProcess:
         """Return the model's outputs, float32, for its inputs in order.
 
         Raises:
-            NoAnswer: where it fails, or exceeds its limits.
+            NoAnswer: where the model fails, or exceeds its limits.
         """
         if not self._end.alive:
             self._start()
@@ -206,6 +207,7 @@ def _widen(handle: int) -> None:
 
 
 def _wait(handle: int, event: int, until: float) -> None:
+    """Wait until a pipe is ready for `event`; raise a TimeoutError at the time `until`."""
     poll = select.poll()
     poll.register(handle, event)
     remaining_s = until - time.monotonic()
@@ -222,6 +224,7 @@ def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and close its pipes."""
     process.kill()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:

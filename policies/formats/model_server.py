@@ -1,13 +1,13 @@
 """The program that runs one foreign model: ONNX, TorchScript, a torch program or a C library.
 
 `model_process.py` starts it by its path, so it imports nothing of the suite. It reads frames from
-standard input and writes an answer to each to standard output. A frame has four parts: the length
+standard input and writes an answer to each to standard output. A frame has three parts: the length
 of the header (four bytes), the header (JSON), and data. The header gives the size of the data,
 either as "bytes" or as the names and shapes of float32 arrays under "arrays". The first frame has
 the model, its kind and the limits; each further frame has the inputs of one call, in the model's
-order. An answer has "error" instead of arrays where the model cannot be loaded or fails.
+order. If the model cannot be loaded or fails, the answer has "error" instead of arrays.
 
-An alarm signal ends the process where a call exceeds its time limit, even without a parent.
+If a call exceeds its time limit, an alarm signal ends the process, even after its parent has ended.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _read(file: IO[bytes], count: int) -> bytearray:
 
 
 def load_onnx(onnxruntime: Any, model: bytes, labels: list[str]) -> Loaded:
-    """Load an ONNX model; the parent process reads its labels."""
+    """Load an ONNX model; `labels` is unused, because the parent process reads the texts."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
@@ -171,7 +171,7 @@ KINDS: dict[str, tuple[str, Callable[[Any, bytes, list[str]], Loaded]]] = {
     "script": ("torch", load_script),
     "library": ("ctypes", load_library),
 }
-"""Kind of model -> the module that runs it, and the function that loads it."""
+"""Kind of model -> the Python module that runs it, and the function that loads it."""
 
 
 def serve(source: IO[bytes], answers: IO[bytes]) -> None:
@@ -183,11 +183,11 @@ def serve(source: IO[bytes], answers: IO[bytes]) -> None:
     name, load = KINDS[header["kind"]]
     engine = importlib.import_module(name)
     # The limit excludes the engine's libraries: those of torch may take gigabytes of addresses.
-    most = _address_space() + header["memory_bytes"]
-    _, allowed = resource.getrlimit(resource.RLIMIT_AS)
-    if allowed != resource.RLIM_INFINITY:
-        most = min(most, allowed)
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    address_limit = _address_space() + header["memory_bytes"]
+    _, system_limit = resource.getrlimit(resource.RLIMIT_AS)
+    if system_limit != resource.RLIM_INFINITY:
+        address_limit = min(address_limit, system_limit)
+    resource.setrlimit(resource.RLIMIT_AS, (address_limit, address_limit))
     try:
         description, run = load(engine, bytes(model), header["labels"])
     except Exception as error:  # onnxruntime's exceptions have no common public base class
@@ -235,10 +235,12 @@ def _address_space() -> int:
 
 
 def _size(size: Any) -> int | None:
+    """Return the size of an axis; None for an axis of any size."""
     return size if isinstance(size, int) else None
 
 
 def _lines(error: Exception) -> list[str]:
+    """Return the lines of an error's message, each cut to 200 characters."""
     text = str(error).strip() or type(error).__name__
     return [line[:200] for line in text.splitlines()]
 

@@ -26,9 +26,9 @@ from policies.spec import PolicyError
 from tracks.input.reading import MODEL_BYTES, InputError, read_bytes, reason
 
 _STANDARD = ("", "ai.onnx")
-"""Names of the standard operators' domain."""
+"""Names of the domain of standard operators."""
 NODES_MOST = 100_000
-"""Most operators of a graph after its functions are inlined."""
+"""Largest number of operators of a graph after its functions are inlined."""
 
 
 def load_onnx(path: Path) -> BlockPolicy:
@@ -161,7 +161,7 @@ def _graph_of(path: Path) -> onnx.ModelProto:
 
 
 def _external_bytes(path: Path, tensors: list[Any]) -> int:
-    """Return the size of external data: of the files, or of all tensors where that is more."""
+    """Return the size of external data: of its files, or of all its tensors if that is larger."""
     sizes, in_memory = {}, 0
     for tensor in tensors:
         file = _data_file(path, tensor)
@@ -172,16 +172,16 @@ def _external_bytes(path: Path, tensors: list[Any]) -> int:
 
 
 def _tensor_bytes(entries: dict[str, Any], size: int) -> int:
-    """Return the bytes of a tensor in a file of `size` bytes; `size` where unspecified."""
+    """Return the size of a tensor in a file of `size` bytes; `size` if the entries are unusable."""
     try:
-        available = size - int(entries.get("offset", 0))
-        return max(0, min(int(entries.get("length", available)), available))
+        bytes_from_offset = size - int(entries.get("offset", 0))
+        return max(0, min(int(entries.get("length", bytes_from_offset)), bytes_from_offset))
     except ValueError:
         return size
 
 
 def _external(tensor: onnx.TensorProto) -> dict[str, Any]:
-    """Return the location of a tensor's data; for a repeated key the last counts, as in onnx."""
+    """Return the entries that locate a tensor's data; the last one of a key counts, as in onnx."""
     return {entry.key: entry.value for entry in tensor.external_data}
 
 

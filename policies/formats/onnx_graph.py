@@ -19,7 +19,9 @@ from policies.networks.tree_arrays import image_weight, kernel_oihw, rows_are_ou
 from policies.spec import PolicySpec
 
 OPSET = 17
+"""Version of the operators."""
 IR_VERSION = 8
+"""Version of the file format."""
 
 
 def onnx_model(
@@ -29,7 +31,7 @@ def onnx_model(
 
     Args:
         params: the network's parameters.
-        spec: the specification that they were trained for.
+        spec: the specification for which the parameters were trained.
         metadata: texts for the file, by key.
     """
     camera, width = spec.camera, spec.hidden_size

@@ -29,9 +29,9 @@ class PolicyCheckpoint:
     params: dict[str, np.ndarray]
     """The network's parameters, float32, with the names and shapes of `network.init`."""
     spec: PolicySpec
-    """The rate, camera and scaling that it was trained for."""
+    """The rate, camera and scaling for which the policy was trained."""
     config: dict[str, Any]
-    """The object of config.json; "training" has the training's configuration."""
+    """The object of config.json; its key "training" has the configuration of the training."""
 
     @property
     def seed(self) -> int | None:
@@ -115,7 +115,7 @@ class DeltaCheckpoint:
     params: dict[str, np.ndarray]
     """The network's parameters, float32, with the names and shapes of `delta_network.init`."""
     config: dict[str, Any]
-    """The object of config.json; "fit" has the fit's configuration and results."""
+    """The object of config.json; its key "fit" has the configuration and results of the fit."""
 
 
 def save_delta(
@@ -147,7 +147,7 @@ def load_delta(folder: Path) -> DeltaCheckpoint:
 
     Raises:
         PolicyError: where the checkpoint is damaged, of another kind, not finite, or its arrays
-            do not have the names and shapes of the network's.
+            do not have the names and shapes of the network's parameters.
     """
     import jax
 

@@ -1,4 +1,4 @@
-"""Check the inputs of a policy file made outside the suite: names, shapes, memory, any format."""
+"""Check the inputs of a policy file that was made outside the suite: names, shapes and memory."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from policies.spec import EXTRAS, Note, PolicyError, PolicySpec
 INPUTS = ("state", "image", "hidden")
 """Names of a program's inputs, in order; a policy without memory omits the last."""
 BLOCK_MOST = 4096
-"""Largest batch size of a model with a fixed one."""
+"""Largest batch size of a model whose batch size is fixed."""
 HIDDEN_MOST = 2**16
-"""Most numbers in the recurrent state of one row."""
+"""Largest number of numbers in the recurrent state of one row."""
 
 
 def check_inputs(
     shapes: dict[str, tuple[Any, ...]], spec: PolicySpec, where: str
 ) -> tuple[int, tuple[int, ...]]:
-    """Return the rows of a block, and the shape of a row's hidden state, from a program's inputs.
+    """Return the number of rows of a block, and the shape of a row's hidden state, of a program.
 
     Args:
-        shapes: shapes by input name, in order; sizes that are not ints are free.
+        shapes: shapes of the program's inputs by name, in order; a size that is not an int is free.
         spec: the file's specification.
         where: the file, for messages.
 
@@ -33,10 +33,10 @@ def check_inputs(
     """
     if not shapes or not set(shapes) <= set(INPUTS):
         raise PolicyError(inputs_message(where, tuple(shapes)))
-    rows = {shape[0] for shape in shapes.values() if shape and isinstance(shape[0], int)}
-    block = rows.pop() if rows else BLOCK
+    batch_sizes = {shape[0] for shape in shapes.values() if shape and isinstance(shape[0], int)}
+    block = batch_sizes.pop() if batch_sizes else BLOCK
     hidden = shapes.get("hidden", (None, 0))[1:]
-    if rows or not hidden or not all(isinstance(size, int) for size in hidden):
+    if batch_sizes or not hidden or not all(isinstance(size, int) for size in hidden):
         raise PolicyError(
             f"{where}: inputs have shapes {shapes}; the first axis of each must be the batch, and "
             "the other axes of 'hidden' must have fixed sizes"
@@ -64,7 +64,7 @@ def check_inputs(
 
 
 def check_memory(metadata: PolicyMetadata, hidden_shape: tuple[int, ...], where: str) -> None:
-    """Refuse a hidden state whose shape is not the contract's.
+    """Refuse a hidden state whose shape differs from the contract.
 
     Raises:
         PolicyError: naming both shapes.

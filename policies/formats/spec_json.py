@@ -1,7 +1,8 @@
 """Convert a `PolicySpec` to JSON and back, and read the metadata of policy files.
 
 A torch, ONNX or C file may have a JSON object under the key `policy.json`, and a contract (names,
-units, frames and scales of its inputs and outputs; see `policies.contract`).
+units, frames and scales of its inputs and outputs; see `policies.contract`). The spec is the part
+of the contract that the suite reads.
 """
 
 from __future__ import annotations
@@ -57,11 +58,11 @@ class PolicyMetadata(NamedTuple):
     """The metadata of a policy file."""
 
     spec: PolicySpec
-    """The file's spec; the default where it has none."""
+    """The file's spec; the default spec if the file has none."""
     contract: contract.Contract | None
     """The file's contract, if it has one."""
     notes: tuple[Note, ...]
-    """Assumptions that were made where the file says nothing."""
+    """Assumptions about the policy that the file does not state."""
 
 
 def labels(spec: PolicySpec, name: str, seed: int | None) -> dict[str, str]:
@@ -87,7 +88,7 @@ def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetada
         where: the file, for messages.
 
     Raises:
-        PolicyError: where a text is not JSON, is of a newer schema or not a spec, or where two
+        PolicyError: where a text is not JSON, has another schema or is not a spec, or where two
             texts contradict each other.
     """
     entries = _object(texts.get(KEY), f"{where}: {KEY}")
@@ -97,14 +98,16 @@ def extract(texts: Mapping[str, str | bytes | None], where: str) -> PolicyMetada
     if "spec" in entries:
         spec = spec_from_json(entries["spec"], f"{where}: {KEY}: spec")
         expected = contract.contract_of(spec)
-        for each, place in contracts:
-            contract.refuse_differences(each, expected, place, f"the spec in {KEY}")
+        for found_contract, place in contracts:
+            contract.refuse_differences(found_contract, expected, place, f"the spec in {KEY}")
         return PolicyMetadata(spec, contracts[0][0] if contracts else None, ())
     if contracts:
-        first = contracts[0][0]
-        for each, place in contracts[1:]:
-            contract.refuse_differences(each, first, place, f"the entry {contract.KEY}")
-        return PolicyMetadata(contract.spec_of(*contracts[0]), first, ())
+        first_contract = contracts[0][0]
+        for found_contract, place in contracts[1:]:
+            contract.refuse_differences(
+                found_contract, first_contract, place, f"the entry {contract.KEY}"
+            )
+        return PolicyMetadata(contract.spec_of(*contracts[0]), first_contract, ())
     spec = spec_from_json({}, where)
     assumed = contract.summary(contract.contract_of(spec))
     note = Note(

@@ -61,7 +61,7 @@ def load_script(path: Path, trust: bool = False) -> BlockPolicy:
 
 
 def _loaded(path: Path, kind: str, words: str, trust: bool) -> ModelProcess:
-    """Return a process that has loaded the file; `words` names its kind in messages."""
+    """Return a process that has loaded the file; `words` is the file's kind in messages."""
     if not trust:
         raise NeedsTrust(
             f"{path}: {words} can run any code of its author while torch loads it; if you trust "
@@ -99,19 +99,19 @@ def _is_weights(data: bytes) -> bool:
 
 def _as_model(loaded: ModelProcess, path: Path, hidden_shape: tuple[int, ...]) -> Model:
     """Return the function that runs the process's model; it checks the number of outputs."""
-    memory = hidden_shape != (0,)
+    has_memory = hidden_shape != (0,)
 
     def model(
         state: np.ndarray, image: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         feed = {"state": state, "image": image}
-        outputs = loaded.run({**feed, "hidden": hidden} if memory else feed)
-        if len(outputs) != 1 + memory:
+        outputs = loaded.run({**feed, "hidden": hidden} if has_memory else feed)
+        if len(outputs) != 1 + has_memory:
             raise PolicyError(
                 f"{path}: gives {len(outputs)} outputs, expected the tensors action"
-                f"{' and hidden' if memory else ''}; see docs/policies.md"
+                f"{' and hidden' if has_memory else ''}; see docs/policies.md"
             )
         action, *next_hidden = outputs
-        return action, next_hidden[0] if memory else hidden
+        return action, next_hidden[0] if has_memory else hidden
 
     return model

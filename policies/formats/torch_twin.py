@@ -14,7 +14,7 @@ from policies.spec import PolicySpec
 
 CONVOLUTIONS = ("conv1", "conv2", "conv3")
 LINEAR = ("state", "action")
-"""Layers whose weights need only another layout."""
+"""Convolutions, and linear layers, whose weights only need another layout."""
 
 
 class TorchTwin(nn.Module):

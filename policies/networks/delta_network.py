@@ -1,8 +1,8 @@
 """The Delta Action network: it corrects the action so that the simulation matches real flights.
 
 Inputs are the velocity in body axes, the attitude and the current action; the output is added to
-the action. The point mass under the corrected action then moves as the recorded vehicle did. The
-network is an MLP and a GRU of 32 units (Su et al. 2026, Sec. III-D and III-E).
+the action. Under the corrected action, the simulated point mass moves as the recorded vehicle did.
+The network is an MLP and a GRU of 32 units (Su et al. 2026, Sec. III-D and III-E).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Params = dict[str, jax.Array]
 HIDDEN = 32
 """Width of the features and of the recurrent state."""
 INPUTS = 9
-"""Numbers in the input: velocity in body axes (3), third row of R (3) and the action (3)."""
+"""Number of inputs: velocity in body axes (3), third row of the attitude matrix (3), action (3)."""
 INPUT_SCALE = (0.2, 0.2, 0.2, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
 """Factors that bring the inputs in m/s and m/s^2 to order one."""
 
 
 @jax.jit
 def init(key: jax.Array) -> Params:
-    """Return random initial parameters; the output layer is zero, so there is no correction."""
+    """Return random initial parameters; the output layer is zero, so the correction is zero."""
     shapes = {
         "input.weight": (INPUTS, HIDDEN),
         "input.bias": (HIDDEN,),
@@ -57,11 +57,11 @@ def step(
     """Return the correction (..., 3) [m/s^2, body axes] and the new hidden state (..., 32).
 
     Args:
-        params: from `init` or a checkpoint.
+        params: the network's parameters, from `init` or a checkpoint.
         hidden: (..., 32) recurrent state.
         vel_b: (..., 3) velocity in body axes [m/s].
-        row3: (..., 3) third row of R, world z in body axes.
-        action_b: (..., 3) the action being corrected [m/s^2].
+        row3: (..., 3) third row of the attitude matrix R: world z in body axes.
+        action_b: (..., 3) the action to correct [m/s^2].
     """
     x = jnp.concatenate([vel_b, row3, action_b], axis=-1) * jnp.asarray(INPUT_SCALE)
     x = leaky_relu(x @ params["input.weight"] + params["input.bias"])

@@ -1,13 +1,13 @@
 """Layers of the networks: convolutions with fast CPU gradients, the GRU, and initial weights.
 
 On the CPU, XLA computes gradients of small convolutions at a tenth of the speed of its matrix
-products, or less. Here they are matrix products. A row of pixels with all its channels is one
-vector, and a kernel row maps it to an output row by a banded matrix, so both gradients are products
-of matrices some hundreds wide. They take two to three times the arithmetic of the convolution, but
-run many times as fast.
+products, or less. So here the gradients are matrix products. A row of pixels with all its channels
+is one vector, and a kernel row maps it to an output row by a banded matrix. Both gradients are then
+products of matrices some hundreds wide. They take two to three times the arithmetic of the
+convolution, but run many times as fast.
 
-XLA divides the sums of a product of two long and narrow matrices among all threads, so its last
-bits would depend on the number of cores. `patch_product` divides the sums itself.
+XLA divides the sums of a product of two long and narrow matrices among all threads. So the last
+bits of the product would depend on the number of cores. `patch_product` divides the sums itself.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import jax.numpy as jnp
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 """Order of axes of the image, the kernel and the result."""
 PIECE = 8
-"""Images in one product of `patch_product`'s gradient, too few for XLA to split among threads."""
+"""Number of images in one product of `patch_product`'s gradient; XLA does not split so few among
+threads."""
 
 
 @jax.custom_vjp
@@ -57,7 +58,7 @@ def conv_valid(x: jax.Array, kernel: jax.Array) -> jax.Array:
 
 
 def _as_rows(x: jax.Array) -> jax.Array:
-    """Return (N, H, W, C) as (H, N, W * C), so that a range of rows is one block of memory."""
+    """Return images (N, H, W, C) as (H, N, W * C), so that a range of rows is contiguous memory."""
     return x.transpose(1, 0, 2, 3).reshape(x.shape[1], x.shape[0], -1)
 
 
@@ -127,8 +128,8 @@ def uniform(key: jax.Array, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, 
 
     They equal those of `jax.random.uniform(key, shape)`. In JAX a random number depends on the key
     and its index only, so a short array is the beginning of a long one. All arrays are therefore
-    drawn with the longest one's length, which compiles ten times as fast as a program for each
-    shape.
+    drawn with the length of the longest array, which compiles ten times as fast as a program for
+    each shape.
     """
     longest = max(math.prod(shape) for shape in shapes.values())
     rows = jax.vmap(lambda row_key: jax.random.uniform(row_key, (longest,), jnp.float32))(

@@ -1,9 +1,9 @@
 """The policy network: CNN and GRU (Su et al. 2026, Sec. III-E; first layers as Zhang et al. 2025).
 
 The encoded inverse depth is max-pooled by 2, so that near objects remain, and passes three
-convolutions. The state's embedding is added to the image's. A GRU (with torch's gate convention)
-and a linear layer compute the wanted net acceleration in body axes. Parameters are a flat dict of
-float32 arrays.
+convolutions. The embedding of the state is added to that of the image. A GRU (with torch's gate
+convention) and a linear layer compute the wanted net acceleration in body axes. Parameters are a
+flat dict of float32 arrays.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
     saturates, and some seeds take a thousand iterations to recover.
     """
     hidden, (first, second, third) = spec.hidden_size, spec.channels
-    fan = {
+    # Name -> shape, and number of inputs of each output (fan-in), which sets the range of values.
+    sizes = {
         "conv1.weight": ((2, 2, 1, first), 4),
         "conv2.weight": ((3, 3, first, second), 9 * first),
         "conv3.weight": ((3, 3, second, third), 9 * second),
@@ -56,8 +57,8 @@ def init(key: jax.Array, spec: PolicySpec) -> Params:
         "gru.bias_hidden": ((3 * hidden,), hidden),
         "action.weight": ((hidden, spec.action.size), hidden),
     }
-    numbers = uniform(key, {name: shape for name, (shape, _) in fan.items()})
-    params = {name: (2 * numbers[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in fan.items()}
+    numbers = uniform(key, {name: shape for name, (shape, _) in sizes.items()})
+    params = {name: (2 * numbers[name] - 1) * fan_in**-0.5 for name, (_, fan_in) in sizes.items()}
     params["state.weight"] *= 0.5
     return params
 
@@ -66,8 +67,8 @@ def adapt_params(params: Params, old: PolicySpec, new: PolicySpec) -> Params:
     """Return the parameters of a policy with spec `old`, adapted to the spec `new`.
 
     Numbers that `new` adds to the state get weights of zero, so the actions do not change. At
-    another rate the memory keeps its time constants in seconds: the update gate's bias is raised by
-    the logarithm of the ratio of the rates, which is exact in the limit of long memory.
+    another rate the memory keeps its time constants in seconds. For this, the bias of the update
+    gate is raised by the logarithm of the ratio of the rates, which is exact for a long memory.
 
     Raises:
         ValueError: where `new` lacks a part of the state, or the specs differ in anything but the
@@ -82,19 +83,19 @@ def adapt_params(params: Params, old: PolicySpec, new: PolicySpec) -> Params:
                 f"the policy to start from has spec.{entry.name} {before}, and this run {after}; "
                 "train without a start, or with the value of the policy"
             )
-    rows, first = [params["state.weight"][: new.base_size]], new.base_size
+    weights, next_row = [params["state.weight"][: new.base_size]], new.base_size
     for key, count in EXTRAS.items():
         before, after = getattr(old, key), getattr(new, key)
         if before and not after:
             raise ValueError(f"the policy to start from has spec.{key}; set spec.{key}=True")
         if before:
-            rows.append(params["state.weight"][first : first + count])
-            first += count
+            weights.append(params["state.weight"][next_row : next_row + count])
+            next_row += count
         elif after:
-            rows.append(jnp.zeros((count, rows[0].shape[1])))
+            weights.append(jnp.zeros((count, weights[0].shape[1])))
     update_gate = slice(new.hidden_size, 2 * new.hidden_size)
     bias = params["gru.bias_input"].at[update_gate].add(math.log(new.rate_hz / old.rate_hz))
-    return {**params, "state.weight": jnp.concatenate(rows), "gru.bias_input": bias}
+    return {**params, "state.weight": jnp.concatenate(weights), "gru.bias_input": bias}
 
 
 def encode(params: Params, image: jax.Array) -> jax.Array:
@@ -117,9 +118,9 @@ def recur(
     """Return the actions (N, 3) [m/s^2, body axes] and the new hidden states (N, hidden).
 
     Args:
-        params: from `init` or a checkpoint.
+        params: the network's parameters, from `init` or a checkpoint.
         hidden: (N, hidden) recurrent state.
-        embedding: (N, hidden) the images' embeddings, from `encode`.
+        embedding: (N, hidden) embeddings of the images, from `encode`.
         state: (N, spec.state_size) the state of `observation.observe`.
     """
     x = leaky_relu(embedding + state @ params["state.weight"] + params["state.bias"])
@@ -135,9 +136,9 @@ def step(
     """Return the actions (N, 3) [m/s^2, body axes] and the new hidden states for one observation.
 
     Args:
-        params: from `init` or a checkpoint.
+        params: the network's parameters, from `init` or a checkpoint.
         hidden: (N, hidden) recurrent state, zero at the start of a trial.
         state: (N, spec.state_size) the state of `observation.observe`.
-        image: (N, height, width) its image.
+        image: (N, height, width) the image of `observation.observe`.
     """
     return recur(params, hidden, encode(params, image), state)

@@ -75,7 +75,10 @@ def kernel_oihw(kernel: np.ndarray) -> np.ndarray:
 
 
 def image_weight(params: Mapping[str, np.ndarray], spec: PolicySpec) -> np.ndarray:
-    """Return the weights (hidden, features) of the image's embedding, features channels first."""
+    """Return the weights (hidden, features) of the image's embedding.
+
+    The features are in the order of torch and ONNX, channels first.
+    """
     rows, columns = spec.camera.height // 4 - 4, spec.camera.width // 4 - 4
     weight = np.asarray(params["image.weight"]).reshape(rows, columns, spec.channels[2], -1)
     return rows_are_outputs(weight.transpose(2, 0, 1, 3).reshape(-1, weight.shape[-1]))

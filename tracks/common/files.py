@@ -28,7 +28,7 @@ PART = ".part"
 PART_NAME = re.compile(r"\.(.+?)-(?:(\d+)-)?[a-z0-9_]{8}\.part")
 """Pattern of a temporary folder's name: the final name, and the number of the writing process."""
 LONGEST_STEM = 200
-"""Most bytes of the final name within the temporary name; file systems allow 255 in all."""
+"""Largest number of bytes of the final name in a temporary name; file systems allow 255 in all."""
 SWEPT_DEPTH = 4
 """Depth of folders that `sweep_parts` searches."""
 
@@ -41,9 +41,9 @@ def user_cache(environment: Mapping[str, str] | None = None) -> Path:
     Args:
         environment: environment variables; None: those of this process.
     """
-    values = os.environ if environment is None else environment
+    variables = os.environ if environment is None else environment
     try:
-        cache = Path(values.get("XDG_CACHE_HOME", ""))
+        cache = Path(variables.get("XDG_CACHE_HOME", ""))
         # A relative path must be ignored: https://specifications.freedesktop.org/basedir
         cache = cache if cache.is_absolute() else Path.home() / ".cache"
         folder = cache / "diffracing-suite"
@@ -132,8 +132,8 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def recover_folder(path: str | os.PathLike[str]) -> None:
     """Complete a replacement by `replacing_folder` that was killed between its two renames.
 
-    The new folder was complete on the disk by then, so it is used. Readers of replaced folders call
-    this first.
+    Between the renames the new folder is complete on the disk, so it is used. Readers of replaced
+    folders call this function first.
     """
     final = Path(path)
     if final.exists():
@@ -152,7 +152,7 @@ def folder_while_used(path: str | os.PathLike[str]) -> Iterator[None]:
     """Make a folder and its parents; remove the new ones that are still empty at the end.
 
     Raises:
-        OSError: where it cannot be made.
+        OSError: where the folder cannot be made.
     """
     folder = Path(path)
     new_folders = [parent for parent in (folder, *folder.parents) if not parent.exists()]
@@ -169,7 +169,7 @@ def check_place(path: str | os.PathLike[str]) -> None:
     """Check that a file can be written at `path`, without writing it.
 
     Raises:
-        OSError: where it cannot.
+        OSError: where it cannot be written.
     """
     final = Path(path)
     with folder_while_used(final.parent):
@@ -241,6 +241,7 @@ def _is_being_written(part: str) -> bool:
 
 
 def _is_alive(process: int) -> bool:
+    """Return whether a process with this number runs, or may run."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -36,7 +36,7 @@ class Grid:
     headers: Sequence[str]
     """One text for each column."""
     rows: Sequence[Sequence[Cell]]
-    """Each with as many cells as there are headers."""
+    """Rows of the table, each with as many cells as there are headers."""
     strong_last: bool = False
     """Whether the last row is a sum, printed in bold."""
     note: str = ""
@@ -99,14 +99,14 @@ def rich_table(grid: Grid) -> Table:
         caption_justify="left",
     )
     for number, row in enumerate(grid.rows):
-        last = grid.strong_last and number == len(grid.rows) - 1
-        if last:
+        is_sum = grid.strong_last and number == len(grid.rows) - 1
+        if is_sum:
             table.add_section()
         cells = [
             f"[{tone}]{literal(cell.text)}[/]" if (tone := tones[cell.tone]) else literal(cell.text)
             for cell in row
         ]
-        table.add_row(*cells, style="bold" if last else None)
+        table.add_row(*cells, style="bold" if is_sum else None)
     return table
 
 

@@ -49,9 +49,9 @@ def _selected(mask: Array, new: Any, old: Any) -> Any:
 def make_contiguous(tree: Any) -> Any:
     """Return nested tuples and dicts of numpy arrays with all arrays C-contiguous.
 
-    numpy's order of summation depends on the memory layout, and a concatenation inherits its parts'
-    layout. Without this, a row's last bit could depend on the other rows. JAX arrays have one
-    layout and are returned unchanged.
+    numpy's order of summation depends on the memory layout, and a concatenation inherits the layout
+    of its parts. So without this function, the last bit of a row could depend on the other rows.
+    JAX arrays have only one layout and are returned unchanged.
     """
     return _mapped(lambda x: np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x, tree)
 

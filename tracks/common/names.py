@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 from unicodedata import category
 
 LONGEST = 80
-"""Most characters of a name that are compared and printed; a file's key may have megabytes."""
+"""Largest number of characters of a name that are compared and printed, because a key of a file may
+have megabytes."""
 
 
 def closest(name: str, allowed: Iterable[str]) -> str | None:
@@ -83,9 +84,10 @@ class Registry(Mapping[str, T]):
         Args:
             kind: name of the kind of entry, for messages.
             group: entry point group, such as `diffracing_suite.effects`.
-            own: the suite's entries in order: each is a value, or the text `module` or
-                `module:attribute` to import it from.
-            check: function (name, value) that returns what is wrong with an added entry, or None.
+            own: the suite's entries in order. Each is a value, or a text `module` or
+                `module:attribute` from which the value is imported.
+            check: function (name, value) that returns what is wrong with an added entry; None if it
+                is valid.
         """
         self._kind, self._group, self._check = kind, group, check
         self._entries: dict[str, Any] = {
@@ -110,7 +112,7 @@ class Registry(Mapping[str, T]):
         """Return the entry `name`.
 
         Raises:
-            ValueError: for an unknown name, with the closest one.
+            ValueError: for an unknown name; the message has the closest known name.
         """
         if name not in self:
             error = unknown_name(self._kind, str(name), self)

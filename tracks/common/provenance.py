@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 VERSION = "0.1.0"
+"""Version of the suite."""
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -19,10 +20,10 @@ _ROOT = Path(__file__).resolve().parents[2]
 def git_commit() -> str | None:
     """Return the git commit of this code, or None where it is unknown (a copy without history).
 
-    Where tracked files differ from the commit, "-dirty-" and 8 hex digits of a digest of the
-    differences follow, so that two states of the code never have the same name. In a checkout, git
-    reports the commit; an installed wheel contains the commit that it was built from. A repository
-    that merely contains the installed package is ignored.
+    If tracked files differ from the commit, "-dirty-" and 8 hex digits of a digest of the
+    differences follow, so that two states of the code do not have the same name. In a checkout, git
+    reports the commit. An installed wheel contains the commit from which it was built. A git
+    repository that only contains the installed package, such as a user's project, is ignored.
     """
     built_from = Path(__file__).with_name("built_from.txt")
     if built_from.is_file():

@@ -53,8 +53,8 @@ def load_shipped(
     """Return the object that a TOML file describes.
 
     Args:
-        source: the file's path (it ends in .toml, has a folder or exists), or the name of a file
-            that the suite ships.
+        source: path of the file, or name of a file that the suite ships. A text counts as a path if
+            it ends in .toml, has a folder or is an existing file.
         folder: folder of the shipped files.
         kind: name of the kind of file, for messages.
         parse: makes the object from the file's table; raises a ValueError for a wrong value.
@@ -85,13 +85,13 @@ def load_shipped(
 
 
 class Table:
-    """One table of a TOML file; it records the keys that are read, so that others are refused."""
+    """One table of a TOML file; it records which keys are read, so that it can refuse others."""
 
     def __init__(self, source: str, place: str, values: Mapping[str, Any]) -> None:
         """Make a reader of a table.
 
         Args:
-            source: path of the file, with which messages begin, or "".
+            source: path of the file, with which messages begin; "" for messages without a path.
             place: dotted name of the table in the file; "" for the whole file.
             values: the table.
         """
@@ -111,7 +111,8 @@ class Table:
         """Return a dataclass from this table's keys; missing fields take their defaults.
 
         Args:
-            cls: its fields are numbers, texts, truth values, tuples of these, or dataclasses.
+            cls: class of the result; its fields are numbers, texts, truth values, tuples of these,
+                or dataclasses.
             also: further allowed keys.
             fixed: values of fields that are not in the table.
         """
@@ -264,8 +265,8 @@ class Table:
         allowed = list(allowed)
         for key in self.values:
             if key not in allowed:
-                near = closest(key, allowed)
-                hint = f" Did you mean {near!r}?" if near else ""
+                similar = closest(key, allowed)
+                hint = f" Did you mean {similar!r}?" if similar else ""
                 where = f"in [{self._place}]" if self._place else "at the top"
                 raise self._refused(
                     f"key {shown(key)} {where} is unknown.{hint} Allowed: {', '.join(allowed)}."

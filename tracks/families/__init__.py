@@ -2,7 +2,8 @@
 
 A family is a rule that draws a track: a function `make(d, rng) -> Layout` of the difficulty `d` and
 a random generator. Another package adds one with an entry point of the group
-`diffracing_suite.tracks`, a program for its own process with `FAMILIES.register(name, make)`.
+`diffracing_suite.tracks`. A program adds one for its own process with
+`FAMILIES.register(name, make)`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from tracks.geometry.scene import Counts, counts
 from tracks.track import Track
 
 
-def _problem(name: str, make: Any) -> str | None:
+def _registration_error(name: str, make: Any) -> str | None:
     return None if callable(make) else f"{make!r}; must be a function (d, rng) -> Layout"
 
 
@@ -32,16 +33,17 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
         "ellipse": judged.ellipse,
         "random": random.make,
     },
-    _problem,
+    _registration_error,
 )
 JUDGED = ("zigzag", "circular", "ellipse")
 """The families on which policies are evaluated; they are trained on `random`."""
 LEVELS = range(10)
 """Difficulty levels, 0 (easy) to 9 (hard)."""
 MAX_COUNTS = Counts(boxes=70, cylinders=15, capsules=12, spheres=12)
-"""Most solids of each kind over all families and levels: 32 frame bars, and 7 stretches (parts of
-the track between two gates) with at most 3 plates, 3 small solids, 1 pillar and 4 ground objects
-each. Small solids and ground objects are distributed evenly over their kinds."""
+"""Largest number of solids of each kind, over all families and levels. A track has 32 bars of gate
+frames, and 7 stretches (parts of the track between two gates). Each stretch has at most 3 plates, 3
+small solids, 1 pillar and 4 ground objects. Small solids and ground objects are distributed evenly
+over the kinds."""
 
 
 def make_track(family: str, level: int, seed: int) -> Track:
@@ -81,7 +83,7 @@ def random_track(
     """Return a new track of the training distribution; its `seed` is 0.
 
     Args:
-        difficulty: d in [0, 1].
+        difficulty: difficulty d in [0, 1].
         rng: random generator.
         mix: probabilities of sharp turns and of obstacles.
 

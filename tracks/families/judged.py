@@ -25,7 +25,7 @@ from tracks.geometry.obstacles import straight_sites
 SPACING_M = 5.0
 """Distance of neighbouring gates of zigzag and ellipse [m]."""
 ZIGZAG_OFFSET_M, ELLIPSE_OFFSET_M = 3.6, 2.5
-"""Largest distance of obstacles from the lines between gates [m]."""
+"""Largest distance of obstacles from the lines between gates, on zigzag and ellipse [m]."""
 STEP = 2 * np.pi / GATE_COUNT
 """Angle between neighbouring gates of the circle [rad]."""
 _CIRCLE_MARGIN_M, _ELLIPSE_MARGIN_M = 1.0, 1.5
@@ -64,8 +64,8 @@ def circular(d: float, rng: np.random.Generator) -> Layout:
     gates = flight_order(gates, first)
     back = gates.center_w[-1] - gates.center_w[0]
     length = float(np.linalg.norm(back))
-    most = min(4.0, length - _CIRCLE_MARGIN_M)
-    distance = rng.uniform(min(2.0, most), most)
+    longest = min(4.0, length - _CIRCLE_MARGIN_M)
+    distance = rng.uniform(min(2.0, longest), longest)
     start_pos_w = gates.center_w[0] + back * distance / length
 
     def site(rng: np.random.Generator, stretch: np.ndarray) -> np.ndarray:
@@ -94,8 +94,8 @@ def ellipse(d: float, rng: np.random.Generator) -> Layout:
     gates = flight_order(gates, pick_first_gate(rng, gates.center_w, 2.0 + _ELLIPSE_MARGIN_M))
     ahead = gates.center_w[0] - gates.center_w[-1]
     length = float(np.linalg.norm(ahead))
-    most = min(3.0, length - _ELLIPSE_MARGIN_M)
-    distance = rng.uniform(min(2.0, most), most)
+    longest = min(3.0, length - _ELLIPSE_MARGIN_M)
+    distance = rng.uniform(min(2.0, longest), longest)
     start_pos_w = gates.center_w[-1] + ahead * distance / length
 
     stretches = np.arange(GATE_COUNT - 1)

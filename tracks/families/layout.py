@@ -15,7 +15,7 @@ from tracks.geometry.obstacles import Obstacles, PerStretch, Site, keep_clear, s
 from tracks.geometry.scene import Boxes, Gates, Scene
 
 GATE_COUNT = 8
-"""Gates of a generated track."""
+"""Number of gates of a generated track."""
 MIN_HEIGHT_M, MID_HEIGHT_M, MAX_HEIGHT_M = 0.8, 1.4, 2.0
 """Lowest, mean and highest height of a gate's centre in the baseline (Yu et al. 2025) [m]."""
 MAX_YAW_NOISE = np.deg2rad(30.0)
@@ -52,9 +52,9 @@ def noisy_gates(
     Args:
         rng: random generator.
         d: difficulty in [0, 1).
-        center_w: (G, 3) [m]; heights are clipped to the baseline's range.
+        center_w: (G, 3) centres of the gates [m]; heights are clipped to the baseline's range.
         heading: (G,) flight directions without noise [rad].
-        max_frame_width_m: largest width of the frames' bars; the smallest is 0.15 m.
+        max_frame_width_m: largest width of the frames' bars [m]; the smallest is 0.15 m.
     """
     n = len(center_w)
     yaw = heading + rng.uniform(-1, 1, n) * MAX_YAW_NOISE * d
@@ -71,14 +71,14 @@ def flight_order(gates: Gates, first: int) -> Gates:
 
 
 def pick_first_gate(rng: np.random.Generator, center_w: np.ndarray, min_length_m: float) -> int:
-    """Return the number of a random gate whose stretch before it is long enough for a start.
+    """Return the number of a random gate, before which the stretch is long enough for a start.
 
-    If there is none, return the gate with the longest stretch before it.
+    If no stretch is long enough, return the gate after the longest one.
 
     Args:
         rng: random generator.
         center_w: (G, 3) gate centres of a closed track in flight order [m].
-        min_length_m: length of a long enough stretch.
+        min_length_m: least length of a stretch for a start [m].
     """
     length = np.linalg.norm(center_w - np.roll(center_w, 1, axis=0), axis=-1)
     fits = np.flatnonzero(length >= min_length_m)

@@ -20,25 +20,26 @@ from tracks.geometry.scene import Gates
 MIN_SPACING_M, MAX_SPACING_M = 2.5, 7.0
 """Least and largest horizontal distance between successive gates [m]."""
 PASSING_M = 1.6
-"""Least horizontal distance of a stretch from the centre of a gate that it does not join [m]."""
+"""Least horizontal distance of a stretch from the centre of any gate that is not one of its ends
+[m]."""
 MAX_APPROACH = np.deg2rad(95.0)
 """Largest angle between a stretch and the direction of a gate that it joins [rad]."""
 MAX_HAIRPIN_APPROACH = np.deg2rad(110.0)
-"""Largest such angle on tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
+"""`MAX_APPROACH` on tracks with hairpins, as at the apexes of the hardest ellipses [rad]."""
 MAX_TOTALS = PerStretch(*(np.array(n) for n in (23, 23, 10, 14)))
-"""Most plates, small solids, pillars and ground objects of a track."""
+"""Largest numbers of plates, small solids, pillars and ground objects of a track."""
 _WALKS = 8
-"""Candidate walks of one draw."""
+"""Number of candidate walks in one draw."""
 _DRAWS = 12
-"""Draws before a straight track is returned."""
+"""Number of draws without a free walk after which a straight track is returned."""
 
 OFFSET_M = (2.0, 4.0)
-"""Range of the largest distance of a track's obstacles from the lines between gates; smaller values
-place more obstacles on the lines [m]."""
+"""Range from which a track draws the largest distance of its obstacles from the lines between gates
+[m]; a smaller distance places more obstacles on the lines."""
 
 
 class Walks(NamedTuple):
-    """Several candidate walks (W of them) with the same drift."""
+    """W candidate walks with the same mean turns."""
 
     center: np.ndarray
     """(W, G, 2) horizontal positions of the gates' centres [m]."""
@@ -58,7 +59,8 @@ class Mix(NamedTuple):
     bare_share: float = 0.2
     """Probability that a track has no obstacles."""
     hairpin_share: float = 0.0
-    """Probability that a track has hairpins, one or two; walks near other gates are redrawn."""
+    """Probability that a track has one or two hairpins; walks that pass near other gates are drawn
+    again."""
     height_spread: float = 1.0
     """Factor on the range of the gates' heights."""
 
@@ -87,23 +89,26 @@ def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:
 
 
 def _obstacle_counts(d: float, rng: np.random.Generator, stretches: int, mix: Mix) -> PerStretch:
-    """Draw obstacle counts: none on some tracks, more than the baseline's on others."""
+    """Draw numbers of obstacles: none on some tracks, more than in the baseline on others."""
     density = rng.uniform(*mix.density) if rng.random() < 1 - mix.bare_share else 0.0
     kind_factor = np.clip(rng.uniform(0.0, 2.0, 4), 0.3, 1.5)
     air, pillar, ground = ramp(1, 3.5, d), ramp(0.8, 1.3, d), 2.0
     mean = density * kind_factor * np.array([air, air, pillar, ground])
     numbers = np.floor(mean[:, None] + rng.random((4, stretches))).astype(int) * (density > 0)
-    for row, most in zip(numbers, MAX_TOTALS, strict=True):
-        if row.sum() > most:
+    for row, largest_total in zip(numbers, MAX_TOTALS, strict=True):
+        if row.sum() > largest_total:
             # Removed at random: otherwise the last stretches would always have fewer obstacles.
-            row[:] = rng.multivariate_hypergeometric(row, int(most))
+            row[:] = rng.multivariate_hypergeometric(row, int(largest_total))
     return PerStretch(*numbers)
 
 
 def _walk(
     d: float, rng: np.random.Generator, mix: Mix
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first free walk."""
+    """Return gate centres (G, 2), yaws (G,) and the start (2,) of the first free walk.
+
+    A walk is free if it passes far enough from other gates, see `_is_free`.
+    """
     # A mix without hairpins draws no number here, so that each seed keeps its track.
     hairpins = mix.hairpin_share > 0 and rng.random() < mix.hairpin_share
     for _ in range(_DRAWS):
@@ -154,7 +159,11 @@ def _candidates(d: float, rng: np.random.Generator, turn: np.ndarray) -> Walks:
 
 
 def _is_free(walks: Walks, max_approach: float = MAX_APPROACH) -> np.ndarray:
-    """Return which walks avoid their other gates and pass each gate in its direction, (W,)."""
+    """Return which walks are free, (W,) bool.
+
+    On a free walk, every stretch keeps its distance from the gates that are not its ends, and
+    passes its two gates in their flight directions.
+    """
     point = np.concatenate([walks.start[:, None], walks.center], axis=1)
     step = np.diff(point, axis=1)
     normal = np.stack([np.cos(walks.yaw), np.sin(walks.yaw)], axis=-1)

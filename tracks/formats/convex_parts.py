@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     import trimesh
 
 _VOLUME_TOLERANCE = 1e-3
-"""Largest share of the convex hull's volume that a part may lack (rounding of stored corners)."""
+"""Largest difference of a part's volume from its convex hull's, as a share of the latter; it allows
+for rounding of stored corners."""
 
 _FLAT = 1e-9
-"""A part whose volume over its cubed largest extent is below this counts as flat."""
+"""A part counts as flat if its volume is below this share of its largest extent cubed."""
 
 _SLIVER = 1e-12
-"""A triangle whose area over its part's squared largest extent is below this is dropped."""
+"""A triangle is dropped if its area is below this share of the part's largest extent squared."""
 
 
 class _Resolver:
@@ -88,8 +89,8 @@ def convex_parts(path: Path) -> list[np.ndarray]:
 
 
 def _triangles_with_area(part: trimesh.Trimesh) -> np.ndarray:
-    least = _SLIVER * float(part.extents.max()) ** 2
-    return np.asarray(part.triangles, float)[part.area_faces > least]
+    least_area = _SLIVER * float(part.extents.max()) ** 2
+    return np.asarray(part.triangles, float)[part.area_faces > least_area]
 
 
 def thickness(triangles: np.ndarray) -> float:
@@ -107,7 +108,7 @@ def _check(path: Path, number: int, total: int, part: trimesh.Trimesh) -> None:
             f"{where} is not closed; close its surface (parts that touch "
             "must be separate objects of an OBJ file, or separate files)"
         )
-    try:
+    try:  # `hull` is the volume of the convex hull
         hull = part.convex_hull.volume
     except Exception:  # Qhull's error; its message is a page long
         hull = 0.0

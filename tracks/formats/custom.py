@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 _START_BEHIND_M = 2.5
 """Default distance of the start before gate 0 [m]."""
 FARTHEST_M = 1e5
-"""Largest coordinate, as in a flight log [m]."""
+"""Largest allowed coordinate, as in a flight log [m]."""
 LEAST_M, MOST_M = 1e-3, 1e5
-"""Smallest and largest length [m]."""
+"""Smallest and largest allowed length [m]."""
 MOST_TABLES = 1000
-"""Most gates, and most solids of each kind; so many are read in about a second."""
+"""Largest number of gates, and of solids of each kind; so many are read in about a second."""
 _RESERVED = (
     *("ground", "parked", "quadrotor box"),
     *(f"rotor_{number} {part}" for number in range(1, 5) for part in ("arm", "disk")),
 )
-"""Names that geoms of the suite's MuJoCo models already have."""
+"""Names that other geoms of the suite's MuJoCo models have."""
 _ROUNDING = 0.01
-"""Share by which a mesh may be thinner than `LEAST_M`, for rounding."""
+"""Share by which a mesh may be thinner than `LEAST_M`, because of rounding."""
 _SINGULAR = {"boxes": "box", "meshes": "mesh"}
 """Singular of the keys that do not end in a plain s."""
 
@@ -62,10 +62,10 @@ def load_track(path: str | os.PathLike[str]) -> Track:
     start_pos_w, start_yaw = _start(top, gates)
 
     names = _Names([f"gate {i} frame" for i in range(len(gate_tables))])
-    boxes, box_names = _read(top, "boxes", _box, names)
-    cylinders, cylinder_names = _read(top, "cylinders", _rod, names)
-    capsules, capsule_names = _read(top, "capsules", _rod, names)
-    spheres, sphere_names = _read(top, "spheres", _sphere, names)
+    boxes, box_names = _solids_of_kind(top, "boxes", _box, names)
+    cylinders, cylinder_names = _solids_of_kind(top, "cylinders", _rod, names)
+    capsules, capsule_names = _solids_of_kind(top, "capsules", _rod, names)
+    spheres, sphere_names = _solids_of_kind(top, "spheres", _sphere, names)
     meshes, mesh_names = _meshes(top, names)
     top.close()
 
@@ -124,7 +124,7 @@ def _tables(top: Table, kind: str) -> list[Table]:
     return tables
 
 
-def _read(
+def _solids_of_kind(
     top: Table, kind: str, read: Callable[[Table], tuple], names: _Names
 ) -> tuple[list[tuple], list[str]]:
     """Return the values and the names of all solids of a kind; `read` reads one table."""
@@ -185,15 +185,15 @@ def _convex(table: Table, polygon: np.ndarray) -> np.ndarray:
     """Return the corners (V, 2) counter-clockwise; refuse them if not convex or self-crossing."""
     side = np.roll(polygon, -1, axis=0) - polygon
     next_side = np.roll(side, -1, axis=0)
-    turn = np.arctan2(_cross(side, next_side), np.sum(side * next_side, axis=-1))
+    turn_at_corner = np.arctan2(_cross(side, next_side), np.sum(side * next_side, axis=-1))
     if np.linalg.norm(side, axis=-1).min() < LEAST_M:
         allowed = f"sides of {LEAST_M:g} m at least"
         raise table.error("polygon", polygon.tolist(), allowed)
-    one_direction = (turn > 1e-6).all() or (turn < -1e-6).all()
-    if not one_direction or not np.isclose(abs(turn.sum()), 2 * np.pi):
+    one_direction = (turn_at_corner > 1e-6).all() or (turn_at_corner < -1e-6).all()
+    if not one_direction or not np.isclose(abs(turn_at_corner.sum()), 2 * np.pi):
         allowed = "the corners [y, z] of a convex polygon in order, no three of them in line"
         raise table.error("polygon", polygon.tolist(), allowed)
-    if turn[0] < 0:
+    if turn_at_corner[0] < 0:
         polygon = polygon[::-1]
     if (_cross(polygon, np.roll(polygon, -1, axis=0)) <= 0).any():
         raise table.error("polygon", polygon.tolist(), "corners around [0, 0], the gate's centre")
@@ -301,7 +301,7 @@ def _sphere(table: Table) -> tuple:
 
 
 def _meshes(top: Table, names: _Names) -> tuple[list[np.ndarray], list[str]]:
-    """Return the triangles (M, 3, 3) in the world and the name of each mesh's convex parts."""
+    """Return the triangles (M, 3, 3), in world axes, and the name of each convex part of meshes."""
     placed = []
     for number, table in enumerate(_tables(top, "meshes")):
         file = top.path.parent / table.text("file")

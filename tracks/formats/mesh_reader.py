@@ -30,9 +30,9 @@ KINDS = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
 READ_S = 60.0
 """Time limit for all files of a track [s]."""
 IDLE_S = 30.0
-"""Time after which the unused process ends [s]."""
+"""Time after its last use at which the process ends [s]."""
 MEMORY_BYTES = 3 * 2**30
-"""Size of the process's address space, libraries included."""
+"""Largest address space of the process, libraries included [bytes]."""
 _PROGRAM = (
     "import sys; sys.path.append(sys.argv[1]); "
     "from tracks.formats.mesh_reader import serve; serve()"
@@ -83,6 +83,7 @@ def _process() -> subprocess.Popen[bytes]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and close its pipes."""
     process.kill()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
@@ -95,7 +96,7 @@ def _request(paths: list[str], names: str) -> tuple[dict[str, Any], bytes]:
     """Send paths to the reading process; return the header and the data of its answer.
 
     Raises:
-        ValueError: where it does not answer in time, or ends.
+        ValueError: where the process does not answer in time, or ends.
     """
     if _process().poll() is not None:
         _end(_process())
@@ -156,8 +157,10 @@ def serve() -> None:
         except ValueError as error:
             _answer(answers, {"error": str(error)}, [])
         except MemoryError:
-            most = f"{MEMORY_BYTES / 2**30:g} GB of memory"
-            _answer(answers, {"error": f"{path}: takes more than {most}; use a simpler mesh"}, [])
+            memory_text = f"{MEMORY_BYTES / 2**30:g} GB of memory"
+            _answer(
+                answers, {"error": f"{path}: takes more than {memory_text}; use a simpler mesh"}, []
+            )
         else:
             sizes = [[len(part) for part in file_parts] for file_parts in parts]
             _answer(answers, {"sizes": sizes}, [p for file_parts in parts for p in file_parts])

@@ -11,7 +11,7 @@ from tracks.geometry.scene import PARKED_Z, Rods
 from tracks.track import Track
 
 _SECTIONS = 24
-"""Facets around cylinders and capsules."""
+"""Number of facets around cylinders and capsules."""
 
 
 def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
@@ -21,7 +21,7 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
     ground, the plane z = 0, has no mesh. Round solids are approximated by inscribed polyhedra.
     """
     scene = track.scene
-    first = np.cumsum((0, *track.mesh_sizes))
+    offsets = np.cumsum((0, *track.mesh_sizes))
     meshes = [
         *(_box(*box) for box in zip(*scene.boxes, strict=True)),
         *_rods(scene.cylinders, _cylinder),
@@ -29,7 +29,7 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
         *(_sphere(*ball) for ball in zip(*scene.spheres, strict=True)),
         *(
             trimesh.Trimesh(**trimesh.triangles.to_kwargs(scene.triangles[begin:end]))
-            for begin, end in zip(first, first[1:], strict=False)
+            for begin, end in zip(offsets, offsets[1:], strict=False)
         ),
     ]
     named = zip(track.names, meshes, strict=True)
@@ -37,7 +37,7 @@ def solid_meshes(track: Track) -> list[tuple[str, trimesh.Trimesh]]:
 
 
 def named_meshes(track: Track) -> dict[str, trimesh.Trimesh]:
-    """Return one mesh for each name in the world frame; the bars of a gate's frame are one."""
+    """Return name -> mesh in the world frame; the bars of a gate's frame are one mesh."""
     parts: dict[str, list[trimesh.Trimesh]] = {}
     for name, mesh in solid_meshes(track):
         parts.setdefault(name, []).append(mesh)

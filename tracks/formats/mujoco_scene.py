@@ -1,4 +1,4 @@
-"""Add a scene (gates, obstacles and the ground) to a MuJoCo model, as geoms of its world body.
+"""Add a scene (gates, obstacles, ground) to a MuJoCo model, as geoms (solids) of its world body.
 
 Solids have MuJoCo's default contact bits, so a drone collides with them; geoms of the world body
 never collide with one another. Rays ignore contact bits and hit every solid, unless they select a
@@ -20,9 +20,9 @@ GROUND = "ground"
 PARKED = "parked"
 """Name of padding geoms."""
 MESH_GROUP = 1
-"""Geom group of meshes, for rays that should hit meshes only."""
+"""Geom group of meshes, so that rays can hit meshes only."""
 _SEPARATOR = "/"
-"""Between the name of a solid and the number of its geom."""
+"""Text between the name of a solid and the number of its geom."""
 
 
 def solid_name(geom_name: str) -> str:
@@ -45,10 +45,10 @@ def add_scene(
 
     Args:
         spec: the model; it is changed in place.
-        scene: not batched.
-        names: as `Track.names`; solids are named by kind and number where it is empty.
-        mesh_sizes: as `Track.mesh_sizes`.
-        pad_to: numbers of primitive solids to pad to; meshes are never padded.
+        scene: the scene, not batched.
+        names: names of the solids, as `Track.names`; if empty, solids are named by kind and number.
+        mesh_sizes: numbers of triangles, as `Track.mesh_sizes`.
+        pad_to: numbers of solids of each kind after padding; meshes are never padded.
 
     Raises:
         ValueError: where the scene has more solids of a kind than `pad_to`, or names and solids
@@ -108,8 +108,8 @@ class _Names:
     def __call__(self, kind: int, number: int) -> str:
         name = PARKED
         if kind == len(self._counts) or number < self._counts[kind]:
-            fallback = f"{Scene._fields[kind + 1]} {number}"
-            name = self._names[self._first[kind] + number] if self._names else fallback
+            numbered_name = f"{Scene._fields[kind + 1]} {number}"
+            name = self._names[self._first[kind] + number] if self._names else numbered_name
         uses = self._used.get(name, 0)
         self._used[name] = uses + 1
         return name if uses == 0 else f"{name}{_SEPARATOR}{uses}"

@@ -20,14 +20,13 @@ class Camera:
     fov_deg: Annotated[tuple[float, float], Range(1.0, 179.0)] = (78.4, 63.8)
     """Horizontal and vertical field of view, edge to edge [deg]."""
     range_m: Annotated[float, Range(0.1, 1000.0)] = 10.0
-    """Largest depth; larger ones are set to it [m]."""
+    """Largest depth [m]; larger depths are set to it."""
     width: Annotated[int, Range(1, 1024)] = 32
-    """Columns of the image [pixels]."""
+    """Number of columns of the image [pixels]."""
     height: Annotated[int, Range(1, 1024)] = 24
-    """Rows of the image [pixels]."""
+    """Number of rows of the image [pixels]."""
     rays: Annotated[int, Range(1, 8)] = 1
-    """Rays in each direction of a pixel (n x n); the pixel is their smallest depth. More rays find
-    thinner objects."""
+    """n: a pixel is the smallest depth of its n x n rays. More rays find thinner objects."""
 
 
 def pixel_rays_b(camera: Camera) -> np.ndarray:
@@ -50,9 +49,9 @@ def pixel_rays_b(camera: Camera) -> np.ndarray:
 def cast_rays_b(camera: Camera) -> np.ndarray:
     """Return all rays of an image in body axes, (rays^2 * height * width, 3), for `nearest`.
 
-    Each pixel is split evenly into rays x rays parts, and a ray goes through the centre of each.
-    The first parts of all pixels come first, so that `nearest` takes the minimum over a leading
-    axis.
+    Each pixel is split evenly into rays x rays parts, and a ray goes through the centre of each
+    part. The first parts of all pixels come first, so that `nearest` takes the minimum over a
+    leading axis.
     """
     n, height, width = camera.rays, camera.height, camera.width
     supersampled = replace(camera, width=n * width, height=n * height)

@@ -1,4 +1,4 @@
-"""Signed distance from points to the solids of a scene and the ground, and directions away (JAX).
+"""Signed distances from points to the solids of a scene and the ground, and directions away (JAX).
 
 Inside a solid the distance is negative and the direction points to the nearest surface, so that a
 repulsive gradient always points to free space. The training's collision loss uses it.
@@ -108,7 +108,7 @@ def distances(scene: Scene, point_w: Array) -> tuple[Array, Array]:
 
     Args:
         scene: arrays (..., N, ...) whose leading shape broadcasts with that of point_w.
-        point_w: (..., 3) [m].
+        point_w: (..., 3) the points [m].
 
     Returns:
         distance (..., N + 1) [m] in the order boxes, cylinders, capsules, spheres, triangles,
@@ -147,9 +147,9 @@ def nearest_obstacle(
         scene = nearest_solids(scene, point_w[:, point_w.shape[1] // 2], limits)
     spread = type(scene)(*(_with_points_axis(part) for part in scene))
     distance, away = distances(spread, point_w)
-    best = distance.argmin(-1)[..., None]
-    nearest = jnp.take_along_axis(distance, best, axis=-1)[..., 0]
-    return nearest, jnp.take_along_axis(away, best[..., None], axis=-2)[..., 0, :]
+    nearest_index = distance.argmin(-1)[..., None]
+    nearest = jnp.take_along_axis(distance, nearest_index, axis=-1)[..., 0]
+    return nearest, jnp.take_along_axis(away, nearest_index[..., None], axis=-2)[..., 0, :]
 
 
 def _with_points_axis(part: Array) -> Array:

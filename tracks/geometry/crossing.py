@@ -10,7 +10,7 @@ from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Array
 
 NEAR_RADIUS_M = 0.35
-"""Yu et al. 2025 count a gate as passed within this distance of its centre [m]."""
+"""Distance from a gate's centre [m] within which Yu et al. 2025 count the gate as passed."""
 
 
 def is_inside(opening_g: Array, point_g: Array) -> Array:
@@ -24,7 +24,7 @@ def sides(opening_g: Array, point_g: Array) -> tuple[Array, Array]:
 
     Args:
         opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
-        point_g: (..., 2) [m].
+        point_g: (..., 2) the point (y, z) [m].
 
     Returns:
         edge (..., V, 2) from corner to corner [m]; turn (..., V), the signed distance of the point
@@ -46,11 +46,11 @@ def crossing(
         rot_w: (..., 3, 3) gate to world.
         opening_g: (..., V, 2) corners (y, z), counter-clockwise [m].
         before_w: (..., 3) start of the step [m].
-        after_w: (..., 3) its end [m].
+        after_w: (..., 3) end of the step [m].
 
     Returns:
-        passed: the step crosses the gate's plane in flight direction inside the opening; missed:
-        it crosses the plane in flight direction outside of it.
+        passed: the step crosses the gate's plane in flight direction, inside the opening; missed:
+        it crosses the plane in flight direction, outside the opening.
     """
     xp = before_w.__array_namespace__()
     before, after = to_local(rot_w, before_w - center_w), to_local(rot_w, after_w - center_w)
@@ -58,8 +58,8 @@ def crossing(
     if nowhere(crosses):
         return crosses, crosses  # the usual case, in which nothing more is to compute
     travel = after[..., 0] - before[..., 0]
-    share = -before[..., 0] / xp.where(crosses, travel, 1.0)
-    point = before[..., 1:] + share[..., None] * (after - before)[..., 1:]
+    fraction = -before[..., 0] / xp.where(crosses, travel, 1.0)
+    point = before[..., 1:] + fraction[..., None] * (after - before)[..., 1:]
     inside = is_inside(opening_g, point)
     return crosses & inside, crosses & ~inside
 

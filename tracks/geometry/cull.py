@@ -15,16 +15,16 @@ import jax.numpy as jnp
 from tracks.geometry.scene import Array, Counts, Scene
 
 _INVISIBLE = 1e6
-"""Added to the score of a solid out of view, so that every visible one comes first [m]."""
+"""Number that is added to the score of a solid out of view, which so comes last [m]."""
 
 
 class Bounds(NamedTuple):
     """Bounding spheres of one kind of solid."""
 
     center_w: Array
-    """(..., N, 3) [m]."""
+    """(..., N, 3) centres [m]."""
     radius: Array
-    """(..., N) [m]."""
+    """(..., N) radii [m]."""
 
 
 def bounds(scene: Scene) -> list[tuple[str, Bounds]]:
@@ -91,7 +91,7 @@ def visible_solids(
         rot_w: (B, 3, 3) body to world.
         rays_b: (R, 3) rays in body axes; the view cone around their mean contains them all.
         range_m: largest planar depth [m].
-        limits: how many of each kind to keep.
+        limits: number of solids of each kind to keep.
     """
     unit = rays_b / jnp.linalg.norm(rays_b, axis=-1, keepdims=True)
     axis_b = unit.mean(0) / jnp.linalg.norm(unit.mean(0))

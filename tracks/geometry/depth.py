@@ -20,7 +20,7 @@ from tracks.geometry.scene import Array, Counts, Rods, Scene
 _FAR = 1e9
 """Depth of a ray without a hit [m]."""
 _TINY = 1e-12
-"""Avoids division by zero."""
+"""Small number that avoids a division by zero."""
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -55,7 +55,8 @@ def _ball(square: Array, cross: Array, excess: Array) -> tuple[Array, Array]:
 
 
 def _box(solid: tuple[Array, ...], rays: Array) -> Array:
-    # The camera in box axes (B, 3); the box's axes in the body frame as rows (B, 3, 3); (B, 3).
+    # The camera's position in box axes (B, 3); the box's axes in the body frame as rows (B, 3, 3);
+    # the box's half sizes (B, 3).
     origin, axes, half = solid
     enter, leave = -_FAR, _FAR
     for i in range(3):
@@ -151,7 +152,7 @@ def depth_image(
         rot_w: (B, 3, 3) body to world.
         rays_b: (R, 3) from `camera.pixel_rays_b`.
         range_m: largest depth [m].
-        limits: use only this many solids of each kind, the nearest visible ones; None uses all,
+        limits: numbers of the nearest visible solids of each kind that are used; None: all solids,
             which is exact.
     """
     if limits is not None:

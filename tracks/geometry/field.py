@@ -11,7 +11,7 @@ from tracks.geometry.rotation import to_local, to_world
 from tracks.geometry.scene import Array
 
 CURRENT = 2e-5
-"""The paper's constant C_I, by which the field is scaled [m]."""
+"""Constant C_I of Su et al. 2026, by which the field is scaled [m]."""
 _TINY = 1e-9
 _WIRE_SQUARED_M2 = 1e-12
 """Least squared distance from the loop: at the loop itself the field is infinite [m^2]."""
@@ -35,16 +35,16 @@ def magnetic_field(
 ) -> Array:
     """Return the field B (..., 3) at point_w in world axes: the sum over the opening's sides.
 
-    The paper's "shortest vector to the wire segment" is taken as the perpendicular to the line
-    through the segment. Only then does the sum satisfy the Biot-Savart law and have no divergence.
+    The "shortest vector to the wire segment" of Su et al. 2026 is taken as the perpendicular to the
+    line through the segment. Only then the sum satisfies the Biot-Savart law and has no divergence.
 
     Args:
         center_w: (..., 3) opening's centre [m].
         rot_w: (..., 3, 3) gate to world.
         opening_g: (..., V, 2) corners (y, z), counter-clockwise seen along -x [m]; repeated corners
             add nothing.
-        point_w: (..., 3) [m].
-        current: the paper's C_I, by which the field is scaled [m].
+        point_w: (..., 3) the point [m].
+        current: factor C_I on the field [m].
     """
     xp = point_w.__array_namespace__()
     point_g = to_local(rot_w, point_w - center_w)
@@ -65,14 +65,14 @@ def attractive_field(
 ) -> Array:
     """Return the attractive field u_A (..., 3) in world axes (Su et al. 2026, Sec. III-C2).
 
-    It has the direction of B. Its magnitude is 0 where the velocity is aligned with B, and largest
-    where it is opposite.
+    It has the direction of the magnetic field B. Its magnitude is 0 where the velocity is along B,
+    and largest where the velocity is opposite to B.
 
     Args:
-        field_w: (..., 3) B from `magnetic_field`.
+        field_w: (..., 3) the field B, from `magnetic_field`.
         vel_w: (..., 3) velocity [m/s].
         decay: lambda_A in (0, 1): |B| is raised to the power 1 - decay.
-        epsilon: added to the denominator of the alignment, which is 0 at rest.
+        epsilon: number that is added to the denominator of the alignment, which is 0 at rest.
     """
     xp = field_w.__array_namespace__()
     size = _norm(field_w)

@@ -69,11 +69,14 @@ def frame_boxes(gates: Gates) -> Boxes:
     corner = np.asarray(gates.opening_g, float)
     side = np.roll(corner, -1, axis=-2) - corner
     length = np.linalg.norm(side, axis=-1)
-    real = length > 1e-9
-    along = np.where(real[..., None], side, [1.0, 0.0]) / np.where(real, length, 1.0)[..., None]
+    has_length = length > 1e-9
+    along = (
+        np.where(has_length[..., None], side, [1.0, 0.0])
+        / np.where(has_length, length, 1.0)[..., None]
+    )
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     width = np.asarray(gates.frame_width, float)[:, None]
-    end, start = _corner_extensions(along, real, width)
+    end, start = _corner_extensions(along, has_length, width)
     # A bar's centre (y, z): half of its length along the side, half of its width outwards.
     middle = (
         corner + along * ((length + end - start) / 2)[..., None] + outward * width[..., None] / 2
@@ -91,16 +94,16 @@ def frame_boxes(gates: Gates) -> Boxes:
     half_width = np.broadcast_to(width, length.shape) / 2
     half_size = np.stack([half_depth, (length + end + start) / 2, half_width], axis=-1)
 
-    center_w = np.where(real[..., None], center_w, [0.0, 0.0, PARKED_Z])
-    half_size = np.where(real[..., None], half_size, 1e-3)
-    count = real.size
+    center_w = np.where(has_length[..., None], center_w, [0.0, 0.0, PARKED_Z])
+    half_size = np.where(has_length[..., None], half_size, 1e-3)
+    count = has_length.size
     return Boxes(
         center_w.reshape(count, 3), rot_w.reshape(count, 3, 3), half_size.reshape(count, 3)
     )
 
 
 def _corner_extensions(
-    along: np.ndarray, real: np.ndarray, width: np.ndarray
+    along: np.ndarray, has_length: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the extensions of each bar at its end and at its start, (G, V) each [m].
 
@@ -109,7 +112,7 @@ def _corner_extensions(
 
     Args:
         along: (G, V, 2) unit vectors along the sides.
-        real: (G, V) whether a side has a length, which a repeated corner has not.
+        has_length: (G, V) bool, whether a side has a length; at a repeated corner it has none.
         width: (G, 1) widths of the bars [m].
     """
 
@@ -117,12 +120,12 @@ def _corner_extensions(
         cosine = np.sum(side * next_side, axis=-1)
         return np.minimum(np.sqrt((1 - cosine) / np.maximum(1 + cosine, 1e-9)), 1.0)
 
-    if real.all():
+    if has_length.all():
         end = width * tan_half_turn(along, np.roll(along, -1, axis=1))
         return end, np.roll(end, 1, axis=1)
-    end, start = np.zeros(real.shape), np.zeros(real.shape)
-    for gate in range(len(real)):
-        sides = np.flatnonzero(real[gate])
+    end, start = np.zeros(has_length.shape), np.zeros(has_length.shape)
+    for gate in range(len(has_length)):
+        sides = np.flatnonzero(has_length[gate])
         next_sides = np.roll(sides, -1)
         end[gate, sides] = width[gate, 0] * tan_half_turn(
             along[gate, sides], along[gate, next_sides]

@@ -17,6 +17,7 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.geometry.scene import Boxes, Gates, Rods, Spheres
 
 BOX, CYLINDER, CAPSULE, SPHERE = range(4)
+"""Numbers of the kinds of solids."""
 KIND_NAMES = ("box", "cylinder", "capsule", "sphere")
 GATE_DISTANCE_M = 1.5
 """Least horizontal distance of an obstacle's centre from a gate's centre [m]."""
@@ -27,7 +28,7 @@ CORRIDOR_CLEARANCE_M = 0.4
 START_CLEARANCE_M = 0.6
 """Least horizontal distance between an obstacle and the line from the start to gate 0 [m]."""
 _TRIES = 24
-"""Positions that are drawn for an obstacle before it is left out."""
+"""Number of positions that are drawn for an obstacle before it is left out."""
 
 Site = Callable[[np.random.Generator, np.ndarray], np.ndarray]
 """A function that draws horizontal positions (n, 2) [m] of n obstacles on given stretches (n,)."""
@@ -52,9 +53,9 @@ class KeepClear(NamedTuple):
     begin: np.ndarray
     """(K, 2) first ends of the lines [m]."""
     end: np.ndarray
-    """(K, 2) their other ends [m]."""
+    """(K, 2) other ends of the lines [m]."""
     clearance_m: np.ndarray
-    """(K,) least distances between a line and an obstacle's surface."""
+    """(K,) least distances between a line and an obstacle's surface [m]."""
     center: np.ndarray
     """(G, 2) gate centres [m]."""
 
@@ -67,7 +68,7 @@ class Obstacles(NamedTuple):
     capsules: Rods
     spheres: Spheres
     names: tuple[str, ...]
-    """In the order boxes, cylinders, capsules, spheres."""
+    """Names of the solids in the order boxes, cylinders, capsules, spheres."""
 
 
 def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
@@ -75,7 +76,7 @@ def keep_clear(gates: Gates, start_pos_w: np.ndarray) -> KeepClear:
 
     Args:
         gates: G gates.
-        start_pos_w: (3,) [m].
+        start_pos_w: (3,) position of the start [m].
     """
     center = gates.center_w[:, :2]
     reach = CORRIDOR_HALF_LENGTH_M * gates.rot_w[:, :2, 0]
@@ -93,9 +94,9 @@ def segment_distance(point: np.ndarray, begin: np.ndarray, end: np.ndarray) -> n
     """Return the distances (...) from points to line segments of D dimensions [m].
 
     Args:
-        point: (..., D) [m].
-        begin: (..., D) [m], broadcast against `point`.
-        end: (..., D) [m], broadcast against `point`.
+        point: (..., D) the points [m].
+        begin: (..., D) first ends of the segments [m], broadcast against `point`.
+        end: (..., D) other ends of the segments [m], broadcast against `point`.
     """
     along = end - begin
     share = np.sum((point - begin) * along, -1) / np.maximum(np.sum(along * along, -1), 1e-12)
@@ -133,7 +134,7 @@ def scatter(
     Args:
         rng: random generator.
         per_stretch: numbers of obstacles on each stretch.
-        site: draws their positions.
+        site: function that draws the obstacles' positions.
         clear: lines to keep free.
     """
     numbers = [int(n.sum()) for n in per_stretch]
@@ -154,8 +155,8 @@ def scatter(
 
     # `size` is a box's half sizes; for the other kinds (radius, unused, half length).
     size = rng.uniform(0.1, 0.3, (total, 3))
-    box = kind == BOX
-    size[box] = rng.uniform(0.05, 0.25, (int(box.sum()), 3))
+    is_box = kind == BOX
+    size[is_box] = rng.uniform(0.05, 0.25, (int(is_box.sum()), 3))
     size[:plates, :2] = rng.uniform(0.2, 0.5, (plates, 1))
     size[:plates, 2] = rng.uniform(0.02, 0.04, plates)
     size[is_pillar, :2] = rng.uniform(0.1, 0.5, (pillars, 1))
@@ -174,7 +175,7 @@ def scatter(
     xy, placed = _place(rng, stretch, _horizontal_radius(kind, size, is_pillar), site, clear)
     center_w = np.concatenate([xy, height[:, None]], axis=-1)
     labels = _labels(numbers, kind)
-    # Indices of the placed boxes, cylinders, capsules and spheres.
+    # Indices of the placed boxes (b), cylinders (c), capsules (p) and spheres (s).
     b, c, p, s = (np.flatnonzero(placed & (kind == each)) for each in range(4))
     return Obstacles(
         Boxes(center_w[b], rot_w[b], size[b]),

@@ -14,7 +14,7 @@ def to_world(rot_w: Array, vector: Array) -> Array:
 
     Args:
         rot_w: (..., 3, 3) body or gate to world.
-        vector: (..., 3) in its axes.
+        vector: (..., 3) vectors in body or gate axes.
     """
     return (rot_w * vector[..., None, :]).sum(-1)
 
@@ -24,7 +24,7 @@ def to_local(rot_w: Array, vector_w: Array) -> Array:
 
     Args:
         rot_w: (..., 3, 3) body or gate to world.
-        vector_w: (..., 3).
+        vector_w: (..., 3) vectors in world axes.
     """
     return (rot_w * vector_w[..., :, None]).sum(-2)
 
@@ -71,8 +71,8 @@ def rot_to_quat(rot: Array) -> Array:
         (wz, xz, yz, 1 - xx - yy + zz),
     )
     outer = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
-    size = xp.stack([rows[i][i] for i in range(4)], axis=-1)
-    best = xp.argmax(size, axis=-1)[..., None, None]
+    diagonal = xp.stack([rows[i][i] for i in range(4)], axis=-1)
+    best = xp.argmax(diagonal, axis=-1)[..., None, None]
     quat = xp.take_along_axis(outer, best, axis=-2)[..., 0, :]
     quat = quat / xp.sqrt(xp.sum(quat**2, axis=-1, keepdims=True))
     return xp.where(quat[..., :1] < 0.0, -quat, quat)
@@ -85,10 +85,10 @@ def exp_rot(vector: Array) -> Array:
     # For small angles the series is exact to rounding; the root has an infinite slope at zero.
     small = squared < 1e-8
     angle = xp.sqrt(xp.where(small, 1.0, squared))
-    first = xp.where(small, 1.0 - squared / 6.0, xp.sin(angle) / angle)
-    second = xp.where(small, 0.5 - squared / 24.0, (1.0 - xp.cos(angle)) / angle**2)
+    sine_factor = xp.where(small, 1.0 - squared / 6.0, xp.sin(angle) / angle)
+    cosine_factor = xp.where(small, 0.5 - squared / 24.0, (1.0 - xp.cos(angle)) / angle**2)
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     zero = xp.zeros_like(x)
     rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
     skew = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
-    return xp.eye(3) + first * skew + second * xp.matmul(skew, skew)
+    return xp.eye(3) + sine_factor * skew + cosine_factor * xp.matmul(skew, skew)

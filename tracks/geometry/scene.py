@@ -14,7 +14,7 @@ import numpy as np
 Array = Any  # numpy.ndarray or jax.Array: the geometry functions take both
 
 PARKED_Z = -1000.0
-"""Height of padding solids [m], out of reach of every ray and distance."""
+"""Height of padding solids [m], so far below the ground that they never matter."""
 
 
 class Gates(NamedTuple):
@@ -27,11 +27,11 @@ class Gates(NamedTuple):
     center_w: Array
     """(G, 3) opening centres [m]."""
     rot_w: Array
-    """(G, 3, 3) gate to world; column 0 is the flight direction."""
+    """(G, 3, 3) rotation, gate to world; column 0 is the flight direction."""
     opening_g: Array
     """(G, V, 2) corners (y, z) of the convex opening [m], counter-clockwise in the y-z plane
-    (from y to z), so that the attractive field passes through it along +x. Openings with fewer
-    corners repeat the last one."""
+    (from y to z), so that the attractive field passes through the opening along +x. Openings with
+    fewer corners than others repeat their last corner."""
     frame_width: Array
     """(G,) width of the frame's bars around the opening [m]."""
     frame_depth: Array
@@ -42,22 +42,22 @@ class Boxes(NamedTuple):
     """Boxes at any orientation."""
 
     center_w: Array
-    """(N, 3) [m]."""
+    """(N, 3) centres [m]."""
     rot_w: Array
-    """(N, 3, 3) box to world."""
+    """(N, 3, 3) rotations, box to world."""
     half_size: Array
-    """(N, 3) [m]."""
+    """(N, 3) half edge lengths [m]."""
 
 
 class Rods(NamedTuple):
     """Cylinders (flat ends) or capsules (round ends), depending on the field of `Scene`."""
 
     center_w: Array
-    """(N, 3) [m]."""
+    """(N, 3) centres [m]."""
     axis_w: Array
-    """(N, 3) unit vectors."""
+    """(N, 3) unit vectors along the axes."""
     radius: Array
-    """(N,) [m]."""
+    """(N,) radii [m]."""
     half_length: Array
     """(N,) half lengths of the straight part, without a capsule's caps [m]."""
 
@@ -66,9 +66,9 @@ class Spheres(NamedTuple):
     """Spheres."""
 
     center_w: Array
-    """(N, 3) [m]."""
+    """(N, 3) centres [m]."""
     radius: Array
-    """(N,) [m]."""
+    """(N,) radii [m]."""
 
 
 class Scene(NamedTuple):
@@ -115,12 +115,12 @@ def _parked(n: int) -> np.ndarray:
 
 
 def _pad_rods(rods: Rods, n: int) -> Rods:
-    more = n - len(rods.radius)
+    missing = n - len(rods.radius)
     return Rods(
-        np.concatenate([rods.center_w, _parked(more)]),
-        np.concatenate([rods.axis_w, np.tile([0.0, 0.0, 1.0], (more, 1))]),
-        np.concatenate([rods.radius, np.full(more, 1e-3)]),
-        np.concatenate([rods.half_length, np.full(more, 1e-3)]),
+        np.concatenate([rods.center_w, _parked(missing)]),
+        np.concatenate([rods.axis_w, np.tile([0.0, 0.0, 1.0], (missing, 1))]),
+        np.concatenate([rods.radius, np.full(missing, 1e-3)]),
+        np.concatenate([rods.half_length, np.full(missing, 1e-3)]),
     )
 
 
@@ -128,7 +128,7 @@ def pad(scene: Scene, to: Counts) -> Scene:
     """Return `scene` padded with parked solids to the numbers `to`.
 
     Raises:
-        ValueError: where the scene has more than `to` of a kind, naming both numbers.
+        ValueError: where the scene has more solids of a kind than `to`, naming both numbers.
     """
     present = counts(scene)
     for kind, n, limit in zip(Counts._fields, present, to, strict=True):
@@ -136,20 +136,20 @@ def pad(scene: Scene, to: Counts) -> Scene:
             raise ValueError(
                 f"scene has {n} {kind}, more than the {limit} it is padded to; pad to more"
             )
-    more = to.boxes - present.boxes
+    missing = to.boxes - present.boxes
     boxes = Boxes(
-        np.concatenate([scene.boxes.center_w, _parked(more)]),
-        np.concatenate([scene.boxes.rot_w, np.tile(np.eye(3), (more, 1, 1))]),
-        np.concatenate([scene.boxes.half_size, np.full((more, 3), 1e-3)]),
+        np.concatenate([scene.boxes.center_w, _parked(missing)]),
+        np.concatenate([scene.boxes.rot_w, np.tile(np.eye(3), (missing, 1, 1))]),
+        np.concatenate([scene.boxes.half_size, np.full((missing, 3), 1e-3)]),
     )
-    more = to.spheres - present.spheres
+    missing = to.spheres - present.spheres
     spheres = Spheres(
-        np.concatenate([scene.spheres.center_w, _parked(more)]),
-        np.concatenate([scene.spheres.radius, np.full(more, 1e-3)]),
+        np.concatenate([scene.spheres.center_w, _parked(missing)]),
+        np.concatenate([scene.spheres.radius, np.full(missing, 1e-3)]),
     )
-    more = to.triangles - present.triangles
+    missing = to.triangles - present.triangles
     corner = np.array([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]]) + _parked(1)
-    triangles = np.concatenate([scene.triangles, np.tile(corner, (more, 1, 1))])
+    triangles = np.concatenate([scene.triangles, np.tile(corner, (missing, 1, 1))])
     return Scene(
         scene.gates,
         boxes,

@@ -22,11 +22,11 @@ from tracks.geometry.rotation import to_local
 from tracks.geometry.scene import Boxes, Rods, Scene
 
 TILE = 6
-"""Most rays across and down a tile; a pixel with more rays is one tile."""
+"""Largest number of rays across and down a tile; a pixel with more rays is one tile."""
 PAIRS_AT_ONCE = 1024
-"""Most pairs of solid and tile that are processed together, so that they fit the CPU's cache."""
+"""Number of pairs of solid and tile that are processed together; so many fit the CPU's cache."""
 RAYS_AT_ONCE = 1 << 20
-"""Most rays of the images that are processed together, to limit memory."""
+"""Largest number of rays of the images that are processed together, to limit memory."""
 _TINY, _FAR = 1e-200, 1e290
 """Offset that avoids division by zero, and the depth of a ray without a hit [m]."""
 
@@ -57,7 +57,7 @@ class _Shape(NamedTuple):
     halves: tuple[np.ndarray, ...]
     """(V,) each: the half lengths along `axes`."""
     radius: np.ndarray
-    """(V,) of the sphere or the rod; 0 for boxes."""
+    """(V,) radius of the sphere or the rod; 0 for boxes."""
 
     def take(self, index: np.ndarray) -> _Shape:
         return take(self, (..., index))
@@ -89,25 +89,25 @@ def depth_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarra
     """Return the planar depth images (N, H, W) [m]; larger depths are set to the camera's range.
 
     Args:
-        tiles: of the camera.
-        scene: batched, (N, ...); its triangles are ignored.
+        tiles: rays of the camera, from `make_tiles`.
+        scene: scenes, batched (N, ...); their triangles are ignored.
         pos_w: (N, 3) camera positions [m].
         rot_w: (N, 3, 3) body to world.
     """
     camera, n = tiles.camera, len(pos_w)
-    most = max(1, RAYS_AT_ONCE // (camera.width * camera.height * camera.rays**2))
+    images_at_once = max(1, RAYS_AT_ONCE // (camera.width * camera.height * camera.rays**2))
     images = np.empty((n, camera.height, camera.width))
-    for low in range(0, n, most):
-        part = slice(low, low + most)
+    for low in range(0, n, images_at_once):
+        part = slice(low, low + images_at_once)
         images[part] = _some_images(tiles, *take((scene, pos_w, rot_w), part))
     return images
 
 
 def _some_images(tiles: Tiles, scene: Scene, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
-    """Return the images of `depth_images` of so few cameras that they fit the memory limit."""
+    """Return `depth_images` for few cameras, within the memory limit."""
     camera, side = tiles.camera, len(tiles.up)
     rows, columns = tiles.up.shape[1], tiles.left.shape[1]
-    # Axes of each camera in the world, (N, 3, 3); `tracks.geometry.rotation` says why no matmul.
+    # Axes of each camera in the world, (N, 3, 3), without matmul: see `tracks.geometry.rotation`.
     axes_w = (rot_w[:, :, :, None] * tiles.axes_b).sum(-2)
     depth = np.full((len(pos_w) * rows * columns, side * side), camera.range_m)
     for (name, ball), cast in zip(bounds(scene), (_box, _cylinder, _capsule, _sphere), strict=True):
@@ -161,9 +161,13 @@ def _in_view(
     radius = ball.radius
     visible = (depth + radius > 0) & (depth - radius < tiles.camera.range_m)
     for offset, edges in ((left, tiles.left_edges), (up, tiles.up_edges)):
-        most, least = edges[0], edges[-1]
-        visible &= offset - most * depth < radius * np.sqrt(1 + most * most)
-        visible &= offset - least * depth > -radius * np.sqrt(1 + least * least)
+        largest_slope, smallest_slope = edges[0], edges[-1]
+        visible &= offset - largest_slope * depth < radius * np.sqrt(
+            1 + largest_slope * largest_slope
+        )
+        visible &= offset - smallest_slope * depth > -radius * np.sqrt(
+            1 + smallest_slope * smallest_slope
+        )
     frame, number = np.nonzero(visible)
     rank = np.arange(len(frame)) - np.searchsorted(frame, frame)
     order = np.argsort(rank, kind="stable")

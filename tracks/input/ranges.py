@@ -1,4 +1,4 @@
-"""Declare the allowed range of each setting in its annotation, and check a whole configuration.
+"""Declare the allowed range of each setting in its annotation, and check a configuration.
 
 A field of a configuration dataclass has its range in its annotation:
 
@@ -25,7 +25,7 @@ class Range:
     low: float
     """Lower bound; it is allowed unless `above` is true."""
     high: float
-    """Upper bound; it is allowed unless `below` is true. If it is infinite, infinity is allowed."""
+    """Upper bound; it is allowed unless `below` is true. An infinite bound allows infinity."""
     above: bool = False
     """Whether values must be greater than `low`."""
     below: bool = False
@@ -46,6 +46,7 @@ class Range:
 
 
 SEED_MOST = 2**32 - 1
+"""Largest seed."""
 Seed = Annotated[int, Range(0, SEED_MOST)]
 """A seed of a random generator."""
 Share = Annotated[float, Range(0.0, 1.0)]
@@ -61,7 +62,7 @@ def check_ranges(config: Any, where: str = "", options: bool = False) -> None:
 
     Args:
         config: a dataclass; nested dataclasses are checked as well.
-        where: prefix of a field's path in the message.
+        where: prefix of the fields' paths in messages.
         options: whether messages name fields as command line options (`--deadline-s` for
             `deadline_s`).
 

@@ -14,17 +14,18 @@ import tomllib
 from typing import Any
 
 TEXT_BYTES = 64 * 2**20
-"""Largest JSON or TOML file."""
+"""Size of the largest JSON or TOML file [bytes]."""
 MODEL_BYTES = 512 * 2**20
-"""Largest ONNX, torch or C policy file, with its external data."""
+"""Size of the largest ONNX, torch or C policy file, with its external data [bytes]."""
 WEIGHTS_BYTES = 2 * 2**30
-"""Largest arrays of a checkpoint; the widest network with its optimiser state fits."""
+"""Size of the largest arrays of a checkpoint [bytes]; the widest network with its optimiser state
+fits."""
 LOG_BYTES = 2 * 2**30
-"""Largest flight log of any format."""
+"""Size of the largest flight log of any format [bytes]."""
 MESH_BYTES = 256 * 2**20
-"""Largest mesh file."""
+"""Size of the largest mesh file [bytes]."""
 DEPTH = 64
-"""Deepest nesting of tables and lists in a JSON or TOML file."""
+"""Deepest allowed nesting of tables and lists in a JSON or TOML file."""
 
 _FILE_TYPES = {
     stat.S_IFIFO: "a named pipe",
@@ -41,7 +42,8 @@ _WRONG_FORMATS = {
     b"<!doctype html": "a web page; download the file itself",
     b"<html": "a web page; download the file itself",
 }
-"""First bytes, in small letters, of files that people pass by mistake, and what to do instead."""
+"""First bytes (in small letters) of files that people pass by mistake -> what the file is, and what
+to do."""
 
 
 class InputError(ValueError):
@@ -150,16 +152,18 @@ def refuse_other_kinds(head: bytes, where: str) -> None:
     """Refuse archives, web pages, pointers of Git LFS and text in UTF-16, by their first bytes.
 
     Raises:
-        InputError: with what it is and what to do.
+        InputError: with the kind of file, and what to do.
     """
     for start, advice in _WRONG_FORMATS.items():
         if head[: len(start)].lower() == start:
             raise InputError(f"{where}: {advice}")
     has_mark = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     # Without a byte order mark: in English text, every second byte is zero.
-    begin = head[:64]
-    zeros = sorted(begin[k::2].count(b"\0") for k in (0, 1))
-    if has_mark or (len(begin) >= 8 and zeros == [0, len(begin) // 2] and begin.isascii()):
+    first_bytes = head[:64]
+    zeros = sorted(first_bytes[k::2].count(b"\0") for k in (0, 1))
+    if has_mark or (
+        len(first_bytes) >= 8 and zeros == [0, len(first_bytes) // 2] and first_bytes.isascii()
+    ):
         raise InputError(
             f"{where}: text in UTF-16, as Excel and PowerShell save it; save it as UTF-8 (Excel: "
             "CSV UTF-8; PowerShell: -Encoding utf8)"

@@ -1,8 +1,9 @@
 """The rate loops of flight controller firmwares (body rates to motor commands), one file each.
 
-A vehicle file selects one by `[controller] kind`. Its module has `Settings` (with the firmware's
-keys), `GROUP` (their table under `[controller]`, "" for none), `gains`, `start` and `update`. The
-nominal loop, kind `p`, is `eval.quadrotor.mixer.rate_torque` and has no state.
+A vehicle file selects a loop by `[controller] kind`. The module of a kind has `Settings` (with the
+firmware's keys), `GROUP` (the settings' table under `[controller]`, "" for none), `LIMITS` (their
+ranges), `gains`, `start` and `update`. The nominal loop, kind `p`, is
+`eval.quadrotor.mixer.rate_torque` and has no state.
 """
 
 from __future__ import annotations
@@ -19,32 +20,35 @@ NOMINAL = "p"
 KINDS: dict[str, Any] = {"betaflight": betaflight, "px4": px4, "crazyflie": crazyflie}
 """Kind -> module of the firmware's loop; `p` is not among them."""
 _MODULES = {module.Gains: module for module in KINDS.values()}
-"""Class of the constants -> module."""
+"""Class `Gains` of a loop's constants -> module of the loop."""
 
 
 class Loop(NamedTuple):
     """A firmware's rate loop and the thrust curve of its motors."""
 
     gains: Any
-    """`Gains` of the kind's module."""
+    """The loop's constants, a `Gains` of the kind's module."""
     thrust: tuple[Array, Array]
-    """t1, t2 of T = t1 u + t2 u^2 [N], where u is the motor command at the nominal voltage."""
+    """Coefficients t1, t2 of a rotor's thrust T = t1 u + t2 u^2 [N] at the nominal voltage, where u
+    is the motor command from 0 to 1."""
 
 
 def loop_of(vehicle: Vehicle) -> Loop | None:
     """Return the firmware's loop of a vehicle, or None for the nominal one.
 
-    Without `[motors]`, a motor command is the ratio of the speed to the largest speed. For the
-    Crazyflie, whose firmware compensates the motors' curve, it is the ratio of thrusts.
+    Without `[motors]`, a motor command is the ratio of a rotor's speed to its largest speed. For
+    the Crazyflie, whose firmware compensates the motors' curve, it is the ratio of thrusts.
     """
     controller = vehicle.controller
     if controller.kind == NOMINAL:
         return None
     import numpy as np
 
-    full = vehicle.rotors.thrust_max
-    linear = controller.kind == "crazyflie"
-    motors = vehicle.motors or MotorMap((full, 0.0) if linear else (0.0, full), 1.0)
+    full_thrust = vehicle.rotors.thrust_max
+    is_linear = controller.kind == "crazyflie"
+    motors = vehicle.motors or MotorMap(
+        (full_thrust, 0.0) if is_linear else (0.0, full_thrust), 1.0
+    )
     gains = KINDS[controller.kind].gains(controller.settings, layout_of(vehicle.rotors))
     first, second = motors.thrust
     return Loop(gains, (np.asarray(first), np.asarray(second)))
@@ -73,7 +77,7 @@ def update(
         rate_cmd_b: (..., 3) commanded body rates [rad/s].
         rate_b: (..., 3) current body rates [rad/s].
         dt: time since the last update [s].
-        scale: (..., 3) factor on the loop's output [1].
+        scale: (..., 3) factor on the loop's output, by the effect `rate_gain`.
     """
     xp = rate_b.__array_namespace__()
     first, second = loop.thrust

@@ -30,11 +30,12 @@ GROUP = ""
 DEG = float(180.0 / np.pi)
 """Degrees in a radian."""
 P_UNIT, I_UNIT, D_UNIT, F_UNIT = 0.032029, 0.244381, 0.000529, 0.00013754
-"""One unit of p, i, d and f, in thousandths of a motor's range per deg/s, deg or deg/s^2."""
+"""Value of one unit of the firmware's gains p, i, d and f, in thousandths of a motor's range per
+deg/s (p), deg (i) or deg/s^2 (d, f)."""
 YAW_I = 2.5
 """The firmware's factor on the gain i of yaw."""
 SUM = 1000.0
-"""Output that is a motor's full range."""
+"""Value of an output that is a motor's full range."""
 LIMITS = {
     "iterm_windup": (0.0, 100.0),
     "tpa_rate": (0.0, 100.0),
@@ -93,7 +94,7 @@ class Gains(NamedTuple):
     d: Array
     f: Array
     limit: Array
-    """(3,) limits of the sum."""
+    """(3,) limits of the sum of all terms."""
     gyro_hz: Array
     """(2,) cutoffs of the gyro's filters [Hz]."""
     dterm_hz: Array
@@ -115,7 +116,7 @@ class State(NamedTuple):
     """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first update."""
+    """(...,) 0 before the first update, then 1."""
     gyro: Array
     """(..., 2, 3) outputs of the gyro's filters [deg/s]."""
     dterm: Array
@@ -123,9 +124,9 @@ class State(NamedTuple):
     setpoint: Array
     """(..., 3, 3) outputs of the set point's filters [deg/s]."""
     slow: Array
-    """(..., 3) low-passed set point [deg/s]."""
+    """(..., 3) low-passed set point, for I-term relax [deg/s]."""
     integral: Array
-    """(..., 3) the term I."""
+    """(..., 3) the term I, in thousandths of a motor's range."""
     yaw: Array
     """(..., 1) filtered term P of yaw."""
     span: Array
@@ -177,7 +178,10 @@ def update(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands (..., 4); see `crazyflie.update`."""
+    """Return the state after an update and the motor commands (..., 4).
+
+    The arguments are those of `crazyflie.update`.
+    """
     xp = rate_b.__array_namespace__()
     started = state.started
     gyro = _chain(started, state.gyro, DEG * rate_b, gain.gyro_hz, dt)
@@ -190,6 +194,7 @@ def update(
     change = (setpoint - pick(started, setpoint, state.setpoint[..., -1, :])) / dt
     error = setpoint - rate
 
+    # The integral grows more slowly while the set point changes, and near the motors' limits.
     slow = pt1(pick(started, setpoint, state.slow), setpoint, gain.relax_hz, dt)
     relax = xp.maximum(1.0 - gain.relaxed * xp.abs(setpoint - slow) / RELAXED, 0.0)
     has_windup = gain.windup < 1.0
@@ -198,12 +203,15 @@ def update(
     integral = state.integral + gain.i * relax * margin[..., None] * error * dt
     integral = xp.clip(integral, -gain.i_limit, gain.i_limit)
 
+    # The terms P, I, D and F, and their sum.
     p = gain.p * error
     yaw = pt1(pick(started, p[..., 2:], state.yaw), p[..., 2:], gain.yaw_hz, dt)
     p = xp.concatenate([p[..., :2], yaw], axis=-1)
     throttle = (throttle - gain.idle) / (1.0 - gain.idle)
-    above = xp.clip((throttle - gain.tpa[1]) / xp.maximum(1.0 - gain.tpa[1], 1e-6), 0.0, 1.0)
-    d = -gain.d * (1.0 - gain.tpa[0] * above)[..., None] * slope
+    above_breakpoint = xp.clip(
+        (throttle - gain.tpa[1]) / xp.maximum(1.0 - gain.tpa[1], 1e-6), 0.0, 1.0
+    )
+    d = -gain.d * (1.0 - gain.tpa[0] * above_breakpoint)[..., None] * slope
     total = xp.clip(scale * (p + integral + d + gain.f * change), -gain.limit, gain.limit)
     span, command = mixed(gain, throttle, total / SUM)
     state = State(xp.ones_like(started), gyro, dterm, setpoints, slow, integral, yaw, span)
@@ -214,24 +222,24 @@ def mixed(gain: Gains, throttle: Array, torque: Array) -> tuple[Array, Array]:
     """Return the largest difference between motors (...,), and the motor commands (..., 4).
 
     Args:
-        gain: gives the layout and the idle command.
+        gain: constants of the loop, of which the layout and the idle command are used.
         throttle: (...,) from 0 (idle) to 1.
         torque: (..., 3) roll, pitch and yaw sums, relative to a motor's range.
     """
     xp = torque.__array_namespace__()
     roll, pitch, yaw = gain.layout
-    mix = torque[..., 0, None] * roll + torque[..., 1, None] * pitch
-    mix = mix + torque[..., 2, None] * yaw
-    low, high = least(mix), largest(mix)
+    per_motor = torque[..., 0, None] * roll + torque[..., 1, None] * pitch
+    per_motor = per_motor + torque[..., 2, None] * yaw
+    low, high = least(per_motor), largest(per_motor)
     span = high - low
     divisor = xp.maximum(span, 1.0)
     throttle = xp.minimum(xp.maximum(throttle, -low / divisor), 1.0 - high / divisor)
-    command = xp.clip(throttle[..., None] + mix / divisor[..., None], 0.0, 1.0)
+    command = xp.clip(throttle[..., None] + per_motor / divisor[..., None], 0.0, 1.0)
     return span, gain.idle + (1.0 - gain.idle) * command
 
 
 def _chain(started: Array, before: Array, value: Array, cutoffs_hz: Array, dt: Array) -> Array:
-    """Return the outputs (..., K, 3) of K first-order filters, each the input of the next.
+    """Return the outputs (..., K, 3) of K first-order filters in series.
 
     Before the first update (`started` is 0) the filters start at their input.
     """

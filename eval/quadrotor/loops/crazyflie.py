@@ -23,9 +23,9 @@ from tracks.geometry.scene import Array
 DEG = float(180.0 / np.pi)
 """Degrees in a radian."""
 FULL = 65535.0
-"""A motor's full command."""
+"""A motor's full command in the firmware, an unsigned number of 16 bits."""
 SIGNED = 32767.0
-"""Largest output of the PID, a signed number of 16 bits."""
+"""Largest output of the PID in the firmware, a signed number of 16 bits."""
 GROUP = "pid_rate"
 """Name of the settings' table under `[controller]`."""
 LIMITS: dict[str, tuple[float, float]] = {}
@@ -49,7 +49,7 @@ class Settings:
     yaw_kd: float = 0.0
     yaw_kff: float = 0.0
     roll_ilimit: float = 33.3
-    """Largest integral of the error [deg], 0: no limit; a constant in the firmware."""
+    """Largest integral of the error [deg]; 0: no limit. It is a constant in the firmware."""
     pitch_ilimit: float = 33.3
     yaw_ilimit: float = 166.7
     lpf_cutoff: float = 0.0
@@ -72,7 +72,7 @@ class State(NamedTuple):
     """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first update."""
+    """(...,) 0 before the first update, then 1."""
     integral: Array
     """(..., 3) integral of the error [deg]."""
     rate: Array
@@ -120,7 +120,7 @@ def update(
         rate_cmd_b: (..., 3) commanded body rates [rad/s].
         rate_b: (..., 3) current body rates [rad/s].
         dt: time since the last update [s].
-        scale: (..., 3) factor on the outputs [1].
+        scale: (..., 3) factor on the outputs, by the effect `rate_gain`.
     """
     xp = rate_b.__array_namespace__()
     setpoint, rate = DEG * rate_cmd_b, DEG * rate_b
@@ -138,6 +138,9 @@ def update(
 
 
 def motor_shares(layout: Layout, out: Array) -> Array:
-    """Return the contributions (..., 4) of outputs (..., 3) to the motors; two are halved."""
-    half = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
-    return half + out[..., 2, None] * layout.yaw
+    """Return the contributions (..., 4) of outputs (..., 3) to the motors.
+
+    Roll and pitch are halved, as in the firmware.
+    """
+    roll_and_pitch = 0.5 * (out[..., 0, None] * layout.roll + out[..., 1, None] * layout.pitch)
+    return roll_and_pitch + out[..., 2, None] * layout.yaw

@@ -21,9 +21,9 @@ class Pair(NamedTuple):
     """State of a second-order filter in direct form II: its last two inner values."""
 
     first: Array
-    """The last value."""
+    """The last inner value."""
     second: Array
-    """The value before it."""
+    """The inner value before the last."""
 
 
 def pt1(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
@@ -32,8 +32,8 @@ def pt1(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
     `y += k (x - y)` with `k = dt / (dt + 1 / (2 pi f))`.
 
     Args:
-        before: y, its last output.
-        value: x, its input.
+        before: y, the filter's last output.
+        value: x, the filter's input.
         cutoff_hz: f [Hz]; 0: the input is returned.
         dt: time since the last output [s].
     """
@@ -50,8 +50,8 @@ def butterworth(memory: Pair, value: Array, cutoff_hz: Array, dt: Array) -> tupl
     0, or of half the sampling rate or more, the output is the input.
 
     Args:
-        memory: state before.
-        value: input.
+        memory: state of the filter before this input.
+        value: input of the filter.
         cutoff_hz: f [Hz].
         dt: time between inputs [s].
     """
@@ -94,7 +94,7 @@ class Layout(NamedTuple):
 
 
 def layout_of(rotors: Rotors) -> Layout:
-    """Return the layout of `rotors`: lever arms over the longest one, and the negative spin."""
+    """Return the layout of `rotors`: lever arms divided by the longest, and the negative spin."""
     x, y, _ = np.asarray(rotors.position, dtype=float).T
     spin = np.asarray(rotors.spin, dtype=float)
     return Layout(y / np.max(np.abs(y)), -x / np.max(np.abs(x)), -spin)

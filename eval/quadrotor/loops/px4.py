@@ -3,8 +3,8 @@
     torque = K (P e + I-term - D accel) + FF setpoint
     I-term += I e (1 - (e / 400 deg/s)^2) dt, within MC_xR_INT_LIM, not further into saturation
 
-Torques are normalised. `accel` is the derivative of the gyro after its second-order low pass,
-filtered by a first-order one (as in PX4's source since 2021; its parameter reference says second).
+Torques are normalised. The gyro passes a second-order low pass; `accel` is its derivative, which
+passes a first-order low pass (as in PX4's source since 2021; the parameter reference says second).
 A motor command is thrust plus 0.707 of roll and pitch plus yaw. If motors saturate, thrust is
 reduced first, then roll and pitch. Yaw is added next, up to 15 % above full command; it is reduced
 where it saturates, and then thrust once more (airmode off). Source: PX4's user guide ("Multicopter
@@ -27,7 +27,7 @@ GROUP = ""
 FAST = float(np.deg2rad(400.0))
 """Errors larger than this do not change the integral [rad/s]."""
 YAW_ROOM = 0.15
-"""Excess over full command that is allowed while yaw is mixed."""
+"""Excess over full command that is allowed while yaw is added."""
 SMALL = 1e-6
 """Torques and contributions below this count as zero."""
 LIMITS = {"THR_MDL_FAC": (0.0, 1.0)}
@@ -81,14 +81,14 @@ class Gains(NamedTuple):
     model: Array
     layout: Layout
     unmixer: Array
-    """(3, 4) from the motors' relative thrusts to their torque."""
+    """(3, 4) matrix from the motors' relative thrusts to the normalised torque."""
 
 
 class State(NamedTuple):
     """State of the loop between updates."""
 
     started: Array
-    """(...,) 0 before the first update."""
+    """(...,) 0 before the first update, then 1."""
     integral: Array
     """(..., 3) the I-term, a normalised torque."""
     rate: Array
@@ -100,7 +100,7 @@ class State(NamedTuple):
     yaw: Array
     """(..., 1) filtered yaw torque."""
     lost: Array
-    """(..., 3) commanded torque less the torque that the last update could produce."""
+    """(..., 3) commanded torque minus the torque that the motors could produce, last update."""
 
 
 def gains(settings: Settings, layout: Layout) -> Gains:
@@ -141,24 +141,27 @@ def update(
     dt: Array,
     scale: Array,
 ) -> tuple[State, Array]:
-    """Return the state after an update and the motor commands (..., 4); see `crazyflie.update`."""
+    """Return the state after an update and the motor commands (..., 4).
+
+    The arguments are those of `crazyflie.update`.
+    """
     xp = rate_b.__array_namespace__()
     initial = settled(rate_b, gain.gyro_cutoff_hz, dt)
     gyro = Pair(*(pick(state.started, a, b) for a, b in zip(initial, state.gyro, strict=True)))
     gyro, rate = butterworth(gyro, rate_b, gain.gyro_cutoff_hz, dt)
     previous = pick(state.started, rate, state.rate)
-    accel = _alpha(state.accel, (rate - previous) / dt, gain.slope_cutoff_hz, dt)
+    accel = _low_pass(state.accel, (rate - previous) / dt, gain.slope_cutoff_hz, dt)
     error = rate_cmd_b - rate
     torque = gain.k * (gain.p * error - gain.d * accel) + state.integral + gain.f * rate_cmd_b
     torque = scale * torque
     # The torque uses the previous integral, which is updated afterwards.
     unsaturated_error = xp.where(state.lost * error > 0.0, 0.0, error)
-    share = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
+    integral_factor = xp.maximum(1.0 - (error / FAST) ** 2, 0.0)
     # As in the firmware, the integral contains K, so its limit is a torque.
-    integral = state.integral + share * gain.k * gain.i * unsaturated_error * dt
+    integral = state.integral + integral_factor * gain.k * gain.i * unsaturated_error * dt
     integral = xp.clip(integral, -gain.i_limit, gain.i_limit)
     wanted_yaw = torque[..., 2:]
-    yaw = _alpha(pick(state.started, wanted_yaw, state.yaw), wanted_yaw, gain.yaw_cutoff_hz, dt)
+    yaw = _low_pass(pick(state.started, wanted_yaw, state.yaw), wanted_yaw, gain.yaw_cutoff_hz, dt)
     torque = xp.concatenate([torque[..., :2], yaw], axis=-1)
     thrust = gain.model * throttle**2 + (1.0 - gain.model) * throttle
     motor_thrust = xp.clip(allocate(gain.layout, thrust, torque), 0.0, 1.0)
@@ -186,11 +189,11 @@ def allocate(layout: Layout, thrust: Array, torque: Array) -> Array:
     roll, pitch, yaw = columns(layout)
     down = -xp.ones(4)
     motor = thrust[..., None] + torque[..., 0, None] * roll + torque[..., 1, None] * pitch
-    motor = _fit(motor, down, 1.0, only_more=True)
-    motor = _fit(_fit(motor, roll, 1.0), pitch, 1.0)
+    motor = _fit_into_range(motor, down, 1.0, only_more=True)
+    motor = _fit_into_range(_fit_into_range(motor, roll, 1.0), pitch, 1.0)
     motor = motor + torque[..., 2, None] * yaw
-    motor = _fit(motor, yaw, 1.0 + YAW_ROOM)
-    return _fit(motor, down, 1.0, only_more=True)
+    motor = _fit_into_range(motor, yaw, 1.0 + YAW_ROOM)
+    return _fit_into_range(motor, down, 1.0, only_more=True)
 
 
 def signal(model: Array, thrust: Array) -> Array:
@@ -201,36 +204,36 @@ def signal(model: Array, thrust: Array) -> Array:
     return 2.0 * thrust / (linear + root)
 
 
-def _alpha(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
-    """Return `pt1`, which as in PX4 is off for cutoffs from half the sampling rate."""
+def _low_pass(before: Array, value: Array, cutoff_hz: Array, dt: Array) -> Array:
+    """Return the output of `pt1`; as in PX4, a cutoff from half the sampling rate disables it."""
     xp = value.__array_namespace__()
     return pt1(before, value, xp.where(cutoff_hz * dt < 0.5, cutoff_hz, 0.0), dt)
 
 
-def _fit(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:
+def _fit_into_range(motor: Array, along: Array, top: float, only_more: bool = False) -> Array:
     """Return the motors shifted along a vector so that they fit into [0, top] as far as possible.
 
     A second shift, by half, balances the motors that exceed the lower and the upper limit.
 
     Args:
-        motor: (..., 4) relative thrusts.
+        motor: (..., 4) relative thrusts of the motors.
         along: (4,) direction of the shift.
-        top: upper limit.
+        top: upper limit of a motor's relative thrust.
         only_more: allow only shifts in the direction of `along`.
     """
     xp = motor.__array_namespace__()
-    gain = _gain(motor, along, top)
+    gain = _shift_into_range(motor, along, top)
     if only_more:
         gain = xp.where(gain > 0.0, gain, 0.0)
         unshifted = gain == 0.0
     else:
         unshifted = xp.zeros_like(gain, dtype=bool)
     shifted = motor + gain[..., None] * along
-    half = xp.where(unshifted, 0.0, 0.5 * _gain(shifted, along, top))
+    half = xp.where(unshifted, 0.0, 0.5 * _shift_into_range(shifted, along, top))
     return shifted + half[..., None] * along
 
 
-def _gain(motor: Array, along: Array, top: float) -> Array:
+def _shift_into_range(motor: Array, along: Array, top: float) -> Array:
     """Return the factor (...,) on `along` that brings the motors into [0, top]."""
     xp = motor.__array_namespace__()
     affected = xp.abs(along) > SMALL

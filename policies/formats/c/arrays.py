@@ -14,9 +14,10 @@ import numpy as np
 from policies.spec import CHANNEL_BLOCK, PolicySpec
 
 BLOCK = CHANNEL_BLOCK
-"""Outputs in a block."""
+"""Number of outputs in a block."""
 LAYERS = ("conv2", "conv3", "image", "gru_input", "gru_hidden")
-"""The large layers, with nearly all weights, which int8 quantises; the others are always float."""
+"""Names of the large layers, which have nearly all weights. Int8 quantises them; the other layers
+are always float."""
 
 
 def padded(size: int) -> int:
@@ -26,28 +27,30 @@ def padded(size: int) -> int:
 
 def matrices(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np.ndarray]:
     """Return each of `LAYERS` as a matrix (inputs, outputs), padded with zeros."""
-    wide, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
-    plain = {name: np.asarray(value, np.float32) for name, value in params.items()}
+    hidden_padded, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
+    float_params = {name: np.asarray(value, np.float32) for name, value in params.items()}
     return {
-        "conv2": plain["conv2.weight"].reshape(-1, spec.channels[1]),
-        "conv3": plain["conv3.weight"].reshape(-1, spec.channels[2]),
-        "image": zero_pad(plain["image.weight"], len(plain["image.weight"]), wide),
-        "gru_input": zero_pad(plain["gru.weight_input"], wide, gates),
-        "gru_hidden": zero_pad(plain["gru.weight_hidden"], wide, gates),
+        "conv2": float_params["conv2.weight"].reshape(-1, spec.channels[1]),
+        "conv3": float_params["conv3.weight"].reshape(-1, spec.channels[2]),
+        "image": zero_pad(
+            float_params["image.weight"], len(float_params["image.weight"]), hidden_padded
+        ),
+        "gru_input": zero_pad(float_params["gru.weight_input"], hidden_padded, gates),
+        "gru_hidden": zero_pad(float_params["gru.weight_hidden"], hidden_padded, gates),
     }
 
 
 def small_arrays(params: Mapping[str, np.ndarray], spec: PolicySpec) -> dict[str, np.ndarray]:
     """Return the arrays that are always float32: first layer, state, biases, action."""
-    wide, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
-    plain = {name: np.asarray(value, np.float32) for name, value in params.items()}
+    hidden_padded, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
+    float_params = {name: np.asarray(value, np.float32) for name, value in params.items()}
     return {
-        "conv1_weight": plain["conv1.weight"].reshape(4, -1),
-        "state_weight": zero_pad(plain["state.weight"], spec.state_size, wide),
-        "state_bias": zero_pad(plain["state.bias"][None], 1, wide),
-        "gru_input_bias": zero_pad(plain["gru.bias_input"][None], 1, gates),
-        "gru_hidden_bias": zero_pad(plain["gru.bias_hidden"][None], 1, gates),
-        "action_weight": plain["action.weight"],
+        "conv1_weight": float_params["conv1.weight"].reshape(4, -1),
+        "state_weight": zero_pad(float_params["state.weight"], spec.state_size, hidden_padded),
+        "state_bias": zero_pad(float_params["state.bias"][None], 1, hidden_padded),
+        "gru_input_bias": zero_pad(float_params["gru.bias_input"][None], 1, gates),
+        "gru_hidden_bias": zero_pad(float_params["gru.bias_hidden"][None], 1, gates),
+        "action_weight": float_params["action.weight"],
     }
 
 

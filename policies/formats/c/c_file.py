@@ -20,7 +20,7 @@ from policies.spec import NeedsTrust, Note, PolicyError, PolicySpec
 _STATE_MOST = 2**26
 """Largest size of the C struct `policy_state`, the memory of one flight [bytes]."""
 _WORD = 4
-"""Size of a float32; states are sent to the process as arrays of them [bytes]."""
+"""Size of a float32 [bytes]; states are sent to the process as arrays of float32."""
 
 
 @final
@@ -29,20 +29,20 @@ class CPolicy:
     """A `Policy` around the two functions of policy.h."""
 
     name: str
-    """Name in tables."""
+    """Name of the policy in tables."""
     spec: PolicySpec
-    """The rate, camera and scaling that it expects."""
+    """The rate, camera and scaling that the policy expects."""
     library: Path
-    """The shared library."""
+    """Path of the compiled shared library."""
     loaded: ModelProcess
     """The process that has loaded the library."""
     state_bytes: int
-    """Size of `policy_state`."""
+    """Size of the C struct `policy_state` [bytes]."""
     notes: tuple[Note, ...] = ()
-    """Assumptions that were made where its file says nothing."""
+    """Assumptions about the policy that its file does not state."""
 
     def start(self, n: int) -> np.ndarray:
-        """Return the `policy_state` of n trials, reset: its bytes as (n, k) float32 words."""
+        """Return the `policy_state` at the start of n trials, as (n, k) float32 zeros."""
         return np.zeros((n, -(-self.state_bytes // _WORD)), np.float32)
 
     def act(
@@ -50,14 +50,14 @@ class CPolicy:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the actions (n, spec.action.size) and the new state; see `Policy.act`."""
         actions = np.empty((len(hidden), self.spec.action.size), np.float32)
-        after = np.empty_like(hidden)
-        most = max(1, ANSWER_BYTES // 2 // max(1, hidden[:1].nbytes))
-        for low in range(0, len(hidden), most):
-            rows = slice(low, low + most)
+        next_hidden = np.empty_like(hidden)
+        rows_at_once = max(1, ANSWER_BYTES // 2 // max(1, hidden[:1].nbytes))
+        for low in range(0, len(hidden), rows_at_once):
+            rows = slice(low, low + rows_at_once)
             feed = {"memory": hidden[rows], "fresh": fresh[rows], "state": state[rows]}
             feed |= {"image": image[rows], "action": actions[rows]}
-            actions[rows], after[rows] = self.loaded.run(feed)
-        return actions, after
+            actions[rows], next_hidden[rows] = self.loaded.run(feed)
+        return actions, next_hidden
 
 
 def load_c(path: Path, trust: bool = False) -> CPolicy:
@@ -94,15 +94,15 @@ def load_c(path: Path, trust: bool = False) -> CPolicy:
 def _refuse_global_state(policy: CPolicy, file: Path) -> None:
     """Refuse code for which equal inputs in several rows give different outputs."""
     rng = np.random.default_rng(0)
-    spec, n = policy.spec, 3
-    hidden, fresh = policy.start(n), np.ones(n, bool)
+    spec, copies = policy.spec, 3
+    hidden, fresh = policy.start(copies), np.ones(copies, bool)
     for _ in range(3):
-        state = np.repeat(rng.normal(size=(1, spec.state_size)), n, 0)
-        image = np.repeat(rng.normal(size=(1, *spec.image_shape)), n, 0)
+        state = np.repeat(rng.normal(size=(1, spec.state_size)), copies, 0)
+        image = np.repeat(rng.normal(size=(1, *spec.image_shape)), copies, 0)
         action, hidden = policy.act(hidden, state, image, fresh)
         if any(row.tobytes() != action[0].tobytes() for row in action):
             raise PolicyError(
                 f"{file}: the same inputs gave two answers; keep all memory of the policy in "
                 "policy_state"
             )
-        fresh = np.zeros(n, bool)
+        fresh = np.zeros(copies, bool)

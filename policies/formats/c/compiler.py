@@ -24,7 +24,7 @@ NATIVE_FLAGS = ("-march=native",)
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 """Options under which the suite's policy.c compiles without warnings."""
 MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM)
-"""Errors of the operating system that the machine causes and not the file."""
+"""Errors of the operating system whose cause is the machine, not the file."""
 COMPILE_S = 600.0
 """Time limit of the compiler [s]."""
 
@@ -65,8 +65,8 @@ def source_files(policy_c: Path) -> list[Path]:
 def compiled_library(policy_c: Path) -> Path:
     """Return the shared library of a policy.c, compiled now or earlier.
 
-    Its name in the cache is a digest of policy.c and policy.h: a change of another header that they
-    include is not detected.
+    Its name in the cache is a digest of policy.c, policy.h and the compiler's command. A change of
+    another header that they include is not detected.
 
     Raises:
         PolicyError: where there is no compiler, or it refuses the file.
@@ -109,7 +109,7 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
     message = ""
     for flags in ((*FLAGS, *NATIVE_FLAGS), FLAGS):
         try:
-            done = subprocess.run(
+            result = subprocess.run(
                 [*compiler, *flags, *arguments],
                 capture_output=True,
                 timeout=COMPILE_S,
@@ -122,15 +122,15 @@ def _compile(compiler: list[str], files: list[Path], out: Path) -> None:
                 f"{policy_c}: {compiler[0]} did not end within {COMPILE_S:g} s; compile it by hand "
                 "to see why"
             ) from None
-        if done.returncode == 0:
+        if result.returncode == 0:
             return
-        message = message or done.stderr.decode(errors="replace").strip()
+        message = message or result.stderr.decode(errors="replace").strip()
         for number in MACHINE_ERRORS:
             if os.strerror(number) in message:
                 path = re.search(r"(/\S+): " + re.escape(os.strerror(number)), message)
                 raise OSError(number, os.strerror(number), path[1] if path else str(out))
-    first = next((line for line in message.splitlines() if "error" in line), message[:300])
+    error = next((line for line in message.splitlines() if "error" in line), message[:300])
     raise PolicyError(
-        f"{policy_c}: {compiler[0]} refuses it ({first[:300]}); export it again, or compile it by "
+        f"{policy_c}: {compiler[0]} refuses it ({error[:300]}); export it again, or compile it by "
         "hand to see all messages"
     )

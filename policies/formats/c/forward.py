@@ -22,11 +22,11 @@ class Observed(NamedTuple):
     """The recorded inputs of a policy over T steps of one or more flights."""
 
     state: np.ndarray
-    """(T, spec.state_size) float32."""
+    """(T, spec.state_size) state observations, float32."""
     image: np.ndarray
-    """(T, height, width) float32, encoded."""
+    """(T, height, width) encoded depth images, float32."""
     fresh: np.ndarray
-    """(T,) bool, true where a flight begins."""
+    """(T,) bool, steps at which a flight begins."""
 
 
 def step(
@@ -40,13 +40,14 @@ def step(
     """Return the action (3,) [m/s^2, body axes] and the new hidden state for one observation.
 
     Args:
-        small: from `arrays.small_arrays`.
+        small: weights and biases of the small layers, from `arrays.small_arrays`.
         spec: the policy's specification.
-        layer: computes the large layers.
-        hidden: recurrent state, zero-padded to whole blocks.
+        layer: function that computes a large layer.
+        hidden: recurrent state, zero-padded to whole blocks of `arrays.BLOCK`.
         state: (spec.state_size,) state observation.
         image: (height, width) encoded depth image.
     """
+    # The network takes the maximum of 2 x 2 pixels, and its first layer 2 x 2 of these.
     rows, columns, units = spec.camera.height // 4, spec.camera.width // 4, spec.hidden_size
     pooled = image.reshape(2 * rows, 2, 2 * columns, 2).max((1, 3))
     patches = pooled.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)

@@ -27,10 +27,10 @@ from tracks.common.names import printable, unknown_name
 DTYPES = ("float32", "int8")
 """Types of the weights."""
 VECTORS = 12
-"""Successive steps in vectors.h, in which the policy keeps its memory."""
+"""Number of successive steps in vectors.h, in which the policy keeps its memory."""
 TOLERANCE = {"float32": 1e-4, "int8": 0.05}
-"""Largest allowed difference of an action from the recorded one [m/s^2]. If a value rounds to the
-neighbouring byte, the action changes by about a hundredth."""
+"""Type -> largest allowed difference of an action from the recorded action [m/s^2]. If one int8
+activation rounds to the neighbouring byte, the action changes by about 0.01 m/s^2."""
 
 
 class Project(NamedTuple):
@@ -52,9 +52,9 @@ def c_project(
 
     Args:
         checkpoint: the policy.
-        name: its name.
+        name: name of the policy.
         dtype: type of the weights, "float32" or "int8".
-        observed: its inputs in recorded flights; required for int8.
+        observed: the policy's inputs in recorded flights; required for int8.
 
     Raises:
         ValueError: for an unknown type.

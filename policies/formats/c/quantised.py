@@ -26,11 +26,11 @@ class Quantised(NamedTuple):
     """A layer of 8 bits: out = (round(x * inverse + zero) @ weight) * scale + offset."""
 
     weight: np.ndarray
-    """(inputs, outputs) int8, -127 to 127."""
+    """(inputs, outputs) weights, int8, from -127 to 127."""
     scale: np.ndarray
-    """(outputs,) float32, output per unit of the integer sum."""
+    """(outputs,) output per unit of the integer sum, float32."""
     offset: np.ndarray
-    """(outputs,) float32, which cancels the contribution of the inputs' zero point."""
+    """(outputs,) offset that cancels the contribution of the inputs' zero point, float32."""
     inverse: float
     """Inverse of the inputs' scale: steps of a byte per unit of the input."""
     zero: int
@@ -40,7 +40,7 @@ class Quantised(NamedTuple):
 def quantise(
     params: Mapping[str, np.ndarray], spec: PolicySpec, observed: Observed
 ) -> dict[str, Quantised]:
-    """Return each of `arrays.LAYERS` with 8 bits, scaled by its inputs for `observed`.
+    """Return each of `arrays.LAYERS` with 8 bits; the range of its inputs in `observed` scales it.
 
     Raises:
         PolicyError: where a sum of products may exceed 32 bits.
@@ -64,7 +64,7 @@ def check_sums(name: str, weight: np.ndarray) -> None:
     Raises:
         PolicyError: naming the layer, its inputs and what to do.
     """
-    # The sum of magnitudes bounds every partial sum as well; an input byte is -128 at the least.
+    # The sum of magnitudes also bounds every partial sum; the magnitude of an input is 128 at most.
     largest = 128 * int(np.abs(weight.astype(np.int64)).sum(0).max())
     if largest > SUM_MOST:
         raise PolicyError(

@@ -22,7 +22,7 @@ from tracks.common.provenance import VERSION
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 """Folder of the C templates."""
 TANH_TERMS = 12
-"""Terms of tanh's continued fraction; for inputs up to 8 the error is below 4e-7."""
+"""Number of terms of tanh's continued fraction; for inputs up to 8 the error is below 4e-7."""
 _OBSERVATION = (
     ("velocity in body axes", "m/s"),
     ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
@@ -53,15 +53,15 @@ def sources(
 
     Args:
         checkpoint: the policy.
-        name: its name.
-        label: JSON with its provenance, spec and contract, from `spec_json.embed`.
+        name: name of the policy.
+        label: JSON with provenance, spec and contract of the policy, from `spec_json.embed`.
         layers: the quantised large layers; None for float32.
     """
     definitions = _definitions(checkpoint, layers)
     values = _values(checkpoint, name, label, layers, constant_bytes(checkpoint, layers))
     kernels = ("head.c", definitions, "common.c", "int8.c" if layers else "float32.c")
-    body = [_filled(part, values) if part.endswith(".c") else part for part in kernels]
-    return {"policy.h": _filled("header.h", values), "policy.c": "".join(body)}
+    body = [_fill_template(part, values) if part.endswith(".c") else part for part in kernels]
+    return {"policy.h": _fill_template("header.h", values), "policy.c": "".join(body)}
 
 
 def constants(
@@ -81,15 +81,22 @@ def constants(
 
 
 def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
-    """Return the lengths of the C code's two float arrays, and of its int8 array (int8 only)."""
+    """Return the lengths of the C code's two float arrays, and of its int8 array.
+
+    The arrays hold the outputs of the layers in turn; only int8 code has the third.
+    """
     rows, columns = spec.camera.height // 4, spec.camera.width // 4
     first = rows * columns * spec.channels[0]
     second = (rows - 2) * (columns - 2) * spec.channels[1]
-    third, wide, gates = flat_features(spec), padded(spec.hidden_size), padded(3 * spec.hidden_size)
+    third, hidden_padded, gates = (
+        flat_features(spec),
+        padded(spec.hidden_size),
+        padded(3 * spec.hidden_size),
+    )
     return (
         max(first, third, gates),
-        max(4 * rows * columns, second, wide),
-        max(first, second, third, wide),
+        max(4 * rows * columns, second, hidden_padded),
+        max(first, second, third, hidden_padded),
     )
 
 
@@ -115,7 +122,7 @@ def _definitions(checkpoint: PolicyCheckpoint, layers: Mapping[str, Quantised] |
     return "".join(texts)
 
 
-def _filled(template: str, values: Mapping[str, Any]) -> str:
+def _fill_template(template: str, values: Mapping[str, Any]) -> str:
     return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(values)
 
 
@@ -154,7 +161,7 @@ def _values(
         "DEPTH_FAR": float_text(camera.range_m),
         "DEPTH_OFFSET": float_text(depth.offset),
         "SHA256": checkpoint.config["weights"]["sha256"],
-        "JSON": _string(label),
+        "JSON": _c_string(label),
         "MACS": multiply_adds(spec),
         "WEIGHT_BYTES": constant_bytes,
         "HIDDEN": padded(spec.hidden_size),
@@ -177,21 +184,21 @@ def _observation(spec: PolicySpec) -> str:
     last, unit = "the last action as it was flown (SI units, limited)", "as the action"
     rows.append((spec.action.size, last, unit))
     rows += [(EXTRAS[key], *_EXTRA[key]) for key in EXTRAS if getattr(spec, key)]
-    lines, first = [], 0
+    lines, index = [], 0
     for count, meaning, unit in rows:
-        indices = f"{first}..{first + count - 1}" if count > 1 else str(first)
+        indices = f"{index}..{index + count - 1}" if count > 1 else str(index)
         lines.append(f" *     {indices}: {meaning} [{unit}]")
-        first += count
+        index += count
     return "\n".join(lines)
 
 
-def _string(text: str) -> str:
+def _c_string(text: str) -> str:
     """Return a text as C string literals, one a line; lines of a macro end in a backslash."""
-    plain = text.encode("ascii", "backslashreplace").decode().replace("\\", "\\\\")
+    escaped = text.encode("ascii", "backslashreplace").decode().replace("\\", "\\\\")
     # Question marks are escaped: two of them can begin a trigraph of C99, which is replaced.
-    plain = plain.replace('"', '\\"').replace("?", "\\?")
+    escaped = escaped.replace('"', '\\"').replace("?", "\\?")
     pieces, piece = [], ""
-    for word in plain.split(" "):
+    for word in escaped.split(" "):
         if len(piece) + len(word) > 88:
             pieces.append(piece)
             piece = ""
@@ -203,8 +210,9 @@ def _string(text: str) -> str:
 def tanh_polynomials(terms: int = TANH_TERMS) -> tuple[list[float], list[float]]:
     """Return p and q, lowest power first, of tanh(x) = x p(x^2) / q(x^2).
 
-    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms`. From the
-    innermost fraction outwards, with s = x^2, (2k + 1) + s / (v / p) = ((2k + 1) v + s p) / v.
+    Lambert 1768: tanh x = x / (1 + x^2 / (3 + x^2 / (5 + ...))), cut after `terms` terms. The
+    fraction is computed from the innermost term outwards. If v / p is the value of a term and
+    s = x^2, the term outside it is (2k + 1) + s / (v / p) = ((2k + 1) v + s p) / v.
     """
     value, previous = [Fraction(2 * terms - 1)], [Fraction(1)]
     for k in range(terms - 2, -1, -1):

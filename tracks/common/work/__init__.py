@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 Workers = int | str
 """Number of processes of this machine, or the address of a cluster's scheduler."""
 MOST = 256
-"""Most processes of this machine."""
+"""Largest number of processes of this machine."""
 _PROTOCOLS = ("tcp", "tls", "ws", "wss")
 """Protocols of a cluster's address."""
 
@@ -80,9 +80,9 @@ def run_pieces(
 
     Args:
         work: a module-level function, or a `functools.partial` of one.
-        pieces: the next is taken when a worker is free.
+        pieces: the pieces; the next one is taken when a worker is free.
         workers: number of processes of this machine, or the cluster's address.
-        keep: called in this process; an exception that it raises ends the work.
+        keep: function that gets the results, in this process; an exception in it ends the work.
         pinned: whether each process of this machine runs on its own, equal share of the cores.
 
     Raises:

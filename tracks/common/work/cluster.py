@@ -41,13 +41,13 @@ Result = TypeVar("Result")
 ANSWER_S = 10.0
 """Time limit for an answer of the scheduler [s]."""
 GRACE_S = 1.0
-"""Extra time after it before this process gives up waiting, should Dask exceed its limit [s]."""
+"""Time after `ANSWER_S` until this process stops waiting, in case Dask exceeds that limit [s]."""
 NO_WORKER_S = 60.0
 """Longest time without workers before the work ends with an error [s]."""
 QUEUED_PER_WORKER = 4
-"""Pieces that are submitted for each worker: one runs, the others wait."""
+"""Number of pieces that are submitted for each worker: one runs, the others wait."""
 QUEUED_LEAST = 64
-"""Fewest pieces that are submitted, so that workers do not wait for small pieces."""
+"""Least number of pieces that are submitted, so that workers do not wait for small pieces."""
 COUNT_S = 5.0
 """Time between two counts of the workers [s]."""
 ADVICE = (
@@ -69,7 +69,7 @@ def size(address: str) -> int:
     """Return the number of worker processes of the cluster.
 
     Raises:
-        UnusableCluster: where none answers at `address`, or it has no workers.
+        UnusableCluster: where no cluster answers at `address`, or it has no workers.
     """
     with _connected(address) as client:
         return len(client.nthreads())
@@ -89,12 +89,12 @@ def run_on_cluster(
         client.replicate([body])
         submitted: dict[Any, int] = {}
         ended: SimpleQueue[Any] = SimpleQueue()
-        workers = _Count(client)
+        workers = _WorkerCount(client)
 
         def submit_more() -> None:
-            most = max(QUEUED_PER_WORKER * workers(), QUEUED_LEAST)
+            most_queued = max(QUEUED_PER_WORKER * workers(), QUEUED_LEAST)
             # Submitting many at once takes little more time than one.
-            free = most - len(submitted) if len(submitted) <= most // 2 else 0
+            free = most_queued - len(submitted) if len(submitted) <= most_queued // 2 else 0
             batch = list(islice(waiting, free))
             if not batch:
                 return
@@ -115,7 +115,7 @@ def run_on_cluster(
             packed_results = client.gather(
                 [f for f in futures if f.status == "finished"], errors="skip"
             )
-            _check(futures, address, submitted)
+            _refuse_failed(futures, address, submitted)
             numbers = [submitted.pop(future) for future in futures]
             del futures  # the cluster keeps a result while a future refers to it
             submit_more()
@@ -127,8 +127,8 @@ def run_on_cluster(
                     keep(number, result)
 
 
-class _Count:
-    """The number of workers, updated from time to time."""
+class _WorkerCount:
+    """The number of workers of a cluster, counted again after `COUNT_S`."""
 
     def __init__(self, client: Any) -> None:
         self._client, self._until, self._count = client, 0.0, 0
@@ -206,7 +206,7 @@ def _next_ended(ended: SimpleQueue[Any], client: Any, address: str) -> list[Any]
     return futures
 
 
-def _check(futures: list[Any], address: str, submitted: dict[Any, int]) -> None:
+def _refuse_failed(futures: list[Any], address: str, submitted: dict[Any, int]) -> None:
     """Raise an error for pieces that the cluster gave up."""
     for future in futures:
         if future.status == "finished":
@@ -225,7 +225,7 @@ def _check(futures: list[Any], address: str, submitted: dict[Any, int]) -> None:
 
 
 def _body(packed: bytes) -> bytes:
-    """Return the packed function; this is the task that all others depend on."""
+    """Return the packed function; this is the task on which all other tasks depend."""
     return packed
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from tracks.common.provenance import VERSION
 
 ROOT = Path(__file__).resolve().parents[3]
-"""Folder of the code, which may differ on another machine."""
+"""Folder of the suite's code; another machine may have another folder."""
 
 
 class WorkerDied(RuntimeError):
@@ -77,7 +77,7 @@ the suite's own processes, and the machines of a cluster given by `--workers`.""
 
 
 def failure(error: Exception) -> Failure:
-    """Return an error for sending; one that cannot be pickled is replaced by its text."""
+    """Return an error for sending; an error that cannot be pickled is replaced by its text."""
     text = "".join(traceback.format_exception(error))
     try:
         pickle.loads(pickle.dumps(error))
@@ -103,8 +103,9 @@ def _reduce_view(view: MappingProxyType[Any, Any]) -> tuple[Any, ...]:
 
 
 OWN_PACKAGES = ("tracks", "policies", "eval", "suite")
+"""The suite's packages."""
 PACKAGES = ("numpy", "scipy", "jax", "jaxlib", "mujoco", "mujoco-mjx", "onnxruntime")
-"""Other packages that influence the numbers."""
+"""Other packages whose version influences the computed numbers."""
 
 
 @functools.cache

@@ -33,9 +33,9 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 REPORT_S = 0.2
-"""Time between two returns of results [s]; each takes about a millisecond."""
+"""Time between two returns of results [s]; a return takes about a millisecond."""
 TRIES = 2
-"""Number of attempts at a piece whose process died."""
+"""Number of attempts at a piece, if its process dies."""
 
 
 @dataclass
@@ -57,10 +57,10 @@ class _Process:
 
     def begin(self) -> None:
         """Start or restart the process."""
-        before = set(multiprocessing.active_children())
+        existing = set(multiprocessing.active_children())
         self.pool = worker_pool(1, self._cores)
         self.pool.submit(usable_cores)  # starts it
-        self._processes = set(multiprocessing.active_children()) - before
+        self._processes = set(multiprocessing.active_children()) - existing
 
     def end(self) -> str:
         """End the process, and return its exit code."""
@@ -129,14 +129,14 @@ def _collect(
         for future in wait(pending, return_when=FIRST_COMPLETED).done:
             process, entry = pending.pop(future)
             try:
-                packed, more = future.result()
+                packed, has_more = future.result()
             except BrokenProcessPool:
                 repeat(process, entry)
                 continue
             results = unpack(packed)
             if isinstance(results, Failure):
                 raise remote_error(results)
-            if more:
+            if has_more:
                 submit(process, entry, is_new=False)
             else:
                 start_next(process)
@@ -176,7 +176,7 @@ def worker_pool(processes: int, cores: Sequence[int] = ()) -> ProcessPoolExecuto
 
     Args:
         processes: number of processes.
-        cores: numbers of the cores that each may use; empty: all.
+        cores: numbers of the cores that each process may use; empty: all cores.
     """
     register_dict_views()
     # Spawned, as threads of JAX and MuJoCo do not survive a fork.

@@ -1,10 +1,10 @@
 """Set the numbers of threads of XLA (JAX's compiler) and numpy, and count the usable cores.
 
-XLA gets a thread for each core, and at least two. With one thread its matrix products (the Eigen
-library's) are divided into other blocks than with several, and are summed in another order. With at
-least two threads, a training gives the same bits on any number of cores; on a single core it is
-about a tenth slower. `policies/networks/layers.py` splits those products whose sums XLA would
-divide among threads.
+XLA gets a thread for each core, and at least two. With one thread its matrix products (of the
+library Eigen) are divided into other blocks than with several threads, and are summed in another
+order. With at least two threads, a training gives the same bits on any number of cores; on a single
+core it is about a tenth slower. `policies/networks/layers.py` splits those products whose sums XLA
+would divide among threads.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from collections.abc import MutableMapping
 VARIABLE = "NPROC"
 """Environment variable that XLA reads when JAX first lists its devices."""
 LEAST, MOST = 2, 4096
-"""Fewest threads that the suite sets, and most that the variable may have."""
+"""Least number of threads that the suite sets, and largest number that the variable may have."""
 
 
 def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
     """Set XLA's threads to the number of cores, and at least two, unless the variable is set.
 
     Args:
-        environment: changed in place; that of this process if not given.
+        environment: environment variables, changed in place; None: those of this process.
 
     Raises:
         ValueError: where the variable is set to an invalid value.
     """
-    values = os.environ if environment is None else environment
-    setting = values.setdefault(VARIABLE, str(_default_threads()))
+    variables = os.environ if environment is None else environment
+    setting = variables.setdefault(VARIABLE, str(_default_threads()))
     # XLA would end the process without a useful message.
     if not (setting.isascii() and setting.isdigit() and 1 <= int(setting[:5]) <= MOST):
         raise ValueError(
@@ -39,29 +39,29 @@ def set_threads(environment: MutableMapping[str, str] | None = None) -> None:
 
 def share_threads(environment: MutableMapping[str, str] | None = None) -> None:
     """Limit the threads to this process's share of the cores, after `set_threads`."""
-    values = os.environ if environment is None else environment
-    values[VARIABLE] = str(min(threads(values), _default_threads()))
+    variables = os.environ if environment is None else environment
+    variables[VARIABLE] = str(min(threads(variables), _default_threads()))
 
 
 def threads(environment: MutableMapping[str, str] | None = None) -> int:
     """Return the number of XLA's threads."""
-    values = os.environ if environment is None else environment
-    return int(values.get(VARIABLE) or usable_cores())
+    variables = os.environ if environment is None else environment
+    return int(variables.get(VARIABLE) or usable_cores())
 
 
 def one_thread_a_product(environment: MutableMapping[str, str] | None = None) -> None:
     """Set numpy's and scipy's matrix products to one thread, unless a variable is set.
 
-    The suite computes many small products. Threads make them no faster on free cores. On a busy
-    core they wait for each other ten to a hundred times as long as the product takes. Call this
-    before numpy is imported, which reads the setting then.
+    The suite computes many small products. On free cores, threads do not make them faster. On busy
+    cores, threads wait for each other ten to a hundred times as long as a product takes. Call this
+    function before numpy is imported, because numpy reads the setting then.
 
     Args:
-        environment: changed in place; that of this process if not given.
+        environment: environment variables, changed in place; None: those of this process.
     """
-    values = os.environ if environment is None else environment
-    if not {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(values):
-        values["OPENBLAS_NUM_THREADS"] = "1"
+    variables = os.environ if environment is None else environment
+    if not {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(variables):
+        variables["OPENBLAS_NUM_THREADS"] = "1"
 
 
 def _default_threads() -> int:
@@ -83,5 +83,5 @@ def core_shares(workers: int) -> list[list[int]]:
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(workers)]
     cores = sorted(os.sched_getaffinity(0))
-    each = len(cores) // workers
-    return [cores[k * each : (k + 1) * each] for k in range(workers)]
+    share_size = len(cores) // workers
+    return [cores[k * share_size : (k + 1) * share_size] for k in range(workers)]
