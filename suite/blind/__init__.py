@@ -1,4 +1,5 @@
 """Blind tests of the diagnosis, which names physical effects that a vehicle file lacks.
 
-Cases with hidden effects are made from seeds, diagnosed without their answers, and scored.
+Cases (simulated flights with a hidden effect) are made from seeds. They are diagnosed without their
+answers, the true effects. Then the diagnoses are scored by the answers.
 """

@@ -1,7 +1,8 @@
 """Draw the blind cases of a set from its seed: which effects are hidden, at which strength.
 
-A blind case is a set of flights with hidden effects, which the diagnosis must name. The order of
-the cases is random, so that it reveals nothing about the hidden effects.
+A blind case is a set of flights with hidden effects, which the diagnosis must name. A null is a
+case without a hidden effect. The order of the cases is random, so that it reveals nothing about the
+hidden effects.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from suite.diagnose.plan import SEPARATIONS
 MULTIPLES = (2.0, 6.0)
 """Strengths of single effects, as multiples of the just detectable strength."""
 FULL_COUNTS = {"null": 100, "outside": 40, "pair": 20, "blurred": 15, "separated": 15}
-"""Kind -> number of cases in a full set, for all kinds but single effects."""
+"""Kind -> number of cases in a full MuJoCo set, for all kinds except single effects."""
 SETS = {"tuning": 1_000_000, "published": 2_000_000}
-"""Seeds of the two sets; the published one is run once."""
+"""Name of each set -> its seed. The published set is run once, after all development."""
 ROTORPY_COUNTS = {"null": 24, "pair": 16}
-"""Kind -> number of cases in the RotorPy set, for all kinds but single effects."""
+"""Kind -> number of cases in the RotorPy set, for all kinds except single effects."""
 CONTINUOUS_COUNTS = {"null": 24, "single": 22, "pair": 10, "outside": 4}
 """Kind -> number of cases in the continuous-time set."""
 EXCLUDED = "hysteresis"
-"""Physics outside the catalogue that the continuous-time set excludes, because most flights close
-to the ground end in a crash at its usual strength."""
+"""Physics outside the catalogue that the continuous-time set does not have: at its usual strength,
+most flights close to the ground crash."""
 MUJOCO, ROTORPY, CONTINUOUS = "mujoco", "rotorpy", "continuous"
-"""Simulators of cases."""
+"""Names of the simulators of cases."""
 
 
 @dataclass(frozen=True)
@@ -40,21 +41,23 @@ class Case:
     """The description of a case, before strengths and flights are computed."""
 
     kind: str
-    """`single` (one effect), `null` (none), `pair` (two effects), `outside` (physics that is not in
-    the catalogue), `blurred` (flights that do not separate two effects) or `separated` (the same,
-    with flights added that do)."""
+    """`single` (one effect), `null` (no effect), `pair` (two effects), `outside` (physics that is
+    not in the catalogue), `blurred` (one effect, and flights that do not separate it from another
+    one) or `separated` (the same with additional flights, which separate the two)."""
     hidden: tuple[str, ...]
     """The hidden effects, or one kind of physics outside the catalogue."""
     multiple: float
-    """Strength, as a multiple of the just detectable one."""
+    """Strength of the hidden effects, as a multiple of the just detectable strength."""
     vehicle: str
-    """Name of the vehicle file for the diagnosis."""
+    """Name of the vehicle file that the diagnosis gets."""
     sensors: str
     """Name of the logged channels and their noise, a key of `SENSORS`."""
     seed: tuple[int, int]
-    """Seeds of all other draws: the set's, and the case's number within its kind."""
+    """Seeds of all other draws: that of the set, and a number that no other case of the set has,
+    except for a blurred case and its separated twin."""
     separation: int = -1
-    """Index in `SEPARATIONS` of a blurred or separated case; -1 for the other kinds."""
+    """Index in `SEPARATIONS` (pairs of effects, and flights that separate them) for a blurred or
+    separated case; -1 for the other kinds."""
     simulator: str = MUJOCO
     """Simulator of the flights."""
 
@@ -88,7 +91,9 @@ def draw_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the RotorPy set: its effects at both multiples, pairs of them, and nulls.
+    """Return the RotorPy set: single effects at both multiples, pairs of effects, and nulls.
+
+    The effects are those that RotorPy can simulate.
 
     Arguments and errors are those of `draw_cases`.
     """
@@ -100,8 +105,9 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
         first, second = (str(name) for name in rng.choice(ROTORPY_EFFECTS, 2, replace=False))
         drawn.append(("pair", (first, second), MULTIPLES[1]))
     drawn += [("null", (), 0.0)] * ROTORPY_COUNTS["null"]
-    share, of_kind = _share_of(count, len(drawn)), Counter(kind for kind, *_ in drawn)
-    remaining = {kind: max(round(share * number), 1) for kind, number in of_kind.items()}
+    # Keep the first ones of each kind in a random order, as many as its share.
+    share, kind_counts = _share_of(count, len(drawn)), Counter(kind for kind, *_ in drawn)
+    remaining = {kind: max(round(share * number), 1) for kind, number in kind_counts.items()}
     cases = {}
     for index in rng.permutation(len(drawn)):
         kind, hidden, multiple = drawn[index]
@@ -117,9 +123,10 @@ def draw_rotorpy_cases(seed: int, count: int | None = None) -> dict[str, Case]:
 
 
 def draw_continuous_cases(seed: int, count: int | None = None) -> dict[str, Case]:
-    """Return the continuous-time set, with each single effect once.
+    """Return the continuous-time set.
 
-    Half of them are at each multiple. Arguments and errors are those of `draw_cases`.
+    It has each single effect once at most, half of them at each of `MULTIPLES`. Arguments and
+    errors are those of `draw_cases`.
     """
     share = _share_of(count, sum(CONTINUOUS_COUNTS.values()))
     rng = np.random.default_rng([seed, 2])
@@ -146,11 +153,11 @@ DRAWERS: dict[str, Callable[[int, int | None], dict[str, Case]]] = {
     ROTORPY: draw_rotorpy_cases,
     CONTINUOUS: draw_continuous_cases,
 }
-"""Simulator -> function that draws its set from seed and approximate number of cases."""
+"""Simulator -> function (seed, approximate number of cases) that draws its set."""
 
 
 def _share_of(count: int | None, full: int) -> float:
-    """Return the share of a `full` set that `count` cases are, at most 1.
+    """Return the share of the cases of a `full` set that `count` cases are, at most 1.
 
     Raises:
         ValueError: for a count below 1.
@@ -173,7 +180,7 @@ def _draw_singles(rng: np.random.Generator, seed: int, share: float) -> list[Cas
 
 
 def _draw_case(rng: np.random.Generator, kind: str, index: int, case_seed: tuple[int, int]) -> Case:
-    """Return case number `index` of a `kind` other than `single`."""
+    """Return case number `index` of a `kind` other than `single`, on MuJoCo."""
     seed = case_seed[0]
     if kind == "outside":
         name, equipment = list(KINDS)[index % len(KINDS)], _draw_equipment(rng, ())

@@ -1,7 +1,8 @@
-"""Fly trajectories of blind cases in continuous time, with an engine of separate code.
+"""Fly trajectories of blind cases in continuous time, with an engine of its own.
 
-The engine shares no code with the model that the diagnosis fits. The tracking controller is the one
-of the other simulators, since it only gives commands.
+A blind case is a set of flights with hidden effects, on which the diagnosis is tested. The engine
+(`suite/blind/continuous/`) shares no code with the model that the diagnosis fits. The tracking
+controller, which follows the trajectory, is that of the other simulators: it only gives commands.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from suite.blind.continuous.quadrotor import quadrotor_of
 from suite.blind.continuous.timing import STEP_S, Conditions, jittered_stamps, schedule
 
 MARGIN_S = 0.25
-"""Time before the first row and after the last one, for poses with a time offset [s]."""
+"""Time that is simulated before the first row of the log and after the last one. A log with wrong
+time stamps of the pose needs it [s]."""
 
 
 def with_loop_frequency(vehicle: Vehicle, frequency: float) -> Vehicle:
@@ -44,10 +46,10 @@ def fly_continuous(
     """Fly N trajectories in parallel.
 
     Args:
-        nominal: vehicle of the tracking controller.
+        nominal: vehicle whose constants the tracking controller uses.
         truth: vehicle that flies; its rate loop gets the frequency of `conditions`.
-        trajectories: the trajectories, a flight for each.
-        conditions: rates and jitter.
+        trajectories: the trajectories; each is one flight.
+        conditions: rates and jitter of the time stamps.
         rng: random generator of time stamps and gusts.
         extra: additional physics; None: none.
         step_s: longest step [s].
@@ -61,7 +63,7 @@ def fly_continuous(
     stamp_s = jittered_stamps(
         rng, len(trajectories), -MARGIN_S, end_s, conditions.row_hz, conditions.jitter
     )
-    # Steps resolve the rotors' lag.
+    # Steps are short enough for the lag of the rotors, but not shorter than 2 % of `step_s`.
     lag_s = quadrotor.time_constant
     lag_step_s = min(step_s, lag_s / 5.0) if lag_s > 0.0 else step_s
     longest_s = max(lag_step_s, 0.02 * step_s)
@@ -96,7 +98,10 @@ class _Pilot:
         self._integral_w = np.zeros((len(trajectories), 3))
 
     def __call__(self, states: Rows) -> tuple[np.ndarray, np.ndarray]:
-        """Return the logged command and the command that acts, (N, 4) each."""
+        """Return the logged command and the command that acts, (N, 4) each.
+
+        They differ if the additional physics changes commands.
+        """
         row = states.number
         reference = Reference(*(field[row] for field in self._reference))
         motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
@@ -111,12 +116,15 @@ class _Pilot:
         return command.packed, acting.packed
 
     def push(self, states: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
-        """Return the force of the additional physics in a step, body axes (N, 3) [N]."""
+        """Return the force of the additional physics in a step, (N, 3) in body axes [N].
+
+        `force_b` (N, 3) is the force of everything else [N], `length_s` (N, 1) that of the step [s].
+        """
         assert self._extra is not None
         motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)
         wrench = Wrench(force_b, np.zeros_like(force_b))
         time_s = states.time_s[:, None]
-        # One number per flight, unlike in other simulators.
+        # The time has one number per flight; other simulators give one number for all.
         return self._extra.wrench(motion, wrench, time_s, length_s).force_b  # pyright: ignore[reportArgumentType]
 
 
@@ -132,7 +140,7 @@ def logs_of(
 
     Args:
         flown: the flights.
-        trajectories: their trajectories, which set the logs' durations.
+        trajectories: trajectories of the flights, which determine the durations of the logs.
         truth: the vehicle that flew.
         sensors: logged channels and their noise.
         conditions: rates, jitter and lost rows.

@@ -27,18 +27,20 @@ from tracks.common.work import Workers, run_pieces
 from tracks.input.reading import read_json
 
 SCHEMA = 1
+"""Version of the files of a set."""
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The files of a set."""
+    """The files of a set with their hashes, so that a later change of a file is noticed."""
 
     cases: dict[str, dict[str, str]]
     """Case -> input file of the diagnosis -> SHA-256 of the file."""
     answers: dict[str, str]
     """Case -> SHA-256 of its answer."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Case -> "not made", for cases without valid flights."""
+    """Case -> "not made", for cases without valid flights. The reasons are with the answers, since
+    they contain the hidden effects."""
 
 
 def make_set(
@@ -56,7 +58,7 @@ def make_set(
         seed: seed of the set.
         count: approximate number of cases; None: all.
         console: shows the progress.
-        simulator: one of `DRAWERS`; all but `mujoco` have smaller sets.
+        simulator: a key of `DRAWERS`. Sets of other simulators than `mujoco` are smaller.
         workers: processes that make cases in parallel; None: this process.
 
     Raises:
@@ -106,7 +108,7 @@ def make_set(
 
 
 def _build(case: Case) -> Iterator[Built | str]:
-    """Yield the contents of a case, or the reason for which it cannot be made."""
+    """Yield once: the contents of a case, or the reason why it cannot be made."""
     try:
         yield build(case)
     except WorkFailed as error:
@@ -133,7 +135,7 @@ def simulator_of(out: Path) -> str:
 
 
 def open_answers(out: Path) -> dict[str, dict[str, Any]]:
-    """Return the answers by case, after checking that no file of the set has changed.
+    """Return case -> answer, after a check that no file of the set has changed.
 
     Raises:
         ValueError: for a changed file.
@@ -154,7 +156,11 @@ def open_answers(out: Path) -> dict[str, dict[str, Any]]:
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:
-    """Write the options of a new set, or check that they are those of the set in `out`."""
+    """Write the options of a new set, or check that they are those of the set in `out`.
+
+    Raises:
+        ValueError: if an option differs.
+    """
     path = out / "set.json"
     stored = read_json(path) if path.is_file() else None
     if stored is None:
@@ -169,4 +175,5 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
 
 
 def _hash(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,7 +1,8 @@
 """The hidden physics of a blind case: values of an effect, or physics that no effect describes.
 
 Effects are the physical causes of mismatch in the catalogue (`eval/effects/`), which a diagnosis
-can name. For physics outside the catalogue the correct verdict is `unknown`.
+can name. For physics outside the catalogue the correct verdict is `unknown`. A wrench is a force
+and a torque together. In the shapes, N is the number of flights.
 """
 
 from __future__ import annotations
@@ -22,26 +23,33 @@ from tracks.common.names import unknown_name
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
-"""Function of strength, true mass [kg], motion, wrench and time [s] that returns an acceleration
-(N, 3), world axes [m/s^2]."""
+"""Function (strength, true mass [kg], motion, wrench, time [s]) -> acceleration (N, 3) in world axes
+[m/s^2]."""
 
 
 class Outside:
     """Base class of physics outside the catalogue, which changes the command or adds a wrench.
 
-    An object may have a state, so it is for one call of `fly`.
+    An object may have a state, such as the position of a load, so each call of `fly` needs a new
+    one.
     """
 
     def __init__(self, strength: float, mass: float) -> None:
-        """Prepare for flights of a quadrotor of true `mass` [kg]; `strength` as in `KINDS`."""
+        """Prepare for flights of a quadrotor of true `mass` [kg].
+
+        `strength` is the size of the physics, in the unit that `KINDS` gives.
+        """
         self.strength, self.mass = strength, mass
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the command that acts."""
+        """Return the command that acts instead of `command`."""
         return command
 
     def wrench(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> Wrench:
-        """Return the wrench that is added to `wrench`, body axes."""
+        """Return the wrench that is added to `wrench`, the present one; both in body axes.
+
+        `dt` is the length of the step [s].
+        """
         acc_w = self.acc_w(motion, wrench, time_s, dt)
         force_b = self.mass * to_local(motion.rot_w, acc_w)
         return Wrench(force_b, np.zeros_like(force_b))
@@ -54,16 +62,19 @@ class Outside:
 class SlungLoad(Outside):
     """A point mass of `strength` kg on an elastic line below the centre of mass.
 
-    It differs from the catalogue's load, which has a stiff line.
+    The catalogue has a load too, but on a stiff line.
     """
 
     LENGTH_M, STIFFNESS, DAMPING = 0.4, 60.0, 0.3
-    """Length of the line without load [m], its stiffness [N/m] and damping [N s/m]."""
+    """Of the line: length without load [m], stiffness [N/m] and damping [N s/m]."""
 
     _pos_w = _vel_w = np.zeros(0)
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
-        """Return the acceleration by the line, and move the load, which hangs at rest at first."""
+        """Return the acceleration by the pull of the line, and move the load by one step.
+
+        At first the load hangs at rest.
+        """
         if not self._pos_w.size:
             stretch = self.strength * GRAVITY / self.STIFFNESS
             self._pos_w = motion.pos_w - np.array([0.0, 0.0, self.LENGTH_M + stretch])
@@ -80,15 +91,18 @@ class SlungLoad(Outside):
 
 
 class Hysteresis(Outside):
-    """Backlash of `strength` m/s^2 in the collective thrust, centred at the start."""
+    """Backlash in the collective thrust: the acting thrust follows the command with a play.
+
+    The play is `strength` m/s^2 wide; at the start the command is in its middle.
+    """
 
     _acting = np.zeros(0)
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the thrust, which changes only at the edges of the backlash."""
-        half = 0.5 * self.strength
+        """Return the command with the acting thrust, which changes only at the edges of the play."""
+        half_width = 0.5 * self.strength
         before = self._acting if self._acting.size else command.thrust
-        self._acting = np.clip(before, command.thrust - half, command.thrust + half)
+        self._acting = np.clip(before, command.thrust - half_width, command.thrust + half_width)
         return Command(np.maximum(self._acting, 0.0), command.rate_b)
 
 
@@ -96,7 +110,10 @@ class BentThrust(Outside):
     """A nonlinear thrust curve."""
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the command with the thrust c + s (c - g)^2 / g, s the strength."""
+        """Return the command with the thrust c + s (c - g)^2 / g.
+
+        c is the commanded thrust, s the strength and g gravity, so a hover does not change.
+        """
         thrust = command.thrust
         curved = thrust + self.strength * (thrust - GRAVITY) ** 2 / GRAVITY
         return Command(np.maximum(curved, 0.0), command.rate_b)
@@ -128,7 +145,7 @@ def _heading_force(s: float, m: float, motion: Motion, wrench: Wrench, t: float)
 
 
 def _wake(s: float, m: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
-    """Return the loss of thrust in the own wake: -s (sink rate beyond 0.5 m/s)^2 along body z."""
+    """Return the loss of thrust in the drone's wake: -s (sink rate beyond 0.5 m/s)^2 on body z."""
     sink_rate = np.maximum(-motion.vel_w[:, 2:] - 0.5, 0.0)
     return -s * sink_rate**2 * motion.rot_w[:, :, 2]
 
@@ -155,13 +172,13 @@ class Kind:
     """One kind of physics outside the catalogue."""
 
     make: Callable[..., Outside]
-    """Function from strength and true mass [kg] to the physics."""
+    """Function (strength, true mass [kg]) -> the physics."""
     unit: str
     """Unit of the strength."""
     usual: float
-    """Usual strength, from which a case's strength is computed."""
+    """Usual strength; a flight with it shows how detectable this physics is."""
     most: float
-    """Largest strength of a case."""
+    """Largest strength in a case."""
 
 
 KINDS: dict[str, Kind] = {
@@ -175,9 +192,9 @@ KINDS: dict[str, Kind] = {
     "updraft": Kind(partial(Push, law=_updraft), "m/s^2", 1.0, 5.0),
     "bent_thrust": Kind(BentThrust, "1", 0.1, 0.4),
 }
-"""Name -> kind of physics outside the catalogue."""
+"""Name of each kind of physics outside the catalogue -> its description."""
 BOUND_SHARE = 0.98
-"""Largest change of a parameter, as a share of the distance to its physical bound."""
+"""Largest change of a parameter, as a share of the distance to the physical bound of its value."""
 
 
 def make_outside(name: str, strength: float, mass: float) -> Outside:
@@ -199,24 +216,26 @@ def draw_change(
     Args:
         rng: random generator of the direction.
         nominal: the vehicle file for the diagnosis.
-        sensors: name of the logged channels and their noise.
+        sensors: name of the logged channels and their noise, a key of `SENSORS`.
         effect: name of the effect.
-        multiple: strength, as a multiple of the detectable one; physical bounds may reduce it.
+        multiple: strength, as a multiple of the just detectable one; physical bounds may reduce it.
 
     Returns:
-        The change of each column in the table of strengths (P,), and its multiple.
+        The change of each of the P parameter components that the table of strengths has (P,), and
+        its strength as a multiple of the just detectable one.
 
     Raises:
         ValueError: if the effect is not identifiable on the flights of the table.
     """
     columns = columns_in_table(nominal.name, sensors, effect)
     room = np.array([column.room(nominal) for column in columns])
+    # 1. A random direction. Some effects change one component only, such as one weak motor.
     if columns[0].spec.one_at_a_time:
         unit_vector = np.eye(len(columns))[rng.integers(len(columns))]
         direction = columns[0].spec.signs[0] * unit_vector
     else:
         sign = rng.choice([-1.0, 1.0], len(columns))
-        # Upwards if the given value cannot, or does not usually, become smaller.
+        # A component grows if its value cannot become smaller, or usually does not.
         upwards = (room[:, 0] > -1e-9) | np.array([c.spec.upwards(nominal) for c in columns])
         direction = rng.uniform(0.5, 1.0, len(columns)) * np.where(upwards, 1.0, sign)
     detectable = detectable_along(nominal.name, sensors, effect, direction)
@@ -225,6 +244,7 @@ def draw_change(
             f"{effect} is not identifiable on vehicle {nominal.name!r} with sensors {sensors!r}; "
             "draw another vehicle or other sensors"
         )
+    # 2. The wanted strength in this direction, made smaller if a component would leave its bounds.
     change = multiple * detectable * direction
     limit = BOUND_SHARE * np.where(change > 0.0, room[:, 1], room[:, 0])
     nonzero = np.abs(change) > 0.0
@@ -235,7 +255,7 @@ def draw_change(
 def changed_values(
     nominal: Vehicle, sensors: str, effect: str, change: np.ndarray, rng: np.random.Generator
 ) -> Any:
-    """Return the values of the effect in the nominal vehicle plus a change, as plain numbers.
+    """Return the values of an effect: those in the nominal vehicle, plus a change.
 
     Args:
         nominal: the vehicle file for the diagnosis.
@@ -260,7 +280,11 @@ def changed_values(
 
 
 def true_parameters(effect: str, values: Any, has_voltage: bool) -> dict[str, Any]:
-    """Return the expected parameters of a diagnosis: totals, None where not identifiable."""
+    """Return the parameters that a diagnosis should estimate, by name.
+
+    They are whole values, not changes from the nominal ones. A component that is not identifiable
+    is None.
+    """
     expected: dict[str, Any] = {}
     for parameter in EFFECTS[effect].identifiable(has_voltage):
         value = getattr(values, parameter.name)

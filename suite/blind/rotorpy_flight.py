@@ -1,12 +1,14 @@
 """Fly trajectories of blind cases in RotorPy, a simulator with different equations.
 
-Tracking controller, rate loop and mixer are the suite's, since the vehicle file describes them.
-RotorPy simulates rotors, air and rigid body, as in the simulator `rotorpy`.
+Tracking controller, rate loop and mixer are those of the suite, since the vehicle file describes
+them. RotorPy simulates rotors, air and rigid body, as in the simulator `rotorpy`.
 
-RotorPy's rotor drag and inflow depend on each hub's airspeed `v + w x r`, those of our catalogue on
-the body's. At rotor speed `Omega` the difference is an angular damping. For each rotor, a drag
-`k Omega` in the rotor plane damps `w_z` by `k Omega (x^2 + y^2)`; an inflow along body z damps
-`w_x` by `k Omega y^2` and `w_y` by `k Omega x^2`.
+The effects rotor drag and inflow depend on an airspeed. In the catalogue it is the airspeed of the
+body. In RotorPy it is that of each hub (centre of a rotor), `v + w x r`, which also moves as the
+body turns. The difference is an angular damping, here "damping by moving hubs". With the rotor
+speed `Omega` and the hub at (x, y), a rotor drag `k Omega` damps `w_z` by
+`k Omega (x^2 + y^2)`. An inflow along body z damps `w_x` by `k Omega y^2` and `w_y` by
+`k Omega x^2`.
 """
 
 from __future__ import annotations
@@ -28,9 +30,10 @@ from eval.worlds.rotorpy_vehicle import ROTORPY_EFFECTS
 from tracks.geometry.rotation import quat_to_rot
 
 DAMPING = "angular_damping"
-"""Effect of the catalogue that a diagnosis may name for the damping by moving hubs."""
+"""Effect of the catalogue that a diagnosis may name because of the damping by moving hubs."""
 WITHIN = 1.5
-"""Largest ratio of a named damping to that in hover; flights differ from hover."""
+"""Largest factor between a named damping and the damping by moving hubs in hover. They differ,
+because the rotor speeds in a flight differ from those in hover."""
 
 
 def check_effects(truth: Vehicle) -> None:
@@ -52,9 +55,9 @@ def fly_rotorpy(
     """Fly `trajectories` in parallel in RotorPy.
 
     Args:
-        nominal: vehicle of the tracking controller, the rate loop and the mixer.
+        nominal: vehicle whose constants the tracking controller, the rate loop and the mixer use.
         truth: vehicle that flies.
-        trajectories: the trajectories, a flight for each.
+        trajectories: the trajectories; each is one flight.
         rate_hz: rows of the records per second [Hz].
 
     Returns:
@@ -73,9 +76,10 @@ def fly_rotorpy(
 
 
 class _RotorpyBodies:
-    """RotorPy's multirotors with our rate loop; their logs count as continuous in time."""
+    """Multirotors of RotorPy with the rate loop of the suite, in the form that `follow` flies."""
 
     integrator: str | None = None
+    """None: their logs count as continuous in time, not as steps of MuJoCo."""
 
     def __init__(self, nominal: Vehicle, truth: Vehicle, reference: Reference, dt: float) -> None:
         count = reference.yaw.shape[1]
@@ -110,7 +114,7 @@ def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.nd
     """Return the angular damping (3,) about body axes that moving hubs cause in hover [1/s].
 
     Args:
-        effects: the effects of a case's answer.
+        effects: the true effects of a case, from its answer.
         vehicle: the vehicle file for the diagnosis.
     """
     hub_b = np.asarray(vehicle.rotors.position)
@@ -127,7 +131,10 @@ def hub_damping(effects: Sequence[Mapping[str, Any]], vehicle: Vehicle) -> np.nd
 
 
 def is_hub_damping(effect: Mapping[str, Any], damping: np.ndarray) -> bool:
-    """Return whether a diagnosis's `effect` is the damping (3,) [1/s] by moving hubs."""
+    """Return whether the named `effect` of a diagnosis is the damping by moving hubs.
+
+    It is if its name, its axis and its size agree with `damping` (3,), that in hover [1/s].
+    """
     if effect["name"] != DAMPING or effect.get("alternatives") or not damping.any():
         return False
     value = np.asarray(effect["parameters"]["coefficient"]["value"], float)

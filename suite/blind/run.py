@@ -20,11 +20,12 @@ from tracks.common.files import write_json
 from tracks.common.work import Workers
 
 Diagnose = Callable[[Sequence[Path], Path, Path], None]
-"""Function of flight logs, the vehicle file and an output folder that writes `diagnosis.json`."""
+"""Function (flight logs, vehicle file, output folder) that writes `diagnosis.json`."""
 TIMED, FAILED = "seconds.json", "error.json"
-"""Files in the folder of a diagnosed case: the time of the diagnosis, or the reason it failed."""
+"""Names of two files. A case has the first one, the time of the diagnosis, or the second one, the
+reason why the diagnosis failed."""
 LONGEST_ERROR = 500
-"""Longest error text that is stored, in characters."""
+"""Largest number of characters of a stored reason."""
 
 
 def run_set(
@@ -34,10 +35,10 @@ def run_set(
     into: Path | None = None,
     workers: Workers | None = None,
 ) -> int:
-    """Diagnose every case without a result, and return the number of cases with one.
+    """Diagnose every case without a result, and return how many cases have a result then.
 
-    A case gets a folder with `diagnosis.json` and `seconds.json`. A case that fails gets
-    `error.json`, and is tried again in the next run.
+    The result of a case is a folder with `diagnosis.json` and `seconds.json`. If a diagnosis fails,
+    the folder has `error.json`, and the next run tries the case again.
 
     Args:
         out: folder of the set.
@@ -65,7 +66,7 @@ def run_set(
 
 def _diagnose_case(diagnose: Diagnose, job: Job, console: Console) -> None:
     """Diagnose the case in the folder `job.reads`, and write the result to `job.folder`."""
-    del console
+    del console  # a job gets one, but the diagnosis prints nothing
     case, folder = job.reads, job.folder
     assert case is not None
     flights = sorted(case.glob("flight_*.parquet"), key=lambda path: int(path.stem.split("_")[1]))
@@ -74,7 +75,7 @@ def _diagnose_case(diagnose: Diagnose, job: Job, console: Console) -> None:
     try:
         diagnose(flights, case / "vehicle.toml", folder)
         json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
-    # Any failure is a result of this case; the other cases continue.
+    # Any error is the result of this case; the other cases continue.
     except Exception as reason:
         write_json(error, {"error": f"{type(reason).__name__}: {reason}"[:LONGEST_ERROR]})
         return
@@ -95,7 +96,8 @@ def diagnose_by_command(flights: Sequence[Path], vehicle: Path, out: Path) -> No
 
     output = io.StringIO()
     args = [*map(str, flights), "--vehicle", str(vehicle), "--out", str(out)]
-    # Hidden effects are as small as flights can detect, often below the thresholds of relevance.
+    # Hidden effects are just detectable. The thresholds of practical relevance would often leave
+    # out such small effects.
     args += ["--relevance", "0", "0", "0"]
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         code = main(["diagnose", *args])

@@ -1,6 +1,9 @@
 """Score the diagnoses of blind cases: compare named effects and intervals with the answers.
 
-A blind case is a set of flights with hidden effects, which the diagnosis must name.
+A blind case is a set of flights with hidden effects, which the diagnosis must name. Its answer has
+the true effects. A diagnosis may name an effect with alternatives, other effects that explain the
+flights as well. The gap is the rollout error on held-out flights; its noise floor is the error that
+measurement noise alone gives.
 """
 
 from __future__ import annotations
@@ -27,8 +30,9 @@ from tracks.common.grid import markdown, table
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
+"""Version of table.json."""
 GAP_LIMIT = 1.1
-"""Limit of the ratio of the remaining gap to the noise floor."""
+"""Goal for the gap with the named effects, divided by the noise floor: at most this."""
 
 
 @dataclass(frozen=True)
@@ -38,27 +42,29 @@ class Verdict:
     case: str
     """Name of the case."""
     kind: str
-    """Kind of the case; see `suite.blind.cases.Case`."""
+    """Kind of the case, such as `single`; see `suite.blind.cases.Case`."""
     hidden: tuple[str, ...]
-    """The hidden effects."""
+    """Names of the hidden effects."""
     multiple: float
-    """Largest strength of a hidden effect, as a multiple of the just detectable one."""
+    """Largest strength of the hidden effects, as a multiple of the just detectable strength."""
     verdict: str
-    """Verdict of the diagnosis; `failed` if there is none."""
+    """Verdict of the diagnosis, such as `named`; `failed` if the diagnosis failed."""
     named: tuple[tuple[str, ...], ...]
-    """Named effects, each with its alternatives."""
+    """Named effects: for each its name, then the names of its alternatives."""
     found: bool
     """Whether every hidden effect is named, with the right alternatives."""
     extra: int
-    """Number of named effects of which neither the name nor an alternative is true."""
+    """Number of named effects that are false: neither the name nor an alternative is true."""
     covered: tuple[bool, ...]
-    """Whether the 95 % interval of each component contains the true value."""
+    """For each component of each correctly named effect: whether the 95 % interval of the diagnosis
+    contains the true value."""
     gap_ratio: float | None
-    """Rollout error with the named effects divided by that of noise alone; None without names."""
+    """Gap with the named effects, divided by the noise floor; None if no effect is named."""
     seconds: float | None
     """Time of the diagnosis [s]."""
     brought: int = 0
-    """Number of named effects that are physics of the simulator itself, by name and size."""
+    """Number of named effects that are not hidden, but true of the simulator: RotorPy has a damping
+    by moving hubs, which a diagnosis may name (see `suite.blind.rotorpy_flight`)."""
 
     @property
     def exact(self) -> bool:
@@ -68,20 +74,20 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Share:
-    """A row of the table: a count of cases, with a 95 % Wilson interval of the share."""
+    """A row of the table: `count` of `of` cases, with a 95 % Wilson interval of this share."""
 
     what: str
     """Description of the counted cases."""
     count: int
     """Number of counted cases."""
     of: int
-    """Number of all cases in question."""
+    """Number of cases that could have been counted, such as all nulls."""
     low: float
-    """Lower end of the interval."""
+    """Lower end of the interval, from 0 to 1."""
     high: float
-    """Upper end of the interval."""
+    """Upper end of the interval, from 0 to 1."""
     wanted: str
-    """The goal, as text."""
+    """The goal, as text; "" without a goal."""
 
 
 def score_case(
@@ -95,10 +101,11 @@ def score_case(
 
     Args:
         name: name of the case.
-        answer: contents of the case's answer.
+        answer: contents of the answer of the case.
         diagnosis: contents of `diagnosis.json`; None if the diagnosis failed.
         seconds: time of the diagnosis [s]; None if it failed.
-        hubs: (3,) angular damping by moving hubs in the simulator [1/s]; None if it has none.
+        hubs: (3,) angular damping about the body axes that the simulator has by itself, because the
+            hubs of the rotors move through the air [1/s]; None if it has none.
     """
     truths: Sequence[Mapping[str, Any]] = answer["effects"]
     hidden = [answer["outside"]] if answer.get("outside") else truths
@@ -106,10 +113,12 @@ def score_case(
     # A named effect with its alternatives is a set of names.
     sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
     brought = [hubs is not None and is_hub_damping(e, hubs) for e in effects]
+    # Which set names which true effect.
     pairs = _match(truths, sets)
     right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
     names, matched = {truth["name"] for truth in truths}, set(pairs.values())
-    # Sets without a true name are extra, and sets whose true name another set already has.
+    # A set is extra if it has no true name, except for a damping by moving hubs. A set with a true
+    # name is extra if another set names that effect already.
     extra = [
         e not in matched if names & set(group) else not brought[e] for e, group in enumerate(sets)
     ]
@@ -119,6 +128,7 @@ def score_case(
         if sets[e][0] == truths[t]["name"]
         for inside in _covered(truths[t]["parameters"], effects[e].get("parameters", {}))
     ]
+    # `after`: the gap after the named effects are added to the simulation.
     gap = (diagnosis or {}).get("gap") or {}
     floor, after = gap.get("noise_floor"), gap.get("after")
     return Verdict(
@@ -140,6 +150,8 @@ def score_case(
 def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
     """Return the scores of all diagnosed cases of the set in `out`.
 
+    `results` is the folder of the diagnoses; None: OUT/results.
+
     Raises:
         ValueError: if a file of the set has changed, or no case was diagnosed.
     """
@@ -152,8 +164,8 @@ def score_set(out: Path, results: Path | None = None) -> list[Verdict]:
         if in_rotorpy:
             vehicle = load_vehicle(str(out / "cases" / name / "vehicle.toml"))
             hubs = hub_damping(answer["effects"], vehicle)
-        diagnosis = _read(folder / name / "diagnosis.json")
-        timing = _read(folder / name / TIMED)
+        diagnosis = _read_if_valid(folder / name / "diagnosis.json")
+        timing = _read_if_valid(folder / name / TIMED)
         # A diagnosis without its time did not end normally.
         completed = diagnosis if timing else None
         seconds = timing["seconds"] if timing else None
@@ -170,7 +182,7 @@ def not_run(out: Path, verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def shares(verdicts: Sequence[Verdict]) -> list[Share]:
-    """Return the rows of the table with shares, without empty ones."""
+    """Return the rows of the table with shares; rows without any case are left out."""
 
     def of(kind: str) -> list[Verdict]:
         return [v for v in verdicts if v.kind == kind]
@@ -178,6 +190,7 @@ def shares(verdicts: Sequence[Verdict]) -> list[Share]:
     single, null, pair = of("single"), of("null"), of("pair")
     # A failed diagnosis names nothing, which must not count as correct.
     completed = [v for v in verdicts if v.verdict != "failed"]
+    # Random effects (gusts) are left out of the gaps: naming them does not predict a flight.
     random_effects = {name for name, effect in EFFECTS.items() if effect.random}
     ratios = [v.gap_ratio for v in verdicts if v.found and not random_effects & set(v.hidden)]
     lines = [
@@ -233,14 +246,14 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     if ratios:
         what = "gap after over noise floor where named, median"
         lines.append([what, f"{median(ratios):.3g}", "", ""])
-    wrong = [
+    unexpected = [
         [v.case, v.kind, ", ".join(v.hidden) or "–", f"{v.multiple:.1f}", v.verdict,
          "; ".join(" or ".join(group) for group in v.named) or "–"]
         for v in verdicts
         if not _is_expected(v)
     ]  # fmt: skip
     heads = ["case", "kind", "hidden", "x detectable", "verdict", "named"]
-    title = f"{len(wrong)} of {len(verdicts)} cases are not as expected:"
+    title = f"{len(unexpected)} of {len(verdicts)} cases are not as expected:"
     missing, failed = not_run(out, verdicts), load_manifest(out).failed
     count = len(missing) + len(verdicts)
     notes = [
@@ -250,7 +263,7 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
     text = "\n".join(
         [
             markdown(table(["", "", "95 % interval", "wanted"], lines)),
-            markdown(table(heads, wrong, title)),
+            markdown(table(heads, unexpected, title)),
             *(f"{note}\n" for note in notes if note),
         ]
     )
@@ -267,7 +280,10 @@ def report(out: Path, verdicts: Sequence[Verdict]) -> str:
 
 
 def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
-    """Return the row of correct cases if a named damping by moving hubs counts as false."""
+    """Return a row (description, goal, flags): exact cases without a named damping by moving hubs.
+
+    The row is empty if no diagnosis names such a damping.
+    """
     brought = any(v.brought for v in verdicts)
     flags = [v.exact and not v.brought for v in verdicts if brought]
     kind = verdicts[0].kind if verdicts else ""
@@ -275,9 +291,9 @@ def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
 
 
 def _match(truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]) -> dict[int, int]:
-    """Return the index of a true effect -> index of the set that names it; each set is used once.
+    """Return the index of each named true effect -> index of the set of names that names it.
 
-    For sets with a common name, first names have priority over alternatives.
+    A set is used once. The first name of a set has priority over its alternatives.
     """
     pairs: dict[int, int] = {}
     for first_only in (True, False):
@@ -326,10 +342,11 @@ def _is_expected(v: Verdict) -> bool:
 
 
 def _nearest(value: float, steps: Sequence[float]) -> float:
+    """Return the entry of `steps` that is nearest to `value`."""
     return min(steps, key=lambda step: abs(step - value))
 
 
-def _read(path: Path) -> Any:
+def _read_if_valid(path: Path) -> Any:
     """Return the contents of a JSON file; None if it is missing or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))

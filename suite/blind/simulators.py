@@ -24,7 +24,7 @@ from suite.blind.rotorpy_flight import fly_rotorpy
 Trajectories = Sequence[Trajectory]
 Random = np.random.Generator
 LogFlights = Callable[[Random | None], tuple[FlightLog, ...]]
-"""Function from the random generator of the noise (None: no noise) to the logs of a case."""
+"""Function (random generator of the noise; None: no noise) -> logs of the flights of a case."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,18 @@ class Simulator:
     nominal: Vehicle
     """The vehicle file for the diagnosis."""
     fly: Callable[..., LogFlights]
-    """Function that flies N trajectories. Its arguments are the true vehicle, the trajectories, the
-    random generator of gusts, and additional physics (optional)."""
+    """Function that flies N trajectories and returns a function that makes their logs. Its
+    arguments are the true vehicle, the trajectories, the random generator of gusts, and additional
+    physics (optional)."""
     conditions: dict[str, Any] = field(default_factory=dict)
-    """Conditions of flight and log, for the answer."""
+    """Conditions of flights and logs, such as rates, which the answer records; may be empty."""
 
 
 def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
-    """Return the simulator of `case`; in continuous time `rng` draws the flights' conditions."""
+    """Return the simulator of `case`.
+
+    For the continuous-time engine `rng` draws the conditions of the flights, such as rates.
+    """
     nominal, sensors = nominal_vehicle(case.vehicle), SENSORS[case.sensors]
 
     def fly_in_steps(

@@ -64,7 +64,7 @@ def run(config: Config, console: Console) -> dict[str, Any]:
 
 
 def _facts(effect: Effect) -> dict[str, Any]:
-    """Return the description of an effect for --json; limits that depend on the vehicle are None."""
+    """Return the description of an effect for --json; limits that vary by vehicle are None."""
     return {
         "summary": effect.summary,
         "equation": effect.equation,

@@ -68,7 +68,7 @@ def list_settings(recipe: str, console: Console) -> list[dict[str, Any]]:
 
 
 class Kind(NamedTuple):
-    """A kind of names. Packages that only the descriptions need are loaded with the descriptions."""
+    """A kind of names. Packages that only the descriptions need are not loaded for the names."""
 
     names: Callable[[], Iterable[str]]
     """Function that returns all names."""
