@@ -1,7 +1,9 @@
 """Make one blind case from its description: flights with hidden effects, their logs, the answer.
 
-The answer has the names that a diagnosis must give. Effects that the flights do not separate come
-from the oracle (`suite/blind/oracle/`), which computes how well flights determine each parameter.
+The answer has the names that a diagnosis must give, and the alternatives: other effects that
+explain the flights as well. The alternatives come from the oracle (`suite/blind/oracle/`), which
+computes how well flights determine each parameter. It expresses a difference as a log-likelihood
+ratio, the squared change of the flights in standard deviations of the noise, divided by two.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from suite.common.errors import WorkFailed
 from suite.diagnose.plan import SEPARATIONS
 
 TRIES = 6
-"""Number of draws of flights and strengths before a case fails."""
+"""Number of draws of flights and strengths; if none is valid, the case fails."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,11 @@ class Built:
     """The contents of a case."""
 
     nominal: Vehicle
-    """The vehicle file for the diagnosis."""
+    """The vehicle file that the diagnosis gets."""
     truth: Vehicle
-    """The flown vehicle."""
+    """The vehicle that flew, with the hidden effects."""
     trajectories: tuple[Trajectory, ...]
-    """The commanded trajectories."""
+    """The commanded trajectories, one for each flight."""
     logs: tuple[FlightLog, ...]
     """The logs of the flights, with noise."""
     answer: dict[str, Any]
@@ -59,6 +61,8 @@ class Built:
 
 def build(case: Case) -> Built:
     """Make the case; the same description always gives the same bits.
+
+    A draw can fail, such as a flight that crashes. Then the next one is tried.
 
     Raises:
         WorkFailed: if no draw of flights and strengths gave valid flights.
@@ -78,13 +82,14 @@ class _Unsuitable(Exception):
 
 def _attempt(case: Case, rng: np.random.Generator) -> Built:
     """Make the case with one draw of flights and strengths, from `rng`."""
-    ways, sensors = _trajectories(case, rng), SENSORS[case.sensors]
+    trajectories, sensors = _trajectories(case, rng), SENSORS[case.sensors]
     simulator = simulator_for(case, rng)
     nominal = simulator.nominal
     if case.kind == "outside":
-        return _outside(case, simulator, sensors, ways, rng)
+        return _build_outside(case, simulator, sensors, trajectories, rng)
+    # 1. Draw the hidden effects: change of the parameters, strength, values.
     changes, multiples, effects = {}, {}, {}
-    # A pair's truth must not depend on the logged channels.
+    # A blurred and a separated case are twins, so their truth must not depend on the channels.
     table = "capture" if case.separation >= 0 else case.sensors
     for name in case.hidden:
         change, multiple = draw_change(rng, nominal, table, name, case.multiple)
@@ -95,8 +100,9 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
     has_voltage = bool(sensors.voltage)
     if case.separation >= 0 and has_voltage:
         _depend_on_voltage(nominal, changes, effects)
+    # 2. Fly, and compute the names that the flights allow; random effects are not reproducible.
     truth = with_effects(simulator.nominal, effects)
-    flown = simulator.fly(truth, ways, rng)
+    flown = simulator.fly(truth, trajectories, rng)
     steady = {name: change for name, change in changes.items() if not EFFECTS[name].random}
     expected = _expected_names(case, nominal, flown(None), sensors, steady) if steady else {}
     answer = {
@@ -112,7 +118,7 @@ def _attempt(case: Case, rng: np.random.Generator) -> Built:
             for name in case.hidden
         ],
     }
-    return _built(case, simulator, truth, ways, flown, answer, rng)
+    return _built(case, simulator, truth, trajectories, flown, answer, rng)
 
 
 def _expected_names(
@@ -122,7 +128,13 @@ def _expected_names(
     sensors: Sensors,
     changes: dict[str, np.ndarray],
 ) -> dict[str, dict[str, Any]]:
-    """Return for each effect in `changes` its strength and the names that may replace it."""
+    """Return for each effect in `changes` its strength and its alternatives.
+
+    The strength is `sigma`, the change of the flights in standard deviations. `required` are the
+    alternatives that a diagnosis must name too, `allowed` those that it may name. `left_over` has
+    the log-likelihood ratio that remains with each alternative, `left_over_of_long_stretches` the
+    same for longer rollouts.
+    """
     info = information(nominal, logs, sensors)
     if case.kind == "pair":
         _check_pair(info, changes, nominal)
@@ -144,7 +156,11 @@ def _expected_names(
 def _depend_on_voltage(
     nominal: Vehicle, changes: dict[str, np.ndarray], effects: dict[str, Any]
 ) -> None:
-    """Make effects of the battery depend on its voltage instead of time, in place."""
+    """Make the effects of the battery depend on its voltage instead of time.
+
+    `changes` and `effects` are changed in place. A log with a voltage allows to identify the
+    dependence on the voltage.
+    """
     for name in effects:
         convert = EFFECTS[name].with_voltage
         if convert is not None:
@@ -157,37 +173,37 @@ def _depend_on_voltage(
 
 
 def _blurred_strength(case: Case, nominal: Vehicle, name: str, change: np.ndarray) -> np.ndarray:
-    """Return `change` scaled to `case.multiple` times the strength detectable on gentle flights.
+    """Return `change` scaled to `case.multiple` times the strength detectable on blurred flights.
 
-    Gentle flights are less informative than those of the table of strengths, and a diagnosis can
-    only name a change that is detectable.
+    Blurred flights are gentle, so they are less informative than the flights of the table of
+    strengths. A diagnosis can only name a change that is detectable.
     """
     sensors = SENSORS["capture"]
-    ways = SEPARATIONS[case.separation].blurred
-    flights = fly(nominal, nominal, [*ways, *ways], sensors.rate_hz)
+    trajectories = SEPARATIONS[case.separation].blurred
+    flights = fly(nominal, nominal, [*trajectories, *trajectories], sensors.rate_hz)
     logs = [log_of(flight, nominal, sensors, None) for flight in flights]
     info = information(nominal, logs, sensors, [name])
     return case.multiple * detectable(info.block(name), change) * change
 
 
-def _outside(
+def _build_outside(
     case: Case,
     simulator: Simulator,
     sensors: Sensors,
-    ways: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory],
     rng: np.random.Generator,
 ) -> Built:
-    """Build a case with physics that no effect describes.
+    """Make a case with physics that no effect describes.
 
-    Its strength is computed on a flight at the usual strength: `case.multiple` times the strength
-    that is just detectable after a fit of the whole catalogue.
+    The strength is `case.multiple` times the strength that is just detectable after a fit of all
+    effects of the catalogue. It is computed from a flight at the usual strength.
     """
     name, nominal = case.hidden[0], simulator.nominal
     kind = KINDS[name]
 
     def fly_at(strength: float) -> tuple[LogFlights, float]:
         extra = make_outside(name, strength, nominal.mass)
-        flown = simulator.fly(nominal, ways, rng, extra)
+        flown = simulator.fly(nominal, trajectories, rng, extra)
         return flown, unexplained_ratio(nominal, flown(None), sensors)
 
     _, ratio = fly_at(kind.usual)
@@ -206,21 +222,21 @@ def _outside(
             "multiple": float(np.sqrt(ratio / THRESHOLD)),
         },
     }
-    return _built(case, simulator, simulator.nominal, ways, flown, answer, rng)
+    return _built(case, simulator, simulator.nominal, trajectories, flown, answer, rng)
 
 
 def unexplained_ratio(nominal: Vehicle, logs: Sequence[FlightLog], sensors: Sensors) -> float:
-    """Return the log-likelihood ratio that remains after a joint fit of the whole catalogue."""
+    """Return the log-likelihood ratio that remains after a joint fit of all effects."""
     block = linearised(nominal, logs, sensors, columns_of(bool(sensors.voltage)))
     residual, jacobian = block.residual.ravel(), block.slope.reshape(block.residual.size, -1)
-    size = np.linalg.norm(jacobian, axis=0)
-    jacobian = jacobian[:, size > 0.0] / size[size > 0.0]
+    column_norm = np.linalg.norm(jacobian, axis=0)
+    jacobian = jacobian[:, column_norm > 0.0] / column_norm[column_norm > 0.0]
     fitted = np.linalg.lstsq(jacobian, residual, rcond=1e-6)[0]
     return float(0.5 * ((residual - jacobian @ fitted) ** 2).sum())
 
 
 def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
-    """Return the trajectories of the case's kind."""
+    """Return the trajectories of a case; slow effects need long flights."""
     if case.separation >= 0:
         entry = SEPARATIONS[case.separation]
         added = entry.separating if case.kind == "separated" else ()
@@ -231,7 +247,11 @@ def _trajectories(case: Case, rng: np.random.Generator) -> list[Trajectory]:
 
 
 def _check_pair(info: Information, changes: dict[str, np.ndarray], nominal: Vehicle) -> None:
-    """Reject two effects if one of them could explain the flights: that is another kind of case."""
+    """Reject two effects if one of them explains most of the other: they would be hard to separate.
+
+    Raises:
+        _Unsuitable: for such a pair.
+    """
     first, second = changes
     for name, other in ((first, second), (second, first)):
         ratio = remaining_ratio(info, {name: changes[name]}, name, other, nominal)
@@ -243,19 +263,19 @@ def _built(
     case: Case,
     simulator: Simulator,
     truth: Vehicle,
-    ways: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory],
     flown: LogFlights,
     answer: dict[str, Any],
     rng: np.random.Generator,
 ) -> Built:
-    """Return the case with noisy logs, and an answer that describes how it was made."""
+    """Return the case with noisy logs, and with an answer that also says how it was made."""
     logs = flown(rng)
     answer = {
         **answer,
         **({"conditions": simulator.conditions} if simulator.conditions else {}),
         "case": asdict(case),
-        "trajectories": [asdict(way) for way in ways],
+        "trajectories": [asdict(way) for way in trajectories],
         # Without a salt a short answer could be guessed from its hash.
         "salt": rng.bytes(16).hex(),
     }
-    return Built(simulator.nominal, truth, tuple(ways), logs, answer)
+    return Built(simulator.nominal, truth, tuple(trajectories), logs, answer)

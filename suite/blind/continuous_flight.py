@@ -118,7 +118,7 @@ class _Pilot:
     def push(self, states: Rows, force_b: np.ndarray, length_s: np.ndarray) -> np.ndarray:
         """Return the force of the additional physics in a step, (N, 3) in body axes [N].
 
-        `force_b` (N, 3) is the force of everything else [N], `length_s` (N, 1) that of the step [s].
+        `force_b` (N, 3) is the force of everything else [N], `length_s` (N, 1) the step's length.
         """
         assert self._extra is not None
         motion = Motion(states.pos_w, states.rot_w, states.vel_w, states.rate_b)

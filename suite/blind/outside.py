@@ -23,7 +23,7 @@ from tracks.common.names import unknown_name
 from tracks.geometry.rotation import to_local
 
 Law = Callable[[float, float, Motion, Wrench, float], np.ndarray]
-"""Function (strength, true mass [kg], motion, wrench, time [s]) -> acceleration (N, 3) in world axes
+"""Function (strength, true mass [kg], motion, wrench, time [s]) -> acceleration (N, 3), world axes
 [m/s^2]."""
 
 
@@ -99,7 +99,7 @@ class Hysteresis(Outside):
     _acting = np.zeros(0)
 
     def command(self, command: Command, time_s: float) -> Command:
-        """Return the command with the acting thrust, which changes only at the edges of the play."""
+        """Return the command with the acting thrust, which moves only at the edges of the play."""
         half_width = 0.5 * self.strength
         before = self._acting if self._acting.size else command.thrust
         self._acting = np.clip(before, command.thrust - half_width, command.thrust + half_width)

@@ -1,8 +1,9 @@
 """Effects on thrust, force and torque in the continuous-time engine, and the wind.
 
 Each effect follows its equation in the catalogue of effects, but shares no code with it. A `Moment`
-has the inputs for N flights. Thrusts are changed in the order of `THRUSTS`: first additions to a
-rotor's thrust, then factors. The wind is steady, with gusts that are first-order coloured noise.
+has the inputs of the equations, for N flights. The effects in `THRUSTS` change the thrusts of the
+rotors in this order: first additions to a thrust, then factors. The wind is steady, with gusts that
+are first-order coloured noise. In the equations, e3 is the body axis z, and x a cross product.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Moment(NamedTuple):
     rot_w: np.ndarray
     """(N, 3, 3) attitude, body to world."""
     air_b: np.ndarray
-    """(N, 3) v_b, velocity relative to the air in body axes [m/s]."""
+    """(N, 3) velocity relative to the air, v_b in the equations, body axes [m/s]."""
     rate_b: np.ndarray
     """(N, 3) body rates w [rad/s]."""
     speed: np.ndarray
@@ -43,14 +44,14 @@ class Moment(NamedTuple):
 
 
 Force = Callable[[Any, Moment], np.ndarray]
-"""Function from an effect's values and a moment to a force or torque (N, 3), body axes."""
+"""Function (values of an effect, moment) -> force [N] or torque [N m], (N, 3) in body axes."""
 Thrust = Callable[[Any, Moment, np.ndarray], np.ndarray]
-"""Function from an effect's values, a moment and the thrusts (N, 4) [N] to changed thrusts."""
+"""Function (values of an effect, moment, thrusts (N, 4) [N]) -> changed thrusts."""
 
 GROUND_CAP = 1.5
-"""Largest factor of the ground effect on a thrust."""
+"""Largest factor by which the ground effect increases a thrust."""
 GROUND_HEIGHT = 1e-3
-"""Least height of a rotor in the ground effect's equation [m]."""
+"""Least height of a rotor in the equation of the ground effect [m]."""
 
 
 def _inflow(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
@@ -59,7 +60,7 @@ def _inflow(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
 
 
 def _ground_effect(effect: Any, at: Moment, thrust: np.ndarray) -> np.ndarray:
-    """Rotor thrust x 1 / (1 - g (r / 4 z_i)^2), z_i its height above z = 0, at most 1.5."""
+    """Rotor thrust times 1 / (1 - g (r / 4 z_i)^2), at most 1.5; z_i is the rotor's height."""
     height = at.pos_w[:, 2:] + at.rot_w[:, 2] @ at.arm.T
     ratio = effect.rotor_radius / (4.0 * np.maximum(height, GROUND_HEIGHT))
     share = effect.strength * ratio**2
@@ -134,14 +135,14 @@ THRUSTS: dict[str, Thrust] = {
     "ground_effect": _ground_effect,
     "battery_sag": _battery_sag,
 }
-"""Effect -> its change of the thrusts (N, 4) [N]."""
+"""Effect -> function that changes the thrusts (N, 4) [N]."""
 FORCES: dict[str, Force] = {
     "linear_drag": _linear_drag,
     "quadratic_drag": _quadratic_drag,
     "rotor_drag": _rotor_drag,
     "translational_lift": _translational_lift,
 }
-"""Effect -> its force on the centre of mass (N, 3), body axes [N]."""
+"""Effect -> function that returns the force on the centre of mass (N, 3), body axes [N]."""
 TORQUES: dict[str, Force] = {
     "blade_flapping": _blade_flapping,
     "torque_trim": _torque_trim,
@@ -149,17 +150,17 @@ TORQUES: dict[str, Force] = {
     "rotor_spin_up": _rotor_spin_up,
     "angular_damping": _angular_damping,
 }
-"""Effect -> its torque (N, 3), body axes [N m]."""
+"""Effect -> function that returns the torque (N, 3), body axes [N m]."""
 WINDS = ("constant_wind", "gusts")
 """Effects that move the air."""
 VERTICAL_SHARE = 0.5
 """Intensity of vertical gusts divided by that of horizontal ones."""
 MIN_AIRSPEED = 1.0
-"""Least airspeed in the correlation time of gusts [m/s]."""
+"""Least airspeed in the formula for the correlation time of gusts [m/s]."""
 
 
 class Wind:
-    """Wind on N flights, computed at the ends of each step and linear between them."""
+    """Wind on N flights, computed at both ends of each step and linear between them."""
 
     def __init__(self, effects: dict[str, Any], count: int, rng: np.random.Generator) -> None:
         """Prepare for `count` flights; gusts start from their stationary distribution."""
@@ -174,6 +175,7 @@ class Wind:
 
     @property
     def _intensity(self) -> np.ndarray:
+        """(3,) standard deviation of the gusts along the world axes [m/s]."""
         assert self._gusts is not None
         return float(self._gusts.intensity) * np.array([1.0, 1.0, VERTICAL_SHARE])
 
@@ -183,7 +185,7 @@ class Wind:
         return self._steady_w + self._gust_w
 
     def step(self, vel_w: np.ndarray, length_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the wind (N, 3) at the start and at the end of a step, and advance it [m/s].
+        """Advance the wind by a step; return it (N, 3) at the start and at the end [m/s].
 
         Gusts follow dw/dt = -w / tau + noise with tau = length / max(airspeed, 1), solved exactly
         for a tau that is constant in the step.

@@ -1,6 +1,7 @@
 """Forces and torques on a flying body, and the derivative of its state.
 
-This is part of the continuous-time engine, which is separate from the model of the diagnosis.
+This is a part of the continuous-time engine, which shares no code with the model of the diagnosis.
+In the shapes, N is the number of flights, which are computed together.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from suite.blind.continuous.air import FORCES, THRUSTS, TORQUES, Moment, Wind
 from suite.blind.continuous.quadrotor import Quadrotor
 
 POS, VEL, QUAT, RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
-"""Parts of a state (N, 13): position and velocity in world axes, attitude (quaternion wxyz, body to
-world), body rates."""
+"""Columns of a state (N, 13): position and velocity in world axes, attitude (quaternion wxyz, body
+to world), body rates."""
 
 
 class Battery(NamedTuple):
@@ -37,7 +38,7 @@ class Body:
         """Prepare for N flights.
 
         Args:
-            quadrotor: the true constants.
+            quadrotor: constants of the vehicle that flies.
             wind: the moving air.
             battery: constants of the battery.
             hover_power: (N, 1) sum of the squared rotor speeds in hover [rad^2/s^2].
@@ -64,7 +65,9 @@ class Body:
         return self._wind_at_ends_w[0]
 
     def begin_row(self, time_s: np.ndarray, speed: np.ndarray) -> None:
-        """Set the wind at the start of a row, and store the voltage drop of the first row.
+        """Set the wind at a row of the log, and store the voltage drop of the first row.
+
+        The first row is the first one at a time of 0 or later.
 
         Args:
             time_s: (N, 1) time of the row [s].
@@ -83,14 +86,14 @@ class Body:
         """Set the commanded rotor speeds of a step.
 
         Args:
-            speed: (N, 4) rotor speeds at its start [rad/s].
+            speed: (N, 4) rotor speeds at the start of the step [rad/s].
             speed_cmd: (N, 4) commanded rotor speeds [rad/s].
             length_s: (N, 1) length of the step [s].
         """
         if self.quadrotor.time_constant > 0.0:
             self._speed_cmd = speed_cmd
         else:
-            # Rotors without lag reach the command within the step.
+            # Rotors without lag reach the command within the step, at a constant rate.
             self._spin_up = (speed_cmd - speed) / np.maximum(length_s, 1e-9)
 
     def spin_up(self, speed: np.ndarray) -> np.ndarray | float:
@@ -100,12 +103,12 @@ class Body:
         return (self._speed_cmd - speed) / self.quadrotor.time_constant
 
     def wind_w(self, share: float) -> np.ndarray:
-        """Return the wind (N, 3) at a fraction `share` of the present step [m/s]."""
+        """Return the wind (N, 3) at a fraction `share` (0 to 1) of the present step [m/s]."""
         before, after = self._wind_at_ends_w
         return before + share * (after - before)
 
     def drop(self, time_s: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return the voltage drop below a full battery in hover (N, 1) [V].
+        """Return how far the voltage is below that of a full battery in hover (N, 1) [V].
 
         Args:
             time_s: (N, 1) time since the first row [s].
@@ -137,6 +140,7 @@ class Body:
             drop_since_start = np.zeros_like(time_s)
         else:
             drop_since_start = self.drop(time_s, speed) - self._first_drop
+        # Everything that the equations of the effects need.
         moment = Moment(
             q.mass, q.inertia, q.arm, q.spin, state[:, POS], rot_w, air_b,
             state[:, RATE], speed, time_s, drop_since_start, self.spin_up(speed),
@@ -159,7 +163,8 @@ class Body:
     ) -> np.ndarray:  # fmt: skip
         """Return the derivative of the state (N, 13) at a fraction `share` of the present step.
 
-        `push_b` (N, 3) is an additional force, body axes [N]; the others are those of `forces`.
+        `push_b` (N, 3) is an additional force in body axes [N]. The other arguments are those of
+        `forces`.
         """
         q = self.quadrotor
         force_b, torque_b, rot_w = self.forces(state, speed, time_s, self.wind_w(share))
@@ -181,7 +186,10 @@ def rotation(quat_wxyz: np.ndarray) -> np.ndarray:
 
 
 def _quadratic(terms: str) -> np.ndarray:
-    """Return the coefficients (16,) of products of a quaternion's parts, as in "+2xy -2wz"."""
+    """Return the coefficients (16,) of the products of two parts of a quaternion.
+
+    `terms` has them as text, such as "+2xy -2wz".
+    """
     coefficients = np.zeros((4, 4))
     for sign, factor, first, second in terms.split():
         coefficients["wxyz".index(first), "wxyz".index(second)] += float(sign + factor)
@@ -196,7 +204,8 @@ _ROTATION = np.stack(
     ],
     axis=1,
 )
-"""(16, 9) coefficients from products of a quaternion's parts to its rotation matrix, row by row."""
+"""(16, 9) matrix that gives a rotation matrix, row by row, from the products of two parts of a
+quaternion."""
 # d(w, x, y, z)/dt = q (0, rate) / 2: a matrix (4, 3) for each part of q.
 _PRODUCT = np.array(
     [
@@ -207,4 +216,4 @@ _PRODUCT = np.array(
     ],
     dtype=float,
 ).reshape(4, 12)
-"""(4, 12) coefficients from a quaternion to the matrix (4, 3) of its product with (0, rate)."""
+"""(4, 12) matrix that gives, from a quaternion, the matrix (4, 3) of its product with (0, rate)."""

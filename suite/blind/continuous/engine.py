@@ -1,8 +1,9 @@
 """The continuous-time engine: it integrates rigid body, rotors and air by Runge-Kutta of order 4.
 
-Events are rows of the log, ticks of the rate loop, and delayed commands that begin to act. Between
-two events the commanded rotor speeds are constant, so the rotors' lag is solved exactly. The rigid
-body is integrated in steps that end at every event.
+Events are rows of the log, ticks of the rate loop (the times at which it computes), and delayed
+commands that begin to act. Between two events the commanded rotor speeds are constant, so the lag
+of the rotors is solved exactly. The rigid body is integrated in steps, one of which ends at each
+event. N flights are computed together.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ class Rows(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """N flights: their states at S + 1 ends of steps, and at R rows before their commands act."""
+    """N flights: their states at the S + 1 ends of S steps, and what is logged at R rows."""
 
     schedule: Schedule
-    """Rows and steps."""
+    """The times of rows and steps."""
     time_s: np.ndarray
-    """(S + 1, N) times [s]."""
+    """(S + 1, N) times of the ends of the steps [s]."""
     state: np.ndarray
     """(S + 1, N, 13) states; `suite.blind.continuous.body` has the order."""
     speed: np.ndarray
@@ -51,19 +52,18 @@ class Flown(NamedTuple):
     command: np.ndarray
     """(R, N, 4) logged commands: thrust [m/s^2], body rates [rad/s]."""
     acting: np.ndarray
-    """(R, N, 4) commands that act, before their delay."""
+    """(R, N, 4) commands that act after their delay; additional physics may have changed them."""
     acc_b: np.ndarray
-    """(R, N, 3) specific force [m/s^2]."""
+    """(R, N, 3) specific force, what an accelerometer measures [m/s^2]."""
     voltage: np.ndarray
     """(R, N) voltage of the battery [V]."""
 
 
 Pilot = Callable[[Rows], tuple[np.ndarray, np.ndarray]]
-"""Function from a row to the logged commands (N, 4) and the commands that act (N, 4)."""
+"""Function (states at a row) -> logged commands (N, 4), commands that act (N, 4)."""
 Push = Callable[[Rows, np.ndarray, np.ndarray], np.ndarray]
-"""Additional physics: function from the states at the start of a step, the force (N, 3) [N] and the
-step's length (N, 1) [s] to a force (N, 3) that is added during the step. Forces are in body axes.
-"""
+"""Additional physics: function (states at the start of a step, force (N, 3) [N], length of the step
+(N, 1) [s]) -> force (N, 3) that is added during the step [N]. Forces are in body axes."""
 
 
 def fly(
@@ -78,10 +78,10 @@ def fly(
     """Fly N flights, which start with the rotors at their speeds in hover.
 
     Args:
-        quadrotor: the true vehicle.
-        plan: rows and steps.
+        quadrotor: constants of the true vehicle.
+        plan: times of rows and steps.
         start: (N, 13) states at the first row.
-        pilot: function that returns the command of each row.
+        pilot: function that returns the commands at each row.
         rng: random generator of gusts.
         battery: constants of the battery.
         push: additional physics; None: none.
@@ -100,6 +100,7 @@ def fly(
     # The commanded rotor speeds change with a tick of the rate loop or a new command.
     is_new = np.any(plan.is_tick, axis=1)
     is_new[1:] |= np.any(plan.acting[1:] != plan.acting[:-1], axis=1)
+    # In all arrays below, the first axis is the row or the step.
     flight = np.arange(count)
     for row in range(rows):
         time_s = plan.stamp_s[row][:, None]
@@ -113,6 +114,7 @@ def fly(
         for step in range(plan.block[row], plan.block[row + 1]):
             begin, length = plan.start_s[step][:, None], plan.length_s[step][:, None]
             states[step], speeds[step] = state, speed
+            # -1 in `acting`: no command has begun to act yet, so the vehicle hovers.
             if is_new[step]:
                 rate_b = np.where(plan.is_tick[step][:, None], state[:, RATE], rate_b)
                 command_row = plan.acting[step]
@@ -138,12 +140,14 @@ def _step(
     lag = body.quadrotor.time_constant
     body.set_command(speed, speed_cmd, length)
     half = 0.5 * length
+    # Rotor speeds at the middle and the end of the step, exactly.
     if lag > 0.0:
         error = speed - speed_cmd
         middle_speed = speed_cmd + error * np.exp(-half / lag)
         end_speed = speed_cmd + error * np.exp(-length / lag)
     else:
         speed = middle_speed = end_speed = speed_cmd
+    # Runge-Kutta of order 4 for the rigid body.
     k1 = body.derivative(state, speed, begin, 0.0, push_b)
     k2 = body.derivative(state + half * k1, middle_speed, begin + half, 0.5, push_b)
     k3 = body.derivative(state + half * k2, middle_speed, begin + half, 0.5, push_b)

@@ -1,6 +1,7 @@
 """Make the flight log of a simulated flight: faults of the log, noise, and lost rows.
 
-The noise is white, or partly coloured as that of a state estimator.
+The noise is white, or partly coloured (correlated in time), like the errors of a state estimator.
+In the shapes, T is the number of rows of a log.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from suite.blind.continuous.engine import Flown
 from suite.blind.continuous.timing import Conditions
 
 LOST_ROWS = 3
-"""Number of consecutive rows without a pose."""
+"""Number of consecutive rows without a pose when a pose is lost."""
 
 
 class Noise(NamedTuple):
-    """Standard deviations of the noise of rows at `rate_hz`; 0 leaves a channel out of the log."""
+    """Standard deviations of the noise in rows at `rate_hz`; with 0 the log lacks the channel."""
 
     rate_hz: float
     """Rate of the rows to which the deviations refer [Hz]."""
@@ -60,10 +61,10 @@ def log_of_flight(
         flown: all flights.
         index: index of the flight.
         duration_s: duration of the log [s].
-        faults: effect -> its values; only faults of a log are used.
-        noise: deviations at their own rate. Rows at another rate have the same noise density, so
-            deviations are multiplied by the root of the rates' ratio.
-        conditions: conditions of the case.
+        faults: effect -> its values. Only effects on the log are used, such as a gyro bias.
+        noise: standard deviations at a given rate. Rows at another rate have the same noise
+            density, so the deviations are multiplied by the square root of the ratio of the rates.
+        conditions: rates, jitter, lost rows and colour of the noise.
         rng: random generator of noise, time stamps and lost rows; None: no errors.
         name: name of the log.
         about: metadata of the log.
@@ -72,14 +73,16 @@ def log_of_flight(
     # Rounding of a stamp must not remove the first row.
     rows = np.flatnonzero((stamps > -1e-9) & (stamps < duration_s))
     time_s = stamps[rows]
+    # 1. The true states at the rows; with a clock offset the pose is that of another time.
     step = flown.schedule.block[rows]
-    delay_s = float(faults["clock_offset"].offset) if "clock_offset" in faults else 0.0
+    offset_s = float(faults["clock_offset"].offset) if "clock_offset" in faults else 0.0
     state = flown.state[step, index]
-    pose = state if delay_s == 0.0 else state_at(flown, index, time_s - delay_s)
+    pose = state if offset_s == 0.0 else state_at(flown, index, time_s - offset_s)
     pos_w, vel_w, quat = pose[:, POS], pose[:, VEL], pose[:, QUAT]
     rate_b = state[:, RATE] + _bias(faults, "gyro_bias")
     acc_b = flown.acc_b[rows, index] + _bias(faults, "accelerometer_bias")
     speed, voltage = flown.speed[step, index], flown.voltage[rows, index]
+    # 2. Noise, lost poses, lost rows and errors of the time stamps.
     kept = np.ones(len(rows), bool)
     if rng is not None:
         draws = _NoiseDraws(rng, time_s, noise, conditions)
@@ -139,7 +142,7 @@ def state_at(flown: Flown, index: int, time_s: np.ndarray) -> np.ndarray:
 
 
 def rotate_attitude(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
-    """Return attitudes (T, 4) rotated further by rotation vectors (T, 3) in body axes [rad]."""
+    """Return the attitudes (T, 4), each rotated by a rotation vector (T, 3) in body axes [rad]."""
     before = Rotation.from_quat(quat_wxyz, scalar_first=True)
     return (before * Rotation.from_rotvec(angle_b)).as_quat(scalar_first=True)
 
@@ -154,12 +157,15 @@ class _NoiseDraws:
         self._rate_hz, self._conditions = noise.rate_hz, conditions
 
     def white_noise(self, sigma: float, size: int, share: float = 1.0) -> np.ndarray:
-        """Return white noise (T, size) with a share of the density of `sigma`."""
+        """Return white noise (T, size), whose density is a `share` of that with `sigma`."""
         factor = np.sqrt(share * self._conditions.row_hz / self._rate_hz)
         return sigma * factor * self._rng.standard_normal((len(self._time_s), size))
 
     def estimator_noise(self, sigma: float) -> np.ndarray:
-        """Return noise (T, 3) with a coloured part, of the same density at low frequencies."""
+        """Return noise (T, 3) that is partly coloured.
+
+        At low frequencies it has the same density as white noise with `sigma`.
+        """
         share, colour_s = self._conditions.coloured, self._conditions.colour_s
         white = self.white_noise(sigma, 3, 1.0 - share)
         # The density of a first-order process at zero frequency is 2 tau sigma^2.
@@ -167,7 +173,7 @@ class _NoiseDraws:
         return white + coloured_sigma * gauss_markov(self._rng, self._time_s, colour_s)
 
     def random_rows(self, share: float) -> np.ndarray:
-        """Return a random `share` of the rows, (T,) bool, without the first two and last four."""
+        """Select a random `share` of the rows, (T,) bool, but not the first two and the last four."""
         is_selected = self._rng.random(len(self._time_s)) < share
         is_selected[:2] = is_selected[-4:] = False
         return is_selected
@@ -179,7 +185,7 @@ def gauss_markov(rng: np.random.Generator, time_s: np.ndarray, colour_s: float) 
     Args:
         rng: random generator.
         time_s: (T,) increasing times [s].
-        colour_s: correlation time [s]: the correlation over dt is exp(-|dt| / colour_s).
+        colour_s: correlation time [s]; the correlation after a time dt is exp(-|dt| / colour_s).
     """
     draws = rng.standard_normal((len(time_s), 3))
     decays = np.exp(-np.diff(time_s) / colour_s)
@@ -192,5 +198,5 @@ def gauss_markov(rng: np.random.Generator, time_s: np.ndarray, colour_s: float) 
 
 
 def _bias(faults: Mapping[str, Any], name: str) -> np.ndarray:
-    """Return the bias (3,) of a sensor, zero without this fault."""
+    """Return the bias (3,) of a sensor from the effect `name`; zero without this effect."""
     return np.asarray(faults[name].bias, dtype=float) if name in faults else np.zeros(3)

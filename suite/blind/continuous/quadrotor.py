@@ -1,8 +1,9 @@
 """The true constants of a vehicle with its effects, and its controller with nominal constants.
 
-The continuous-time engine shares only definitions with the suite: the five steps of the nominal
-quadrotor (docs) and the equations of the catalogue of effects. It calls no function of the
-catalogue. The controller computes torque from body rates, and rotor speeds from torque.
+The continuous-time engine shares only definitions with the rest of the suite: the documented model
+of the nominal quadrotor, and the equations of the catalogue of effects. It calls no function of the
+catalogue. The controller is the rate loop (body rates to torque) and the mixer (torque to rotor
+speeds). It knows the nominal constants only, as on a real drone.
 """
 
 from __future__ import annotations
@@ -26,29 +27,31 @@ LOG_FAULTS = ("gyro_bias", "accelerometer_bias", "clock_offset")
 
 
 class NominalConstants(NamedTuple):
-    """Constants of the rate loop and the mixer: the vehicle file's nominal values."""
+    """Constants of the rate loop and the mixer: the nominal values, those in the vehicle file."""
 
     mass: float
     """Nominal mass [kg]."""
     inertia: np.ndarray
     """(3,) nominal inertia [kg m^2]."""
     rate_gain: np.ndarray
-    """(3,) true gain K [1/s], since the effect `rate_gain` is an error of the loop itself."""
+    """(3,) gain K of the rate loop [1/s]. It is the true one: the effect `rate_gain` means that the
+    loop has another gain than the vehicle file says."""
     shares: np.ndarray
-    """(4, 4) thrust of each rotor for a unit of (collective, torque about x, y, z)."""
+    """(4, 4) thrust of each rotor (rows) for a unit of collective thrust and of the torques about x,
+    y and z (columns)."""
     thrust_max: float
     """Largest thrust of one rotor [N]."""
     thrust_coefficient: float
-    """k_T [N/(rad/s)^2]."""
+    """Thrust coefficient k_T of a rotor [N/(rad/s)^2]."""
     period_s: float
     """Period of the rate loop [s]."""
 
 
 class Quadrotor(NamedTuple):
-    """The true constants."""
+    """The true constants of the vehicle that flies."""
 
     nominal: NominalConstants
-    """Constants of the controller."""
+    """Constants that the controller uses."""
     mass: float
     """Mass [kg]."""
     inertia: np.ndarray
@@ -60,9 +63,9 @@ class Quadrotor(NamedTuple):
     spin: np.ndarray
     """(4,) directions of rotation s_i, 1 or -1."""
     thrust_coefficient: np.ndarray
-    """(4,) k_T of each rotor [N/(rad/s)^2]."""
+    """(4,) thrust coefficient k_T of each rotor [N/(rad/s)^2]."""
     torque_coefficient: np.ndarray
-    """(4,) k_Q of each rotor [N m/(rad/s)^2]."""
+    """(4,) torque coefficient k_Q of each rotor [N m/(rad/s)^2]."""
     thrust_axis: np.ndarray
     """(3,) unit vector of the total thrust, body axes."""
     time_constant: float
@@ -74,7 +77,7 @@ class Quadrotor(NamedTuple):
 
 
 def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
-    """Return the true vehicle and its controller from the numbers of `vehicle`.
+    """Return the constants of `vehicle` with its effects, and those of its controller without.
 
     Raises:
         ValueError: for an effect without an equation in this engine.
@@ -90,8 +93,8 @@ def quadrotor_of(vehicle: Vehicle) -> Quadrotor:
 
     def value(effect: str, parameter: str, default: Any) -> Any:
         """Return a parameter of an effect, or the default where the vehicle lacks the effect."""
-        found = getattr(effects[effect], parameter) if effect in effects else default
-        return np.asarray(found, dtype=float)
+        raw_value = getattr(effects[effect], parameter) if effect in effects else default
+        return np.asarray(raw_value, dtype=float)
 
     rotors, controller = vehicle.rotors, vehicle.controller
     hubs, spin = np.array(rotors.position, dtype=float), np.array(rotors.spin, dtype=float)
@@ -131,7 +134,7 @@ def tilted_z(angle: np.ndarray) -> np.ndarray:
 
 
 TINY = 1e-12
-"""Smaller thrusts are rounding errors [N]."""
+"""Thrusts below this are rounding errors [N]."""
 
 
 def commanded_speeds(
@@ -140,9 +143,9 @@ def commanded_speeds(
     """Return the rotor speeds (N, 4) that the rate loop commands [rad/s].
 
     Args:
-        nominal: the controller's constants.
-        command: (N, 4) thrust per nominal mass [m/s^2], body rates [rad/s].
-        rate_b: (N, 3) body rates measured by the loop [rad/s].
+        nominal: constants of the controller.
+        command: (N, 4) commanded thrust per nominal mass [m/s^2] and body rates [rad/s].
+        rate_b: (N, 3) body rates that the rate loop measured at its last tick [rad/s].
     """
     inertia = nominal.inertia
     x, y, z = inertia
@@ -156,31 +159,33 @@ def commanded_speeds(
 def allocate_thrust(
     nominal: NominalConstants, collective: np.ndarray, torque_b: np.ndarray
 ) -> np.ndarray:
-    """Return each rotor's thrust (N, 4) [N].
+    """Return the thrust of each rotor (N, 4) [N].
 
-    If a rotor would exceed [0, f_max], roll and pitch are scaled by one factor until their spread
-    is f_max, the collective is set to the nearest feasible value, and yaw is scaled to the
-    remaining range.
+    If a rotor would leave the range from 0 to f_max, three steps limit the thrusts. Roll and pitch
+    are scaled by one factor until their spread over the rotors is f_max. The collective thrust is
+    set to the nearest feasible value. Yaw is scaled to the range that remains.
 
     Args:
-        nominal: the controller's constants.
+        nominal: constants of the controller.
         collective: (N,) commanded sum of the thrusts [N].
         torque_b: (N, 3) commanded torque, body axes [N m].
     """
     share, limit = nominal.shares[:, 0], nominal.thrust_max
-    tilt = torque_b[:, :2] @ nominal.shares[:, 1:3].T
-    yaw = torque_b[:, 2:] * nominal.shares[:, 3]
-    unlimited = collective[:, None] * share + tilt + yaw
+    tilt_thrust = torque_b[:, :2] @ nominal.shares[:, 1:3].T
+    yaw_thrust = torque_b[:, 2:] * nominal.shares[:, 3]
+    unlimited = collective[:, None] * share + tilt_thrust + yaw_thrust
     saturated = np.any((unlimited < 0.0) | (unlimited > limit), axis=1)
     if not saturated.any():
         return unlimited
-    spread = tilt.max(axis=1) - tilt.min(axis=1)
-    tilt = tilt * np.minimum(1.0, limit / np.maximum(spread, TINY))[:, None]
-    least = (-tilt / share).max(axis=1)
-    most = ((limit - tilt) / share).min(axis=1)
-    without_yaw = np.minimum(np.maximum(collective, least), most)[:, None] * share + tilt
-    room = np.where(yaw > 0.0, limit - without_yaw, without_yaw)
-    yaws = np.abs(yaw) > TINY
-    ratio = np.where(yaws, np.maximum(room, 0.0) / np.where(yaws, np.abs(yaw), 1.0), 1.0)
-    limited = without_yaw + np.minimum(ratio.min(axis=1, keepdims=True), 1.0) * yaw
+    spread = tilt_thrust.max(axis=1) - tilt_thrust.min(axis=1)
+    tilt_thrust = tilt_thrust * np.minimum(1.0, limit / np.maximum(spread, TINY))[:, None]
+    least = (-tilt_thrust / share).max(axis=1)
+    most = ((limit - tilt_thrust) / share).min(axis=1)
+    without_yaw = np.minimum(np.maximum(collective, least), most)[:, None] * share + tilt_thrust
+    room = np.where(yaw_thrust > 0.0, limit - without_yaw, without_yaw)
+    has_yaw = np.abs(yaw_thrust) > TINY
+    ratio = np.where(
+        has_yaw, np.maximum(room, 0.0) / np.where(has_yaw, np.abs(yaw_thrust), 1.0), 1.0
+    )
+    limited = without_yaw + np.minimum(ratio.min(axis=1, keepdims=True), 1.0) * yaw_thrust
     return np.where(saturated[:, None], np.clip(limited, 0.0, limit), unlimited)

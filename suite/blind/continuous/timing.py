@@ -1,8 +1,9 @@
 """Timing in the continuous-time engine: random rates and jitter, and the schedule of the steps.
 
-Events are rows of the log, ticks of the rate loop, and delayed commands that begin to act. Every
-event is the end of a step, so that nothing jumps within a step. The steps of N flights are aligned
-row by row; a flight with fewer steps between two rows has steps of zero length before the next row.
+Events are rows of the log, ticks of the rate loop (the times at which it computes), and delayed
+commands that begin to act. A step ends at every event, so that nothing jumps within a step. N
+flights are computed together, so they have the same number of steps between two rows. A flight that
+needs fewer gets steps of zero length before the next row.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ import numpy as np
 STEP_S = 1e-3
 """Longest step [s]."""
 SAME_S = 1e-9
-"""Events closer than this are merged [s]."""
+"""Events whose times differ by less than this are one event [s]."""
 
 
 class Schedule(NamedTuple):
-    """R rows and S steps of N flights."""
+    """The times of R rows and S steps of N flights."""
 
     stamp_s: np.ndarray
-    """(R + 1, N) times of rows and their commands; the last is the end of the flight [s]."""
+    """(R + 1, N) times of the rows, at which commands are given; the last is the end of the flight
+    [s]."""
     block: np.ndarray
-    """(R + 1,) index of the first step after each row."""
+    """(R + 1,) index of the first step after each row; the last is S."""
     start_s: np.ndarray
     """(S, N) start of each step [s]."""
     length_s: np.ndarray
@@ -32,7 +34,7 @@ class Schedule(NamedTuple):
     is_tick: np.ndarray
     """(S, N) whether the rate loop runs at the start of the step."""
     acting: np.ndarray
-    """(S, N) index of the row whose command acts in the step; -1 before the first."""
+    """(S, N) index of the row whose command acts in the step; -1 before the first command acts."""
 
 
 def jittered_stamps(
@@ -41,8 +43,8 @@ def jittered_stamps(
 ) -> np.ndarray:  # fmt: skip
     """Return the time stamps (R + 1, N) of rows from `start_s` past `end_s` [s].
 
-    Rows are nominally 1 / `rate_hz` apart. The row at time 0 has no jitter; the others have a
-    uniform jitter of up to `jitter` rows.
+    Rows are nominally 1 / `rate_hz` apart. The row at time 0 has no jitter. The other rows are
+    early or late by up to `jitter` times the distance of rows, with a uniform distribution.
     """
     period = 1.0 / rate_hz
     number = np.arange(int(np.ceil(start_s / period)), int(np.ceil(end_s / period)) + 2)
@@ -64,7 +66,7 @@ def schedule(
     """
     flights = [_steps_of_flight(stamps, loop_s, delay_s, step_s) for stamps in stamp_s.T]
     rows = len(stamp_s) - 1
-    # Every row gets the number of steps of the flight that has most.
+    # The number of steps after a row is that of the flight that needs most.
     counts = np.stack([np.bincount(row, minlength=rows) for row, *_ in flights], axis=1)
     padded = counts.max(axis=1)
     block = np.concatenate([[0], np.cumsum(padded)])
@@ -77,20 +79,25 @@ def schedule(
         start_s[steps, index], length_s[steps, index] = start, length
         is_tick[steps, index], acting[steps, index] = tick, command
         # In steps of zero length the command of the step before continues to act.
-        empty = np.ones(len(start_s), bool)
-        empty[steps] = False
-        before = np.maximum.accumulate(np.where(empty, 0, np.arange(len(start_s))))
-        acting[empty, index] = acting[before[empty], index]
+        is_padding = np.ones(len(start_s), bool)
+        is_padding[steps] = False
+        last_real_step = np.maximum.accumulate(np.where(is_padding, 0, np.arange(len(start_s))))
+        acting[is_padding, index] = acting[last_real_step[is_padding], index]
     return Schedule(stamp_s, block, start_s, length_s, is_tick, acting)
 
 
 def _steps_of_flight(
     stamps: np.ndarray, loop_s: float, delay_s: float, step_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the steps of one flight: row, start, length, loop tick, row of the acting command."""
+    """Return the steps of one flight, as five arrays with an entry per step.
+
+    They are the row before the step, its start [s], its length [s], whether the rate loop has a
+    tick at its start, and the row whose command acts.
+    """
+    # 1. Ticks: the loop starts again at every row.
     ticks = np.maximum(np.ceil(np.diff(stamps) / loop_s - SAME_S / loop_s), 1.0).astype(int)
     tick_s = np.repeat(stamps[:-1], ticks) + _rank(ticks) * loop_s
-    # Times at which commands begin to act, unless a tick is at the same time.
+    # 2. Times at which commands begin to act, unless a tick is at the same time.
     acting_s = stamps[:-1] + delay_s
     acting_s = acting_s[acting_s < stamps[-1]]
     after = np.searchsorted(tick_s, acting_s)
@@ -102,7 +109,7 @@ def _steps_of_flight(
     is_tick = np.arange(len(event_s)) < len(tick_s)
     order = np.argsort(event_s, kind="stable")
     event_s, is_tick = event_s[order], is_tick[order]
-    # The time between two events is divided into equal steps.
+    # 3. The time between two events is divided into equal steps.
     between_s = np.diff(np.append(event_s, stamps[-1]))
     steps = np.maximum(np.ceil(between_s / step_s - 1e-6), 1.0).astype(int)
     rank = _rank(steps)
@@ -120,46 +127,51 @@ def _rank(counts: np.ndarray) -> np.ndarray:
 
 
 LOOP_HZ = (200.0, 2000.0)
-"""Range of the rate loops' frequency [Hz]."""
+"""Range of the frequency of the rate loop [Hz]."""
 ROW_HZ = (50.0, 1000.0)
-"""Range of the rows' rate, at most the loop's frequency [Hz]."""
+"""Range of the rate of rows, which is at most the frequency of the loop [Hz]."""
 USUAL_LOOPS = (200.0, 250.0, 400.0, 500.0, 800.0, 1000.0, 1600.0, 2000.0)
-"""Frequencies of half of the cases [Hz]."""
+"""Common frequencies of rate loops; half of the cases have one of them [Hz]."""
 USUAL_ROWS = (50.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0)
-"""Row rates of half of the cases, if the loop is fast enough [Hz]."""
+"""Common rates of rows; half of the cases have one of them that the loop allows [Hz]."""
 JITTER = 0.3
-"""Largest jitter of a stamp, in rows."""
+"""Largest jitter of a time stamp, as a share of the distance of two rows."""
 CLOCK_S = 1e-4
 """Largest error of a logged stamp [s]."""
 DROPPED = 0.01
 """Largest share of rows that the log lacks."""
 COLOUR_S = (0.02, 0.2)
-"""Correlation times of an estimator's errors [s]."""
+"""Range of the correlation time of the errors of a state estimator [s]."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of one case, which are in its answer."""
+    """Rates and errors of the log of one case; the answer of the case records them."""
 
     loop_hz: float
-    """Frequency of the rate loop, which is in the vehicle file [Hz]."""
+    """Frequency of the rate loop, which the vehicle file has too [Hz]."""
     row_hz: float
     """Nominal rate of commands and rows [Hz]."""
     jitter: float
-    """Largest jitter of the true stamps, uniform to both sides [rows]."""
+    """Largest jitter of the true times of rows, to both sides, as a share of the distance of two
+    rows."""
     clock_s: float
     """Largest error of a logged stamp, uniform to both sides [s]."""
     dropped: float
-    """Share of lost rows; their commands act."""
+    """Share of the rows that the log lacks; their commands act all the same."""
     coloured: float
-    """Share of the noise of poses and velocities that is coloured (first-order Gauss-Markov); the
-    other part is white."""
+    """Share of the noise of poses and velocities that is coloured (correlated in time, a first-order
+    Gauss-Markov process); the other part is white."""
     colour_s: float
     """Correlation time of the coloured noise [s]."""
 
 
 def draw_conditions(rng: np.random.Generator) -> Conditions:
-    """Draw the conditions of a case: half have coloured noise, some have no jitter."""
+    """Draw the conditions of a case.
+
+    Half of the cases have coloured noise. One in five has no jitter, one in five no errors of the
+    time stamps, and two in five lose no rows.
+    """
     loop_hz = _rate(rng, USUAL_LOOPS, LOOP_HZ)
     max_row_hz = min(ROW_HZ[1], loop_hz)
     usual = tuple(rate for rate in USUAL_ROWS if rate <= max_row_hz)

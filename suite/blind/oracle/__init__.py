@@ -1,4 +1,5 @@
 """The oracle of the blind cases: how well flights determine each parameter of an effect.
 
-It is computed without a diagnosis, and decides which names an answer allows.
+The oracle does not use the result of a diagnosis. It decides how strong the hidden effects are, and
+which alternatives the answer of a case requires and allows.
 """

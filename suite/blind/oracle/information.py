@@ -1,13 +1,13 @@
 """The Fisher information of flights about all parameters of the catalogue of effects.
 
-With g the whitened Jacobian of all logged channels, the information is G = g^T g. To first order a
-parameter change theta from the nominal vehicle has the expected log-likelihood ratio
-theta^T G theta / 2. The part of it that remains after a fit of another effect is a Schur complement
-of G.
+With g the Jacobian of all logged channels, divided by their noise, the information is G = g^T g. To
+first order a parameter change theta from the nominal vehicle has the expected log-likelihood ratio
+theta^T G theta / 2. This is half of the squared change of the channels, in standard deviations of
+the noise. The part of it that remains after a fit of another effect is a Schur complement of G.
 
-g is the linearisation of the diagnosis's rollouts at the nominal vehicle, along flights without
-noise. Its errors are therefore also errors of the oracle; the simulators of the cases do not depend
-on it.
+g is the linearisation of rollouts (short simulated flights) at the nominal vehicle, along flights
+without noise. The rollouts are those of the diagnosis, so errors of them are also errors of the
+oracle. The simulators of the cases do not depend on them.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ from suite.diagnose.evidence.rollouts import RolloutModel, rollout_evidence, sta
 from suite.diagnose.thresholds import THRESHOLDS
 
 SHORT_S, LONG_S = 0.5, LENGTH_S
-"""Lengths of short and long rollouts [s]; the effect of a force grows with the square of time."""
+"""Lengths of short and long rollouts [s]. Long ones are more sensitive: the displacement by a force
+grows with the square of time."""
 THRESHOLD = 12.5
-"""Expected log-likelihood ratio of a just detectable effect: five sigma."""
+"""Expected log-likelihood ratio of a just detectable effect: five standard deviations (5^2 / 2)."""
 REQUIRED = 0.125
-"""A name with a smaller remaining log-likelihood ratio in long rollouts (half a sigma; two sigma in
-rollouts of twice their length) must be among the alternatives."""
+"""An effect that leaves a smaller log-likelihood ratio in long rollouts must be an alternative. It
+is half a standard deviation, or two of them in rollouts of twice the length."""
 ALLOWED = THRESHOLD
-"""Only a name with a smaller remaining ratio in short rollouts may be among the alternatives."""
+"""Only an effect that leaves a smaller ratio in short rollouts may be an alternative."""
 MOSTLY = 0.25
-"""A name can replace another one only if its remaining ratio is below this share of the whole
-ratio."""
+"""Only an effect that leaves less than this share of the ratio of the true effect may be an
+alternative."""
 GUST_DRAWS = 24
-"""Number of flights with random wind on each trajectory."""
+"""Number of flights with random wind on each trajectory, to estimate the covariance of the wind."""
 LIMITS = replace(THRESHOLDS, most_windows=100_000)
 """Thresholds of the diagnosis, but with no limit on the number of windows."""
 
 
 class Column(NamedTuple):
-    """One component of one parameter, which is a column of the Jacobian."""
+    """One component of one parameter; it belongs to a column of the Jacobian."""
 
     effect: str
     """Name of the effect."""
@@ -62,7 +63,7 @@ class Column(NamedTuple):
 
     @property
     def spec(self) -> Parameter:
-        """The parameter in the catalogue."""
+        """The description of the parameter in the catalogue."""
         parameters = EFFECTS[self.effect].parameters
         return next(parameter for parameter in parameters if parameter.name == self.parameter)
 
@@ -71,7 +72,10 @@ class Column(NamedTuple):
         return float(np.ravel(getattr(values, self.parameter))[self.component])
 
     def room(self, nominal: Vehicle) -> tuple[float, float]:
-        """Return the allowed change down and up from the value in the nominal vehicle."""
+        """Return the largest allowed changes from the value in the nominal vehicle.
+
+        They are the change downwards (negative or 0) and the change upwards.
+        """
         value = self.value(all_values(nominal)[self.effect])
         return bound_value(self.spec.low, nominal) - value, bound_value(
             self.spec.high, nominal
@@ -83,9 +87,10 @@ class Information:
     """The information G of flights with one set of sensors."""
 
     columns: tuple[Column, ...]
-    """The P parameters."""
+    """The P parameter components."""
     matrix: np.ndarray
-    """(P, P) G, in the order of `columns`, in units of the parameters."""
+    """(P, P) the information G; rows and columns are in the order of `columns`, and units are those
+    of the parameters."""
 
     def rows_of(self, effect: str) -> list[int]:
         """Return the indices of the columns of `effect`."""
@@ -98,7 +103,9 @@ class Information:
 
 
 def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
-    """Return the identifiable components of the effects `names`, or of all; no random wind.
+    """Return the identifiable components of the effects `names`, or of all effects.
+
+    Effects that do not depend on the state alone (random wind) have none.
 
     Args:
         has_voltage: whether the battery's voltage is logged.
@@ -135,28 +142,32 @@ def linearised(
     columns: Sequence[Column],
     horizon_s: float = SHORT_S,
 ) -> Block:
-    """Return the residual and Jacobian of rollouts along logs, whitened.
+    """Return the residual and the Jacobian of rollouts along logs, divided by the noise.
 
-    The unknown states at the starts of the rollouts are projected out.
+    The states at the starts of the rollouts are unknown: the part of residual and Jacobian that
+    they could explain is removed (projected out).
 
     Args:
         nominal: the nominal vehicle, at which the rollouts are linearised.
         logs: logs without noise.
-        sensors: their noise; rows at another rate have the same weight per second.
-        columns: parameters of the Jacobian.
-        horizon_s: length of a rollout, and time between their starts [s].
+        sensors: noise of the channels. Rows at another rate get the same weight per second.
+        columns: parameter components, the columns of the Jacobian.
+        horizon_s: length of a rollout, and time between the starts of two rollouts [s].
     """
     space = make_space(nominal)
     entries = [Column(e.effect, e.parameter, e.component or 0) for e in space.entries]
     along = [entries.index(column) for column in columns]
     integrator = logs[0].integrator or "continuous"
+    # Rollouts with logged commands as input (False: not with measured rotor speeds).
     model = RolloutModel(nominal, space, False, bool(sensors.voltage), integrator)
     windows, _ = cut(logs, nominal, False, horizon_s, LIMITS, integrator)
     assert windows is not None, "flights of a case are longer than a second"
     row_s = np.asarray(windows.row_s)
+    # Rows after the horizon do not count.
     windows = windows._replace(valid=windows.valid & (row_s < horizon_s + 1e-6)[..., None])
-    begin = start_estimate(model, windows)
-    linear = model.linearise(begin.theta, begin.free, windows, [*along, *model.starts])
+    start = start_estimate(model, windows)
+    linear = model.linearise(start.theta, start.free, windows, [*along, *model.starts])
+    # Noise of the channels; scaled to the rate of the rows, NaN for a channel that is not logged.
     vector_sigmas = (sensors.pos, sensors.attitude, sensors.vel, sensors.gyro, sensors.acc)
     sigma = np.array([*np.repeat(vector_sigmas, 3), *[sensors.rotor] * 4])
     row_hz = (row_s > 0.0).sum(axis=1).mean() / LENGTH_S
@@ -173,18 +184,19 @@ def gust_strength(
 ) -> float:
     """Return the size of a random wind at which the log-likelihood ratio is `THRESHOLD`.
 
-    The wind adds a covariance to the noise. With lambda its whitened eigenvalues at size s = 1, a
-    window adds (s^2 lambda - log(1 + s^2 lambda)) / 2 to the ratio.
+    The wind adds a covariance to the noise. Let lambda be an eigenvalue of this covariance in a
+    window (a short part of a flight) at size s = 1, divided by the noise. Each lambda adds
+    (s^2 lambda - log(1 + s^2 lambda)) / 2 to the ratio.
 
     Args:
         nominal: the nominal vehicle.
         trajectories: trajectories of the flights.
         sensors: logged channels and their noise.
-        name: the effect; s is its first parameter, and the others are neutral.
+        name: name of the effect; s is its first parameter, and the others have no influence.
         rng: random generator of the wind.
 
     Returns:
-        The size s, infinite if it is beyond the bound of its parameter.
+        The size s; infinite if it is beyond the upper bound of the parameter.
     """
     wind = EFFECTS[name].values(1.0, *neutral(EFFECTS[name], nominal)[1:])
     windy = with_effects(nominal, {name: wind})
@@ -192,6 +204,7 @@ def gust_strength(
     logs = [log_of(flight, nominal, sensors, None) for flight in flights]
     residual = linearised(nominal, logs, sensors, ()).residual
     residual = residual.reshape(GUST_DRAWS, -1, residual.shape[1])
+    # The small matrix of products (draws x draws) has the same eigenvalues as the covariance.
     gram = np.einsum("kwd,lwd->wkl", residual, residual) / GUST_DRAWS
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)
 
@@ -204,12 +217,12 @@ def gust_strength(
 
 
 def log_ratio(matrix: np.ndarray, change: np.ndarray) -> float:
-    """Return the expected log-likelihood ratio of a `change` (P,) for information (P, P)."""
+    """Return the expected log-likelihood ratio of a `change` (P,), for the information (P, P)."""
     return float(0.5 * change @ matrix @ change)
 
 
 def detectable(matrix: np.ndarray, direction: np.ndarray) -> float:
-    """Return the multiple of `direction` (P,) that is just detectable; infinite if never."""
+    """Return the multiple of `direction` (P,) that is just detectable; infinite if none is."""
     ratio = log_ratio(matrix, direction)
     return float(np.sqrt(THRESHOLD / ratio)) if ratio > 1e-12 else float("inf")
 
@@ -225,18 +238,19 @@ def remaining_ratio(
     """Return the log-likelihood ratio that remains if `other` is fitted instead of `instead_of`.
 
     Args:
-        info: information of the case's flights.
-        truth: true effect -> change of its columns from the nominal vehicle.
+        info: information of the flights of the case.
+        truth: true effect -> change of its components from the nominal vehicle.
         instead_of: the true effect that is left out; the other true effects are fitted too.
         other: the effect that is fitted in its place, within its physical bounds.
         nominal: the nominal vehicle.
-        column: index of the only fitted column of `other`; None: all.
+        column: index of the only component of `other` that is fitted; None: all are fitted.
     """
     others_true = [row for name in truth if name != instead_of for row in info.rows_of(name)]
     replaced, fitted = info.rows_of(instead_of), info.rows_of(other)
     fitted = fitted if column is None else [fitted[column]]
     used, count = [*replaced, *fitted, *others_true], len(replaced)
-    # Least squares with a root of the information, whose parameters are scaled to unit diagonal.
+    # Bounded least squares, with a square root of the information as the design matrix. Parameters
+    # are scaled, so that the diagonal of the information is 1.
     matrix = info.matrix[np.ix_(used, used)]
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
@@ -251,11 +265,11 @@ def remaining_ratio(
 def alternatives(
     info: Information, truth: Mapping[str, np.ndarray], nominal: Vehicle
 ) -> dict[str, dict[str, float]]:
-    """Return true effect -> name that may replace it -> remaining log-likelihood ratio.
+    """Return true effect -> possible alternative -> log-likelihood ratio that remains with it.
 
     Arguments are those of `remaining_ratio`.
     """
-    found: dict[str, dict[str, float]] = {name: {} for name in truth}
+    by_effect: dict[str, dict[str, float]] = {name: {} for name in truth}
     for other in nameable_effects():
         if other in truth or EFFECTS[other].random:
             continue
@@ -265,10 +279,10 @@ def alternatives(
         one_at_a_time = any(info.columns[row].spec.one_at_a_time for row in rows)
         columns = range(len(rows)) if one_at_a_time else (None,)
         for name in truth:
-            whole = log_ratio(info.block(name), truth[name])
+            full_ratio = log_ratio(info.block(name), truth[name])
             remaining = min(
                 remaining_ratio(info, truth, name, other, nominal, column) for column in columns
             )
-            if remaining < min(ALLOWED, MOSTLY * whole):
-                found[name][other] = remaining
-    return found
+            if remaining < min(ALLOWED, MOSTLY * full_ratio):
+                by_effect[name][other] = remaining
+    return by_effect

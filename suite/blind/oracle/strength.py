@@ -1,9 +1,10 @@
 """The just detectable strength of each effect, computed from flights without noise.
 
-It depends only on the flights, not on a diagnosis. A change of an effect's parameters is just
+It depends only on the flights, not on a diagnosis. A change of the parameters of an effect is just
 detectable if the expected log-likelihood ratio against the nominal vehicle is
-`information.THRESHOLD`. `suite blind strengths` writes the committed table. An effect that is not
-in it is computed when it is needed.
+`information.THRESHOLD`. The table of strengths is a file of the suite, which the command
+`suite blind strengths` writes. The strength of an effect that is not in the table, such as one of a
+plugin, is computed when it is needed.
 """
 
 from __future__ import annotations
@@ -34,11 +35,13 @@ from tracks.common.files import write_json
 from tracks.common.provenance import stamp
 
 SCHEMA = 1
+"""Version of the table."""
 TABLE = Path(__file__).parent / "strengths.json"
-"""The committed table."""
+"""File of the table of strengths."""
 VEHICLES = Path(__file__).parents[1] / "vehicles"
+"""Folder of the nominal vehicles of the cases."""
 FLIGHTS_SEED = 7_000_000
-"""Seed of the table's flights; no case uses it."""
+"""Seed of the flights from which the table is computed; no case uses it."""
 
 
 def nominal_vehicle(name: str) -> Vehicle:
@@ -52,7 +55,10 @@ def vehicle_names() -> list[str]:
 
 
 def write_table(console: Console) -> Path:
-    """Write the table, `strengths` of every effect by vehicle and sensors, and return its path."""
+    """Write the table of strengths, and return its path.
+
+    It has the entries of every effect, for every nominal vehicle and set of sensors.
+    """
     settings = list(product(vehicle_names(), SENSORS))
     entries: dict[str, Any] = {name: {} for name in vehicle_names()}
     with console.progress("strengths", len(settings)) as update:
@@ -66,7 +72,11 @@ def write_table(console: Console) -> Path:
 
 
 def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any]:
-    """Compute the table's entries of the effects `names`.
+    """Compute the entries of the effects `names` in the table.
+
+    An entry has `columns` (names and indices of the parameter components), and `matrix`, the
+    information about them. A random effect has `detectable` instead of `matrix`, the just
+    detectable size of its first parameter.
 
     Args:
         vehicle: name of the nominal vehicle.
@@ -75,6 +85,7 @@ def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any
     """
     nominal, entries, channels = nominal_vehicle(vehicle), {}, SENSORS[sensors]
     rng = np.random.default_rng(FLIGHTS_SEED)
+    # Slow effects, such as an empty battery, need long flights.
     ordinary, long = ordinary_flights(rng), long_flights(rng)
     for slow, trajectories in ((False, ordinary), (True, long)):
         steady = [n for n in names if EFFECTS[n].slow == slow and not EFFECTS[n].random]
@@ -92,7 +103,7 @@ def strengths(vehicle: str, sensors: str, names: Sequence[str]) -> dict[str, Any
 
 
 def columns_in_table(vehicle: str, sensors: str, effect: str) -> list[Column]:
-    """Return the parameter components of `effect` that define its strength."""
+    """Return the parameter components of `effect` in the table, which define its strength."""
     return [Column(effect, str(p), int(c)) for p, c in _entry(vehicle, sensors, effect)["columns"]]
 
 
@@ -101,7 +112,7 @@ def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndar
 
     Args:
         vehicle: name of the nominal vehicle.
-        sensors: name of the logged channels and their noise.
+        sensors: name of the logged channels and their noise, a key of `SENSORS`.
         effect: name of the effect.
         direction: (P,) change of each of `columns_in_table`.
     """
@@ -114,6 +125,6 @@ def detectable_along(vehicle: str, sensors: str, effect: str, direction: np.ndar
 
 @cache
 def _entry(vehicle: str, sensors: str, effect: str) -> dict[str, Any]:
-    """Return an effect's entry in the table, or compute it."""
+    """Return the entry of an effect in the table; it is computed if the table lacks it."""
     stored = json.loads(TABLE.read_text(encoding="utf-8"))["vehicles"][vehicle][sensors].get(effect)
     return strengths(vehicle, sensors, [effect])[effect] if stored is None else stored
