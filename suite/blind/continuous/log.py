@@ -173,7 +173,7 @@ class _NoiseDraws:
         return white + coloured_sigma * gauss_markov(self._rng, self._time_s, colour_s)
 
     def random_rows(self, share: float) -> np.ndarray:
-        """Select a random `share` of the rows, (T,) bool, but not the first two and the last four."""
+        """Select a random `share` of the rows, (T,) bool, but not the first two and last four."""
         is_selected = self._rng.random(len(self._time_s)) < share
         is_selected[:2] = is_selected[-4:] = False
         return is_selected

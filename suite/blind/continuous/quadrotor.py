@@ -37,8 +37,8 @@ class NominalConstants(NamedTuple):
     """(3,) gain K of the rate loop [1/s]. It is the true one: the effect `rate_gain` means that the
     loop has another gain than the vehicle file says."""
     shares: np.ndarray
-    """(4, 4) thrust of each rotor (rows) for a unit of collective thrust and of the torques about x,
-    y and z (columns)."""
+    """(4, 4) thrust of each rotor (rows) for a unit of collective thrust and of the torques about
+    x, y and z (columns)."""
     thrust_max: float
     """Largest thrust of one rotor [N]."""
     thrust_coefficient: float

@@ -160,8 +160,8 @@ class Conditions:
     dropped: float
     """Share of the rows that the log lacks; their commands act all the same."""
     coloured: float
-    """Share of the noise of poses and velocities that is coloured (correlated in time, a first-order
-    Gauss-Markov process); the other part is white."""
+    """Share of the noise of poses and velocities that is coloured (correlated in time, a
+    first-order Gauss-Markov process); the other part is white."""
     colour_s: float
     """Correlation time of the coloured noise [s]."""
 

@@ -105,7 +105,7 @@ class Information:
 def columns_of(has_voltage: bool, names: Sequence[str] | None = None) -> tuple[Column, ...]:
     """Return the identifiable components of the effects `names`, or of all effects.
 
-    Effects that do not depend on the state alone (random wind) have none.
+    Effects that are no function of the vehicle's state (random wind) have none here.
 
     Args:
         has_voltage: whether the battery's voltage is logged.
