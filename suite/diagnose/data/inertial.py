@@ -85,7 +85,7 @@ def specific_force_w(log: FlightLog) -> np.ndarray | None:
 
 
 def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
-    """Return `logs` of one vehicle; those without a position get a pose from `by_inertia`."""
+    """Return `logs` of one vehicle; inertial ones get a pose from gyro and accelerometer."""
     inertial_logs = iter(by_inertia([log for log in logs if is_inertial(log)]))
     return [next(inertial_logs) if is_inertial(log) else log for log in logs]
 

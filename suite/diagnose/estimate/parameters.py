@@ -131,8 +131,8 @@ def refuse_own_motion(vehicle: Vehicle) -> None:
 def make_space(vehicle: Vehicle) -> ParameterSpace:
     """Return the space of all numbers that flights of `vehicle` can identify.
 
-    Without effects that the state does not determine (random ones), without known constants, and
-    without components that no flight shows.
+    It does not contain random effects, effects with a state of their own, known constants, and
+    components that no flight shows.
 
     Raises:
         ValueError: for a vehicle whose file has an effect with a motion of its own.
@@ -140,14 +140,14 @@ def make_space(vehicle: Vehicle) -> ParameterSpace:
     refuse_own_motion(vehicle)
     base, entries = all_values(vehicle), []
     for name, effect in EFFECTS.items():
-        if not effect.by_state:
+        if not effect.by_state:  # random, or with a state of its own
             continue
         for parameter in effect.parameters:
             if not parameter.fitted:
                 continue
             now = np.atleast_1d(np.asarray(getattr(base[name], parameter.name), dtype=float))
             for k in range(max(parameter.size, 1)):
-                if k in parameter.unseen:
+                if k in parameter.unseen:  # a component that is not identifiable from flights
                     continue
                 entries.append(
                     FittedNumber(

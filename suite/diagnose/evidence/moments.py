@@ -65,6 +65,7 @@ class ForceModel:
         `voltage` says whether the rows have a battery voltage.
         """
         self.space = space
+        # Only effects that depend on the state alone: neither random nor with a state of their own.
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
         self._vehicle = VehicleArrays(*nominal_quadrotor(vehicle), base)
         self._compiled = _accelerations(space.layout, voltage)
@@ -104,7 +105,7 @@ def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Arr
 
 
 def motion_of(plant: Plant, rows: FlightRows) -> Motion:
-    """Return the motion (N, ...) on `rows`, corrected for the faults of the log in `plant`."""
+    """Return the motion (N, ...) on `rows`, without the faults of the log among plant.effects."""
     logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
     return Motion(*to_true(plant.effects, logged)[:4])
 
@@ -153,7 +154,8 @@ class Weights(NamedTuple):
     memory: np.ndarray
     """(3,) autocorrelation time of the residual, as a number of moments, by axis."""
     trim: np.ndarray
-    """(3,) standard deviation of the flights' means, by axis; infinite with too few flights."""
+    """(3,) standard deviation of the trim (constant force or torque) from flight to flight, by
+    axis; infinite with too few flights."""
     base: np.ndarray | None = None
     """(3,) standard deviation of an error that all flights share, by axis; None if there is none.
     The mean of reference flights has such an error."""
@@ -174,6 +176,7 @@ def compare(
     for number, flight in enumerate(flights):
         accelerations = model.at(theta, flight.rows, indices)
         mean, count = flight.form.mean, len(flight.form.middle_s)
+        # Mean accelerations of the model, and their slopes, by the bumps of the flight.
         value = mean @ accelerations.value[:, view.columns]
         slope = accelerations.slope[:, view.columns]
         slope = (mean @ slope.reshape(len(slope), -1)).reshape(count, *slope.shape[1:])
@@ -185,12 +188,14 @@ def compare(
             slope = to_body @ slope
         excluded = [axis for axis in range(3) if axis not in view.axes]
         residual[:, excluded], slope[:, excluded] = 0.0, 0.0
+        # Uncertainty of a pose that was computed from gyro and accelerometer.
         pose_slope_b = flight.rows.pose_slope_b if view.in_world else None
         pose_slope = np.zeros((count, 3, 0))
         if pose_slope_b is not None:
             pose_slope = (mean @ pose_slope_b.reshape(len(pose_slope_b), -1)).reshape(count, 3, -1)
         fields = (flight.form.middle_s, value, residual, slope, pose_slope)
         parts.append(ViewData(np.full(count, number), *fields))
+    # Flights may have different numbers of unknowns of the pose: pad with zeros.
     widest = max(part.pose_slope.shape[2] for part in parts)
     for k, part in enumerate(parts):
         padding = ((0, 0), (0, 0), (0, widest - part.pose_slope.shape[2]))
@@ -251,11 +256,11 @@ def _autocorrelation_time(deviations: list[np.ndarray], limits: Thresholds) -> n
 
     A lag is a distance in moments, and `deviations` are those of each flight from its mean.
     """
-    power = np.sum([(deviation**2).sum(axis=0) for deviation in deviations], axis=0)
+    power = np.sum([(series**2).sum(axis=0) for series in deviations], axis=0)
     total, correlated = np.ones(3), np.ones(3, bool)
     for lag in range(1, limits.longest_memory):
         product = np.sum(
-            [(deviation[lag:] * deviation[:-lag]).sum(axis=0) for deviation in deviations], axis=0
+            [(series[lag:] * series[:-lag]).sum(axis=0) for series in deviations], axis=0
         )
         correlation = product / np.maximum(power, 1e-300)
         correlated &= correlation > LEAST_CORRELATION
@@ -270,6 +275,7 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
     residual, slope = data.residual.copy(), data.slope.copy()
     # Standard deviation of independent noise with the same effect as the autocorrelated one.
     unit = weights.scatter * np.sqrt(weights.memory)
+    # Subtract a share of each flight's mean, since its trim is random.
     for number in np.unique(data.flight):
         rows = data.flight == number
         variance = weights.scatter**2 * weights.memory / rows.sum()
@@ -281,7 +287,8 @@ def whitened(data: ViewData, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
                 residual[rows], slope[rows], data.pose_slope[rows], unit
             )
     if weights.base is not None:
-        # With an infinite trim the flights' means hold no information, and the share is 0.
+        # Subtract a share of the mean of all flights. Where the trim is infinite the share is 0, as
+        # the flights' means hold no information.
         variance = weights.scatter**2 * weights.memory + weights.trim**2
         share = 1.0 - 1.0 / np.sqrt(1.0 + len(residual) * weights.base**2 / variance)
         residual -= share * residual.mean(axis=0)

@@ -71,6 +71,7 @@ def fly_windows(
     burn_in = windows.burn_in_rate_b.shape[1]
     edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
     spans = Steps(jnp.diff(edge_s), sample_s > 0.0, jnp.asarray(windows.lead_s))
+    # Time becomes the first axis here and below, as the simulation scans along it.
     spans, command = jax.tree.map(
         lambda field: jnp.swapaxes(field, 0, 1),
         (spans, _acting_commands(windows, plant.constants.delay)),
@@ -121,8 +122,8 @@ def difference(
     now = _places(jnp.asarray(windows.row_s), edge_s)
     rate_b, force_b = _interpolated(track.rate_b, now), _interpolated(forces, now)
     logged = to_logged(values, Sample(*_pose(track, pose, integrator), rate_b, force_b))
+    # The attitude's error is the vector of the rotation between both attitudes, for small angles.
     rotation = jnp.matmul(jnp.swapaxes(windows.row_rot_w, -1, -2), logged.rot_w)
-    # Vector of the rotation between both attitudes, for small angles.
     attitude = 0.5 * jnp.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
@@ -232,9 +233,9 @@ def _places(time_s: Any, edge_s: Any) -> Any:
 
 def _interpolated(series: Any, place: Any) -> Any:
     """Return `series` (B, S + 1, K) at `place` (see `_places`), linear between ends of steps."""
-    index, since_s, length_s = place
-    start = jnp.take_along_axis(series, index[..., None], axis=1)
-    end = jnp.take_along_axis(series, index[..., None] + 1, axis=1)
+    step, since_s, length_s = place
+    start = jnp.take_along_axis(series, step[..., None], axis=1)
+    end = jnp.take_along_axis(series, step[..., None] + 1, axis=1)
     return start + (since_s / length_s)[..., None] * (end - start)
 
 
@@ -243,18 +244,18 @@ def _pose(track: Motion, place: Any, integrator: str) -> tuple[Any, Any, Any]:
 
     They follow the integrator within a step, and are extrapolated before the start.
     """
-    index, since_s, length_s = place
+    step, since_s, length_s = place
     since_s, length_s = since_s[..., None], length_s[..., None]
 
     def pick(series: Any, at: Any) -> Any:
         return jnp.take_along_axis(series, at.reshape(*at.shape, *[1] * (series.ndim - 2)), axis=1)
 
-    vel_w, new_vel_w = pick(track.vel_w, index), pick(track.vel_w, index + 1)
-    rate_b, new_rate_b = pick(track.rate_b, index), pick(track.rate_b, index + 1)
+    vel_w, new_vel_w = pick(track.vel_w, step), pick(track.vel_w, step + 1)
+    rate_b, new_rate_b = pick(track.rate_b, step), pick(track.rate_b, step + 1)
     gained_w = since_s / length_s * (new_vel_w - vel_w)
     if integrator == "euler":  # semi-implicit: the step's new velocity moves the position
-        pos_w, turn = pick(track.pos_w, index) + since_s * new_vel_w, since_s * new_rate_b
+        pos_w, turn = pick(track.pos_w, step) + since_s * new_vel_w, since_s * new_rate_b
     else:
-        pos_w = pick(track.pos_w, index) + since_s * (vel_w + 0.5 * gained_w)
+        pos_w = pick(track.pos_w, step) + since_s * (vel_w + 0.5 * gained_w)
         turn = since_s * (rate_b + 0.5 * since_s / length_s * (new_rate_b - rate_b))
-    return pos_w, jnp.matmul(pick(track.rot_w, index), exp_rot(turn)), vel_w + gained_w
+    return pos_w, jnp.matmul(pick(track.rot_w, step), exp_rot(turn)), vel_w + gained_w

@@ -261,6 +261,7 @@ class RolloutModel:
         errors of rotor speeds (4 at each knot if measured speeds are the input)."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the start numbers among all directions, after the parameters."""
+        # Only effects that depend on the state alone: neither random nor with a state of their own.
         base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
         self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
         self.dt = step_s(vehicle)

@@ -82,8 +82,8 @@ def less_reference_residual(
 ) -> ViewEvidence:
     """Return the evidence of `flights`, from which the reference flights' residual is subtracted.
 
-    The residual is described by its mean and by a ridge regression on the motion. It is that at the
-    parameters `theta` (P,) of `fit_balance`.
+    That residual is computed at the parameters `theta` (P,) of `fit_balance`, and is described by
+    its mean and a ridge regression on the motion.
     """
     data, inputs = reference.residuals(theta), _motion_inputs(reference, theta)
     deviation = centred(data.residual, data.flight)
@@ -92,8 +92,8 @@ def less_reference_residual(
     ridge = reference.limits.carried_ridge * len(scaled) * np.eye(scaled.shape[1])
     slope_of_error = np.linalg.solve(scaled.T @ scaled + ridge, scaled.T @ deviation)
     mean = means_of(data.residual, data.flight).mean(axis=0)
-    task = replace(reference, flights=flights)
-    return replace(task, carried=_motion_inputs(task, theta) / spread @ slope_of_error + mean)
+    later = replace(reference, flights=flights)
+    return replace(later, carried=_motion_inputs(later, theta) / spread @ slope_of_error + mean)
 
 
 @dataclass(frozen=True)
@@ -184,20 +184,20 @@ def change_evidence(
     # Residuals also vary within a flight, by errors of the model. So only the flights' means are
     # compared, with the noise that such a mean has.
     moments = np.unique(data.flight, return_counts=True)[1].mean()
-    of_mean = weights.scatter * np.sqrt(weights.memory / moments)
-    weights = weights._replace(scatter=of_mean, memory=np.ones(3))
+    noise_of_mean = weights.scatter * np.sqrt(weights.memory / moments)
+    weights = weights._replace(scatter=noise_of_mean, memory=np.ones(3))
     trim = spread.along[task.view.name] * gain
     if task.view.in_world:
         trim[:2] = np.inf  # forces across the thrust: a tilted attitude would look the same
     base = np.where(np.isfinite(trim), trim, 0.0) / np.sqrt(count)
     weights = weights._replace(trim=trim, base=base)
     mean_change = np.abs(means_of(data.residual, data.flight).mean(axis=0))
-    wide = weights._replace(trim=np.hypot(trim, task.limits.gain_error * mean_change))
+    with_gain_error = weights._replace(trim=np.hypot(trim, task.limits.gain_error * mean_change))
     # The means contain little information: every candidate that explains them is an alternative,
     # even one that explains much less than the best (a share of 1 switches that limit off).
     limits = replace(task.limits, rival_share=1.0)
     evidence = ChangeEvidence(
-        task.view, task.model, flights, limits, task.carried, True, wide, weights, spread
+        task.view, task.model, flights, limits, task.carried, True, with_gain_error, weights, spread
     )
     return evidence, Estimate(start)
 
@@ -308,9 +308,9 @@ def _error_falls(
 ) -> tuple[np.ndarray, float]:
     """Return the fall (F,) of each later flight's squared error, and the sum of the old errors.
 
-    The error falls from that with the parameters of the reference flights, `before` (K,), to that
-    with parameters fitted to later flights, `after` (F, K). For each flight these are the mean of
-    the fits to all other later flights.
+    The old errors are those with the parameters of the reference flights, `before` (K,). The new
+    errors are with parameters that fit later flights, `after` (F, K): for each flight, with the
+    mean of the fits to all other later flights.
     """
     falls, total = [], 0.0
     for place, number in enumerate(np.unique(inside.flight)):

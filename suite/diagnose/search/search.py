@@ -73,24 +73,24 @@ def search(
     """
     limits = evidence.limits
     task = SearchTask(among, say, seed, limits)
-    here = evaluated_at(known or evidence.estimate_noise(start), start, among)
-    first = _scores(task, here, [], among)
+    current = evaluated_at(known or evidence.estimate_noise(start), start, among)
+    first = _scores(task, current, [], among)
     named: list[NamedEffect] = []
     # Forward selection: add the best candidate, then drop names that it has made unnecessary.
     for _ in range(2 * limits.most_names):  # a name that was dropped may be named again
         best = None
         if len(named) < limits.most_names:
-            scores = first if here.at is start else None
-            best = _best_candidate(task, here, named, among, scores)
+            scores = first if current.at is start else None
+            best = _best_candidate(task, current, named, among, scores)
         if best is None or (named and best[0].gain <= limits.least_name_share * first[0].gain):
             break
         name, at = best
-        new = _one_name_per_effect(name)
-        known = here.evidence.estimate_noise(at)
-        named, at = _drop_unneeded(task, known[0], at, [*named, *new], len(new) == 1)
-        here = evaluated_at(known if at is best[1] else known[0].relinearise(at), at, among)
-    named, at = _settle(task, here.evidence, here.at, named)
-    last = judged = _final_fit(here.evidence, at, named)
+        new_names = _one_name_per_effect(name)
+        known = current.evidence.estimate_noise(at)
+        named, at = _drop_unneeded(task, known[0], at, [*named, *new_names], len(new_names) == 1)
+        current = evaluated_at(known if at is best[1] else known[0].relinearise(at), at, among)
+    named, at = _settle(task, current.evidence, current.at, named)
+    last = judged = _final_fit(current.evidence, at, named)
     # If even the best model leaves more than noise, decide again with the residual as noise.
     misfit = last.evidence.misfit_as_noise(last.at, last.block)
     if misfit is not None:
@@ -117,10 +117,12 @@ def _one_name_per_effect(name: NamedEffect) -> list[NamedEffect]:
 
 
 def _scores(
-    task: SearchTask, here: Evaluation, others: Sequence[int], among: Sequence[Candidate]
+    task: SearchTask, current: Evaluation, others: Sequence[int], among: Sequence[Candidate]
 ) -> list[CandidateScore]:
     """Return the scores of `among`, each fitted in addition to the parameters at `others`."""
-    return here.evidence.scores(here.block, here.equations, here.at.theta, others, among, task.seed)
+    return current.evidence.scores(
+        current.block, current.equations, current.at.theta, others, among, task.seed
+    )
 
 
 def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -> Evaluation:
@@ -132,7 +134,7 @@ def _final_fit(evidence: Evidence, at: Estimate, named: Sequence[NamedEffect]) -
 
 def _best_candidate(
     task: SearchTask,
-    here: Evaluation,
+    current: Evaluation,
     named: Sequence[NamedEffect],
     among: Sequence[Candidate],
     known: Sequence[CandidateScore] | None = None,
@@ -144,43 +146,45 @@ def _best_candidate(
 
     Args:
         task: inputs of the search.
-        here: evaluation without the candidate.
+        current: evaluation with the present names, without the candidate.
         named: names that are fitted together with every candidate.
         among: the candidates.
         known: scores of the candidates, if they were computed before.
-        tested: candidate of a name that was taken out of `here` to be tested against alternatives.
-            If given, all candidates that could replace it are fitted, significant or not.
+        tested: candidate of a name that was taken out of `current`, to be tested against the other
+            candidates. If given, all that could replace it are fitted, significant or not.
     """
-    limits, evidence, space = task.limits, here.evidence, here.evidence.space
+    limits, evidence, space = task.limits, current.evidence, current.evidence.space
     others = _indices(named)
-    free = [c for c in among if not set(c.indices) & set(others)]
-    scores = {s.candidate: s for s in known or _scores(task, here, others, free)}
-    # Choose the candidates that are worth a fit: those with good scores (`near`) ...
-    near = list(scores)
+    unnamed = [c for c in among if not set(c.indices) & set(others)]
+    scores = {s.candidate: s for s in known or _scores(task, current, others, unnamed)}
+    # Choose the candidates that are worth a fit: those with good scores ...
+    shortlist = list(scores)
     if tested is None:
         least = limits.near_share * max((s.gain for s in scores.values()), default=0.0)
-        near = [
+        shortlist = [
             c
             for c, score in scores.items()
             if score.p_value <= evidence.name_p_value and score.gain >= least
         ]
     # ... that could be the best to first order, and of the single effects only the first few.
-    columns, theta = here.equations.columns_of, here.at.theta
-    falls = {c: chi2_fall(here.equations, theta, space, [*others, *columns(c)]) for c in near}
-    near = [c for c in near if c == tested or could_be_best(falls, c, limits)]
+    columns, theta = current.equations.columns_of, current.at.theta
+    falls = {
+        c: chi2_fall(current.equations, theta, space, [*others, *columns(c)]) for c in shortlist
+    }
+    shortlist = [c for c in shortlist if c == tested or could_be_best(falls, c, limits)]
     if tested is None:
-        single = [c for c in near if not c.parts][: limits.short_list]
-        near = [c for c in near if c.parts or c in single]
+        single = [c for c in shortlist if not c.parts][: limits.short_list]
+        shortlist = [c for c in shortlist if c.parts or c in single]
     # Fit each of them, and keep those that pass the tests of the evidence.
-    before = cross_validated_chi2(evidence, here.block, here.at, others)
-    total, trials = float(here.equations.chi2.sum()), list[_Trial]()
-    for candidate in near:
-        at, block = fit_with(here, others, candidate)
+    errors_before = cross_validated_chi2(evidence, current.block, current.at, others)
+    chi2_before, trials = float(current.equations.chi2.sum()), list[_Trial]()
+    for candidate in shortlist:
+        at, block = fit_with(current, others, candidate)
         indices = [*others, *candidate.indices]
-        gains = before - cross_validated_chi2(evidence, block, at, indices)
-        share = evidence.explained_share(here.block, at, block, candidate, gains)
+        gains = errors_before - cross_validated_chi2(evidence, block, at, indices)
+        share = evidence.explained_share(current.block, at, block, candidate, gains)
         chi2 = float((block.residual**2).sum())
-        outcome = f"lowers the squared error by {total - chi2:,.0f} times the noise variance"
+        outcome = f"lowers the squared error by {chi2_before - chi2:,.0f} times the noise variance"
         if share is None:
             outcome = "rejected: flights disagree, or a value is implausible or explains too little"
         task.say(f"fitted {candidate.label}: {outcome}")
@@ -197,7 +201,7 @@ def _best_candidate(
     # Those about as good as the lowest cost are `close`. Of these, the significant one that the
     # evidence prefers is named, and the others are its alternatives.
     lowest = min(trial.cost for trial in trials)
-    explained = total - chi2_fall(here.equations, theta, space, others) - lowest
+    explained = chi2_before - chi2_fall(current.equations, theta, space, others) - lowest
     allowed = max(min(limits.rival_chi2, limits.rival_share * explained), 0.0)
     close = [trial for trial in trials if trial.cost - lowest <= allowed]
     significant = [trial for trial in close if trial.name.p_value <= evidence.name_p_value]
@@ -232,8 +236,8 @@ def _replace_or_drop(
     without = Estimate(theta, at.free)
     others = [*named[:place], *named[place + 1 :]]
     among = [c for c in among if tested not in c.parts]
-    here = evaluated_at(evidence.relinearise(without), without, among)
-    best = _best_candidate(task, here, others, among, None, tested)
+    current = evaluated_at(evidence.relinearise(without), without, among)
+    best = _best_candidate(task, current, others, among, None, tested)
     if best is None:
         return others, without
     return [*named[:place], *_one_name_per_effect(best[0]), *named[place + 1 :]], best[1]

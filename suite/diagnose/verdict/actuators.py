@@ -185,6 +185,7 @@ def _mismatch(
         best = minimize_scalar(cost, bounds=bounds, method="bounded", options=options)
         return min((float(best.fun), float(best.x)), (cost(0.0), 0.0))
 
+    # Best delay and lag together, and the best delay for the nominal lag.
     delay, _ = _best_delay(lambda delay: best_lag(delay)[0], limits)
     _, time_constant = best_lag(delay)
     _, nominal_error = _best_delay(
@@ -244,6 +245,7 @@ def wrench_difference(
 
 
 def _rms(values: np.ndarray) -> float:
+    """Return the root mean square of all `values`."""
     return float(np.sqrt((values**2).mean()))
 
 

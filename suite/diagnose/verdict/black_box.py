@@ -295,6 +295,7 @@ def _errors(
         carry = jax.lax.cond(index % network_steps == 0, run_network, lambda _: carry, None)
         return carry, carry[1]
 
+    # Carried from step to step: the memory of the network, and its last correction.
     initial_carry = (
         jnp.zeros((count, delta_network.HIDDEN)),
         jnp.zeros((count, len(OUTPUT_SCALE))),
