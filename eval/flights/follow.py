@@ -84,7 +84,7 @@ class Bodies(Protocol):
     """N vehicles in a simulator, stepped together."""
 
     integrator: str | None
-    """As `Recording.integrator`."""
+    """Integrator of the simulator, as in `Recording.integrator`."""
 
     def motion(self) -> tuple[Motion, np.ndarray]:
         """Return the current rigid-body states (N, ...) and attitudes (N, 4) wxyz."""

@@ -180,7 +180,7 @@ def _change_axes(signals: dict[str, Signal], signal: str, column: Column) -> Non
     samples = signals.pop(signal)
     value = samples.value
     if signal == "acc" and not column.gravity:
-        value = value + [0.0, 0.0, GRAVITY]  # to the specific force, which contains gravity
+        value = value + [0.0, 0.0, GRAVITY]  # a specific force is 9.81 m/s^2 upwards at rest
     if "quat" not in signals:
         if signal == "acc":
             for k, axis in enumerate("xyz"):

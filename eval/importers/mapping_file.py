@@ -91,8 +91,8 @@ class Column:
     other_axes: bool = False
     """Whether the signal has the second choice of `AXES`."""
     gravity: bool = True
-    """Whether an acceleration in world axes contains gravity (specific force); False: it is the
-    derivative of the velocity."""
+    """Whether an acceleration in world axes is a specific force (at rest 9.81 m/s^2 upwards);
+    False: it is the derivative of the velocity."""
     inverse: bool = False
     """Whether a quaternion rotates world axes to body axes; False: body axes to world axes."""
     per_mass: bool = True

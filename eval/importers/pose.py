@@ -284,7 +284,7 @@ def _refine(
     centred = rotated - rotated.mean(0)
     scale = float(np.sum(gyro * centred) / max(np.sum(centred**2), 1e-12))
     residual = gyro - scale * rotated
-    # residual = bias + slope * (error of the offset + error of the drift * since)
+    # residual = bias + slope * (error of the offset + error of the drift * since_middle_s)
     columns = [slope.ravel(), (slope * since_middle_s).ravel()]
     columns += [np.tile(axis, len(rotated)) for axis in np.eye(3)]
     design = np.stack(columns, axis=1)

@@ -205,7 +205,7 @@ def clearance(
         period_s: time between decisions [s].
     """
     path = seen.vel_b[:, None] * times[:, None]
-    # The last action acts during the lag, then the new one.
+    # The last action acts for `lag_s`, then the new one.
     until_lag = _displacement(seen.last_b, times, 0.0)
     path += until_lag - _displacement(seen.last_b, times, limits.lag_s)
     path += _displacement(first_b, times, limits.lag_s)

@@ -28,7 +28,8 @@ NEAR_STEPS = 40
 """Number of physics steps between updates of the nearest solids. Meanwhile a drone flies 0.4 m, at
 5 m/s and 500 Hz."""
 HALVINGS = 20
-"""Number of bisections of a capsule's length, which find the nearest point to a millionth of it."""
+"""Number of bisections along a capsule's axis; they find the nearest point to a millionth of the
+length."""
 ROUNDS = 12
 """Number of projections from the box to a cylinder and back."""
 OVER_RELAXATION = 1.5

@@ -160,7 +160,7 @@ def exported_checkpoint(name_or_folder: str | Path) -> tuple[str, PolicyCheckpoi
     """Return the name and the checkpoint of one of the suite's policies.
 
     Raises:
-        PolicyError: where it is not one of them, or cannot be used.
+        PolicyError: where the name or folder is no policy of the suite, or cannot be used.
     """
     folder = shipped.locate(name_or_folder)
     if not folder.is_dir():

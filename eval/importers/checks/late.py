@@ -1,6 +1,6 @@
 """Estimate and remove the delay of a log's pose against its gyro.
 
-The pose comes from motion capture or a state estimator, whose clock may lag and drift.
+The pose comes from motion capture or a state estimator, whose clock may be late and may drift.
 """
 
 from __future__ import annotations
