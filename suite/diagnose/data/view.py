@@ -222,6 +222,8 @@ def weak_form(
         if last - first < LEAST_ROWS or not usable[first:last].all():
             continue
         from_centre = middle[first:last] - centre
+        # Normalised over the rows: the bump to an integral of 1; its slope so that it is exact for
+        # accelerations that are constant or linear in time.
         if slope:
             bump = np.sin(2.0 * np.pi * from_centre / width_s)
             bump -= (bump * span[first:last]).sum() / span[first:last].sum()
@@ -244,6 +246,8 @@ def weak_form(
         places = (np.concatenate([row, row]), np.concatenate([column, column + 1]))
         return sparse.csr_array((np.concatenate([before, after]), places), shape=shape)
 
+    # Mean accelerations are sums of w times the steps of the velocity from row to row. Means of
+    # accelerations use both ends of each step (trapezoids).
     bump, weight = np.concatenate(bumps), 0.5 * np.concatenate(spans)
     middle_s = np.array(centres)
     middle_row = nearest(time_s, middle_s)

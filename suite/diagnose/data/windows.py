@@ -159,7 +159,7 @@ def cut(
         limits: longest hole in a window, and largest numbers of windows.
         integrator: integrator of the model; with "euler" its steps are the rate loop's periods.
         coarser: the windows that an earlier call returned. If given, the same ones are cut with
-            steps of twice the length, and every second rotor speed and `with_hidden_torque`.
+            steps of twice the length, from every second rotor speed and `with_hidden_torque`.
         only: numbers of the flights that are cut; all if not given.
     """
     starts, warnings = list[tuple[int, int]](), list[str]()  # (flight, row) each
