@@ -4,7 +4,7 @@ The model is a network that corrects the actions. A window is a short part of a 
 replay starts from the measured state; this includes the rotor speeds and the commands that are
 delayed and still to act. Each row of the log is one step of the attitude loop. The commanded yaw
 rate is the recorded one, because an action does not set the heading. The plant is the model of
-mixer, rotors and effects of the vehicle, for steps of a given delay_steps.
+mixer, rotors and effects of the vehicle, for steps of a given length.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def cut_quadrotor_windows(
     Args:
         logs: the flights.
         config: the vehicle and its physics rate.
-        duration_s: delay_steps of a window [s].
+        duration_s: length of a window [s].
         stride_s: approximate time between the starts of windows [s].
         row_s: time between rows [s]; by default `row_period` of these logs.
 
@@ -139,6 +139,7 @@ def _flight_windows(
     # Middle of each physics step before a window, as time before its start.
     ages_s = substeps.dt * (np.arange(delay_steps) + 0.5)
     speed = np.full((len(time_s), 4), np.nan) if log.rotor_speed is None else log.rotor_speed
+    # `log.whole` marks the rows with a complete state and command.
     decision_rows = np.flatnonzero(decides & log.whole)
     if len(decision_rows) < 2:
         return []
@@ -148,8 +149,8 @@ def _flight_windows(
     for number, first in enumerate(decision_rows.tolist()):
         if time_s[first] < next_s or first < rows_before or first + rows >= len(time_s):
             continue
+        # The rows of the window, with those whose commands are still delayed at its start.
         used = slice(first - rows_before, first + rows + 1)
-        # `log.whole` marks the rows with a complete state and command.
         is_steady = np.abs(np.diff(time_s[used]) - row_s) < 0.2 * row_s
         if not (log.whole[used].all() and is_steady.all()):
             continue

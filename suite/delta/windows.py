@@ -79,7 +79,7 @@ def cut_windows(logs: Sequence[FlightLog], duration_s: float, stride_s: float) -
     steps = min(len(window.action_b) for window in windows)
 
     def truncated(window: PointMassWindows) -> PointMassWindows:
-        """Truncate a window to the number of decisions that all have."""
+        """Truncate a window to the number of decisions that all windows have."""
         return window._replace(
             pos_w=window.pos_w[: steps + 1],
             vel_w=window.vel_w[: steps + 1],
@@ -195,35 +195,38 @@ def _flight_windows(log: FlightLog, duration_s: float, stride_s: float) -> list[
     # Rows with a decision, with all values, and with a next row for the acceleration.
     rows = np.flatnonzero(decides & log.whole)
     rows = rows[rows + 1 < len(log.time_s)]
-    time, rot = log.time_s[rows], quat_to_rot(log.quat_wxyz[rows])
-    time_to_next = (log.time_s[rows + 1] - time)[:, None]
-    acc = (log.vel_w[rows + 1] - log.vel_w[rows]) / time_to_next
-    command = (rot @ action[rows][:, :, None])[:, :, 0]
-    heading = _heading(rot)
+    decision_s, rot_w = log.time_s[rows], quat_to_rot(log.quat_wxyz[rows])
+    time_to_next = (log.time_s[rows + 1] - decision_s)[:, None]
+    acc_w = (log.vel_w[rows + 1] - log.vel_w[rows]) / time_to_next
+    command_w = (rot_w @ action[rows][:, :, None])[:, :, 0]
+    heading_w = _heading(rot_w)
     row_s = float(np.median(np.diff(log.time_s)))
-    period = decision_period(time, row_s)
-    if np.isnan(period):
+    period_s = decision_period(decision_s, row_s)
+    if np.isnan(period_s):
         return []
-    steps, stride = round(duration_s / period), max(1, round(stride_s / period))
-    burn_in_count = round(BURN_IN_S / period)
+    steps, stride = round(duration_s / period_s), max(1, round(stride_s / period_s))
+    burn_in_count = round(BURN_IN_S / period_s)
     windows = []
     for first in range(HISTORY, len(rows) - steps, stride):
         span = slice(first, first + steps + 1)
-        gaps = np.diff(time[first - HISTORY : first + steps + 1])
+        gaps_s = np.diff(decision_s[first - HISTORY : first + steps + 1])
         # A window with a lost decision, also in its history, is left out.
-        if not are_consecutive(gaps, period, row_s).all() or not np.isfinite(acc[first]).all():
+        if (
+            not are_consecutive(gaps_s, period_s, row_s).all()
+            or not np.isfinite(acc_w[first]).all()
+        ):
             continue
         windows.append(
             PointMassWindows(
                 log.pos_w[rows[span]],
                 log.vel_w[rows[span]],
-                acc[first],
-                rot[first],
-                heading[span],
+                acc_w[first],
+                rot_w[first],
+                heading_w[span],
                 action[rows[span]][:-1],
-                command[first - HISTORY : first][::-1],
-                np.diff(time[span]),
-                burn_in_before(rot, log.vel_w[rows], action[rows], first, burn_in_count),
+                command_w[first - HISTORY : first][::-1],
+                np.diff(decision_s[span]),
+                burn_in_before(rot_w, log.vel_w[rows], action[rows], first, burn_in_count),
             )
         )
     return windows

@@ -142,8 +142,8 @@ class HiddenLoopConfig(LoopConfig):
 def loop_by_content(config: LoopConfig) -> LoopConfig:
     """Return the settings without paths of files, whose content is in `digests`.
 
-    So a loop can be continued from another folder or machine. A name may be that of a file and of
-    something shipped. As in loading, the shipped policy is taken, but the vehicle file.
+    So a loop can be continued from another folder or machine. If a name is that of a file as well
+    as of something shipped, it means the shipped policy, or the vehicle file, as in loading.
     """
 
     def without_path(name_or_path: str) -> str:

@@ -1,1 +1,4 @@
-"""The differentiable trainer; it needs jax, numpy and pure-Python packages only."""
+"""The differentiable trainer: trains a policy by gradients through simulated flights.
+
+It needs jax, numpy and pure-Python packages only.
+"""

@@ -36,7 +36,7 @@ def encoder_gradient(
 
     Args:
         params: the policy's parameters.
-        images: (N, height, width).
+        images: (N, height, width) encoded images, inverse depths.
         cotangents: (N, hidden) gradient of the loss with respect to the embeddings.
     """
     size = _chunk_size(images.shape[0])
@@ -70,7 +70,7 @@ def sampled_encoder_gradient(
 
     Args:
         params: the policy's parameters.
-        images: (T, B, height, width).
+        images: (T, B, height, width) encoded images of all steps.
         cotangents: (T, B, hidden) gradient of the loss with respect to the embeddings.
         stride: a divisor of T.
         key: selects the first step.
@@ -108,10 +108,12 @@ def make_gradient(
         ) -> tuple[jax.Array, StepRecord]:
             return rollout(params, embedding_shift, worlds, key, frozen_encode, delta)
 
+        # First pass: gradients with respect to the parameters and to the embeddings.
         embedding_shift = jnp.zeros((steps, worlds.pos_w.shape[0], width))
         (loss, records), (direct, cotangents) = jax.value_and_grad(
             rollout_loss, argnums=(0, 1), has_aux=True
         )(params, embedding_shift)
+        # Second pass: the gradient through the encoder.
         through_images = sampled_encoder_gradient(
             params, records.image, cotangents, stride, jax.random.fold_in(key, stride)
         )

@@ -4,7 +4,8 @@ Each term is a function that returns a loss (B,), one per world (a simulated sce
 batch. A new term needs that function, a line in `LOSSES` and its weight in `LossConfig`. The names
 L_..., beta and u_A are those of the paper. In this file the gap is not the glossary's: it is the
 distance of a point to the nearest solid, minus the safety radius. The (attractive) field pulls the
-gradient towards the gate. The goal of the progress term is the gate or a point before it.
+gradient towards the gate. The goal of the progress term is the gate or a point before it. The path
+is the straight line that the drone flies in the step; terms evaluate S points of it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ Term = Callable[[LossConfig, Step], jax.Array]
 
 
 def barrier(step: Step) -> jax.Array:
-    """Return ln(1 + e^{beta_2 gap}), (B, S), at S points of the path that is flown in the step."""
+    """Return ln(1 + e^{beta_2 gap}), (B, S), which grows if a point of the path is too near."""
     return jax.nn.softplus(BARRIER_SLOPE * step.gap)
 
 

@@ -37,8 +37,8 @@ from tracks.geometry.rotation import exp_rot, to_local
 from tracks.geometry.scene import Counts
 
 SEEN = Counts(boxes=24, cylinders=8, capsules=5, spheres=5)
-"""Number of solids of each kind in a training image, the nearest ones. Images of the judge, which
-scores policies in MuJoCo, have all solids."""
+"""Number of solids of each kind in an image of the training, the nearest ones. Images of the judge,
+which scores policies in MuJoCo, have all solids."""
 
 
 class RolloutCarry(NamedTuple):
@@ -126,7 +126,7 @@ class SensorModels(NamedTuple):
     """
 
     start: Callable[[Worlds, View], Any]
-    """(worlds, view at the start) -> memory of the models."""
+    """(worlds, view at the start) -> memory of the models: past views, and states of the models."""
     measure: Callable[[Worlds, View, jax.Array, Any], tuple[View, Any]]
     """(worlds, true view, keys (B,), memory) -> (view with errors, new memory)."""
 
@@ -156,6 +156,7 @@ def make_sensor_models(config: TrainConfig) -> SensorModels:
 
     def measure(worlds: Worlds, truth: View, keys: jax.Array, memory: Any) -> tuple[View, Any]:
         past_views, states = memory
+        # Random numbers of each model.
         draws, views = {}, (truth, *past_views)
         for number, name in enumerate(seen_models):
             model_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, number + 1)
@@ -163,6 +164,7 @@ def make_sensor_models(config: TrainConfig) -> SensorModels:
             draws[name] = jax.vmap(lambda key, n=needs: keyed_draws(n, key, spec.camera))(
                 model_keys
             )
+        # The delayed view, with a random variation of the delay (jitter); then the other errors.
         delayed = truth
         if past_views:
             assert worlds.sensed is not None

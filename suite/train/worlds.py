@@ -49,6 +49,7 @@ class Worlds(NamedTuple):
     """A batch of worlds, (B, ...)."""
 
     scene: Scene
+    """Gates and obstacles of the tracks."""
     pos_w: Array
     """(B, 3) position at the start [m]."""
     vel_w: Array

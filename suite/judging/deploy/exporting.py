@@ -86,6 +86,7 @@ def _record_source(policy: str, out: Path, files: Sequence[str], seed: int | Non
     records = _read_sources(out / NOTE)
     for file in files:
         old = records.get(file, {})
+        # The same policy may be exported again, also from another place or with new weights.
         if (out / file).exists() and source != old.get("source") and digest != old.get("sha256"):
             old_source = old.get("source", "an unrecorded policy")
             raise ValueError(

@@ -90,9 +90,11 @@ class Companion:
         self._box = allowed_box(points, self._limits)
         camera = policy.spec.camera
         self._assembler = ImageAssembler(camera.height, camera.width, camera.range_m)
+        # The last complete depth image; times of arrival; checks.
         self._depth: np.ndarray | None = None
         self._depth_time_s = self._state_arrival_s = clock()
         self._clock_check = ClockCheck(self._limits)
+        # The policy's memory, its last action, the heading, and when it decides next.
         self._hidden, self._fresh = policy.start(1), True
         self._action_b = first_action(policy.spec.action, vehicle)[None]
         self._heading_w = np.zeros((1, 3))
@@ -101,10 +103,13 @@ class Companion:
         self.gate = 0
         """Number of passed gates, which is the index of the next one."""
         self.late_answers = self.bad_actions = self.missed_decisions = 0
+        """Numbers of late answers, of actions that were not finite, and of missed decisions."""
         self.over: str | None = None
         """Reason of the handover; None before it."""
         self.rows: list[Row] = []
+        """States and set points of the flight so far."""
         self.events: list[str] = []
+        """What happened, with times, for the log."""
 
     @property
     def flying(self) -> bool:

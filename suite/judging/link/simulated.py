@@ -93,6 +93,7 @@ class SimulatedVehicle:
         self._command: Command | None = None
         self._command_step = self._ticks = 0
         self.images = 0
+        """Number of sent images."""
 
     @property
     def over(self) -> bool:
@@ -110,12 +111,13 @@ class SimulatedVehicle:
         return self._ticks * self.dt
 
     def step(self, datagrams: list[bytes], clock_s: float | None = None) -> list[bytes]:
-        """Fly one physics step and return the datagrams sent before it.
+        """Make one physics step; return the datagrams of the state and the image at its beginning.
 
         Args:
             datagrams: the datagrams that were received since the last step.
             clock_s: time for the time stamps [s]; None: the time since the start.
         """
+        # Take the newest valid set point, within the vehicle's limits.
         for message in self._wire.decode(datagrams):
             if (
                 isinstance(message, SetPoint)
@@ -204,6 +206,7 @@ class SimulatedVehicle:
             pos_z=float(pos_w[2]),
             time_s=step * self.dt,
             v_max=float(progress.v_max[0]),
+            # Mean over the start (at rest) and the states after each step, without a diverged one.
             v_mean=float(progress.v_sum[0]) / max(step + (ended != DIVERGED), 1),
             gates_8s=int(progress.gates_8s[0]),
             gates_035=int(progress.gates_035[0]),

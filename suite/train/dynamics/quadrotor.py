@@ -88,7 +88,7 @@ def substeps(config: QuadrotorConfig, period_s: float) -> Substeps:
 
 
 def truncated_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """Return standard normal draws, clipped to -2 to 2."""
+    """Return draws of a standard normal distribution, clipped to the range from -2 to 2."""
     return np.clip(rng.standard_normal(shape), -2.0, 2.0)
 
 

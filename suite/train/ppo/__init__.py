@@ -1,1 +1,4 @@
-"""Recurrent PPO in the worlds and dynamics of the trainer, as a baseline."""
+"""Recurrent PPO (proximal policy optimisation) in the worlds and dynamics of the trainer.
+
+It is the baseline of the differentiable trainer.
+"""

@@ -18,7 +18,7 @@ from tracks.geometry.clearance import nearest_obstacle
 from tracks.geometry.rotation import to_local
 
 Params = dict[str, jax.Array]
-
+"""Weights and biases of the critic's layers, by name."""
 AHEAD_S = (0.0, 0.1, 0.2, 0.4, 0.8)
 """Times from now at which the critic's inputs have the distance to solids, for a flight at constant
 velocity [s]."""

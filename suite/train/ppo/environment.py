@@ -50,6 +50,7 @@ class PeriodResult(NamedTuple):
     """Results of a policy period, (B,) each."""
 
     reward: RewardTerms
+    """Terms of the reward."""
     collided: jax.Array
     """Bool: the drone touched a solid."""
     passed: jax.Array

@@ -41,10 +41,15 @@ class RewardTerms(NamedTuple):
     """Weighted terms, (B,) each; their sum is the reward of the step."""
 
     collision: jax.Array
+    """Term of a collision (lambda_1)."""
     avoid: jax.Array
+    """Terms of nearness to solids and of flight towards them (lambda_2, lambda_3)."""
     smooth: jax.Array
+    """Terms of acceleration and jerk (lambda_4, lambda_5)."""
     passing: jax.Array
+    """Term of a passed gate (lambda_6)."""
     progress: jax.Array
+    """Term of the speed towards the gate (lambda_7)."""
 
     def total(self) -> jax.Array:
         """Return the reward (B,)."""

@@ -91,7 +91,10 @@ def start_state(config: PpoConfig) -> PpoState:
 
 
 def shuffled(key: jax.Array, count: int, epochs: int, parts: int) -> jax.Array:
-    """Return the indices (epochs * parts, count // parts) of each minibatch, shuffled per epoch."""
+    """Return the indices of each minibatch, (epochs * parts, count // parts).
+
+    Each of the `epochs` shuffles the `count` indices and divides them into `parts` minibatches.
+    """
     orders = [jax.random.permutation(k, count) for k in jax.random.split(key, epochs)]
     return jnp.stack(orders).reshape(epochs * parts, count // parts)
 
@@ -103,7 +106,7 @@ def actor_gradient(
 
     Args:
         config: the run.
-        actor: the point of differentiation.
+        actor: the policy and its exploration, at which the gradient is computed.
         images: (T, B, height, width) images of the rollout.
         sequences: (T, B, ...) other numbers of the same worlds.
         key: selects the images for the encoder's gradient, with `episode.image_stride`.
