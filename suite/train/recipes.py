@@ -32,7 +32,7 @@ from tracks.geometry.camera import Camera
 
 
 def race_paper() -> TrainConfig:
-    """Return the recipe of `race-paper`: the paper's state of 12 numbers, a point mass."""
+    """Return the recipe of `race-paper`: the point mass, and the paper's state of 12 numbers."""
     return TrainConfig()
 
 
@@ -139,7 +139,7 @@ def paper() -> TrainConfig:
 
 
 def quick() -> TrainConfig:
-    """Return a run of minutes on two cores, through the point mass; its policy is slow."""
+    """Return a run of minutes on two cores, through the point mass; its policy flies slowly."""
     base = race_paper()
     return replace(
         base,
