@@ -72,6 +72,7 @@ class BlockPolicy:
         return _nan_if_overflowed(actions, next_hidden)
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
+        """Return `rows` padded with zeros to a full block."""
         if len(rows) == self.block:
             return rows
         block = np.zeros((self.block, *rows.shape[1:]), np.float32)

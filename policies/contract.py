@@ -36,6 +36,7 @@ KEY = "contract"
 VERSION = 1
 """Version of the contract's layout."""
 BODY = "body: x forward, y left, z up"
+"""Text for the body frame."""
 
 
 @dataclass(frozen=True)

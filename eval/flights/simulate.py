@@ -126,6 +126,7 @@ class _MujocoBodies:
         return Motion(pose[:, :3], rot_w, velocity[:, :3], velocity[:, 3:]), pose[:, 3:]
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
+        """Simulate one physics step; see `eval.flights.follow.Bodies`."""
         speed, added = self._state.rotor_speed, self._no_wrench
         power = (speed**2).sum(-1) / self._hover - 1.0
         drop = FALL_V_PER_S * time_s + SAG_V * power

@@ -129,6 +129,8 @@ def _punches(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _chirp(path: Trajectory, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return oscillations along all axes, whose frequencies grow during the flight."""
+
     def sweep(first_hz: float, last_hz: float) -> np.ndarray:
         """Return an oscillation whose frequency grows linearly, with about constant speed."""
         slope = (last_hz - first_hz) / path.duration_s

@@ -38,6 +38,7 @@ SIGNAL_TEXTS = {
 GROUP_TEXTS = {"pos": "position", "quat": "attitude", "rate": "body rates", "command": "commands"}
 """Groups of columns that a partial log may lack, and their names in messages."""
 _ROTORS = ("motor", "pwm")
+"""Signals of the rotors; either is enough for the quantities that need rotor speeds."""
 QUANTITIES = (
     ("the force on the body (thrust, mass, drag)", ("pos", "quat"), (*_ROTORS, "cmd_thrust")),
     ("its torque (inertia, rotors, centre of mass)", ("rate",), (*_ROTORS, "cmd_torque")),

@@ -31,6 +31,7 @@ _ANGLE = {"rad": 1.0, "deg": DEG}
 _ACCELERATION = {"m/s^2": 1.0, "g": GRAVITY}
 _ROTOR_SPEED = {"rad/s": 1.0, "rpm": RPM, "Hz": float(2.0 * np.pi)}
 _FRACTION = {"1": 1.0, "%": 0.01, "65535": 1.0 / 65535.0}
+"""Tables of units of length, body rate, ...: unit -> factor to the unit of the flight log."""
 PER_MASS = "N"
 """Unit of a thrust command that the import divides by the mass; other units are per mass."""
 UNITS: dict[str, dict[str, float]] = {

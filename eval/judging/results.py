@@ -79,6 +79,7 @@ def _kinds() -> dict[str, str]:
 
 
 def _column_type(kind: str) -> Any:
+    """Return the Parquet type of a field, from its type as text."""
     import pyarrow as pa
 
     kinds = {

@@ -31,6 +31,7 @@ NOTE = (
 )
 """Note below every table."""
 PAIR_NOTE = "Differences are on the same trials; success: Newcombe's paired interval."
+"""Note below the table of differences."""
 
 
 class Tally(NamedTuple):
@@ -174,6 +175,7 @@ def markdown_table(summary: dict[str, Any]) -> str:
 
 
 def _cell_grid(cells: Sequence[Tally]) -> Grid:
+    """Return a table with a line for each cell."""
     return table_of(
         cells,
         ("policy", lambda cell: cell.policy),
@@ -197,6 +199,8 @@ def _other_endings(cell: Tally) -> str:
 
 
 def _pair_grid(paired: Sequence[Pairing]) -> Grid:
+    """Return a table of the differences from the first policy."""
+
     def points(pair: Pairing) -> str:
         value, low, high = (100 * x for x in pair.success)
         return f"{value:+.0f} [{low:+.0f}, {high:+.0f}] points"

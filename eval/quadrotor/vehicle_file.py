@@ -209,6 +209,7 @@ def _controller_table(controller: Controller) -> dict[str, Any]:
 
 
 def _camera(table: Table) -> Camera:
+    """Return the camera of the table [camera]."""
     table.expect(["pitch_deg", "fov_deg", "range"])
     camera = Camera()
     return replace(

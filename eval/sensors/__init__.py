@@ -71,6 +71,7 @@ SENSORS: Registry[Sensor] = Registry(
     {sensor.name: sensor for sensor in _BUILT_IN},
     _registration_error,
 )
+"""All sensor models by name, those of other packages included."""
 
 Models = Mapping[str, Any]
 """Name of a model -> its values (the model's NamedTuple)."""

@@ -23,6 +23,7 @@ BEHIND_M, ABOVE_M, AHEAD_M = 1.5, 0.55, 1.2
 MIN_EYE_HEIGHT_M = 0.15
 """Least height of the camera above the ground [m]."""
 NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.0)
+"""No additional lines in a picture."""
 
 
 class Scenery(NamedTuple):

@@ -14,6 +14,7 @@ CRASH, START = (208, 47, 47), (31, 59, 115)
 SOLID, SOLID_EDGE = (201, 206, 214), (138, 147, 160)
 """Colours of obstacles, and of their edges."""
 DRONE = (40, 44, 52)
+"""Colour of the drone and of texts."""
 AXES = ((220, 60, 60), (60, 160, 70), (60, 100, 220))
 """Colours of the axes x, y and z."""
 

@@ -31,6 +31,7 @@ SIMULATED = ((224, 137, 43), (36, 99, 201), (122, 92, 184))
 ERRORS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "rad/s"}
 """Part of the state -> unit of its error."""
 SERIES = tuple(f"{group}_{axis}" for group in ("velocity", "rates") for axis in "xyz")
+"""Names of the curves: velocity and body rates, along each axis."""
 
 
 class States(NamedTuple):
@@ -195,6 +196,7 @@ def _concatenate_with_gaps(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _layout(flights: Sequence[ComparedFlight]) -> rrb.Blueprint:
+    """Return the layout of the recording, with a tab for each flight."""
     times = [flight.measured.time_s for flight in flights]
     # The playback skips the start, where simulations still agree with the measurement.
     playback_s = (0.1 * float(times[0][-1]), max(float(time[-1]) for time in times))

@@ -41,6 +41,7 @@ PATH_WIDTH = 2.2
 PASSED, CRASH, START, GREY = map(
     hex_text, (colours.PASSED, colours.CRASH, colours.START, colours.SOLID_EDGE)
 )
+"""Colours as texts for matplotlib; see `eval.view.colours`."""
 
 
 def write_picture(
@@ -267,6 +268,7 @@ def _speed_range(flights: Sequence[Flight | None]) -> Normalize:
 
 
 def _colour_bar(figure: Figure, axes: list[Axes], speed: Normalize) -> None:
+    """Draw the colour scale of the speeds next to `axes`."""
     bar = figure.colorbar(
         ScalarMappable(speed, SPEED_MAP), ax=axes, fraction=0.03, aspect=32, pad=0.015
     )
@@ -298,6 +300,7 @@ def _title(track: Track) -> str:
 
 
 def _outcome(result: TrialResult, short: bool = False) -> str:
+    """Return the outcome of a trial as text; `short` leaves out speeds and names."""
     gates = "1 gate" if result.gates_passed == 1 else f"{result.gates_passed} gates"
     text = f"{result.ending} after {result.time_s:.2f} s, {gates} passed"
     if short:
@@ -307,6 +310,7 @@ def _outcome(result: TrialResult, short: bool = False) -> str:
 
 
 def _save(figure: Figure, path: str | Path, dpi: int) -> Path:
+    """Write a figure as a file, completely or not at all."""
     FigureCanvasAgg(figure)
     for text in figure.findobj(Text):
         text.set_parse_math(False)  # names of policies and tracks may have dollar signs

@@ -30,6 +30,7 @@ from tracks.geometry.camera import Camera, optical_axis_b
 from tracks.track import Track
 
 APPLICATION = "diffracing-suite"
+"""Name of the application in the rerun viewer."""
 SCHEMA = 1
 """Version of the recording's entities, which is stored in its properties."""
 GROUND = (226, 228, 224)

@@ -26,6 +26,7 @@ from tracks.geometry.rotation import quat_to_rot
 from tracks.track import Track
 
 SUFFIXES = (".mp4", ".gif")
+"""Allowed endings of a video file."""
 DEPTH_RANGE_M = 10.0
 """Depth at the end of the colour scale [m]."""
 TRAIL_S = 1.6

@@ -41,8 +41,11 @@ half the distance flown in a step at 1 m/s."""
 PARALLEL = 1e-3
 """Directions within this angle of parallel [rad] need no common normal: other axes cover them."""
 _CULLED = ("boxes", "cylinders", "capsules", "spheres")
+"""Kinds of solids of which only the nearest are tested."""
 _BOX_AXES = tuple(np.eye(3, dtype=np.float32))
+"""Axes of the box, in the box's axes."""
 _CORNERS = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(8, 3)
+"""(8, 3) corners of the box, relative to its half extents."""
 
 
 def near_solids(scene: Scene, pos_w: Array) -> Scene:

@@ -234,6 +234,7 @@ class MjxWorld:
 
     @functools.partial(jax.jit, static_argnums=0)
     def _view(self, state: SlotStates, course: Course, scene: Scene) -> View:
+        """Return the current view of all slots."""
         pos_w, rot_w, vel_w, _ = _motion(state.qpos, state.qvel)
         depth = depth_image(scene, pos_w, rot_w, self._rays_b, self._camera.range_m)
         gate = next_gate(course, state.progress.gates)
@@ -339,6 +340,7 @@ class MjxWorld:
         return jax.vmap(step_body)(qpos, qvel, applied)
 
     def _rows(self, due: Array, state: SlotStates, rotor_speed: Array) -> Rows:
+        """Return the rows of the flight logs, for the slots in `due` (N,) bool."""
         command = state.loops.command
         return Rows(
             due, state.progress.step * self.dt, state.qpos[:, :3], state.qpos[:, 3:],

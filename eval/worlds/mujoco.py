@@ -28,9 +28,11 @@ class MujocoWorld(SceneSlots):
         step: np.ndarray,
         noise: np.ndarray | None,
     ) -> tuple[AutopilotState, Wrench]:
+        """Return the autopilot's state, and the force and torque on the body."""
         return autopilot_step(self._autopilot, self._loops, motion, action_b, gate_w, step, noise)
 
     def _move(self, flying: np.ndarray, motion: Motion, push: Wrench) -> np.ndarray:
+        """Let MuJoCo move the bodies under the force and torque `push`."""
         invalid = ~is_wrench(self._rules, push)
         moving = flying & ~invalid
         self._applied[:, :3] = to_world(motion.rot_w, push.force_b)

@@ -101,6 +101,7 @@ class RotorpyWorld(SceneSlots):
         step: np.ndarray,
         noise: np.ndarray | None,
     ) -> tuple[AutopilotState, StepInput]:
+        """Return the autopilot's state, and the rotor speeds and wind for RotorPy."""
         loops = attitude_step(self._autopilot, self._loops, motion, action_b, gate_w, step)
         plant = self._autopilot.plant
         motor_action = motor_speed_command(self._autopilot, action_b)
@@ -112,6 +113,7 @@ class RotorpyWorld(SceneSlots):
         return loops, StepInput(speed_cmd, motion.vel_w - air_vel_w)
 
     def _move(self, flying: np.ndarray, motion: Motion, push: StepInput) -> np.ndarray:
+        """Let RotorPy move the bodies; then MuJoCo finds the contacts."""
         qpos, qvel, speed = self._multirotor.step(
             self._qpos, self._qvel, self._loops.plant.rotor_speed, push
         )

@@ -46,6 +46,7 @@ from tracks.track import Track
 TO_CONTACTS = int(mujoco.mjtStage.mjSTAGE_VEL)
 """Stage of the engine after which the contacts of a state are known."""
 _NOTHING = int(mujoco.mjtStage.mjSTAGE_NONE)
+"""Stage of the engine before any computation."""
 
 
 class SceneSlots(ABC):

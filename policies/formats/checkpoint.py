@@ -29,6 +29,7 @@ from tracks.input.reading import (
 
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
+"""Names of the files in a checkpoint."""
 SCHEMA = 1
 """Version of the folder's layout; files of another version are refused."""
 
@@ -222,6 +223,7 @@ def _read(path: Path, most_bytes: int) -> bytes:
 
 
 def _require(path: Path, table: Mapping[str, Any], key: str, kind: type) -> None:
+    """Refuse a table without a value of type `kind` under `key`."""
     value = table.get(key)
     if not isinstance(value, kind) or isinstance(value, bool):
         raise PolicyError(

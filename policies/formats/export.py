@@ -205,5 +205,6 @@ _WRITERS: dict[str, tuple[str, Callable[[PolicyCheckpoint, dict[str, str]], byte
     "torch": (".pt2", torch_program),
     "onnx": (".onnx", onnx_file),
 }
+"""Format -> ending of the file, and function that returns the file's bytes."""
 FORMATS = (*_WRITERS, "c")
 """Names of the formats."""

@@ -171,6 +171,7 @@ class ModelProcess:
         )
 
     def _write(self, data: memoryview, until: float) -> None:
+        """Write bytes to the process, or raise a TimeoutError at the time `until`."""
         pipe = self._process.stdin
         assert pipe is not None
         while data:
@@ -181,6 +182,7 @@ class ModelProcess:
                 continue
 
     def _read(self, count: int, until: float) -> bytearray:
+        """Read `count` bytes from the process, or raise a TimeoutError at the time `until`."""
         pipe = self._process.stdout
         assert pipe is not None
         if not 0 <= count <= ANSWER_BYTES:
@@ -216,6 +218,7 @@ def _wait(handle: int, event: int, until: float) -> None:
 
 
 def _how_it_ended(process: subprocess.Popen[bytes]) -> str:
+    """Return a text on why the process gave no answer."""
     try:
         code = process.wait(1.0)
     except subprocess.TimeoutExpired:

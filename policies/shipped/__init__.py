@@ -8,6 +8,7 @@ DEFAULT = "race"
 """Name of the default policy."""
 
 _HERE = Path(__file__).resolve().parent
+"""Folder of the shipped policies."""
 
 
 def names() -> list[str]:

@@ -35,6 +35,7 @@ def select(mask: Array, new: Any, old: Any) -> Any:
 
 
 def _selected(mask: Array, new: Any, old: Any) -> Any:
+    """Return the result of `select`, without its shortcut for a mask that is true everywhere."""
     if isinstance(new, dict):
         return {name: _selected(mask, new[name], old[name]) for name in new}
     if isinstance(new, tuple):
@@ -62,6 +63,7 @@ def take(tree: Any, rows: Any) -> Any:
 
 
 def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Return nested tuples and dicts with `function` applied to each array."""
     if isinstance(tree, dict):
         return {name: _mapped(function, part) for name, part in tree.items()}
     if isinstance(tree, tuple):

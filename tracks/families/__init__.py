@@ -35,6 +35,7 @@ FAMILIES: Registry[Callable[[float, np.random.Generator], Layout]] = Registry(
     },
     _registration_error,
 )
+"""Name of a family -> function that draws its tracks."""
 JUDGED = ("zigzag", "circular", "ellipse")
 """The families on which policies are evaluated; they are trained on `random`."""
 LEVELS = range(10)

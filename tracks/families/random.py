@@ -66,6 +66,7 @@ class Mix(NamedTuple):
 
 
 MIX = Mix()
+"""The default probabilities."""
 
 
 def make(d: float, rng: np.random.Generator, mix: Mix = MIX) -> Layout:

@@ -35,6 +35,7 @@ class _Resolver:
         self._folder, self._remaining_bytes = folder.resolve(), most_bytes
 
     def get(self, name: str) -> bytes:
+        """Return the contents of the file `name`, which must be below the folder of the mesh."""
         path = (self._folder / name).resolve()
         if not path.is_relative_to(self._folder):
             raise InputError(f"{path}: is not below the folder of the mesh that refers to it")

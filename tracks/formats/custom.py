@@ -283,6 +283,7 @@ def _is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
 
 
 def _box(table: Table) -> tuple:
+    """Return centre, rotation and half size of a box."""
     return (
         _place(table, "center"),
         rotation(table),
@@ -291,6 +292,7 @@ def _box(table: Table) -> tuple:
 
 
 def _rod(table: Table) -> tuple:
+    """Return centre, axis, radius and half length of a cylinder or capsule."""
     axis = _unit(table, "axis", table.vector("axis", 3, (0.0, 0.0, 1.0)))
     radius, length = _length(table, "radius"), _length(table, "length")
     return _place(table, "center"), axis, radius, length / 2

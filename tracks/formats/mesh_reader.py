@@ -37,6 +37,7 @@ _PROGRAM = (
     "import sys; sys.path.append(sys.argv[1]); "
     "from tracks.formats.mesh_reader import serve; serve()"
 )
+"""Program of the reading process; its argument is the folder of the code."""
 
 
 def load_convex_parts(paths: Sequence[Path]) -> list[list[np.ndarray]]:

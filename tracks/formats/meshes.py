@@ -77,6 +77,7 @@ def _capsule(radius: float, half_length: float) -> trimesh.Trimesh:
 
 
 def _rods(rods: Rods, make: Callable[[float, float], trimesh.Trimesh]) -> list[trimesh.Trimesh]:
+    """Return the meshes of rods; `make` returns one along z from its radius and half length."""
     meshes = []
     for center_w, axis_w, radius, half_length in zip(*rods, strict=True):
         matrix = np.array(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis_w))

@@ -26,6 +26,7 @@ def _direction(vector: Array, length: Array) -> Array:
 
 
 def _box(boxes: Boxes, point_w: Array) -> tuple[Array, Array]:
+    """Return signed distances to boxes, and directions away (see `distances`)."""
     local = (point_w[..., None, :] - boxes.center_w)[..., None, :] @ boxes.rot_w
     local = local[..., 0, :]
     # Signed distance to the faces of each axis, negative inside; the largest is that of the box.
@@ -42,12 +43,14 @@ def _box(boxes: Boxes, point_w: Array) -> tuple[Array, Array]:
 
 
 def _sphere(spheres: Spheres, point_w: Array) -> tuple[Array, Array]:
+    """Return signed distances to spheres, and directions away (see `distances`)."""
     away = point_w[..., None, :] - spheres.center_w
     length = _norm(away)
     return length - spheres.radius, _direction(away, length)
 
 
 def _capsule(rods: Rods, point_w: Array) -> tuple[Array, Array]:
+    """Return distances to rods with round ends, and directions away (see `distances`)."""
     away = point_w[..., None, :] - rods.center_w
     along = jnp.clip((away * rods.axis_w).sum(-1), -rods.half_length, rods.half_length)
     away = away - along[..., None] * rods.axis_w

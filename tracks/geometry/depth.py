@@ -55,6 +55,7 @@ def _ball(square: Array, cross: Array, excess: Array) -> tuple[Array, Array]:
 
 
 def _box(solid: tuple[Array, ...], rays: Array) -> Array:
+    """Return the depths of hits on boxes."""
     # The camera's position in box axes (B, 3); the box's axes in the body frame as rows (B, 3, 3);
     # the box's half sizes (B, 3).
     origin, axes, half = solid
@@ -67,6 +68,7 @@ def _box(solid: tuple[Array, ...], rays: Array) -> Array:
 
 
 def _sphere(solid: tuple[Array, ...], rays: Array) -> Array:
+    """Return the depths of hits on spheres."""
     origin, radius = solid
     excess = _dot(origin, origin) - radius * radius
     return _entry(*_ball(_dot(rays, rays), _dot(origin[:, None], rays), excess[:, None]))
@@ -89,6 +91,7 @@ def _cylinder(solid: tuple[Array, ...], rays: Array) -> Array:
 
 
 def _capsule(solid: tuple[Array, ...], rays: Array) -> Array:
+    """Return the depths of hits on capsules: a cylinder and two spheres."""
     origin, axis, radius, half = solid
     offset = axis * half[:, None]
     ends = jnp.minimum(

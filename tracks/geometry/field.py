@@ -13,11 +13,13 @@ from tracks.geometry.scene import Array
 CURRENT = 2e-5
 """Constant C_I of Su et al. 2026, by which the field is scaled [m]."""
 _TINY = 1e-9
+"""Least divisor, so that no division is by zero."""
 _WIRE_SQUARED_M2 = 1e-12
 """Least squared distance from the loop: at the loop itself the field is infinite [m^2]."""
 
 
 def _norm(vector: Array) -> Array:
+    """Return the norms of vectors, with a gradient of zero at zero."""
     xp = vector.__array_namespace__()
     square = (vector * vector).sum(-1)
     # At zero the root's slope is infinite, and its gradient would be NaN.

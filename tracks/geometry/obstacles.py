@@ -19,6 +19,7 @@ from tracks.geometry.scene import Boxes, Gates, Rods, Spheres
 BOX, CYLINDER, CAPSULE, SPHERE = range(4)
 """Numbers of the kinds of solids."""
 KIND_NAMES = ("box", "cylinder", "capsule", "sphere")
+"""Names of the kinds of solids, in the order of their numbers."""
 GATE_DISTANCE_M = 1.5
 """Least horizontal distance of an obstacle's centre from a gate's centre [m]."""
 CORRIDOR_HALF_LENGTH_M = 1.5

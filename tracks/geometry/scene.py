@@ -115,6 +115,7 @@ def _parked(n: int) -> np.ndarray:
 
 
 def _pad_rods(rods: Rods, n: int) -> Rods:
+    """Return `rods` padded with parked rods to `n` rods."""
     missing = n - len(rods.radius)
     return Rods(
         np.concatenate([rods.center_w, _parked(missing)]),

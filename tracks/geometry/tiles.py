@@ -258,6 +258,7 @@ def _ball(
 
 
 def _box(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depths of entry and exit for boxes."""
     enter, leave = np.full_like(square, -np.inf), np.full_like(square, np.inf)
     for axis, half in zip(shape.axes, shape.halves, strict=True):
         near, far = _slab(_dot(shape.center, axis), half, linear(axis))
@@ -267,12 +268,14 @@ def _box(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray,
 
 
 def _sphere(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depths of entry and exit for spheres."""
     center = shape.center
     excess = _dot(center, center) - shape.radius * shape.radius
     return _ball(square, linear(center), excess)
 
 
 def _cylinder(shape: _Shape, linear: Linear, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depths of entry and exit for cylinders with flat ends."""
     (axis,), (half,), center, radius = shape.axes, shape.halves, shape.center, shape.radius
     along, rate = _dot(center, axis), linear(axis)
     excess = _dot(center, center) - along * along - radius * radius

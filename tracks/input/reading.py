@@ -176,6 +176,7 @@ def reason(error: OSError) -> str:
 
 
 def _check(path: str, status: os.stat_result, most_bytes: int) -> None:
+    """Refuse a file that is not regular or is too large, by its status."""
     if not stat.S_ISREG(status.st_mode):
         kind = _FILE_TYPES.get(stat.S_IFMT(status.st_mode), "of an unknown kind")
         raise InputError(f"{path}: cannot be read: it is {kind}, not a regular file")

@@ -32,6 +32,7 @@ COARSE = 4.0
 """A signal is coarse if its median change between samples is below this many steps of its
 resolution. Repeated samples of a coarse signal may be real."""
 TEXTS = {"pos": "position", "quat": "attitude"}
+"""Signals and their names in messages."""
 TURNING = 0.05
 """Least body rate at which an interpolated attitude can be detected [rad/s]."""
 EXACT = 1e-3

@@ -55,6 +55,7 @@ FORMATS: Registry[Format] = Registry(
     },
     _registration_error,
 )
+"""Name of a format -> module that detects and reads it."""
 
 
 def detect(path: Path, options: ImportOptions) -> str:

@@ -38,8 +38,11 @@ from eval.logs.faults.motors import check_count
 
 SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False
+"""The format has fixed names and a single pose, see `Format`."""
 HEAD = b"\xa3\x95\x80"
+"""First bytes of a log."""
 MESSAGES = ("IMU", "ATT", "XKF1", "NKF1", "RATE", "CTUN", "RCOU", "ESC", "BAT", "PARM", "MSG")
+"""Kinds of message that are read."""
 OPEN_HANDLES = ("data_map", "filehandle")
 """Attributes of a pymavlink reader that must be closed."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
@@ -51,6 +54,7 @@ MOTOR_1 = 33
 """SERVOn_FUNCTION of motor 1; motors 2 to 4 have the next numbers."""
 DEG, RPM = np.pi / 180.0, np.pi / 30.0
 MISSING = "an ArduPilot log; pip install 'diffracing-suite[mavlink]' reads it"
+"""Reason of the error if pymavlink is not installed."""
 
 Rows = Mapping[str, np.ndarray]
 """The columns of one kind of message, by field name."""

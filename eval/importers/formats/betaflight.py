@@ -29,6 +29,7 @@ from eval.logs.files import first_line, read_columns, read_head
 
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"
 TAKES_MAP = TAKES_SOURCE = False
+"""The format has fixed names and no pose, see `Format`."""
 MOTOR_SIDE = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 """Positions of motors 1 to 4 (x forward, y left): rear right, front right, rear left, front
 left."""
@@ -48,7 +49,9 @@ LEAST_V, MOST_V = 2.5, 30.0
 `blackbox_decode` divides by ten to make volts, which was right before Betaflight 4 only. A battery
 with more than seven cells is rarer than this error."""
 _UNIT = re.compile(r"^(?P<name>.*?)(?: \((?P<unit>[^()]*)\))?$")
+"""Pattern of a column's name, with its unit in brackets, if any."""
 _ERPM = re.compile(r"^eRPM(?:\(/100\))?\[(\d)\]$")
+"""Pattern of the name of a column with a motor's eRPM."""
 
 
 def detect(head: bytes, options: ImportOptions) -> bool:

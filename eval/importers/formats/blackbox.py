@@ -25,6 +25,7 @@ MISSING = (
     "a raw Blackbox log; pip install 'diffracing-suite[blackbox]' reads it, or decode it with "
     "blackbox_decode and import the CSV"
 )
+"""Reason of the error if the decoder is not installed."""
 
 
 class Decoded(NamedTuple):

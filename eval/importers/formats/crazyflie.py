@@ -33,6 +33,7 @@ from tracks.common.names import closest
 
 SUMMARY = "log of the Crazyflie's micro SD card deck"
 USD = b"\xbc"
+"""First byte of a log."""
 CODES = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"} | {
     "e": "<f2",
     "f": "<f4",

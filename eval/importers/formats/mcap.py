@@ -35,6 +35,7 @@ from tracks.common.toml_table import read_toml
 SUMMARY = "MCAP with ROS 2 messages (pip install 'diffracing-suite[mcap]')"
 TAKES_SOURCE = False
 MCAP = b"\x89MCAP0\r\n"
+"""First bytes of a file."""
 KINDS: dict[str, tuple[str, ...]] = {
     "odometry": ("nav_msgs/Odometry",),
     "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),

@@ -37,7 +37,9 @@ from tracks.input.ranges import is_number
 
 SUMMARY = "PX4 ULog (.ulg)"
 TAKES_MAP = TAKES_SOURCE = False
+"""The format has fixed names and a single pose, see `Format`."""
 ULOG = b"ULog\x01\x12\x35"
+"""First bytes of a log."""
 TOPICS = (
     "vehicle_attitude",
     "vehicle_odometry",
@@ -50,6 +52,7 @@ TOPICS = (
     "battery_status",
     "actuator_motors",
 )
+"""Topics that are read."""
 QUAD_X = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 """PX4's motors 1 to 4 (x forward, y left): front right, rear left, front left, rear right."""
 QUADROTOR = 2
@@ -222,6 +225,7 @@ def _attitude(topic: Topic) -> Part | None:
 
 
 def _throttle(topic: Topic) -> Part | None:
+    """Return the normalised collective thrust, positive along body z, of a rates set point."""
     value = _columns(topic, ["thrust_body[2]"])
     if value is None:
         value = _columns(topic, ["thrust"])  # before v1.10, positive upwards

@@ -26,7 +26,9 @@ from tracks.common.names import closest
 
 SUMMARY = "CSV or Parquet, described by a mapping file (--map)"
 ASKED_LAST = True
+"""Other formats are tried before this one, which accepts any table."""
 PARQUET = b"PAR1"
+"""First bytes of a Parquet file."""
 _LIST_ENTRY = re.compile(r"^(.*)\[(\d)\]$")
 """Name of one number of a list column, such as `pos[0]`."""
 

@@ -137,6 +137,7 @@ def _vectors(observed: Observed, actions: np.ndarray, tolerance: float) -> str:
 
 
 def _table(name: str, size: str, values: np.ndarray) -> str:
+    """Return the C definition of an array with a row for each step."""
     rows = [
         "    {" + ", ".join(float_text(x) for x in np.ravel(row).astype(np.float32).tolist()) + "}"
         for row in values

@@ -28,6 +28,7 @@ _OBSERVATION = (
     ("third row of R: the world's z axis in body axes, (0, 0, 1) when level", "1"),
     ("from the drone to the centre of the next gate, in body axes", "m"),
 )
+"""Meaning and unit of the first three parts of the state."""
 _ACTIONS = {
     "acceleration": """the wanted net acceleration in current body axes [m/s^2]. Gravity is
  *   compensated: an action of zeros keeps the velocity. The wanted specific force is
@@ -38,12 +39,14 @@ _ACTIONS = {
  *   body rates about x, y and z [rad/s], which the vehicle's rate loop follows.""",
     "motors": "the four rotors' shares of their largest $WHAT, 0 to 1.",
 }
+"""Kind of action -> meaning, for the comment in the header."""
 _EXTRA = {
     "second_gate": ("to the centre of the gate after the next (or the last), in body axes", "m"),
     "gate_axis": ("the next gate's flight direction, a unit vector in body axes", "1"),
     "second_axis": ("the flight direction of the gate after it (or of the last)", "1"),
     "speed_input": ("commanded speed, 0 (careful) to 1", "1"),
 }
+"""Optional part of the state -> meaning and unit."""
 
 
 def sources(

@@ -54,11 +54,13 @@ ADVICE = (
     "on a machine with the suite and its extra `cluster`, `dask scheduler` starts one and "
     "`dask worker ADDRESS --nworkers N --nthreads 1` gives it N processes"
 )
+"""How to start a cluster, for messages."""
 TLS_ADVICE = (
     "give this machine the scheduler's authority and a certificate with its key, as the "
     "environment's DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ...__TLS__CLIENT__CERT and "
     "...__TLS__CLIENT__KEY (docs/scaling.md)"
 )
+"""How to connect to an encrypted scheduler, for messages."""
 
 
 class UnusableCluster(ValueError):
