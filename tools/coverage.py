@@ -2,14 +2,15 @@
 
     python tools/coverage.py COUNT [SEED] [CASES] [OUT.json]
 
-It identifies COUNT simulated vehicles with random numbers (`tests/support/fleets.py`) from the logs
-of each of CASES (separated by commas; default all). For every number of a vehicle file it prints:
+It estimates the parameters of COUNT simulated vehicles with random parameters
+(`tests/support/fleets.py`). A case says which signals the logs have; CASES are separated by commas,
+and all by default. For every parameter of a vehicle file the tool prints:
 
 - for how many vehicles it was estimated,
 - for how many of these the 95 % interval contains the true value, with Wilson's interval,
 - the median half-width of the interval, relative to the true value,
-- mean and root mean square of the pulls, which are errors divided by half-widths; 0 and 0.51 for
-  exact intervals.
+- mean and root mean square of the pulls. A pull is an error divided by the half-width of the
+  interval. For exact intervals the mean is 0 and the root mean square 0.51.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ CASES = {
 def pulls(
     fleet: Fleet, recordings: Sequence[Recording], case: str, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
-    """Return the pull and the relative half-width of every estimated number, by name.
+    """Return name -> (pull, relative half-width) of every estimated parameter.
 
     Args:
         fleet: the true vehicle.
-        recordings: its flights.
+        recordings: flights of this vehicle.
         case: a key of `CASES`.
-        rng: random generator of the logs' noise.
+        rng: random generator of the noise of the logs.
     """
     drive, removed = CASES[case]
     logs = [
@@ -83,7 +84,7 @@ def pulls(
 
 
 def fly_fleet(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
-    """Return a random vehicle and its flights; None where these fail."""
+    """Return a random vehicle and its flights; None if a flight fails."""
     fleet = drawn(np.random.default_rng((seed, number)))
     try:
         return fleet, recordings_of(fleet)
@@ -92,9 +93,13 @@ def fly_fleet(seed: int, number: int) -> tuple[Fleet, list[Recording]] | None:
 
 
 def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple[str, str], list]:
-    """Return (case, name of a number) -> rows of vehicle, pull and relative half-width.
+    """Return (case, name of a parameter) -> rows, each (vehicle, pull, relative half-width).
 
-    Rows are also written to the JSON file `out`, if it is not empty.
+    Args:
+        count: number of vehicles.
+        seed: seed of the vehicles and the noise.
+        cases: keys of `CASES`.
+        out: JSON file to which the rows are also written; "" for none.
     """
     rows: dict[tuple[str, str], list] = defaultdict(list)
     start_s, number, done = time.monotonic(), 0, 0
@@ -116,7 +121,7 @@ def measure(count: int, seed: int, cases: Sequence[str], out: str) -> dict[tuple
 
 
 def main(count: int, seed: int, cases: Sequence[str], out: str) -> None:
-    """Identify `count` vehicles, and print the table; arguments as in `measure`."""
+    """Identify `count` vehicles, and print the table; the arguments are those of `measure`."""
     print("| log | number | estimated | covered | 95 % interval of that | half-width | pulls |")
     print("|---|---|---|---|---|---|---|")
     for (case, key), rows in sorted(measure(count, seed, cases, out).items()):

@@ -6,10 +6,13 @@ Run it before and after a change, on the same machine, and compare the two files
     python tools/fingerprint.py --out after.json --work runs/fingerprint-after
     python tools/fingerprint.py --compare before.json after.json
 
-It uses commands only, so that it does not depend on the layout of the code. The digests are of
-trials of the shipped policies (levels 0 and 9), gradient steps of every recipe and of both
-dynamics, a Delta Action Model (a network that corrects actions) in each, `suite identify` on
-simulated flights, and the diagnosis of 20 blind cases (flights with hidden effects).
+It uses commands only, so that it does not depend on the layout of the code. It computes digests of:
+
+- trials of the shipped policies (levels 0 and 9),
+- the weights after a few gradient steps, for every recipe and for both dynamics,
+- a Delta Action Model (a network that corrects actions), for both dynamics,
+- the result of `suite identify` on simulated flights,
+- the diagnosis of 20 blind cases (flights with hidden effects).
 """
 
 from __future__ import annotations
@@ -27,9 +30,11 @@ from typing import Any
 import numpy as np
 
 POLICIES = ("race", "race-small", "race-paper")
+"""Policies that fly in MuJoCo."""
 RECIPES = ("race", "race-small", "race-paper", "paper")
+"""Recipes of the trainings."""
 MJX_POLICIES = ("race-paper", "race")
-"""Policies that fly in MJX too, which takes longer."""
+"""Policies that also fly in MJX, which takes longer."""
 STAMPS = ("version", "commit", "git_commit", "schema", "created", "seconds", "out")
 """Keys that may differ between two versions of the code with equal results."""
 
@@ -45,7 +50,7 @@ def suite(*args: str | Path) -> None:
 
 
 def array_digest(arrays: dict[str, np.ndarray]) -> str:
-    """Return the SHA-256 of the arrays' names, types, shapes and bytes."""
+    """Return the SHA-256 of the names, types, shapes and bytes of arrays."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -159,7 +164,7 @@ PARTS: dict[str, Callable[[Path], dict[str, str]]] = {
     "identify": identify,
     "diagnosis": diagnosis,
 }
-"""Name of a part of the suite -> function of a working folder that returns name -> digest."""
+"""Part of the suite -> function (working folder) -> digests by name."""
 
 
 def compare(before: Path, after: Path) -> int:

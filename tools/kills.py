@@ -3,15 +3,14 @@
     python tools/kills.py COUNT [COMMAND ...] [--seed N]
     python tools/kills.py COUNT --signals [--seed N]
 
-Every command of the table below first runs undisturbed. Then it is run COUNT times. Each of these
-runs is killed at a random time of the command's duration and started again, up to six times, and
-then runs to its end. Its files must equal those of the undisturbed run, except for times and
-stamps. The tool prints a line for each run, and fails if one differs. It counts only kills of a
-command that was still running.
+Every command of `COMMANDS` first runs undisturbed. Then it is run COUNT times. Each of these runs
+is killed at a random time and started again, up to six times, and then runs to its end. Its files
+must equal those of the undisturbed run, except for times and stamps. The tool prints a line for
+each run, and fails if the files of one differ. A kill counts only if the command was still running.
 
-With --signals a training without stored compiled code gets Ctrl-C or SIGTERM instead, COUNT times
-at a random time of its first 20 s. The tool fails if one does not end with exit code 130 within
-5 s.
+With --signals the tool tests COUNT trainings instead, without stored compiled code. Each gets
+Ctrl-C or SIGTERM at a random time of its first 20 s. The tool fails if one of them does not end
+with exit code 130 within 5 s.
 """
 
 from __future__ import annotations
@@ -30,7 +29,9 @@ from pathlib import Path
 from typing import Any
 
 EASY = "--track zigzag --difficulty 0"
+"""Options of short flights."""
 WORLDS = "episode.batch=8 episode.steps=30"
+"""Settings of a small training."""
 COMMANDS = {
     "train": f"train --recipe quick --iterations 60 --set {WORLDS}",
     "eval": f"eval --policy race-paper --trials 12 {EASY}",
@@ -42,9 +43,10 @@ COMMANDS = {
 }
 """Name -> command without --out; FLIGHTS stands for the folder of the recorded flights."""
 COMPARED = ("*.safetensors", "*.parquet", "metrics.jsonl", "diagnosis.json", "flights.json")
-"""Files of a run that are compared."""
+"""Patterns of the files of a run that are compared."""
 SHARES = (1.0, 0.5, 0.5, 0.5, 0.5, 0.5)
-"""Latest time of each kill of a run, as a share of the duration of an undisturbed run."""
+"""Latest time of the first, second, ... kill of a run, as a share of the duration of an undisturbed
+run."""
 IGNORED_KEYS = ("seconds", "steps_per_s", "cold", "git_commit", "out", "collection", "source")
 """Keys of JSON files that differ between equal runs: times and folders."""
 WITHIN_S = 5.0
@@ -59,7 +61,7 @@ def start(command: str, out: Path) -> subprocess.Popen[bytes]:
 
 
 def digest(out: Path) -> str:
-    """Return the SHA-256 of a run's compared files, 16 digits, or "nothing" without files."""
+    """Return the SHA-256 (16 digits) of the compared files of a run; "nothing" without files."""
     sums = hashlib.sha256()
     paths = {path for pattern in COMPARED for path in out.rglob(pattern)}
     for path in sorted(paths):
@@ -82,6 +84,7 @@ def _content(path: Path) -> bytes:
 
 
 def _without_ignored(value: Any) -> Any:
+    """Return contents of a JSON file without the ignored keys."""
     if isinstance(value, dict):
         return {
             key: _without_ignored(entry) for key, entry in value.items() if key not in IGNORED_KEYS
@@ -116,7 +119,7 @@ def start_and_kill(command: str, out: Path, after_s: float) -> bool:
 
 
 def start_and_signal(number: signal.Signals, after_s: float) -> tuple[int, float]:
-    """Send a signal to a training after a time.
+    """Start a training, and send it a signal after the time `after_s` [s].
 
     Returns:
         The exit code of the training, and the time from the signal to its end [s].
@@ -137,7 +140,7 @@ def start_and_signal(number: signal.Signals, after_s: float) -> tuple[int, float
 
 
 def send_signals(count: int, rng: random.Random) -> int:
-    """Test `count` signals, and return the tool's exit code."""
+    """Test `count` trainings that get a signal, and return the exit code of the tool."""
     failures = 0
     for _ in range(count):
         number, after_s = rng.choice([signal.SIGINT, signal.SIGTERM]), rng.uniform(1.5, 20.0)
@@ -178,6 +181,7 @@ def main() -> int:
                     times_s.append(time_s)
                 kills += len(times_s)
                 finish(command, out)
+                # Hidden files are temporary ones, which the finished command must have removed.
                 same = digest(out) == expected
                 temporary = sorted(path.name for path in out.rglob(".*"))
                 failures += not same or bool(temporary)

@@ -1,7 +1,8 @@
 """Print requirements.lock: the installed version of each package that pyproject.toml requires.
 
-`make lock` runs it. The lock has the project's requirements, its extra `dev`, and the requirements
-of those. Local version suffixes are removed, so that every package index has the versions.
+`make lock` runs it. The lock has the requirements of the project and of its extra `dev`, and all
+that these require in turn. Local parts of versions (`+cpu`) are removed, because other package
+indexes do not have them.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ HEADER = """\
 # Exact versions for `make env`, written by `make lock`. Python 3.11 to 3.13.
 # The GPU libraries of torch's Linux builds are pinned by torch itself.
 """
+"""Comment above the versions."""
 
 
 def closure(requirements: list[str]) -> dict[str, str]:
-    """Return package -> installed public version, for `requirements` and all that they require.
+    """Return package -> installed version, for `requirements` and all that they require in turn.
 
     Raises:
-        ValueError: where a package is not installed, or not at an allowed version.
+        ValueError: if a package is not installed, or not at an allowed version.
     """
     versions: dict[str, str] = {}
     visited: set[tuple[str, str]] = set()

@@ -1,12 +1,12 @@
-"""Measure whether the diagnosis stays correct if its model is wrong by design.
+"""Measure whether the diagnosis stays correct if no model of its catalogue can be right.
 
     python tools/misfit.py COUNT [SEED]
 
 The diagnosis names physical effects that explain flights. Every case here has a hidden linear drag,
 and a force field that no effect describes. The field is so strong that the error of a model with
-the true drag is 20 times the noise. The tool runs one process for each core and prints a line for
-each case, then how many 95 % intervals of the drag contain the truth and how many cases have a
-false name.
+the true drag is 20 times the noise. The tool runs one process for each core, and prints a line for
+each case. Then it prints how many 95 % intervals of the drag contain the true value, and in how
+many cases an effect is named that is not there.
 """
 
 from __future__ import annotations
@@ -41,17 +41,20 @@ from tracks.common.work.threads import one_thread_a_product
 TARGET_ERROR = 20.0
 """Rollout error of a model with the true drag, in units of the noise."""
 DRAG = "linear_drag"
+"""The hidden effect."""
 WAVES = 3
 """Number of sine waves in the force field along each axis."""
 LENGTH_M = (3.0, 10.0)
 """Shortest and longest wavelength [m]."""
 FIRST_STRENGTH = 0.3
-"""Root mean square of the force field along each axis in the first trial [m/s^2]."""
+"""Root mean square of the force field along each axis in the first flights of a case, from which
+the final strength is computed [m/s^2]."""
 TRIES = 8
-"""Largest number of draws until the flights succeed."""
+"""Largest number of draws of a case; one is valid if all flights succeed."""
 
 Outcome = tuple[list[bool], list[str], str]
-"""Whether each interval of the drag contains the truth, the false names, and a line to print."""
+"""For each component of a named drag, whether the interval contains the true value; the false
+names; and a line to print."""
 
 
 def force_law(rng: np.random.Generator) -> Law:
@@ -75,13 +78,13 @@ def rollout_error(
 ) -> tuple[float, Noise]:
     """Return the rollout error of `vehicle` along `logs` in units of the noise, and the noise.
 
-    With `noise` None, it is measured on these logs.
+    If `noise` is None, it is measured on these logs.
     """
     windows, _ = cut(logs, vehicle, rotor_input=False)
     assert windows is not None
     model = RolloutModel(vehicle, make_space(vehicle), rotor_input=False, voltage=False)
-    begin = start_estimate(model, windows)
-    linear = model.linearise(begin.theta, begin.free, windows, model.starts)
+    start = start_estimate(model, windows)
+    linear = model.linearise(start.theta, start.free, windows, model.starts)
     noise = noise or measured_noise(linear.residual, linear.start_slope, windows)
     return gap_of(linear, windows, noise).rms, noise
 
@@ -105,6 +108,8 @@ def run_case(seed: list[int]) -> Outcome:
         extra = Push(strength, truth.mass, law)
         return simulator.fly(truth, trajectories, flight_rng, extra)(flight_rng)
 
+    # The noise is measured without the field. The error grows with the strength of the field, so
+    # one flight gives the strength for the wanted error.
     _, noise = rollout_error(fly_logs(0.0), truth, None)
     first_error, _ = rollout_error(fly_logs(FIRST_STRENGTH), truth, noise)
     logs = fly_logs(FIRST_STRENGTH * TARGET_ERROR / first_error)
@@ -124,7 +129,7 @@ def run_case(seed: list[int]) -> Outcome:
 
 
 def first_valid_draw(seed: list[int]) -> Iterator[Outcome]:
-    """Yield the outcome of the first draw of a case whose flights succeed, if any."""
+    """Yield the outcome of the first draw of a case whose flights succeed; nothing if none does."""
     keep_compiled()
     for attempt in range(TRIES):
         with contextlib.suppress(FlightFailed):

@@ -2,15 +2,15 @@
 
     python tools/mutants.py COUNT [--seed N] [--out FILE.json] [--again]
 
-A mutant is a copy of the code with one change: another operator (+ and -, * and /, < and <=, == and
-!=, and/or, & and |), a sign or a `not` less, or another number. It survives if no test fails. Not
-changed are messages, annotations and subscripts, and numbers that are a choice: defaults of
-settings, the catalogue's bounds and usual sizes, and tolerances below 1e-6. AREAS lists the files
-and their tests, which run up to the first failure.
+A mutant is a copy of the code with one change: another operator (+ for -, * for /, < for <=, == for
+!=, and for or, & for |, and the reverse), one sign or `not` less, or another number. It survives if
+no test fails. The tool does not change messages, annotations and subscripts. Nor does it change
+numbers that are a choice: defaults of settings, bounds and usual sizes in the catalogue, and
+tolerances below 1e-6. AREAS lists the files and their tests, which run up to the first failure.
 
-The same command continues after an interruption, also with changed code: mutants in FILE.json come
-first, then others. With --again those that survived are tested again. The tool prints the
-survivors; the exit code is 1 if they are more than 5 %.
+The same command continues after an interruption, also with changed code: mutants with a result in
+FILE.json come first, then others. With --again those that survived are tested again. The tool
+prints the survivors. The exit code is 1 if more than 5 % survive.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from plant_faults import LONGEST_S, ROOT, copy_tree, run_tests
 IMPORTERS = (
     "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
 )
+"""Tests of the importers, as in `AREAS`."""
 AREAS = (
     ("suite/train/losses.py", "suite/train/test_losses suite/train/test_config"),
     ("tracks/geometry/field.py", "tracks/geometry/test_field"),
@@ -48,37 +49,45 @@ AREAS = (
     ("eval/importers/formats/*.py", f"{IMPORTERS} importers/test_damaged"),
     ("policies/formats/c/templates/*.c", "policies/formats/c"),
 )  # fmt: skip
-"""Files, and the beginnings of the paths of their tests (eval/ where no package is named)."""
+"""Areas of the code: files, and their tests as paths below tests/ without .py. A path that begins
+with no package is below tests/eval/."""
 PAIRS = "+ - * / < <= > >= == != and or & |".split()
+"""Operators; the first and the second replace each other, the third and the fourth, and so on."""
 OTHER = {operator: PAIRS[k ^ 1] for k, operator in enumerate(PAIRS)} | {"**": "*"}
-"""Operator -> the operator that replaces it, its neighbour in `PAIRS`."""
+"""Operator -> the operator that replaces it, the other one of its pair (k ^ 1 is the neighbour of
+an even or odd k)."""
 CHOICE = re.compile(r"\w+: [^#]* = |(.*\W)?(low|high|typical)=[^=]*$")
-"""The text before a default, a bound or a usual size in its line."""
+"""Pattern of the text before a default, a bound or a usual size in its line."""
 TOLERANCE = re.compile(r"\d+(\.\d*)?e-([7-9]|[1-9]\d)f?")
-"""A number below 1e-6."""
+"""Pattern of a number below 1e-6."""
 C_TOKEN = re.compile(r"(?<= )(\+|-|\*|/|<|<=|>|>=|==|!=|&&)(?= )|(?<![\w.])\d+\.\d*f?\b")
-"""An operator or a number in C code."""
+"""Pattern of an operator or a number in C code."""
 
 
 class Mutant(NamedTuple):
-    """One change: the bytes from `first` to `last` of a file become `new`."""
+    """One change of a file."""
 
     file: str
+    """Path of the file, relative to the checkout."""
     first: int
+    """Index of the first byte that is replaced."""
     last: int
+    """Index of the first byte after those that are replaced."""
     new: str
+    """Text that replaces them."""
     tests: str
-    """Beginnings of the paths of the tests, as in `AREAS`."""
+    """Tests of the file, as in `AREAS`."""
 
 
 def other_number(text: str) -> str:
-    """Return a text with another number than that of `text`, of the same type."""
+    """Return a number as text: an integer one larger than that in `text`, or a float 1.25 times."""
     value = ast.literal_eval(text.rstrip("f"))
     return f"({value + 1 if isinstance(value, int) else 1.25 * value or 1.0!r})"
 
 
 def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
-    """Yield first byte, last byte and new text of every possible change of a Python file."""
+    """Yield (first, last, new) of every possible change of a Python file, as in `Mutant`."""
+    # The syntax tree has lines and columns; a change has bytes of the file.
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -100,13 +109,16 @@ def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
             yield span(node)[0], span(node.operand)[0], ""
         elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
             yield *span(node), other_number(repr(node.value))
+        # The operator is in the text between its two operands.
         for left, right in pairs:
             first, last = span(left)[1], span(right)[0]
-            for found in re.finditer(rb"\*\*|[<>=!]=|[-+*/<>&|]|\b(and|or)\b", source[first:last]):
-                yield first + found.start(), first + found.end(), OTHER[found[0].decode()]
+            for operator in re.finditer(
+                rb"\*\*|[<>=!]=|[-+*/<>&|]|\b(and|or)\b", source[first:last]
+            ):
+                yield first + operator.start(), first + operator.end(), OTHER[operator[0].decode()]
         for name, value in ast.iter_fields(node):
-            left_out = name in ("annotation", "returns", "decorator_list", "slice")
-            if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert) or left_out:
+            skipped = name in ("annotation", "returns", "decorator_list", "slice")
+            if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert) or skipped:
                 continue
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST):
@@ -116,7 +128,7 @@ def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
 
 
 def mutants(copy: Path) -> list[list[Mutant]]:
-    """Return all mutants of each area in `AREAS`."""
+    """Return all mutants of each area in `AREAS`; `copy` is the folder of the code."""
     areas = []
     for pattern, tests in AREAS:
         areas.append([])
@@ -133,10 +145,10 @@ def mutants(copy: Path) -> list[list[Mutant]]:
 
 
 def describe(copy: Path, mutant: Mutant) -> tuple[str, bool]:
-    """Return a mutant's name, and whether a test should detect it.
+    """Return the name of a mutant, and whether a test should detect it.
 
-    The name does not depend on other lines of the file. A test cannot detect a change of a number
-    that is a choice, such as a default.
+    The name has the text of the line, not its number, so it stays the same if other lines change.
+    A test cannot detect a change of a number that is a choice, such as a default.
     """
     source = (copy / mutant.file).read_bytes()
     lines, row = source.splitlines(), source[: mutant.first].count(b"\n")
@@ -152,10 +164,10 @@ def describe(copy: Path, mutant: Mutant) -> tuple[str, bool]:
 
 
 def tests_fail(copy: Path, tests: str, cpu_s: float = LONGEST_S) -> bool:
-    """Return whether tests fail, or need more than `cpu_s` of processor time [s].
+    """Return whether `tests` fail, or need more than `cpu_s` of processor time [s].
 
     Raises:
-        SystemExit: if they did not run.
+        SystemExit: if the tests did not run.
     """
     names = [part if part.startswith(("suite", "tracks", "policies", "eval")) else f"eval/{part}"
              for part in tests.split()]  # fmt: skip
@@ -164,7 +176,7 @@ def tests_fail(copy: Path, tests: str, cpu_s: float = LONGEST_S) -> bool:
     code, message = run_tests(copy, paths, cpu_s)
     if code > 2:
         raise SystemExit(f"{tests}: pytest ended with {code} ({message})")
-    return code != 0  # 2: the mutant cannot be imported
+    return code != 0  # 1: a test failed; 2: the mutant cannot be imported
 
 
 def children_s() -> float:
@@ -188,6 +200,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         copy_tree(ROOT, copy)
+        # The order takes one mutant of each area in turn, so that all have an equal share.
         areas = [rng.sample(area, len(area)) for area in mutants(copy)]
         longest = max(map(len, areas))
         order = [area[k] for k in range(longest) for area in areas if k < len(area)]
@@ -198,6 +211,7 @@ def main() -> int:
         limit_s: dict[str, float] = {}
         for name, mutant in candidates[: args.count]:
             if not known.get(name):
+                # Tests without a mutant must pass; their time gives the limit for the mutants.
                 if mutant.tests not in limit_s:
                     before = children_s()
                     if tests_fail(copy, mutant.tests):

@@ -36,19 +36,20 @@ if TYPE_CHECKING:
     from eval.worlds.trial import TrialResult
 
 MB = 1e6
+"""Bytes in a megabyte."""
 PROGRESS_EVERY = 10_000
-"""Number of pieces between two lines of progress."""
+"""Number of pieces between two printed lines about the progress."""
 
 
 class Clock:
-    """A clock that prints the time since its last line."""
+    """A clock that measures processor time and wall time, and prints both."""
 
     def __init__(self) -> None:
         """Start the clock."""
         self.wall, self.busy = time.monotonic(), _processor_s()
 
     def say(self, what: str, count: int = 1) -> None:
-        """Print the time since the last line, for work `what` that was done `count` times."""
+        """Print the time since the last line, for the work `what` that was done `count` times."""
         wall, busy = time.monotonic() - self.wall, _processor_s() - self.busy
         each = f", {1e6 * busy / count:.0f} us each" if count > 1 else ""
         print(f"{what}: {busy:.1f} s ({wall:.1f} s wall){each}; {memory_mb():.0f} MB", flush=True)
@@ -73,7 +74,7 @@ def empty_piece(size: int, piece: int) -> Iterator[bytes]:
 
 @contextlib.contextmanager
 def workers_of(text: str | None) -> Iterator[Workers]:
-    """Yield the workers of a text as in --workers, or the address of a new local cluster."""
+    """Yield the workers that `text` describes as in --workers; without it a new local cluster."""
     if text:
         yield read_workers(text) or 1
         return
@@ -86,7 +87,7 @@ def workers_of(text: str | None) -> Iterator[Workers]:
 
 
 def engine(count: int, args: argparse.Namespace) -> None:
-    """Measure the driver with `count` pieces that do nothing."""
+    """Measure the load of the driver with `count` pieces that do nothing."""
     with workers_of(args.workers) as workers:
         done, clock, started = 0, Clock(), time.monotonic()
 
@@ -106,13 +107,14 @@ def engine(count: int, args: argparse.Namespace) -> None:
 
 
 def some_trial(number: int) -> TrialResult:
-    """Return an invented trial with the given number."""
+    """Return the result of an invented trial, whose level and seed follow from `number`."""
     from eval.worlds.trial import TrialResult
 
-    rest = dict.fromkeys(TrialResult._fields[-5:], 0)
+    # The last five fields do not matter here.
+    last_fields = dict.fromkeys(TrialResult._fields[-5:], 0)
     return TrialResult(
         "zigzag", number % 10, number, "p", "v", "mujoco", True, 8, "finished", None,
-        0.123456789, 0.2, 0.3, 5.0, 4.0, 3.0, **rest,
+        0.123456789, 0.2, 0.3, 5.0, 4.0, 3.0, **last_fields,
     )  # fmt: skip
 
 
@@ -138,7 +140,7 @@ def journal(count: int, args: argparse.Namespace) -> None:
 
 
 def sweep(count: int, args: argparse.Namespace) -> None:
-    """Measure the driver in a study with one trial of each of `count` vehicles."""
+    """Measure the load of the driver in a study of `count` vehicles with one trial each."""
     from eval.quadrotor.vehicle_file import load_vehicle
     from eval.worlds.trial import TrialSpec
     from suite.experiments.study import judging
@@ -150,6 +152,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
         for share in shares:
             yield share.number, some_trial(0)
 
+    # Flights are replaced by invented results, so that only the driver works.
     judging._fly_piece = piece
     vehicle, trial, clock = load_vehicle("reference"), TrialSpec("zigzag", 0, 0), Clock()
     setups = (
@@ -163,7 +166,7 @@ def sweep(count: int, args: argparse.Namespace) -> None:
 
 
 def costs(count: int, args: argparse.Namespace) -> None:
-    """Measure one piece of each kind: its time, and the data sent to and from a worker."""
+    """Measure a piece of each kind: its time, and the size of the data to and from a worker."""
     set_threads()
     from eval.judging.judge import Record, Task, fly_share
     from eval.quadrotor.vehicle_file import load_vehicle
@@ -213,7 +216,7 @@ def costs(count: int, args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run one measurement of the command line."""
+    """Run the measurement that the command line names."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -2,10 +2,11 @@
 
     python tools/plant_faults.py [--tree DIR] [--out FILE.json] [--only NUMBER ...] [--list]
 
-A fault replaces a text that occurs exactly once below its folder by a wrong one: a sign, an axis, a
-row, a term, a unit or a threshold. The tests named with it run without the fault first, then with
-it, in a copy of the files that git tracks in DIR. The fault is caught if a test fails. The same
-command continues after an interruption. The exit code is 1 if a fault was not caught.
+A fault replaces a text of the code by a wrong one, such as another sign, axis, row, term, unit or
+threshold. The text must occur exactly once below the folder of the fault. Each fault has a list of
+tests. They run in a copy of the files that git tracks in DIR, first without the fault, then with
+it. The fault is caught if a test fails. The same command continues after an interruption. The exit
+code is 1 if a fault was not caught.
 """
 
 from __future__ import annotations
@@ -23,22 +24,23 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 LONGEST_S = 300.0
-"""Longest duration of the tests [s]; a fault with which they run for longer is caught."""
+"""Longest duration of the tests of a fault [s]. If they run longer with the fault, it is caught."""
 FAILED = 1
 """Exit code of pytest if a test fails."""
 
 
 class Fault(NamedTuple):
-    """One fault."""
+    """One planted fault."""
 
     folder: str
-    """Folder of the code with the text."""
+    """Folder of the code in which the text occurs once."""
     old: str
-    """Text of the code."""
+    """Correct text, as in the code."""
     new: str
     """Wrong text that replaces it."""
     tests: str
-    """Ends of the names of the test files that should catch the fault; not all must exist."""
+    """Test files that should catch the fault: the ends of their paths, without .py. At least one of
+    the files must exist."""
 
 
 FAULTS = (
@@ -133,7 +135,7 @@ FAULTS = (
     Fault("suite/judging/link", "since_s + limits.jump_m", "since_s + 2.0 * limits.jump_m",
           "test_companion test_link test_watchdog"),
 )  # fmt: skip
-"""Forty: 6 of tracks, 6 of policies, 14 of eval, 14 of suite."""
+"""The forty faults: 6 in tracks, 6 in policies, 14 in eval, 14 in suite."""
 
 
 def copy_tree(tree: Path, place: Path) -> list[str]:
@@ -149,30 +151,33 @@ def copy_tree(tree: Path, place: Path) -> list[str]:
 
 
 def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
-    """Return the file that has the fault's text.
+    """Return the file that has the text of the fault.
 
     Args:
         fault: the fault.
-        names: names of all files.
-        copy: folder of their copies.
+        names: paths of all files, relative to the checkout.
+        copy: folder with the copies of the files.
 
     Raises:
         SystemExit: if the text does not occur exactly once.
     """
-    inside = [copy / name for name in names if name.startswith(f"{fault.folder}/")]
-    inside = [path for path in inside if path.suffix in (".py", ".c")]
-    holds = [path for path in inside for _ in range(path.read_text("utf-8").count(fault.old))]
-    if len(holds) != 1:
-        found = ", ".join(str(path.relative_to(copy)) for path in holds) or "nowhere"
+    sources = [copy / name for name in names if name.startswith(f"{fault.folder}/")]
+    sources = [path for path in sources if path.suffix in (".py", ".c")]
+    # A file is listed as often as it has the text.
+    occurrences = [
+        path for path in sources for _ in range(path.read_text("utf-8").count(fault.old))
+    ]
+    if len(occurrences) != 1:
+        found = ", ".join(str(path.relative_to(copy)) for path in occurrences) or "nowhere"
         raise SystemExit(
-            f"{fault.old!r}: found {len(holds)} times below {fault.folder} ({found}), allowed is "
+            f"{fault.old!r}: found {len(occurrences)} times below {fault.folder} ({found}), allowed is "
             "once; make the fault's text in tools/plant_faults.py that of the code"
         )
-    return holds[0]
+    return occurrences[0]
 
 
 def tests_of(fault: Fault, names: list[str]) -> list[str]:
-    """Return the existing test files of a fault, from the `names` of all files.
+    """Return the test files of a fault that are among the `names` of all files.
 
     Raises:
         SystemExit: if none exists.
@@ -189,7 +194,7 @@ def run_tests(copy: Path, tests: list[str], cpu_s: float = LONGEST_S) -> tuple[i
     """Run `tests` in the folder `copy`, for at most `cpu_s` of processor time [s].
 
     Returns:
-        pytest's exit code, and its last failed test or else its last line.
+        The exit code of pytest, and its last line about a failed test, or else its last line.
     """
     limits = (int(cpu_s), int(cpu_s) + 5)
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--assert=plain"]
@@ -207,7 +212,7 @@ def run_tests(copy: Path, tests: list[str], cpu_s: float = LONGEST_S) -> tuple[i
 
 
 class Work:
-    """A copy of a checkout in which faults are planted, and the stored results."""
+    """A copy of a checkout in which faults are planted, and the stored results of tests."""
 
     def __init__(self, tree: Path, copy: Path, out: Path) -> None:
         """Copy the checkout `tree` to `copy`; results are stored in the file `out`."""
@@ -215,10 +220,10 @@ class Work:
         self._done = json.loads(out.read_text("utf-8")) if out.is_file() else {}
 
     def result(self, number: int) -> dict[str, Any]:
-        """Return whether the tests catch fault `number`, and their message.
+        """Return whether the tests catch fault `number` (from 1), and their message.
 
         Raises:
-            SystemExit: if they fail without the fault.
+            SystemExit: if the tests fail without the fault.
         """
         fault = FAULTS[number - 1]
         place, tests = place_of(fault, self.names, self.copy), tests_of(fault, self.names)
@@ -235,11 +240,14 @@ class Work:
         return {"number": number, "file": file, "caught": code != 0, "said": message}
 
     def _run(self, tests: list[str], place: Path) -> tuple[int, str]:
-        """Run tests, or return the stored result for the same contents of them and of `place`."""
-        sums = hashlib.sha256()
+        """Run tests, and store the result; or return the result that is stored already.
+
+        A stored result counts for the same contents of the tests and of the file `place`.
+        """
+        sha256 = hashlib.sha256()
         for path in (place, *(self.copy / test for test in tests)):
-            sums.update(path.read_bytes())
-        key = f"{' '.join(tests)} {place.relative_to(self.copy)} {sums.hexdigest()[:16]}"
+            sha256.update(path.read_bytes())
+        key = f"{' '.join(tests)} {place.relative_to(self.copy)} {sha256.hexdigest()[:16]}"
         if key not in self._done:
             self._done[key] = run_tests(self.copy, tests)
             self._out.parent.mkdir(parents=True, exist_ok=True)

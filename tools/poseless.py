@@ -3,13 +3,15 @@
     python tools/poseless.py [CASES [SEED [FIRST]]]
 
 An effect is a physical cause of a mismatch between vehicle file and flights. Every case has one
-hidden effect of usual size, or none, in a vehicle that flies six trajectories of 8 s in MuJoCo. Its
+hidden effect of usual size, or none, in a vehicle that flies six trajectories of 8 s in MuJoCo. The
 logs have only gyro, accelerometer, set points, rotor speeds and voltage, with noise and constant
-biases of a small board's sensors. The tool prints a line for each case, with the errors of the
-named parameters divided by half their intervals. Then it prints how often the only name is right,
-how often a vehicle without an effect gets a name (false alarm), and how many 95 % intervals contain
-the truth, each with its 95 % interval (Clopper and Pearson). 60 cases take about 6 minutes on two
-cores.
+biases as the sensors of a small board have them.
+
+The tool prints a line for each case, with the errors of the named parameters divided by half of
+their intervals. Then it prints three shares, each with its 95 % interval (Clopper and Pearson):
+cases in which the hidden effect is named and nothing else; vehicles without an effect for which one
+is named (false alarms); and 95 % intervals that contain the true value. 60 cases take about 6
+minutes on two cores.
 """
 
 from __future__ import annotations
@@ -37,28 +39,31 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 
 NOMINAL = "reference"
+"""Name of the vehicle file that the diagnosis gets."""
 IDENTIFIABLE = (
     *("thrust_scale", "weak_motor", "linear_drag", "rotor_drag", "quadratic_drag", "thrust_tilt"),
     *("com_offset", "torque_trim", "inertia_scale", "inflow"),
 )
-"""Effects that change body rates or specific force on such flights."""
+"""The hidden effects: those that change body rates or specific force on such flights."""
 CLEAN_EVERY = 4
-"""Every case with a number divisible by this has no hidden effect."""
+"""Cases whose number is divisible by this have no hidden effect ("clean")."""
 BOARD = Sensors("board", 100.0, pos=0.0, attitude=0.0, gyro=0.03, acc=0.3, rotor=3.0, voltage=0.05)
+"""Rate and noise of the logs."""
 GYRO_BIAS, ACC_BIAS = 0.005, 0.05
-"""Standard deviations of the constant errors of each axis in a flight [rad/s], [m/s^2]."""
+"""Standard deviations of the constant errors of gyro [rad/s] and accelerometer [m/s^2], drawn for
+each axis and flight."""
 FLIGHTS, FLIGHT_S = 6, 8.0
 """Number of flights of a case, and their duration [s]."""
 
 
 def hidden_values(name: str, vehicle: Vehicle, rng: np.random.Generator) -> Any:
-    """Return an effect's values, which differ from the vehicle file's by a usual size."""
+    """Return random values of an effect, which differ from those of `vehicle` by a usual size."""
     effect, values = EFFECTS[name], []
     for k, p in enumerate(effect.parameters):
         change = np.full(p.size or 1, rng.uniform(*p.typical) * rng.choice(p.signs))
         if p.direction:
             change *= np.asarray(p.direction)
-        if p.one_at_a_time:
+        if p.one_at_a_time:  # one component only, such as one weak motor: a random one
             change = np.roll(change, rng.integers(len(change)))
         nominal = vehicle.effects.get(name)
         value = (
@@ -69,11 +74,12 @@ def hidden_values(name: str, vehicle: Vehicle, rng: np.random.Generator) -> Any:
 
 
 def fly_logs(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[FlightLog]:
-    """Return logs without a pose of flights of the vehicle `true`.
+    """Fly the vehicle `true`, and return logs without a pose.
 
     The tracking controller uses the vehicle file `nominal`.
     """
     while True:
+        # Trajectories close to the ground are left out.
         trajectories = [t for _ in range(2) for t in ordinary_flights(rng, FLIGHT_S)]
         trajectories = [t for t in trajectories if t.kind != "low"][:FLIGHTS]
         try:
@@ -97,7 +103,13 @@ def fly_logs(nominal: Vehicle, true: Vehicle, rng: np.random.Generator) -> list[
 
 
 def run(cases: int, seed: int, first: int) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Yield the hidden effect's name and values, and the diagnosis, case by case."""
+    """Yield the hidden effect ("" for none), its values and the diagnosis, case by case.
+
+    Args:
+        cases: number of cases.
+        seed: seed of all draws.
+        first: number of the first case.
+    """
     nominal = load_vehicle(NOMINAL)
     for number in range(first, first + cases):
         rng = np.random.default_rng([seed, number])
@@ -111,7 +123,10 @@ def run(cases: int, seed: int, first: int) -> Iterator[tuple[str, Any, dict[str,
 
 
 def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
-    """Yield the errors of a named effect's parameters, divided by half their 95 % intervals."""
+    """Yield the error of each parameter of a named effect, divided by half of its 95 % interval.
+
+    `truth` has the true values, `effect` is the entry of the diagnosis.
+    """
     parameters = effect["parameters"]
     rotor = parameters.get("index", {}).get("value")
     for key, entry in parameters.items():
@@ -126,7 +141,7 @@ def errors(truth: Any, effect: dict[str, Any]) -> Iterator[float]:
 
 
 def outcome_of(name: str, effects: list[dict[str, Any]]) -> str:
-    """Return the outcome as text; `name` is the hidden effect, "" for none."""
+    """Return the outcome of a case as text; `name` is the hidden effect, "" for none."""
     name_sets = [{e["name"], *e["alternatives"]} for e in effects]
     if not name:
         return "false alarm" if effects else "clean"
@@ -144,7 +159,7 @@ def share_line(label: str, count: int, of: int) -> str:
 
 
 def main() -> None:
-    """Run the cases and print their table."""
+    """Run the cases, and print a line for each and the shares."""
     words = sys.argv[1:]
     cases, seed, first = (int(v) for v in (*words, *("60", "5600000", "0")[len(words) :]))
     keep_compiled()

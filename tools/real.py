@@ -2,10 +2,10 @@
 
     python tools/real.py LOGS OUT
 
-`suite identify` estimates the numbers of a vehicle file from flights; `suite diagnose` names the
-physical effects that it lacks. LOGS has the folders `nanobench`, `crazypad` and `crazyswarm2` with
-the authors' files (sources in docs/results/real.md). OUT gets flights, vehicle files, diagnoses and
-the page `real.md`.
+`suite identify` estimates the parameters of a vehicle file from flights. `suite diagnose` names the
+physical effects that the file lacks. LOGS has a folder for each laboratory with the files of its
+authors: `nanobench`, `crazypad` and `crazyswarm2` (sources in docs/results/real.md). OUT gets
+flights, vehicle files, diagnoses and the page `real.md`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from suite.cli import main
 
 FITTED = ("B10_lissajous_fast_rep1", "B2_circle_fast_rep2", "B3_figure8_fast_rep1",
           "B3_figure8_slow_rep2")  # fmt: skip
-"""Flights of nanobench from which the vehicle file is identified; the others are diagnosed."""
+"""Flights of nanobench from which the vehicle file is estimated; the others are diagnosed."""
 MASSES = {
     "upgraded": (
         ("log10", "log12"),
@@ -33,7 +33,8 @@ MASSES = {
     ),
     "standard": (("log150", "log155"), ("log160", "log170", "log180")),
 }
-"""Motors of crazyswarm2 -> reference flights, and the flights compared with them."""
+"""Motors of the drone of crazyswarm2 -> flights that are the reference, and flights with other
+masses that are compared with them."""
 
 
 def suite(*words: Any) -> dict[str, Any]:
@@ -54,8 +55,8 @@ def import_flights(files: Iterable[Path], folder: Path, *options: Any) -> dict[s
     """Import logs that `folder` lacks, and return name -> path of all flights.
 
     Args:
-        files: the authors' logs.
-        folder: folder of the flights.
+        files: logs of the authors.
+        folder: folder of the imported flights.
         options: options of `suite import`.
     """
     flights = {}
@@ -83,7 +84,10 @@ def names_line(diagnosis: dict[str, Any]) -> str:
 
 
 def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
-    """Return the lines on nanobench: the diagnosis with and without the identified drag."""
+    """Return the lines of the page on nanobench: diagnoses with and without the estimated drag.
+
+    `options` are further options of `suite import`, such as those that remove the pose.
+    """
     flights = import_flights(logs.glob("*.csv"), out / "flights", "--map", "nanobench", *options)
     fitted = [flights[name] for name in FITTED]
     others = [path for name, path in flights.items() if name not in FITTED]
@@ -124,7 +128,10 @@ def nanobench(logs: Path, out: Path, *options: Any) -> list[str]:
 
 
 def named_change(out: Path, references: Sequence[Path], flights: Sequence[Path]) -> str:
-    """Return the effects that `flights` have in comparison with `references`, in a line."""
+    """Return the effects that `flights` have in comparison with `references`, in a line.
+
+    A flight is not compared with itself, so references that are among the flights do not count.
+    """
     other_references = [path for path in references if path not in flights]
     if len(other_references) < 2:
         return "too few references"
@@ -134,9 +141,11 @@ def named_change(out: Path, references: Sequence[Path], flights: Sequence[Path])
 
 
 def crazypad(logs: Path, out: Path, *options: Any) -> list[str]:
-    """Return the lines on crazypad: each condition's flights together, and each flight alone.
+    """Return the lines of the page on crazypad.
 
-    With `options`, which remove the pose, only the controller logs are used: they have body rates.
+    The flights of each condition, such as an added weight, are diagnosed together and one by one.
+    The reference are the normal flights of the same vehicle. With `options`, which remove the pose,
+    only the controller logs are used, since they have body rates.
     """
     lines = [
         "| logs, vehicle | condition | all flights together | each alone |",
@@ -162,7 +171,10 @@ def crazypad(logs: Path, out: Path, *options: Any) -> list[str]:
 
 
 def crazyswarm2(logs: Path, out: Path) -> list[str]:
-    """Return the lines on crazyswarm2, where flights with the same mass are diagnosed together."""
+    """Return the lines of the page on crazyswarm2.
+
+    Flights with the same mass are diagnosed together, in comparison with the reference flights.
+    """
     masses = {
         file.stem.replace("info", "log"): float(line.split(":")[1])
         for file in logs.glob("info*.yaml")
@@ -170,26 +182,29 @@ def crazyswarm2(logs: Path, out: Path) -> list[str]:
         if line.startswith("mass:")
     }
     lines = ["| motors | reference | flights | mass [kg] | named |", "|---|---|---|---|---|"]
-    for motors, (before, after) in MASSES.items():
-        nominal, folder = masses[before[0]], out / motors
-        files = [logs / name for name in (*before, *after)]
+    for motors, (reference_names, compared_names) in MASSES.items():
+        nominal, folder = masses[reference_names[0]], out / motors
+        files = [logs / name for name in (*reference_names, *compared_names)]
         flights = import_flights(
             files, folder / "flights", "--map", "crazyswarm2", "--mass", nominal
         )
-        references = [flights[name] for name in before]
-        for mass in sorted({masses[name] for name in after}):
-            names = [name for name in after if masses[name] == mass]
+        references = [flights[name] for name in reference_names]
+        for mass in sorted({masses[name] for name in compared_names}):
+            names = [name for name in compared_names if masses[name] == mass]
             paths = [flights[name] for name in names]
             named = named_change(folder / f"{mass}", references, paths)
             lines.append(
-                f"| {motors} | {', '.join(before)} ({nominal}) | {', '.join(names)} | {mass} "
+                f"| {motors} | {', '.join(reference_names)} ({nominal}) | {', '.join(names)} | {mass} "
                 f"| {named} |"
             )
     return lines
 
 
 def write_page(logs: Path, out: Path) -> None:
-    """Diagnose the flights of all three laboratories, two also without a pose; write the page."""
+    """Diagnose the flights of the three laboratories, and write the page.
+
+    The flights of two laboratories are also diagnosed without their pose.
+    """
     no_pose = [word for name in ("pos", "quat", "vel") for word in ("--read", f"{name}=drop")]
     parts = {
         "nanobench": lambda: nanobench(logs / "nanobench", out / "nanobench"),

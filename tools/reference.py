@@ -29,6 +29,7 @@ from suite.train.recipes import named_recipe
 HEADS = Path(__file__).with_name("heads")
 """Folder of the text above the generated part of each page."""
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
+"""Folder of the generated pages."""
 HEAD = "<!-- Made by tools/reference.py; change the code, not this page. -->\n"
 """First line of each page."""
 WITHOUT_AXIS = {
@@ -49,7 +50,7 @@ SETTING_GROUPS = {
 
 
 def head(page: str) -> str:
-    """Return a page's title and introduction."""
+    """Return the title and the introduction of a page."""
     return (HEADS / f"{page}.md").read_text(encoding="utf-8")
 
 
@@ -79,7 +80,10 @@ def commands() -> str:
 
 
 def _default(option: Option) -> str:
-    """Return an option's default as a cell; empty where the text says what happens without it."""
+    """Return the default of an option as the text of a cell.
+
+    It is empty if the description says what happens without the option.
+    """
     value = option.default
     if value is MISSING:
         return "required"
@@ -94,7 +98,7 @@ class _Plain(str):
 
 
 def _signature(function: Any) -> str:
-    """Return a function's signature, with one parameter in a line."""
+    """Return the signature of a function, with one parameter in a line."""
     signature = inspect.signature(function)
     parameters = [
         parameter.replace(annotation=_Plain(parameter.annotation))
@@ -120,9 +124,9 @@ def python() -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a setting's value as a cell; the phases of a recipe are counted."""
-    counted = isinstance(value, tuple) and value and is_dataclass(value[0])
-    return f"{len(value)} of them" if counted else cell(value)
+    """Return the value of a setting as the text of a cell; for phases it is their number."""
+    is_phases = isinstance(value, tuple) and value and is_dataclass(value[0])
+    return f"{len(value)} of them" if is_phases else cell(value)
 
 
 def training() -> str:
@@ -130,6 +134,7 @@ def training() -> str:
     groups = dict[str, list[str]]()
     for setting in settings(named_recipe("race")):
         path = setting.path
+        # The vehicle of the quadrotor is chosen by --vehicle, not by settings.
         if not path.startswith("quadrotor.vehicle."):
             group = path.split(".")[0] if "." in path else ""
             default, about = _value(setting.default), cell(setting.about)
@@ -144,7 +149,8 @@ def training() -> str:
 
 
 def _meaning(entry: Any, parameter: str) -> str:
-    """Return the text below a parameter's field, without its shape and unit."""
+    """Return the text below the field of a parameter, without its shape and unit."""
+    # `measured_state` makes its parameters from those of one axis: pos_x_noise -> noise.
     if entry.values is MeasuredState:
         suffix = re.sub(r"^[a-z]+_[xyz]_?", "", parameter)
         text = WITHOUT_AXIS.get(parameter) or field_texts(Axis)[suffix or "noise"]
@@ -186,7 +192,7 @@ GENERATORS = {
 
 
 def main(check: bool) -> int:
-    """Write the pages, or with `check` compare them with the generated text."""
+    """Write the pages, or with `check` compare them with the generated text; return the exit code."""
     stale = 0
     for name, make in GENERATORS.items():
         path, text = PAGES / f"{name}.md", f"{HEAD}{make().rstrip()}\n"

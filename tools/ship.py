@@ -2,9 +2,9 @@
 
     python tools/ship.py RUN --eval EVAL [--name race] [--speed 0.8]
 
-RUN is a folder of `suite train`, EVAL one of `suite eval`; without it the card has no table yet. A
-policy whose speed is an input flies at --speed by default. The card is a page that says how the
-policy was made and how well it flies.
+The card is a page that says how the policy was made and how well it flies. RUN is a folder of
+`suite train`, EVAL is a folder of `suite eval`. Without EVAL the card has no table of results. A
+policy with a speed input gets --speed as its usual speed.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from suite.loop.compare import BEFORE
 from tracks.common.files import replacing_folder, write_json
 
 SHELF = Path(__file__).resolve().parent.parent / "policies" / "shipped"
+"""Folder of the shipped policies."""
 
 
 def card(name: str, run: Path, judged: Path | None) -> str:
@@ -32,7 +33,7 @@ def card(name: str, run: Path, judged: Path | None) -> str:
     Args:
         name: name of the shipped policy.
         run: folder of the training.
-        judged: folder of the evaluation; None: no table.
+        judged: folder of the evaluation; None: the card has no table of results.
     """
     training, rows = json.loads((run / "run.json").read_text(encoding="utf-8")), curve.read(run)
     seconds = sum(row["seconds"] for row in rows)
@@ -75,7 +76,7 @@ trials' seeds were not flown while the recipe was made.
 
 
 def main() -> None:
-    """Write policies/shipped/NAME from the command line's folders."""
+    """Write policies/shipped/NAME from the folders in the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of suite train")
     parser.add_argument("--eval", type=Path, help="folder of suite eval of the run's policy")

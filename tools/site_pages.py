@@ -1,9 +1,9 @@
-"""Hooks of mkdocs for `make docs`: links that lead out of docs/, two added pages, and the search.
+"""Functions that mkdocs calls for `make docs`: for links out of docs/, two pages, and the search.
 
-In the repository a link out of docs/ opens a file. The site has no such files, so the hook replaces
-the link by the file's path. A link to a file that does not exist ends the build. CONTRIBUTING.md
-and CHANGELOG.md become pages of the site. The search excludes docs/archive, whose pages describe
-removed policies and experiments.
+In the repository a link out of docs/ opens a file. The site has no such files, so the link is
+replaced by the path of the file. A link to a file that does not exist ends the build.
+CONTRIBUTING.md and CHANGELOG.md become pages of the site. The search excludes docs/archive, whose
+pages describe removed policies and experiments.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 from mkdocs.structure.files import File
 
 ROOT = {"contributing.md": "CONTRIBUTING.md", "releases.md": "CHANGELOG.md"}
-"""Page of the site -> file of the repository's root."""
+"""Page of the site -> file in the root folder of the repository."""
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+[^)#\s]+)(?:#[^)]*)?\)")
 """A link, not a picture, whose path begins with at least one `../`."""
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
-    """Return a page's text, with links out of docs/ replaced by paths in the repository.
+    """Return the text of a page, with links out of docs/ replaced by paths in the repository.
 
     Raises:
         FileNotFoundError: for a link to a file that does not exist.
