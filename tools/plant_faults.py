@@ -164,16 +164,14 @@ def place_of(fault: Fault, names: list[str], copy: Path) -> Path:
     sources = [copy / name for name in names if name.startswith(f"{fault.folder}/")]
     sources = [path for path in sources if path.suffix in (".py", ".c")]
     # A file is listed as often as it has the text.
-    occurrences = [
-        path for path in sources for _ in range(path.read_text("utf-8").count(fault.old))
-    ]
-    if len(occurrences) != 1:
-        found = ", ".join(str(path.relative_to(copy)) for path in occurrences) or "nowhere"
+    holders = [path for path in sources for _ in range(path.read_text("utf-8").count(fault.old))]
+    if len(holders) != 1:
+        found = ", ".join(str(path.relative_to(copy)) for path in holders) or "nowhere"
         raise SystemExit(
-            f"{fault.old!r}: found {len(occurrences)} times below {fault.folder} ({found}), allowed is "
+            f"{fault.old!r}: found {len(holders)} times below {fault.folder} ({found}), allowed is "
             "once; make the fault's text in tools/plant_faults.py that of the code"
         )
-    return occurrences[0]
+    return holders[0]
 
 
 def tests_of(fault: Fault, names: list[str]) -> list[str]:

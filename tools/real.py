@@ -182,19 +182,19 @@ def crazyswarm2(logs: Path, out: Path) -> list[str]:
         if line.startswith("mass:")
     }
     lines = ["| motors | reference | flights | mass [kg] | named |", "|---|---|---|---|---|"]
-    for motors, (reference_names, compared_names) in MASSES.items():
-        nominal, folder = masses[reference_names[0]], out / motors
-        files = [logs / name for name in (*reference_names, *compared_names)]
+    for motors, (base, compared_names) in MASSES.items():
+        nominal, folder = masses[base[0]], out / motors
+        files = [logs / name for name in (*base, *compared_names)]
         flights = import_flights(
             files, folder / "flights", "--map", "crazyswarm2", "--mass", nominal
         )
-        references = [flights[name] for name in reference_names]
+        references = [flights[name] for name in base]
         for mass in sorted({masses[name] for name in compared_names}):
             names = [name for name in compared_names if masses[name] == mass]
             paths = [flights[name] for name in names]
             named = named_change(folder / f"{mass}", references, paths)
             lines.append(
-                f"| {motors} | {', '.join(reference_names)} ({nominal}) | {', '.join(names)} | {mass} "
+                f"| {motors} | {', '.join(base)} ({nominal}) | {', '.join(names)} | {mass} "
                 f"| {named} |"
             )
     return lines

@@ -192,7 +192,10 @@ GENERATORS = {
 
 
 def main(check: bool) -> int:
-    """Write the pages, or with `check` compare them with the generated text; return the exit code."""
+    """Write the pages, or with `check` compare them with the generated text.
+
+    Return the exit code: 1 if `check` finds a page that differs.
+    """
     stale = 0
     for name, make in GENERATORS.items():
         path, text = PAGES / f"{name}.md", f"{HEAD}{make().rstrip()}\n"
