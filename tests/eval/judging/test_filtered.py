@@ -45,8 +45,8 @@ def flown(
     found: list[np.ndarray] = []
 
     class Watched(Filtered):
-        def see(self, seen: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
-            seen = super().see(seen, truth, fresh, flying)
+        def see(self, view: View, truth: View, fresh: np.ndarray, flying: np.ndarray) -> View:
+            seen = super().see(view, truth, fresh, flying)
             assert self.filters is not None and self._truth is not None
             past.append(View(*self._truth))
             if len(past) > 1:
