@@ -79,6 +79,7 @@ def json_digest(path: Path) -> str:
     """Return the digest of a JSON file without the keys of `STAMPS`."""
 
     def without_stamps(value: Any) -> Any:
+        """Return contents of a JSON file without the keys of STAMPS; of a path only the name."""
         if isinstance(value, dict):
             return {k: without_stamps(v) for k, v in value.items() if k not in STAMPS}
         if isinstance(value, str) and "/" in value:  # a path in the folder of the run

@@ -67,6 +67,7 @@ def force_law(rng: np.random.Generator) -> Law:
     amplitude *= np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
 
     def law(strength: float, mass: float, motion: Motion, wrench: Wrench, t: float) -> np.ndarray:
+        """Return the acceleration (N, 3) at the present positions [m/s^2]."""
         angle = np.einsum("akw,nw->nak", wave_vector, motion.pos_w)
         return strength * (amplitude * np.sin(angle + phase)).sum(axis=-1)
 
@@ -104,6 +105,7 @@ def run_case(seed: list[int]) -> Outcome:
     flight_seed = int(rng.integers(2**32))
 
     def fly_logs(strength: float) -> tuple[FlightLog, ...]:
+        """Return the logs of the flights with a field of this strength; the noise is the same."""
         flight_rng = np.random.default_rng(flight_seed)
         extra = Push(strength, truth.mass, law)
         return simulator.fly(truth, trajectories, flight_rng, extra)(flight_rng)

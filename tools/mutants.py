@@ -93,11 +93,13 @@ def changes(source: bytes) -> Iterator[tuple[int, int, str]]:
         starts.append(starts[-1] + len(line))
 
     def span(node: ast.expr) -> tuple[int, int]:
+        """Return the first byte of a node, and the first byte after it."""
         assert node.end_lineno and node.end_col_offset is not None
         return (starts[node.lineno - 1] + node.col_offset,
                 starts[node.end_lineno - 1] + node.end_col_offset)  # fmt: skip
 
     def visit(node: ast.AST) -> Iterator[tuple[int, int, str]]:
+        """Yield the changes of a node and of the nodes in it."""
         pairs: list[tuple[ast.expr, ast.expr]] = []
         if isinstance(node, ast.BinOp):
             pairs = [(node.left, node.right)]
@@ -153,11 +155,11 @@ def describe(copy: Path, mutant: Mutant) -> tuple[str, bool]:
     source = (copy / mutant.file).read_bytes()
     lines, row = source.splitlines(), source[: mutant.first].count(b"\n")
     text, equal_before = lines[row].decode().strip(), lines[:row].count(lines[row])
-    before = source[: mutant.first].splitlines()[-1].decode().lstrip()
+    text_before = source[: mutant.first].splitlines()[-1].decode().lstrip()
     old = source[mutant.first : mutant.last].decode()
-    choice = CHOICE.match(before) or TOLERANCE.fullmatch(old)
+    choice = CHOICE.match(text_before) or TOLERANCE.fullmatch(old)
     name = (
-        f"{mutant.file}: {old!r} -> {mutant.new!r} at {len(before)} in {text!r}"
+        f"{mutant.file}: {old!r} -> {mutant.new!r} at {len(text_before)} in {text!r}"
         + f" {equal_before + 1}" * bool(equal_before)
     )
     return name, not choice
@@ -213,10 +215,10 @@ def main() -> int:
             if not known.get(name):
                 # Tests without a mutant must pass; their time gives the limit for the mutants.
                 if mutant.tests not in limit_s:
-                    before = children_s()
+                    processor_s_before = children_s()
                     if tests_fail(copy, mutant.tests):
                         raise SystemExit(f"{mutant.tests}: fail without any mutant; repair them")
-                    limit_s[mutant.tests] = 20.0 + 3.0 * (children_s() - before)
+                    limit_s[mutant.tests] = 20.0 + 3.0 * (children_s() - processor_s_before)
                 path = copy / mutant.file
                 source = path.read_bytes()
                 changed = source[: mutant.first] + mutant.new.encode() + source[mutant.last :]

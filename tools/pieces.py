@@ -92,6 +92,7 @@ def engine(count: int, args: argparse.Namespace) -> None:
         done, clock, started = 0, Clock(), time.monotonic()
 
         def keep(number: int, result: bytes) -> None:
+            """Count a finished piece, and print the progress."""
             nonlocal done
             done += 1
             if done % PROGRESS_EVERY == 0:

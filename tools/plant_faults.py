@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
+"""Folder of the checkout."""
 LONGEST_S = 300.0
 """Longest duration of the tests of a fault [s]. If they run longer with the fault, it is caught."""
 FAILED = 1

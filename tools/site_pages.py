@@ -31,6 +31,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     folder = (docs / page.file.src_uri).parent
 
     def as_path(match: re.Match[str]) -> str:
+        """Return the text that replaces a link; a link within docs/ is kept."""
         text, target = match[1], (folder / match[2]).resolve()
         if target.is_relative_to(docs):
             return match[0]

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+"""Folder of the checkout."""
 LONGEST, MEAN, MOST = 35, 17.0, 25_000
 """Largest number of words in a sentence, in the mean sentence, and in all pages together."""
 REPLACED = {
@@ -29,7 +30,7 @@ REPLACED = {
     r"\bdoubted\b|\blent\b": "held fixed",
     r"\bnobody here\b|\bno real vehicle has\b": "not yet validated on hardware",
 }
-"""Regular expression of a word -> its replacement."""
+"""Regular expression of words that the pages avoid -> what to write instead."""
 
 
 def pages() -> Iterator[Path]:

@@ -202,6 +202,7 @@ def _build_outside(
     kind = KINDS[name]
 
     def fly_at(strength: float) -> tuple[LogFlights, float]:
+        """Return flights at a strength, and the log-likelihood ratio that remains after a fit."""
         extra = make_outside(name, strength, nominal.mass)
         flown = simulator.fly(nominal, trajectories, rng, extra)
         return flown, unexplained_ratio(nominal, flown(None), sensors)

@@ -79,6 +79,7 @@ def make_set(
     with console.progress("cases", len(cases)) as update:
 
         def keep(number: int, built: Built | str) -> None:
+            """Write the files of a case, or keep the reason why it cannot be made."""
             name = names[number]
             if isinstance(built, str):
                 failed[name] = built

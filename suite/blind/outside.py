@@ -69,6 +69,7 @@ class SlungLoad(Outside):
     """Of the line: length without load [m], stiffness [N/m] and damping [N s/m]."""
 
     _pos_w = _vel_w = np.zeros(0)
+    """Position [m] and velocity [m/s] of the load; empty before the first step."""
 
     def acc_w(self, motion: Motion, wrench: Wrench, time_s: float, dt: float) -> np.ndarray:
         """Return the acceleration by the pull of the line, and move the load by one step.
@@ -97,12 +98,13 @@ class Hysteresis(Outside):
     """
 
     _acting = np.zeros(0)
+    """(N,) acting thrust per mass [m/s^2]; empty before the first step."""
 
     def command(self, command: Command, time_s: float) -> Command:
         """Return the command with the acting thrust, which moves only at the edges of the play."""
         half_width = 0.5 * self.strength
-        before = self._acting if self._acting.size else command.thrust
-        self._acting = np.clip(before, command.thrust - half_width, command.thrust + half_width)
+        acting = self._acting if self._acting.size else command.thrust
+        self._acting = np.clip(acting, command.thrust - half_width, command.thrust + half_width)
         return Command(np.maximum(self._acting, 0.0), command.rate_b)
 
 

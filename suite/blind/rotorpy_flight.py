@@ -94,11 +94,13 @@ class _RotorpyBodies:
         self._no_wind_w = np.zeros((count, 3))
 
     def motion(self) -> tuple[Motion, np.ndarray]:
+        """Return the present motion, and the attitudes as quaternions wxyz (N, 4)."""
         quat = self._qpos[:, 3:]
         rot_w = quat_to_rot(quat)
         return Motion(self._qpos[:, :3], rot_w, self._qvel[:, :3], self._qvel[:, 3:]), quat
 
     def step(self, motion: Motion, command: Command, time_s: float) -> Step:
+        """Advance all flights by one step, and return what a log of it has."""
         speed = self._speed
         push = StepInput(wanted_speed(self._plant, command, motion.rate_b), self._no_wind_w)
         self._qpos, self._qvel, self._speed = self._multirotor.step(

@@ -22,7 +22,9 @@ from suite.blind.oracle.strength import nominal_vehicle
 from suite.blind.rotorpy_flight import fly_rotorpy
 
 Trajectories = Sequence[Trajectory]
+"""Trajectories of a case, one for each flight."""
 Random = np.random.Generator
+"""Short name of the type."""
 LogFlights = Callable[[Random | None], tuple[FlightLog, ...]]
 """Function (random generator of the noise; None: no noise) -> logs of the flights of a case."""
 
@@ -51,6 +53,7 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     def fly_in_steps(
         truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
     ) -> LogFlights:
+        """Fly in MuJoCo or RotorPy, which advance in steps of the period of the rate loop."""
         if case.simulator == ROTORPY:
             flown = fly_rotorpy(nominal, truth, trajectories, sensors.rate_hz)
         else:
@@ -70,6 +73,7 @@ def simulator_for(case: Case, rng: np.random.Generator) -> Simulator:
     def fly_in_continuous_time(
         truth: Vehicle, trajectories: Trajectories, rng: Random, extra: Extra | None = None
     ) -> LogFlights:
+        """Fly in the continuous-time engine."""
         flown = fly_continuous(nominal_at_rate, truth, trajectories, conditions, rng, extra)
         return lambda rng: logs_of(flown, trajectories, truth, sensors, conditions, rng)
 

@@ -70,6 +70,7 @@ class Console:
         started = last = clock()
 
         def update(done: float, note: str = "") -> None:
+            """Print a line, unless the last one was printed a short time ago."""
             nonlocal last
             now = clock()
             if now - last < PLAIN_PERIOD_S:

@@ -24,6 +24,7 @@ INTERRUPTED = 130
 """Exit code: the command was interrupted by Ctrl-C or by a signal to end."""
 
 _ROOT = Path(__file__).resolve().parents[2]
+"""Folder of the four packages."""
 _PACKAGES = tuple(str(_ROOT / room) for room in ("tracks", "policies", "eval", "suite"))
 """Folders of the suite's four packages."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)

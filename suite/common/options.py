@@ -22,6 +22,7 @@ import tyro
 from tracks.input.ranges import ranged
 
 T = TypeVar("T")
+"""Type of the value of an option."""
 GROUP = "advanced"
 """Title of the group of rare options in the help, and annotation that marks a rare option."""
 Advanced = Annotated[T, GROUP]
@@ -268,6 +269,7 @@ def settings(config: Any) -> Iterator[Setting]:
 
 
 def _nested_settings(config: Any, prefix: str, allowed: dict[str, str]) -> Iterator[Setting]:
+    """Yield the settings of `config`, whose names begin with `prefix`; `allowed` has the ranges."""
     texts = all_field_texts(type(config))
     for field in dataclasses.fields(config):
         path, value = f"{prefix}{field.name}", getattr(config, field.name)

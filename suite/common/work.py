@@ -21,6 +21,7 @@ from tracks.common.work import WorkerDied, Workers, read_workers, run_pieces, us
 from tracks.common.work.threads import share_threads
 
 Result = TypeVar("Result")
+"""Type of the result of a job."""
 
 WorkersOption = Advanced[
     Annotated[str | None, tyro.conf.arg(metavar="N|HOST:PORT", help_behavior_hint="")]
@@ -97,6 +98,7 @@ def do_jobs(
     with console.progress(title, len(jobs)) as update:
 
         def keep(number: int, result: Any) -> None:
+            """Store the result of a job; from a cluster it also has the files of the folder."""
             if isinstance(workers, str):
                 result, files = result
                 replace_content(jobs[number].folder, files)

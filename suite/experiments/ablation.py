@@ -119,6 +119,7 @@ def settings(config: Config) -> list[training.Setting]:
     base = options.four_gate_recipe(config)
 
     def setting(kind: str, weight: float, **changes: float) -> training.Setting:
+        """Return the setting of a kind, with `changes` of the weights of the loss in the recipe."""
         weights = {"progress": weight, "progress_norm": 0.0, **changes}
         recipe = in_every_phase(base, "loss", **weights)
         return training.Setting(f"{kind} {weight:g}", KINDS[kind], recipe)

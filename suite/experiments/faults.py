@@ -207,6 +207,7 @@ def _check_cases(
     with console.progress("logs", len(cases)) as show, path.open("a", encoding="utf-8") as file:
 
         def keep(number: int, answer: Answer) -> None:
+            """Store an answer in the file, so that an interrupted run can continue."""
             answers[missing[number]] = answer
             file.write(json.dumps([missing[number], answer]) + "\n")
             file.flush()

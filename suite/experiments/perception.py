@@ -87,6 +87,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     def fly_sweeps(
         sets: Mapping[str, SensorSet], magnitudes: Sequence[float], policies: Mapping[str, str]
     ) -> disturbed.SweepResults:
+        """Return the results of each of `sets` at each of `magnitudes`."""
         sweeps = magnitude_sweeps(sets, magnitudes)
         conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
         return disturbed.fly_conditions([], conditions, policies, sweep_trials, workspace, console)[

@@ -194,12 +194,12 @@ class Wind:
             vel_w: (N, 3) velocities of the vehicles [m/s].
             length_s: (N, 1) length of the step [s].
         """
-        before = self._gust_w
+        gust_before_w = self._gust_w
         if self._gusts is not None:
             air_w = vel_w - self._steady_w
             airspeed = np.sqrt((air_w * air_w).sum(axis=1, keepdims=True))
             rate = np.maximum(airspeed, MIN_AIRSPEED) / float(self._gusts.length)
             decay = np.exp(-length_s * rate)
-            noise = self._intensity * self._rng.standard_normal(before.shape)
-            self._gust_w = decay * before + np.sqrt(1.0 - decay**2) * noise
-        return self._steady_w + before, self._steady_w + self._gust_w
+            noise = self._intensity * self._rng.standard_normal(gust_before_w.shape)
+            self._gust_w = decay * gust_before_w + np.sqrt(1.0 - decay**2) * noise
+        return self._steady_w + gust_before_w, self._steady_w + self._gust_w

@@ -123,13 +123,13 @@ def state_at(flown: Flown, index: int, time_s: np.ndarray) -> np.ndarray:
     """
     ends = flown.time_s[:, index]
     time_s = np.clip(time_s, ends[0], ends[-1])
-    after = np.clip(np.searchsorted(ends, time_s, side="right"), 1, len(ends) - 1)
+    step_end = np.clip(np.searchsorted(ends, time_s, side="right"), 1, len(ends) - 1)
     # Steps of zero length have equal ends; the last of them starts the next step with a length.
-    before = after - 1
-    span = ends[after] - ends[before]
-    share = np.where(span > 0.0, (time_s - ends[before]) / np.where(span > 0.0, span, 1.0), 1.0)
+    step_start = step_end - 1
+    span = ends[step_end] - ends[step_start]
+    share = np.where(span > 0.0, (time_s - ends[step_start]) / np.where(span > 0.0, span, 1.0), 1.0)
     s, h = share[:, None], span[:, None]
-    start, end = flown.state[before, index], flown.state[after, index]
+    start, end = flown.state[step_start, index], flown.state[step_end, index]
     state = start + s * (end - start)
     state[:, POS] = (
         (1.0 + 2.0 * s) * (1.0 - s) ** 2 * start[:, POS]
@@ -143,8 +143,8 @@ def state_at(flown: Flown, index: int, time_s: np.ndarray) -> np.ndarray:
 
 def rotate_attitude(quat_wxyz: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
     """Return the attitudes (T, 4), each rotated by a rotation vector (T, 3) in body axes [rad]."""
-    before = Rotation.from_quat(quat_wxyz, scalar_first=True)
-    return (before * Rotation.from_rotvec(angle_b)).as_quat(scalar_first=True)
+    attitude = Rotation.from_quat(quat_wxyz, scalar_first=True)
+    return (attitude * Rotation.from_rotvec(angle_b)).as_quat(scalar_first=True)
 
 
 class _NoiseDraws:

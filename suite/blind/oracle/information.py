@@ -209,6 +209,7 @@ def gust_strength(
     eigenvalues = np.maximum(np.linalg.eigvalsh(gram), 0.0)
 
     def excess(log_size: float) -> float:
+        """Return the log-likelihood ratio above THRESHOLD for the logarithm of a size s."""
         scaled = np.exp(2.0 * log_size) * eigenvalues
         return float(0.5 * (scaled - np.log1p(scaled)).sum()) - THRESHOLD
 

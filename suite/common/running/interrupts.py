@@ -33,6 +33,7 @@ MESSAGE = (
     "suite: interrupted in a step that cannot be stopped (mostly the compiler), so ended at once; "
     "what was saved is kept\n"
 )
+"""Message of a process that the second thread ends."""
 _SHOW_CURSOR = "\x1b[?25h"
 """Terminal code that shows the cursor, which a progress bar hides."""
 
@@ -50,6 +51,7 @@ def ends_in_seconds() -> Iterator[None]:
     old_hook = sys.unraisablehook
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
+        """Handle a signal in the main thread."""
         handled.set()
         raise KeyboardInterrupt
 
@@ -58,6 +60,7 @@ def ends_in_seconds() -> Iterator[None]:
             os.kill(os.getpid(), signals[-1])
 
     def resend_lost_interrupt(args: sys.UnraisableHookArgs) -> None:
+        """Send an interrupt again that Python lost; report other lost errors as before."""
         if not issubclass(args.exc_type, KeyboardInterrupt):
             old_hook(args)
             return

@@ -21,6 +21,7 @@ from tracks.common.files import replacing_folder, user_cache
 from tracks.common.work.pickling import pack
 
 Result = TypeVar("Result")
+"""Type of the result of a job."""
 Content = dict[str, bytes]
 """Path of each file relative to its folder -> content of the file."""
 

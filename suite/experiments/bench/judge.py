@@ -40,6 +40,7 @@ class OwnRays(MujocoWorld):
         self._scenes: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def _images(self, slots: np.ndarray, pos_w: np.ndarray, rot_w: np.ndarray) -> np.ndarray:
+        """Return the depth images of the environments `slots`, one camera after the other."""
         images = []
         for row, slot in enumerate(slots.tolist()):
             model = self._models[slot]
@@ -67,6 +68,7 @@ def run(policy: str = "", trials: int = TRIALS, time_limit_s: float = 20.0) -> C
     results: dict[str, list[TrialResult]] = {}
 
     def judge(simulator: str, slots: int) -> None:
+        """Fly all trials, `slots` at a time, and keep their results."""
         options = JudgeOptions(slots=slots, workers=1, rules=Rules(time_limit_s=time_limit_s))
         results[simulator] = fly(loaded, specs, vehicle, simulator, options)
 

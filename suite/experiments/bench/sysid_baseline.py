@@ -88,6 +88,7 @@ def prepare(task: Task, sigma: np.ndarray) -> Problem:
         state: np.ndarray,
         **_: Any,
     ) -> tuple[np.ndarray, Any, Any]:
+        """Return the simulated states minus the measured ones, divided by the noise."""
         # Row k - 1 of `state` has the time and the state after step k; measured row 0 is the start.
         rows = np.clip(np.rint(measured.times[1:] / dt).astype(int), 1, len(state)) - 1
         errors = _difference(state[rows, 1 : 1 + STATE_SIZE], measured.data[1:])

@@ -33,15 +33,22 @@ SIZES = ("camera", "hidden_size", "channels")
 
 
 class TorchState(NamedTuple):
-    """State of the point mass as tensors; `point_mass.PointMassState` has shapes and units."""
+    """State of the point mass as tensors, with the fields of `point_mass.PointMassState`."""
 
     pos_w: Tensor
+    """(B, 3) position [m]."""
     vel_w: Tensor
+    """(B, 3) velocity [m/s]."""
     thrust_w: Tensor
+    """(B, 3) net acceleration by thrust and gravity, after the lag and without drag [m/s^2]."""
     acc_w: Tensor
+    """(B, 3) net acceleration [m/s^2]."""
     rot_w: Tensor
+    """(B, 3, 3) attitude, body to world."""
     heading_w: Tensor
+    """(B, 3) wanted heading, horizontal unit vectors."""
     commands_w: Tensor
+    """(B, 2, 3) the last two commands, latest first [m/s^2]."""
 
 
 def to_torch(tree: Any) -> Any:

@@ -15,6 +15,7 @@ import torch
 from tracks.geometry.scene import Gates, Scene
 
 Tensor = torch.Tensor
+"""Short name of the type."""
 FAR, TINY = 1e9, 1e-12
 """Depth of a ray that hits nothing [m], and the lower limit of divisors."""
 
@@ -187,11 +188,11 @@ def crossed(gate: Gates, before_w: Tensor, after_w: Tensor) -> Tensor:
 
     See `tracks.geometry.crossing.crossing`.
     """
-    before = to_local(gate.rot_w, before_w - gate.center_w)
-    after = to_local(gate.rot_w, after_w - gate.center_w)
-    crosses = (before[:, 0] < 0) & (after[:, 0] >= 0)
-    travel = torch.where(crosses, after[:, 0] - before[:, 0], 1.0)
-    point = before[:, 1:] + (-before[:, 0] / travel)[:, None] * (after - before)[:, 1:]
+    start_g = to_local(gate.rot_w, before_w - gate.center_w)
+    end_g = to_local(gate.rot_w, after_w - gate.center_w)
+    crosses = (start_g[:, 0] < 0) & (end_g[:, 0] >= 0)
+    travel = torch.where(crosses, end_g[:, 0] - start_g[:, 0], 1.0)
+    point = start_g[:, 1:] + (-start_g[:, 0] / travel)[:, None] * (end_g - start_g)[:, 1:]
     edge = gate.opening_g.roll(-1, -2) - gate.opening_g
     away = point[:, None] - gate.opening_g
     turn = edge[..., 0] * away[..., 1] - edge[..., 1] * away[..., 0]

@@ -39,8 +39,11 @@ class Condition:
     size_text: str
     """Size of the disturbance as text, with its unit."""
     vehicle: Vehicle
+    """Vehicle that flies."""
     sensors: SensorSet = PERFECT
+    """Errors in what the policies see."""
     simulator: str = "mujoco"
+    """Name of the simulator."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ def _set_effect(
     """Return a function that sets a parameter of an effect to `scale` times a size."""
 
     def make(vehicle: Vehicle, size: float) -> tuple[Vehicle, SensorSet]:
+        """Return `vehicle` with the effect at `size`, and perfect sensors."""
         values = EFFECTS[name].values(**{field: _plain(np.asarray(scale) * size)})
         return with_effect(vehicle, name, values), PERFECT
 

@@ -30,8 +30,9 @@ class ConditionResult(NamedTuple):
     """A condition and the results of every policy under it, on the same trials."""
 
     condition: Condition
+    """Vehicle, sensors and simulator of the flights."""
     results: Mapping[str, Sequence[TrialResult]]
-    """Results of the trials, by the policy's label."""
+    """Label of each policy -> results of its trials."""
 
     def success(self, policy: str) -> Interval:
         """Return the success rate over all tracks and levels."""

@@ -40,6 +40,7 @@ from tracks.common.work import Workers, run_pieces, usable_cores, worker_count
 from tracks.families import JUDGED
 
 Key = TypeVar("Key", bound=Hashable)
+"""Type of the keys of requests."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,9 @@ class TrialRequest:
     """Trials of one setup."""
 
     setup: Setup
+    """Policy, vehicle, sensors and simulator of the trials."""
     trials: Sequence[TrialSpec]
+    """Track, level and seed of each trial."""
 
 
 def fly_trials(
@@ -111,6 +114,7 @@ def fly_trials(
             with console.progress(title, total) as update:
 
                 def keep(piece: int, answer: tuple[int, TrialResult]) -> None:
+                    """Store the result of a trial in the journal of its setup."""
                     journal_number, result = answer
                     all_journals[journal_number].append(result)
                     # A sweep has more journals than a process may have open files.
@@ -186,7 +190,9 @@ class Share(NamedTuple):
     number: int
     """Number of the setup in the order of all setups."""
     setup: Setup
+    """Policy, vehicle, sensors and simulator of the trials."""
     trials: Sequence[TrialSpec]
+    """Track, level and seed of each trial."""
 
 
 def _loaders(policies: Iterable[str], workers: Workers) -> Loaders:

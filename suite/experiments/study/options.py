@@ -18,6 +18,7 @@ from tracks.common.names import unknown_name
 from tracks.input.ranges import Iterations, Range, Seed, Trials, check_ranges
 
 T = TypeVar("T")
+"""Type of the entries of `select`."""
 
 GATES = 4
 """Number of gates in the paper's ablation and its comparison of schemes."""

@@ -15,8 +15,11 @@ class Spread(NamedTuple):
     """The values of one measure, such as `v_max`, over the training seeds."""
 
     mean: float
+    """Mean over the seeds."""
     least: float
+    """Smallest value."""
     most: float
+    """Largest value."""
 
 
 class Summary(NamedTuple):

@@ -59,6 +59,7 @@ class TrainingResult(NamedTuple):
     setting: str
     """Key of the setting."""
     seed: int
+    """Seed of the training."""
     policy: str
     """Folder of the checkpoint. A diverged training has the last checkpoint with finite weights."""
     seconds: float
@@ -80,7 +81,9 @@ class Study:
     """What is trained and measured: every setting from every training seed."""
 
     settings: Sequence[Setting]
+    """The compared settings."""
     seeds: Sequence[int]
+    """Seeds of the trainings of each setting."""
     unseen: UnseenWorlds
     """How the policies are measured, in the dynamics of the training."""
     by_seed: bool = False
