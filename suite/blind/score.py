@@ -111,39 +111,40 @@ def score_case(
     hidden = [answer["outside"]] if answer.get("outside") else truths
     effects = [] if diagnosis is None else diagnosis.get("effects", [])
     # A named effect with its alternatives is a set of names.
-    sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
-    brought = [hubs is not None and is_hub_damping(e, hubs) for e in effects]
+    name_sets = tuple((e["name"], *e.get("alternatives", [])) for e in effects)
+    is_brought = [hubs is not None and is_hub_damping(e, hubs) for e in effects]
     # Which set names which true effect.
-    pairs = _match(truths, sets)
-    right = [_is_right(truths[t], sets[e]) for t, e in pairs.items()]
-    names, matched = {truth["name"] for truth in truths}, set(pairs.values())
+    pairs = _match(truths, name_sets)
+    is_right = [_is_right(truths[t], name_sets[e]) for t, e in pairs.items()]
+    true_names, matched = {truth["name"] for truth in truths}, set(pairs.values())
     # A set is extra if it has no true name, except for a damping by moving hubs. A set with a true
     # name is extra if another set names that effect already.
-    extra = [
-        e not in matched if names & set(group) else not brought[e] for e, group in enumerate(sets)
+    is_extra = [
+        e not in matched if true_names & set(group) else not is_brought[e]
+        for e, group in enumerate(name_sets)
     ]
     covered = [
         inside
         for t, e in pairs.items()
-        if sets[e][0] == truths[t]["name"]
+        if name_sets[e][0] == truths[t]["name"]
         for inside in _covered(truths[t]["parameters"], effects[e].get("parameters", {}))
     ]
     # `after`: the gap after the named effects are added to the simulation.
     gap = (diagnosis or {}).get("gap") or {}
-    floor, after = gap.get("noise_floor"), gap.get("after")
+    noise_floor, after = gap.get("noise_floor"), gap.get("after")
     return Verdict(
         name,
         answer["kind"],
         tuple(each["name"] for each in hidden),
         float(max((each["multiple"] for each in hidden), default=0.0)),
         "failed" if diagnosis is None else str(diagnosis["verdict"]),
-        sets,
-        bool(truths) and len(right) == len(truths) and all(right),
-        sum(extra),
+        name_sets,
+        bool(truths) and len(is_right) == len(truths) and all(is_right),
+        sum(is_extra),
         tuple(covered),
-        after / floor if floor and after is not None and sets else None,
+        after / noise_floor if noise_floor and after is not None and name_sets else None,
         seconds,
-        sum(brought),
+        sum(is_brought),
     )
 
 
@@ -290,7 +291,9 @@ def _without_hubs(verdicts: Sequence[Verdict]) -> tuple[str, str, list[bool]]:
     return f"  {kind}: with no damping by moving hubs in addition", "", flags
 
 
-def _match(truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]]) -> dict[int, int]:
+def _match(
+    truths: Sequence[Mapping[str, Any]], name_sets: Sequence[tuple[str, ...]]
+) -> dict[int, int]:
     """Return the index of each named true effect -> index of the set of names that names it.
 
     A set is used once. The first name of a set has priority over its alternatives.
@@ -298,7 +301,7 @@ def _match(truths: Sequence[Mapping[str, Any]], sets: Sequence[tuple[str, ...]])
     pairs: dict[int, int] = {}
     for first_only in (True, False):
         for t, truth in enumerate(truths):
-            for e, group in enumerate(sets):
+            for e, group in enumerate(name_sets):
                 names = group[:1] if first_only else group
                 if t not in pairs and e not in pairs.values() and truth["name"] in names:
                     pairs[t] = e

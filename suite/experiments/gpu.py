@@ -112,43 +112,45 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
             f"--worlds is {' '.join(map(str, config.worlds))}, but JAX finds no GPU here (see "
             "suite info): install '.[cuda]', or measure the CPU with --worlds 64 --train-worlds 64"
         )
+    # 1. The best speed of the device, for comparison with the speed of the training.
     device, vehicle = jax.devices()[0], load_vehicle("reference")
-    best = multiplying_rate(config.matrix)
-    console.say(f"{device.device_kind}: {best / 1e12:.1f} TFLOP/s in a product of matrices")
-    # Another process flies the trials on the CPU while this one measures the accelerator.
+    peak_rate = multiplying_rate(config.matrix)
+    console.say(f"{device.device_kind}: {peak_rate / 1e12:.1f} TFLOP/s in a product of matrices")
+    # 2. Training and judging. Another process flies the same trials on the CPU at the same time.
     with worker_pool(1) as cpu_process:
         cpu_results = cpu_process.submit(fly_on_cpu, config, vehicle)
         programs = compile_programs(config, vehicle, console)
         rows = trainer_speeds(config, programs.updates, console)
         judge = [judge_speed(config, vehicle, worlds, console) for worlds in config.worlds]
-        pairs = compare_with_cpu(programs.results, cpu_results.result(), console)
+        comparison = compare_with_cpu(programs.results, cpu_results.result(), console)
+    # 3. The short training.
     step_s = {row.worlds: row.seconds for row in rows if row.model == "quadrotor"}
-    short = short_training(config, vehicle, step_s[config.train_worlds], workspace, console)
+    short_result = short_training(config, vehicle, step_s[config.train_worlds], workspace, console)
     trainer = [row._asdict() for row in rows]
     memory = peak_memory()
     facts = {
         "device": f"{len(jax.devices())} x {device.device_kind}",
-        "a product of matrices": f"{best / 1e12:.1f} TFLOP/s, float32 unrounded",
+        "a product of matrices": f"{peak_rate / 1e12:.1f} TFLOP/s, float32 unrounded",
         "a gradient step": f"of the recipe gpu's last phase, {_steps(config)} decisions per world",
         "most memory held": "unknown" if memory is None else f"{memory / 1e9:.1f} GB",
         "compiling": f"{programs.seconds:.0f} s, all programs at once",
     }
-    curve = Picture(curves_chart({"training": short["curve"]}), "The short training's curve")
+    curve = Picture(curves_chart({"training": short_result["curve"]}), "The short training's curve")
     parts: dict[str, Sequence[Grid | Picture]] = {
-        "Trainer": [trainer_grid(trainer, _steps(config), best)],
+        "Trainer": [trainer_grid(trainer, _steps(config), peak_rate)],
         "Judge": [judge_grid(judge)],
-        "The same trials on the CPU": [pairs_grid(pairs)],
-        "A short training": [curve, training_grid(short)],
+        "The same trials on the CPU": [pairs_grid(comparison)],
+        "A short training": [curve, training_grid(short_result)],
     }
     numbers = {
         "device": device.device_kind,
-        "multiplying_rate": best,
+        "multiplying_rate": peak_rate,
         "compile_s": programs.seconds,
         "memory_bytes": memory,
         "trainer": trainer,
         "judge": judge,
-        "paired": pairs,
-        "training": short,
+        "paired": comparison,
+        "training": short_result,
     }
     return PageContents(facts, parts, numbers)
 

@@ -84,17 +84,14 @@ def _effect_condition(vehicle: Vehicle, effect: Effect, sign: int) -> Condition:
     size = parameter.typical[1]
     zero = np.asarray(getattr(neutral(effect, vehicle), parameter.name), float)
     zero = np.zeros_like(zero) if parameter.whole else zero
+    # The usual size in the usual direction, within the physical bounds; a larger value is kept.
     direction = np.asarray(parameter.direction) if parameter.direction else np.ones(zero.shape)
-    new_array = zero + sign * size * direction
-    new_array = np.clip(
-        new_array, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle)
-    )
-    old_array = np.asarray(getattr(values, parameter.name), float)
-    new_array = np.where(np.abs(old_array - zero) > np.abs(new_array - zero), old_array, new_array)
-    value = _plain(new_array)
-    number = (
-        "(" + ", ".join(f"{v:.3g}" for v in new_array) + ")" if new_array.ndim else f"{value:.3g}"
-    )
+    new = zero + sign * size * direction
+    new = np.clip(new, bound_value(parameter.low, vehicle), bound_value(parameter.high, vehicle))
+    given = np.asarray(getattr(values, parameter.name), float)
+    new = np.where(np.abs(given - zero) > np.abs(new - zero), given, new)
+    value = _plain(new)
+    number = "(" + ", ".join(f"{v:.3g}" for v in new) + ")" if new.ndim else f"{value:.3g}"
     unit = "" if parameter.unit == "1" else parameter.unit
     size_text = f"{parameter.name} {number} {unit}".strip()
     changed = with_effect(vehicle, effect.name, values._replace(**{parameter.name: value}))
