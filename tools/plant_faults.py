@@ -48,7 +48,7 @@ FAULTS = (
     # tracks: field, gates, cameras, solids
     Fault("tracks", "return ((1 - aligned) / xp.max", "return ((1 + aligned) / xp.max",
           "test_field"),
-    Fault("tracks", "share = -before[..., 0] /", "share = before[..., 0] /", "test_crossing"),
+    Fault("tracks", "fraction = -before[..., 0] /", "fraction = before[..., 0] /", "test_crossing"),
     Fault(
         "tracks", "2 * (x * y - w * z), 2 * (x * z + w * y)",
         "2 * (x * y + w * z), 2 * (x * z + w * y)", "test_geometry",
@@ -97,8 +97,8 @@ FAULTS = (
     Fault("eval/importers", '"mrad/s": 1e-3', '"mrad/s": 1e-2',
           "importers/test_mapping importers/test_frames"),
     # eval: judging, statistics
-    Fault("eval/worlds", "xp.where(free & (rot_w[:, 2, 2] < 0), TIPPED",
-          "xp.where(free & (rot_w[:, 2, 2] < 0.05), TIPPED", "test_trial"),
+    Fault("eval/worlds", "xp.where(live_without_contact & (rot_w[:, 2, 2] < 0), TIPPED",
+          "xp.where(live_without_contact & (rot_w[:, 2, 2] < 0.05), TIPPED", "test_trial"),
     Fault("eval/worlds", "progress.step <= short_step, gates", "progress.step < short_step, gates",
           "test_trial"),
     Fault("eval/judging", "np.rint((place + 1) * self._period - ages)",
@@ -122,7 +122,7 @@ FAULTS = (
     Fault("suite/delta", "np.where(up[..., 2:] < 0, -forward, forward)", "forward",
           "delta/test_windows"),
     # suite: diagnosis
-    Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (taken**2).sum(axis=(2, 3))",
+    Fault("suite/diagnose", "(slow**2).sum(axis=(2, 3)) - (explained**2).sum(axis=(2, 3))",
           "(slow**2).sum(axis=(2, 3))", "diagnose/fit/test_fit"),
     Fault("suite/diagnose", "float((1 + (null >= fall).sum()) / (1 + draws))",
           "float((null >= fall).sum() / (1 + draws))", "test_permutation"),
