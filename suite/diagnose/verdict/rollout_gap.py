@@ -2,9 +2,10 @@
 
 A rollout is a simulated stretch of a flight, from a measured start state. Its start state is fitted
 within the measurement noise. The gap is the slow part of the remaining errors, divided by the slow
-errors that measurement noise alone gives; so 1 means noise only. The plain errors from the measured
-start states are reported as well, in metres and so on. Their noise floor is the noise of the start
-states, carried through the rollout by the model's Jacobian.
+errors that measurement noise alone gives; so 1 means noise only. "Slow" errors are those averaged
+over many rows, in which a wrong model shows and white noise does not. The plain errors from the
+measured start states are reported as well, in metres and so on. Their noise floor is the noise of
+the start states, carried through the rollout by the model's Jacobian.
 
 The numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4). A
 rollout with time steps of twice the length, and with every second rotor speed, differs from the
@@ -192,10 +193,12 @@ def start_noise(
 
 
 def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return the RMS errors (..., 12) of a perfect model, by noise in the start and in the row.
+    """Return the RMS errors (..., 12) that a perfect model would still have.
 
-    `slope` (..., 12, F) is the derivative of a row's state by the F start numbers, and `noise` (F,)
-    the noise of these. The first 12 of it are also the noise of the row's own state.
+    They have two causes: the noise of the measured start state, carried to this row by `slope`, and
+    the noise of the measurement in the row itself. `slope` (..., 12, F) is the derivative of a
+    row's state by the F numbers of the start state, and `noise` (F,) their noise. The first 12
+    entries of `noise` serve for both causes.
     """
     return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
 
