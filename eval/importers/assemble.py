@@ -115,7 +115,9 @@ def assemble(
     findings += order_motors(rows, recording.motor_side, options.vehicle)
     rows = read_rows(rows, orders)
     findings += rates_wanted(rows, options.vehicle)
-    more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix)
+    # Corrected faults are no longer in the rows, so only doubts count.
+    doubts = [finding for finding in findings if finding.status == "doubt"]
+    more_findings, _, corrected_rows = run_checks(rows, DRIVE, context, options.fix, doubts)
     findings += more_findings
     rows = corrected_rows if options.fix else rows
     doubtful = {f.signal for f in findings if f.status == "doubt"}

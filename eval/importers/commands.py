@@ -74,7 +74,7 @@ def thrust_command(
         return []
     throttle = rows["throttle"][:, 0]
     if options.full_thrust is None and options.vehicle and options.vehicle.motors:
-        return _by_motors(rows, options.vehicle, options.vehicle.motors)
+        return [_by_motors(rows, options.vehicle, options.vehicle.motors)]
     full, findings = _full_thrust(rows, throttle, options, by_acc)
     if full is None:
         return findings
@@ -82,14 +82,14 @@ def thrust_command(
     return findings
 
 
-def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> list[Finding]:
-    """Convert a throttle to thrust by the vehicle's `[motors]`, in place; return the findings."""
+def _by_motors(rows: dict[str, np.ndarray], vehicle: Vehicle, motors: MotorMap) -> Finding:
+    """Convert a throttle to thrust by the vehicle's `[motors]`, in place; return the finding."""
     voltage = rows["voltage"][:, 0] if "voltage" in rows else None
     thrust = 4.0 * motor_thrust(motors, rows["throttle"], voltage)[:, 0] / vehicle.mass
     rows["cmd_thrust"] = thrust[:, None]
     with_battery = "with the battery's voltage" if voltage is not None else "without a voltage"
     text = f"normalised; by [motors] of vehicle {vehicle.name!r}, {with_battery}"
-    return [Finding("note", "thrust", text), *_check_mean_thrust(rows, thrust)]
+    return Finding("note", "thrust", text)
 
 
 def _full_thrust(
@@ -103,7 +103,7 @@ def _full_thrust(
     if options.vehicle is not None:
         full = options.vehicle.full_thrust
         text = f"normalised; full throttle is {full:.4g} m/s^2 by the vehicle file, {linear}"
-        return full, [Finding("note", "thrust", text), *_check_mean_thrust(rows, full * throttle)]
+        return full, [Finding("note", "thrust", text)]
     if "acc" in rows and by_acc:
         full, residual = _fit_full_thrust(throttle, rows["acc"][:, 2])
         low, high = FULL_THRUST_RANGE
@@ -141,22 +141,6 @@ def _fit_full_thrust(throttle: np.ndarray, acc_z: np.ndarray) -> tuple[float, fl
     full = float(np.median(acc_z[usable] / throttle[usable]))
     residual = acc_z[usable] - full * throttle[usable]
     return full, MAD_TO_SD * float(np.median(np.abs(residual - np.median(residual))))
-
-
-def _check_mean_thrust(rows: dict[str, np.ndarray], thrust: np.ndarray) -> list[Finding]:
-    """Return a doubt where the means of `thrust` (T,) [m/s^2] and of the accelerometer differ."""
-    if "acc" not in rows:
-        return []
-    usable = np.isfinite(thrust) & np.isfinite(rows["acc"][:, 2])
-    measured = float(np.mean(rows["acc"][usable, 2])) if usable.any() else 0.0
-    ratio = float(np.mean(thrust[usable])) / measured if measured > 1.0 else 1.0
-    if 0.7 < ratio < 1.4:
-        return []
-    text = (
-        f"the mean command is {ratio:.2f} times the accelerometer's mean; possible causes are the "
-        "vehicle's mass, thrust coefficient or speed_max, or a nonlinear throttle"
-    )
-    return [Finding("doubt", "thrust", text)]
 
 
 def rates_wanted(rows: dict[str, np.ndarray], vehicle: Vehicle | None) -> list[Finding]:

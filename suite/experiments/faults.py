@@ -26,7 +26,14 @@ from eval.logs.flight_log import FlightLog, read_flight
 from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
 from eval.vehicles.vehicle import Vehicle, with_effects
 from suite.common.console import Console
-from suite.experiments.injected.flights import TRUE_EFFECTS, as_log, flight_signals, real_logs
+from suite.experiments.injected.flights import (
+    REAL_MOTORS,
+    TRUE_EFFECTS,
+    as_log,
+    flight_signals,
+    real_logs,
+    with_linear_motors,
+)
 from suite.experiments.injected.kinds import KINDS, Kind, inject
 from suite.experiments.injected.writers import WRITERS
 from suite.experiments.pages.document import PageContents
@@ -158,20 +165,16 @@ def _simulated_cases(config: Config, flights: Sequence[Path]) -> Iterator[Case]:
 
 
 def _signals_of(format: str) -> set[str]:
-    """Return the signals that a simulated log of this format has."""
-    shared_signals = {
-        "time",
-        "pos",
-        "quat",
-        "rate",
-        "acc",
-        "motor",
-        "cmd_rate",
-        "throttle",
-        "voltage",
+    """Return the signals that a written flight of a format holds."""
+    common = {"time", "pos", "quat", "rate", "acc", "motor", "cmd_rate", "throttle", "voltage"}
+    others = {
+        "px4": {"vel"},
+        "crazyflie": {"vel", "pwm"},
+        "betaflight": {"pwm"},
+        "table": {"vel", "pwm"},
+        FLIGHT_LOG: {"vel", "pwm", "baro", "cmd_thrust"},
     }
-    further_signals = {"betaflight": set(), FLIGHT_LOG: {"vel", "baro", "cmd_thrust"}}
-    return shared_signals | further_signals.get(format, {"vel"})
+    return common | others[format]
 
 
 def _real_cases(real: Sequence[Path], count: int) -> Iterator[Case]:
@@ -229,7 +232,7 @@ def _check(case: Case, vehicle_name: str, seed: int) -> Iterator[Answer]:
         log, vehicle = _import_real(case.path)
         signals = rows_of(log)
     else:
-        vehicle = load_vehicle(vehicle_name)
+        vehicle = with_linear_motors(load_vehicle(vehicle_name))
         signals = flight_signals(read_flight(case.path), vehicle, rng)
     faulty = inject(kind, signals, vehicle) if kind.names else signals
     vehicle = vehicle if kind.vehicle is None else kind.vehicle(vehicle)
@@ -265,6 +268,7 @@ def _import_real(path: Path) -> tuple[FlightLog, Vehicle]:
     """Return a real log after its import, and the vehicle that it is compared with."""
     name = path.parent.name if path.parent.name in ("nanobench", "crazyswarm2") else "crazypad"
     vehicle = load_vehicle("crazyflie21")
+    vehicle = replace(vehicle, motors=REAL_MOTORS.get(name, vehicle.motors))
     options = ImportOptions(map=Path(name), partial=True, vehicle=vehicle)
     return import_log(path, None, options)[0], vehicle
 

@@ -33,8 +33,8 @@ from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, from_euler
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
+from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.motors import check_count
 
 SUMMARY = "ArduPilot log (.bin)"
 TAKES_MAP = TAKES_SOURCE = False

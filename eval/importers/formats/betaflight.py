@@ -23,8 +23,8 @@ from eval.importers.formats.table import numbers
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.motors import check_count
 from eval.logs.files import first_line, read_columns, read_head
 
 SUMMARY = "Blackbox log (.bbl, .bfl), or CSV of blackbox_decode; --pose or --partial"

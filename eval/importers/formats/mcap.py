@@ -27,8 +27,8 @@ from eval.importers.options import ImportOptions
 from eval.importers.rows import in_world
 from eval.importers.signals import Recording, Signal, collect
 from eval.logs.columns import FlightLogError, quoted
+from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.motors import check_count
 from eval.logs.files import read_head
 from tracks.common.toml_table import read_toml
 

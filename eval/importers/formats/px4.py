@@ -29,8 +29,8 @@ from eval.importers.frames import HALF_TURN, QUAT_HALF_TURN, rotate
 from eval.importers.options import ImportOptions
 from eval.importers.signals import Recording, collect
 from eval.logs.columns import FlightLogError, quoted
+from eval.logs.faults.drive.motors import check_count
 from eval.logs.faults.finding import Finding
-from eval.logs.faults.motors import check_count
 from eval.logs.faults.sensors import check_voltage_fails
 from eval.logs.files import read_head
 from tracks.input.ranges import is_number

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 ROTATE = "rotate the vehicle by hand, propellers off, by 90 deg and back about x, then y, then z"
 TILT = "fly 2 m forward and back, then 2 m left and back, briskly"
+CLIMB = "climb and descend briskly, from a full to an almost empty battery"
 PULSE = "propellers off or the vehicle held down: pulse motor 1, then 2, 3 and 4, a second each"
 STICKS = "hold a roll, a pitch and a yaw rate of 1 rad/s and of 3 rad/s for a second each"
 REST = "let the vehicle rest, level, for a second"
@@ -49,6 +50,9 @@ FAULTS: dict[str, tuple[str, str]] = {
         "hover for two seconds",
     ),
     "throttle_range": ("the throttle is not from 0 to 1", "hover for two seconds"),
+    "throttle_curve": ("thrust grows with the throttle by another curve, or its size", CLIMB),
+    "motor_map": ("[motors] of the vehicle file: size or curve of thrust over command", CLIMB),
+    "battery_scaling": ("thrust changes with the battery's voltage by another exponent", CLIMB),
     "thrust_scale": ("thrust is not what the vehicle file says", "hover for two seconds"),
     "voltage": ("the battery's voltage is impossible", "log the battery that drives the motors"),
     "vehicle_mass": ("the mass was entered several times", "hover for two seconds"),

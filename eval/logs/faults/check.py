@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from eval.effects.interface import GRAVITY
 from eval.logs.columns import GROUPS
 from eval.logs.faults.catalogue import FAULTS, manoeuvre
 from eval.logs.faults.clock import check_clock, check_time
-from eval.logs.faults.commands import (
+from eval.logs.faults.drive.commands import (
     check_controller_rate,
+    check_gyro_scale,
     check_gyro_signs,
     check_rate_command,
     check_throttle,
     check_thrust_command,
 )
+from eval.logs.faults.drive.motor_map import check_motor_map
+from eval.logs.faults.drive.motors import check_lift, check_motors
 from eval.logs.faults.finding import Finding, findings_of, line
-from eval.logs.faults.motors import check_lift, check_motors
 from eval.logs.faults.pose import Rows, check_pose, fit_pose_readings
 from eval.logs.faults.reading import Readings, read_rows, readings_in
 from eval.logs.faults.sensors import check_accelerometer_bias, check_barometer, check_voltage
 from eval.logs.faults.vectors import check_accelerometer, check_gyro, check_velocity
-from eval.logs.faults.vehicle import check_camera, check_vehicle_numbers
+from eval.logs.faults.vehicle import LIFT, check_camera, check_vehicle_numbers
 from eval.logs.flight_log import FlightLog, columns_from_log, log_from_columns
 from eval.vehicles.vehicle import Vehicle
 from tracks.common.names import unknown_name
@@ -40,6 +43,8 @@ class CheckContext:
     vehicle: Vehicle | None = None
     policy_hz: float | None = None
     policy_fov: tuple[float, float] | None = None
+    found: frozenset[str] = frozenset()
+    """Faults that earlier checks of the log found."""
 
 
 Check = Callable[[Rows, CheckContext], list[Finding]]
@@ -49,16 +54,18 @@ POSE: tuple[Check, ...] = (
     lambda rows, _: check_pose(rows, fit_pose_readings(rows)),
     lambda rows, _: check_gyro(rows),
     lambda rows, _: check_velocity(rows),
-    lambda rows, _: check_accelerometer(rows),
+    lambda rows, against: check_accelerometer(rows, "body_frame" in against.found),
 )
 """Position, attitude, rates, velocity and acceleration; each check relies on those before it."""
 DRIVE: tuple[Check, ...] = (
     lambda rows, _: check_voltage(rows),
     lambda rows, against: check_gyro_signs(rows, against.vehicle),
+    lambda rows, against: check_gyro_scale(rows, against.vehicle),
     lambda rows, against: check_motors(rows, against.vehicle),
     lambda rows, against: check_lift(rows, against.vehicle),
     lambda rows, _: check_throttle(rows),
     lambda rows, against: check_thrust_command(rows, against.vehicle),
+    lambda rows, against: check_motor_map(rows, against.vehicle),
     lambda rows, against: check_rate_command(rows, against.vehicle),
     lambda rows, _: check_accelerometer_bias(rows),
     lambda rows, _: check_barometer(rows),
@@ -66,8 +73,29 @@ DRIVE: tuple[Check, ...] = (
 """Motors, commands and other sensors."""
 
 
+SIGNALS = {
+    "attitude": "quat",
+    "position": "pos",
+    "velocity": "vel",
+    "gyro": "rate",
+    "accelerometer": "acc",
+    "motors": "motor",
+    "rotor speeds": "motor",
+    "motor commands": "pwm",
+    "throttle": "throttle",
+    "rate command": "cmd_rate",
+    "thrust command": "cmd_thrust",
+    "voltage": "voltage",
+}
+"""Subject of a finding -> its signal."""
+
+
 def run_checks(
-    rows: Rows, checks: Sequence[Check], against: CheckContext, fix: bool
+    rows: Rows,
+    checks: Sequence[Check],
+    against: CheckContext,
+    fix: bool,
+    before: Sequence[Finding] = (),
 ) -> tuple[list[Finding], Readings, dict[str, np.ndarray]]:
     """Return the findings, the readings that correct certain faults, and the corrected rows.
 
@@ -76,19 +104,47 @@ def run_checks(
         checks: in order; each gets the rows that those before it corrected.
         against: the references.
         fix: report corrections as made; otherwise as doubts. Later checks get corrected rows.
+        before: findings of earlier checks on the same rows.
     """
     findings, readings, rows = [], (), dict(rows)
     if len(rows["time"]) < LEAST_ROWS:
         return findings, readings, rows
+    # No vehicle has such a full thrust: its file is reported, and nothing compared with it.
+    implausible = against.vehicle is not None and against.vehicle.full_thrust > LIFT[1] * GRAVITY
+    against = replace(against, vehicle=None) if implausible else against
+    trusted = dict(rows)
+    if implausible and "throttle" in rows:
+        trusted.pop("cmd_thrust", None)  # made of the throttle by that vehicle file
+    for finding in before:
+        trusted = _without_doubted(trusted, finding)
     for check in checks:
-        for finding in check(rows, against):
+        for finding in check(trusted, against):
             if finding.status == "corrected":
                 more = readings_in(finding.fix)
-                rows = read_rows(rows, more)
+                rows, trusted = read_rows(rows, more), read_rows(trusted, more)
                 readings += more
                 finding = finding if fix else finding._replace(status="doubt")
+            else:
+                trusted = _without_doubted(trusted, finding)
             findings.append(finding)
+            if finding.status in ("corrected", "doubt"):
+                against = replace(against, found=against.found | {finding.fault})
     return findings, readings, rows
+
+
+def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str, np.ndarray]:
+    """Return the rows for later checks, which would name a second fault for an open one.
+
+    A signal with an open doubt is read as its fix says, or left out where the fix is no reading.
+    """
+    signal = SIGNALS.get(finding.signal)
+    if finding.fault == "accelerometer_axes":
+        return rows  # `check_gyro_signs` decides whether all axes of the body are others
+    if not finding.is_open or signal not in rows:
+        return rows
+    if readings := readings_in(finding.fix):
+        return read_rows(rows, readings)
+    return {name: value for name, value in rows.items() if name != signal}
 
 
 def check_log(

@@ -15,6 +15,7 @@ from eval.importers.frames import conjugate, multiply, rotation_vector
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import SPAN_S, Rows
 from eval.logs.faults.reading import TIMES, option
+from eval.logs.faults.relation import jackknife_error
 
 STEPS_S = (5e-5, 0.25)
 """Possible time between rows of a log [s]."""
@@ -170,7 +171,7 @@ def delay_of(
     parts = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
     if whole is None or any(part is None for part in parts):
         return None
-    error = _jackknife(np.array(parts, dtype=np.float64))
+    error = jackknife_error(np.array(parts, dtype=np.float64))
     return Late(whole, error, first_drift + more, drift_error, middle, duration)
 
 
@@ -184,14 +185,8 @@ def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[flo
     if any(part is None for each in halves for part in each):
         return 0.0, np.inf
     both = np.array(halves, dtype=np.float64)
-    error = float(np.hypot(_jackknife(both[0, 1:]), _jackknife(both[1, 1:])))
+    error = float(np.hypot(jackknife_error(both[0, 1:]), jackknife_error(both[1, 1:])))
     return float(both[1, 0] - both[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
-
-
-def _jackknife(left_out: np.ndarray) -> float:
-    """Return the standard error from estimates with one block left out each."""
-    count = len(left_out)
-    return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
 
 
 def _lowest(trials: np.ndarray, cost: np.ndarray) -> float | None:

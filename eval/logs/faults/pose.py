@@ -15,7 +15,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, multiply, rotate, rotation_vector
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.reading import axes_matrix, option, read_as
+from eval.logs.faults.reading import ORDERS, axes_matrix, option, read_as
 from eval.logs.faults.relation import Match, match, rms, smooth
 from eval.logs.velocity import velocity_from_position
 
@@ -35,7 +35,6 @@ EACH = 0.06
 """Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
 DRAG, BIAS = 1.2, 1.0
 """Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
-_ORDERS = ("", "xyzw")
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
 _ANGLES = ("-roll", "-pitch", "-yaw")
@@ -200,7 +199,7 @@ def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
         if {"ned", "frd"} & steps:
             name = "body_frame" if "frd" in steps and "ned" not in steps else "world_frame"
         name = "quaternion_direction" if "inverse" in steps else name
-        name = "quaternion_order" if "xyzw" in steps else name
+        name = "quaternion_order" if steps & set(ORDERS) else name
         yield name, "attitude", pose
     if best.length != 1.0:
         yield "position_unit", "position", world
@@ -224,6 +223,9 @@ def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
 def _words(best: Reading) -> str:
     words = {
         "xyzw": "the quaternion is xyzw",
+        "wxyz": "the quaternion is wxyz",
+        "ned-xyzw": "the file's quaternion is xyzw",
+        "ned-wxyz": "the file's quaternion is wxyz",
         "inverse": "it maps world to body",
         "ned": "its world points down",
         "frd": "its body is forward-right-down",
@@ -247,12 +249,12 @@ def _figures(one: Reading) -> str:
 
 
 def _bases() -> Iterator[str]:
-    yield from ("+".join(s for s in (o, i) if s) for o in _ORDERS for i in _SENSES)
+    yield from ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES)
     yield from _ANGLES
 
 
 def _attitudes() -> Iterator[str]:
-    for base in ("+".join(s for s in (o, i) if s) for o in _ORDERS for i in _SENSES):
+    for base in ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES):
         for frames in _FRAMES:
             yield "+".join(s for s in (base, frames) if s)
     yield from _ANGLES

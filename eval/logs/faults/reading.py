@@ -5,7 +5,9 @@
 | `0.01` | multiply by this | all |
 | `x,-y,-z` | take these columns with these signs | pos vel rate acc cmd_rate cmd_torque |
 | `2,1,4,3` | these motors of the vehicle's order, in this order | motor motor_cmd pwm |
-| `xyzw` | the file's columns have this order | quat cmd_quat |
+| `xyzw` | the file's columns have this order, and were read as wxyz | quat cmd_quat |
+| `wxyz` | the file's columns have this order, and were read as xyzw | quat cmd_quat |
+| `ned-xyzw`, `ned-wxyz` | the same in a file with NED world and FRD body | quat cmd_quat |
 | `inverse` | the file's quaternion maps world to body | quat cmd_quat |
 | `ned`, `frd` | the file's world points down; its body is forward-right-down | quat cmd_quat |
 | `-roll`, `-pitch`, `-yaw` | change the angle's sign | quat cmd_quat |
@@ -26,7 +28,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from eval.effects.interface import GRAVITY
-from eval.importers.frames import conjugate, from_euler, multiply, rotate
+from eval.importers.frames import QUAT_HALF_TURN, conjugate, from_euler, multiply, rotate
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of time -> seconds."""
@@ -39,7 +41,9 @@ _HALF = np.array([0.0, 1.0, 0.0, 0.0])
 _AXES = re.compile(r"^-?[xyz],-?[xyz],-?[xyz]$")
 _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
 _ANGLES = ("-roll", "-pitch", "-yaw")
-_QUAT_STEPS = ("xyzw", "inverse", "ned", "frd", *_ANGLES)
+ORDERS = ("xyzw", "wxyz", "ned-xyzw", "ned-wxyz")
+"""Steps that change the order of a quaternion's columns."""
+_QUAT_STEPS = (*ORDERS, "inverse", "ned", "frd", *_ANGLES)
 Readings = tuple[tuple[str, str], ...]
 """(signal, steps) in the order of application."""
 
@@ -155,6 +159,10 @@ def _turned(value: np.ndarray, step: str, quat: np.ndarray) -> np.ndarray:
 def _quat_as(value: np.ndarray, step: str) -> np.ndarray:
     if step == "xyzw":
         return value[:, [3, 0, 1, 2]]
+    if step == "wxyz":
+        return value[:, [1, 2, 3, 0]]
+    if step.startswith("ned-"):
+        return _quat_as(value * QUAT_HALF_TURN, step.removeprefix("ned-")) * QUAT_HALF_TURN
     if step == "inverse":
         return conjugate(value)
     if step == "ned":

@@ -133,6 +133,12 @@ def rms(value: np.ndarray) -> float:
     return float(np.sqrt(np.mean(squared))) if len(squared) else 0.0
 
 
+def jackknife_error(left_out: np.ndarray) -> float:
+    """Return the standard error from estimates (B,) that leave out one block each."""
+    count = len(left_out)
+    return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
+
+
 def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows in which both are finite and neither is an outlier."""
     good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)

@@ -47,6 +47,8 @@ SLOW = 1.25
 CALM_SPEED = 0.3
 """Smallest usable speed, root mean square [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
+SIMPLER = 0.03
+"""Advantage of the first choices among readings of an accelerometer, as a relative residual."""
 OK = 0.3
 """Largest relative error of a correct signal."""
 UPWARDS = 0.5
@@ -214,10 +216,15 @@ def check_velocity(rows: Rows) -> list[Finding]:
     return findings + [one for one in unit if one.status != "ok"]
 
 
-def check_accelerometer(rows: Rows) -> list[Finding]:
+def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     """Return the faults of the accelerometer, compared with the path's acceleration.
 
     Without a path only its unit is checked: in flight it reads about one g.
+
+    Args:
+        rows: see `check.run_checks`.
+        body_is_frd: the attitude or the gyro was found in forward-right-down axes, so these axes
+            are the first choice. A flight with little drag does not show the sign along x.
     """
     if "acc" in rows and not {"pos", "quat"} <= rows.keys():
         return _unit_alone(rows)
@@ -249,7 +256,8 @@ def check_accelerometer(rows: Rows) -> list[Finding]:
         )
     residual = {name: rms(value - force) / size for name, value in readings.items()}
     given = residual["", 1.0]
-    best = min(residual, key=lambda name: residual[name] + 0.03 * (name[0] != ""))
+    first = "x,-y,-z" if body_is_frd else ""
+    best = min(residual, key=lambda name: residual[name] + SIMPLER * (name[0] not in ("", first)))
     figures = f"it is off the path's acceleration less gravity by {100 * given:.0f} %"
     lateral = _sideways(readings["", 1.0], force)
     if best[0] and best[1] == 1.0 and residual[best] > 0.6 * given and given < OK:

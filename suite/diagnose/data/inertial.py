@@ -1,14 +1,12 @@
-"""Flights without a pose: computes attitude and velocity from gyro and accelerometer.
+"""Flights without a pose: attitude and velocity by gyro and accelerometer from where they start.
 
-Specific force is what an accelerometer measures: acceleration minus gravity. A log begins at rest
-or in hover, so its first specific force points up. From there the gyro is integrated to the
-attitude, and the specific force plus gravity to the velocity. The result drifts, but its error
-depends on few numbers: tilt and velocity at the start, and the biases of gyro and accelerometer.
-Drag makes these identifiable, as the force across the thrust is opposite to the velocity (Leishman
-et al. 2014, doi 10.1109/MCS.2013.2287362). The drag coefficients are estimated, too, since the
-vehicle file may lack them; all flights of a vehicle share them. The fit is least squares, with
-usual sizes as priors, over pieces of a flight that last `PIECE_S`. Yaw and position start at 0, and
-the height far above any ground.
+A log begins at rest or in hover, so its first specific force points up. From there the gyro is
+integrated to the attitude, and the specific force less gravity to the velocity. The drift depends
+on few numbers: tilt and velocity at the start, and the biases of gyro and accelerometer. Drag makes
+them observable, as the force across the thrust is opposite to the velocity (Leishman et al. 2014,
+doi 10.1109/MCS.2013.2287362). The drag coefficients are estimated too, since the vehicle file may
+lack them; all flights of a vehicle share them. Least squares with usual sizes as priors is done for
+pieces of `PIECE_S` of a flight. Yaw and position start at 0, far above any ground.
 
 In such flights the model is compared with the accelerometer, not with a derivative of the velocity.
 """
@@ -29,56 +27,61 @@ from suite.diagnose.data.sampling import interpolate
 from tracks.geometry.rotation import rot_to_quat
 
 PIECE_S = 12.0
-"""Length of a piece of a flight; each has its own tilt, velocity and biases [s]."""
+"""Tilt, velocity and biases are estimated anew after this [s]."""
 WIDTH_S = 0.2
-"""Time over which forces are averaged before they are compared [s]."""
+"""Forces are compared as means over this time [s]."""
+KNOT_S = 1.0
+"""The tilt error may change after each of this: errors of the gyro make it a random walk [s]."""
+WALK, LEAST_WALK = 0.02, 0.001
+"""Standard deviation of such a change, before it is estimated and at least [rad]. Rows of a gyro
+that were sampled without a filter, or interpolated, have far more than its noise."""
+DRAWS = 8
+"""Of the velocity's error."""
 START_S = 0.1
-"""Time over which the first specific force is averaged [s]."""
+"""The first specific force is the mean over this time [s]."""
 LIKE_GRAVITY = 1.0
-"""The first specific force counts as up if its size differs from gravity by less than this [m/s^2].
-Otherwise the body starts level."""
+"""It is up where it is within this of gravity [m/s^2]; the body starts level otherwise."""
 PRIOR = np.repeat([0.03, 0.1, 0.005, 0.1], 3)
-"""(12,) prior standard deviations of a piece's numbers: tilt [rad] and velocity [m/s] at its start,
-biases of gyro [rad/s] and accelerometer [m/s^2], three each."""
-LATER = np.repeat([0.05, 1.0, 0.005, 0.1], 3)
-"""(12,) prior standard deviations of the pieces after the first one."""
+"""Standard deviations: tilt [rad] and velocity [m/s] at the start, biases of gyro [rad/s] and
+accelerometer [m/s^2], three each."""
+LATER = np.repeat([0.1, 1.0, 0.005, 0.1], 3)
+"""The same of later pieces."""
 DRAG, DRAG_PRIOR = np.array([0.3, 0.3, 0.0]), np.array([0.4, 0.4, 0.02])
-"""Usual drag across the thrust and its prior standard deviation: linear drag along x and along y
-[1/s], and drag that grows with the speed [1/m]."""
+"""Usual drag across the thrust and its standard deviation: linear along x and y [1/s], and with the
+speed [1/m]."""
 FORCE_NOISE, LEAST_NOISE = 0.2, 0.02
-"""RMS difference between a mean force and such a drag: first guess, and lower limit [m/s^2]."""
-ROUNDS = 6
-"""Number of Gauss-Newton steps of the fit."""
+"""What a mean force is off such a drag by, before it is estimated and at least [m/s^2]."""
+ROUNDS, SETTLED = 20, 0.003
+"""Most rounds of the fit; a round that changes drag [1/s] and noise by less is the last."""
 HIGH_M = 1000.0
-"""Height of the start, far from the ground and its effects [m]."""
+"""Height of the start: nothing near."""
 UNSEEN = (
     "position, heading and height: wind, ground, and faults of pose or velocity",
     "the accelerometer's own scale, which has the same effect as thrust over mass",
     "the gyro's own scale if they have no attitude, which has the same effect as inertia",
 )
-"""Quantities that are not identifiable from a flight without a pose, in words."""
+"""What a flight without a pose does not show, in words."""
 
 
 def is_inertial(log: FlightLog) -> bool:
     """Return whether `log` has no position, and an accelerometer and a gyro in its place."""
-    has_accelerometer = log.acc_b is not None and np.isfinite(log.acc_b).any(axis=0).all()
-    return "pos" in log.partial and "rate" not in log.partial and bool(has_accelerometer)
+    has = log.acc_b is not None and np.isfinite(log.acc_b).any(axis=0).all()
+    return "pos" in log.partial and "rate" not in log.partial and bool(has)
 
 
 @dataclass(frozen=True)
 class InertialLog(FlightLog):
-    """A flight whose pose is computed from gyro and accelerometer."""
+    """A flight whose pose is by inertia."""
 
     pose_slope_b: np.ndarray | None = None
-    """(N, 3, K) change of the drag's acceleration, in body axes, by one prior standard deviation of
-    each of K unknown numbers of the pose [m/s^2]."""
+    """(N, 3, K) how the drag's acceleration changes with what is not known of the pose, each by its
+    standard deviation before the flight [m/s^2]."""
+    vel_noise_b: np.ndarray | None = None
+    """(N, 3, `DRAWS`) draws of the velocity's error by the tilt's random walk [m/s]."""
 
 
 def specific_force_w(log: FlightLog) -> np.ndarray | None:
-    """Return the acceleration (N, 3) in the world from an inertial log's accelerometer [m/s^2].
-
-    None for another log.
-    """
+    """Return the acceleration (N, 3) in the world by the accelerometer of an inertial log."""
     if not isinstance(log, InertialLog) or log.acc_b is None:
         return None
     return (log.rot_w @ log.acc_b[..., None])[..., 0] - [0.0, 0.0, GRAVITY]
@@ -91,56 +94,59 @@ def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
 
 
 def by_inertia(logs: Sequence[FlightLog]) -> list[InertialLog]:
-    """Return `logs` of one vehicle with poses that are computed from gyro and accelerometer.
-
-    All of them must be inertial logs (see `is_inertial`).
-    """
+    """Return inertial `logs` of one vehicle with their pose by gyro and accelerometer."""
     flights = [_pieces(log) for log in logs]
-    drag = _fit_drag(flights) if flights else DRAG
-    return [_with_pose(log, pieces, drag) for log, pieces in zip(logs, flights, strict=True)]
+    drag = _fitted(flights) if flights else DRAG
+    return [_whole(log, pieces, drag) for log, pieces in zip(logs, flights, strict=True)]
 
 
-def _fit_drag(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
-    """Fit the numbers of all pieces and the drag that they share; return this drag (3,).
+def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
+    """Fit the numbers of all pieces and the drag that they share, and return that (3,).
 
-    The numbers are set in the pieces. `flights` holds the pieces of each flight.
+    A piece starts where it stands, whatever the piece before it changes: coupled starts make the
+    rounds diverge in long flights. The noise of the force and the random walk of the tilt are
+    estimated as well, the walk by expectation maximisation (Dempster et al. 1977).
     """
     drag, noise = DRAG, FORCE_NOISE
+    pieces = [piece for flight in flights for piece in flight]
     for _ in range(ROUNDS):
         hessian, gradient = np.diag(DRAG_PRIOR**-2), (DRAG - drag) / DRAG_PRIOR**2
-        eliminated = []
-        for piece in (one for pieces in flights for one in pieces):
-            design, right_side = piece.sides(drag, noise)
-            own_columns, shared = design[:, :12], np.column_stack([right_side, design[:, 12:]])
-            own_solution = np.linalg.lstsq(own_columns, shared, rcond=None)[0]
-            # What the piece's own numbers do not explain is information on the shared drag.
-            unexplained = shared - own_columns @ own_solution
-            hessian = hessian + unexplained[:, 1:].T @ unexplained[:, 1:]
-            gradient = gradient + unexplained[:, 1:].T @ unexplained[:, 0]
-            eliminated.append((piece, own_solution))
+        eliminated, variances = [], []
+        for piece in pieces:
+            design, left = piece.sides(drag, noise)
+            own, shared = design[:, :-3], np.column_stack([left, design[:, -3:]])
+            covariance = np.linalg.inv(own.T @ own)
+            to_own = covariance @ (own.T @ shared)
+            # What its own numbers do not explain is information on the drag that all share.
+            rest = shared - own @ to_own
+            hessian = hessian + rest[:, 1:].T @ rest[:, 1:]
+            gradient = gradient + rest[:, 1:].T @ rest[:, 0]
+            eliminated.append((piece, to_own))
+            variances.append(np.diag(covariance)[12:])
         change = np.maximum(np.linalg.solve(hessian, gradient), -drag)
-        for piece, own_solution in eliminated:
-            piece.numbers = piece.numbers + own_solution[:, 0] - own_solution[:, 1:] @ change
+        for piece, to_own in eliminated:
+            piece.numbers = piece.numbers + to_own[:, 0] - to_own[:, 1:] @ change
         drag = drag + change
-        for pieces in flights:
-            for last, piece in pairwise(pieces):
-                piece.begin_after(last)
-        errors = np.concatenate([one.off(drag) for pieces in flights for one in pieces])
-        noise = max(float(np.sqrt((errors**2).mean())), LEAST_NOISE)
+        off = np.concatenate([piece.off(drag) for piece in pieces])
+        before, noise = noise, max(float(np.sqrt((off**2).mean())), LEAST_NOISE)
+        changes = np.concatenate([piece.numbers[12:] for piece in pieces])
+        if len(changes):
+            walk = float(np.sqrt(np.mean(changes**2 + np.concatenate(variances))))
+            for piece in pieces:
+                piece.prior[12:] = max(walk, LEAST_WALK)
+        if np.abs(change).max() < SETTLED and abs(noise / before - 1.0) < SETTLED:
+            break
     return drag
 
 
 def _pieces(log: FlightLog) -> list[_Piece]:
-    """Return the pieces of a flight, each of which begins where the last one ends.
-
-    Several pieces are fitted one by one, so that the end of each is known.
-    """
+    """Return the pieces of a flight, each fitted alone where the one before it ends."""
     assert log.acc_b is not None
     time_s = log.time_s
     rate_b, acc_b = (interpolate(time_s, time_s, value) for value in (log.rate_b, log.acc_b))
     known = np.flatnonzero(np.isfinite(log.quat_wxyz).all(axis=1))
-    # A log that has an attitude has one shortly after its first row.
-    rot = log.rot_w[known[0]] if len(known) else _start_attitude(time_s, acc_b)
+    # An attitude is within moments of the first row.
+    rot = log.rot_w[known[0]] if len(known) else _start(time_s, acc_b)
     count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S))
     edges = np.linspace(0, len(time_s) - 1, count + 1).astype(int)
     parts = [slice(first, last + 1) for first, last in pairwise(edges)]
@@ -151,60 +157,73 @@ def _pieces(log: FlightLog) -> list[_Piece]:
         if len(pieces) > 1:
             pieces[-1].begin_after(pieces[-2])
         if len(parts) > 1:
-            _fit_drag([pieces[-1:]])
+            _fitted([pieces[-1:]])
     return pieces
 
 
-def _with_pose(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> InertialLog:
-    """Return `log` with the pose of its `pieces`; two neighbouring pieces share one row.
-
-    `drag` (3,) is the fitted drag.
-    """
+def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> InertialLog:
+    """Return `log` with the pose of its `pieces`, which share the row between two of them."""
     rot_w, vel_w = np.empty((len(log.time_s), 3, 3)), np.zeros((len(log.time_s), 3))
-    pose_slope_b = np.zeros((len(log.time_s), 3, 12 * len(pieces)))
-    next_row = 0
-    for k, piece in enumerate(pieces):
-        part = slice(next_row, next_row + len(piece.time_s))
-        next_row = part.stop - 1
+    pose_slope_b = np.zeros((len(log.time_s), 3, sum(len(piece.prior) for piece in pieces)))
+    vel_noise_b, rng = np.zeros((*vel_w.shape, DRAWS)), np.random.default_rng(0)
+    first, column = 0, 0
+    for piece in pieces:
+        part = slice(first, first + len(piece.time_s))
+        first = part.stop - 1
         rot_w[part], vel_w[part] = piece.flown()
         slopes = np.swapaxes(rot_w[part], 1, 2) @ piece.slopes(rot_w[part])
-        horizontal = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
-        drag_rate = np.append(horizontal, horizontal.mean())[:, None]
-        pose_slope_b[part, :, 12 * k : 12 * k + 12] = -drag_rate * slopes * piece.prior
+        errors_w = [piece.velocity_error(rot_w[part], rng) for _ in range(DRAWS)]
+        vel_noise_b[part] = np.swapaxes(rot_w[part], 1, 2) @ np.stack(errors_w, axis=-1)
+        usual = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
+        along = np.append(usual, usual.mean())[:, None]
+        columns = slice(column, column + len(piece.prior))
+        column = columns.stop
+        pose_slope_b[part, :, columns] = -along * slopes * piece.prior
     pos_w = np.zeros_like(vel_w)
     pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(log.time_s)[:, None], axis=0)
     pos_w[:, 2] += HIGH_M
     quat = np.asarray(rot_to_quat(rot_w))
     about = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
-    return InertialLog(**{**about, "velocity_derived": False}, pose_slope_b=pose_slope_b)
+    about["velocity_derived"] = False
+    return InertialLog(**about, pose_slope_b=pose_slope_b, vel_noise_b=vel_noise_b)
 
 
 class _Piece:
-    """A piece of a flight with N rows: signals, start, and the numbers (12,) that `PRIOR` lists."""
+    """A piece of a flight, what it starts from, and its numbers (12 + 2 K,).
+
+    These are those of `PRIOR`, and the change of the tilt about x and y at K knots.
+    """
 
     def __init__(self, time_s: np.ndarray, rate_b: np.ndarray, acc_b: np.ndarray,
                  rot: np.ndarray, prior: np.ndarray) -> None:  # fmt: skip
         self.time_s, self.rate_b, self.acc_b, self.rot = time_s, rate_b, acc_b, rot
-        self.vel, self.prior, self.numbers = np.zeros(3), prior, np.zeros(12)
-        self.span = np.diff(time_s)
-        rows_per_mean = max(1, round(WIDTH_S / float(np.median(self.span))))
-        self.first = np.arange(0, len(time_s), rows_per_mean)
+        self.vel, self.span = np.zeros(3), np.diff(time_s)
+        times = np.arange(time_s[0] + KNOT_S, time_s[-1] - 0.5 * KNOT_S, KNOT_S)
+        self.knots = np.searchsorted(time_s, times)
+        self.prior = np.append(prior, np.full(2 * len(self.knots), WALK))
+        self.numbers = np.zeros(len(self.prior))
+        each = max(1, round(WIDTH_S / float(np.median(self.span))))
+        self.first = np.arange(0, len(time_s), each)
         self.rows = np.diff(np.append(self.first, len(time_s)))
 
     def means(self, values: np.ndarray) -> np.ndarray:
-        """Return the means (M, ...) of `values` (N, ...) over times of `WIDTH_S`."""
+        """Return the means (M, ...) of `values` (N, ...)."""
         sums = np.add.reduceat(values, self.first, axis=0)
         return sums / self.rows.reshape(-1, *[1] * (values.ndim - 1))
 
     def flown(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return attitude (N, 3, 3) and velocity (N, 3), with the present numbers."""
-        tilt, vel, gyro, _ = self.numbers.reshape(4, 3)
+        """Return attitude (N, 3, 3) and velocity (N, 3)."""
+        tilt, vel, gyro, _ = self.numbers[:12].reshape(4, 3)
         rate_b = self.rate_b - gyro
         turns = Rotation.from_rotvec(0.5 * (rate_b[1:] + rate_b[:-1]) * self.span[:, None])
         rot_w = np.empty((len(self.time_s), 3, 3))
         rot_w[0] = Rotation.from_rotvec(tilt).as_matrix() @ self.rot
         for k, turn in enumerate(turns.as_matrix()):
             rot_w[k + 1] = rot_w[k] @ turn
+        walk = np.zeros((len(self.time_s), 3))
+        for knot, change in zip(self.knots, self.numbers[12:].reshape(-1, 2), strict=True):
+            walk[knot:, :2] += change
+        rot_w = Rotation.from_rotvec(walk).as_matrix() @ rot_w
         moved = self._integral(self._force_w(rot_w) - [0.0, 0.0, GRAVITY])
         return rot_w, self.vel + vel + moved
 
@@ -214,54 +233,66 @@ class _Piece:
         self.rot, self.vel = rot_w[-1], vel_w[-1]
 
     def off(self, drag: np.ndarray) -> np.ndarray:
-        """Return the mean forces (M, 2) along x and y minus those of the `drag` (3,) [m/s^2]."""
+        """Return by what the mean forces (M, 2) along x and y are off `drag` (3,) [m/s^2]."""
         rot_w, vel_w = self.flown()
         vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
-        drag_rate = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
-        return self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_rate * vel_b)
+        per = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
+        return self.means(self.acc_b[:, :2] - self.numbers[9:11] + per * vel_b)
 
     def sides(self, drag: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the two sides of the equations of a step: matrix (R, 15) and right side (R,).
+        """Return the equations (R, P + 3) of its P numbers and the drag, and what they leave.
 
-        The unknowns are changes of the piece's 12 numbers and of the 3 drags. The first equations
-        are those of the mean forces, in units of `noise`, the last 12 the priors of the numbers.
+        The first are those of the mean forces, the last its own numbers' priors.
         """
         rot_w, vel_w = self.flown()
         to_body = np.swapaxes(rot_w, 1, 2)
         vel_b = (to_body @ vel_w[..., None])[:, :2, 0]
         speed = np.linalg.norm(vel_w, axis=1)[:, None]
-        drag_rate = drag[:2] + drag[2] * speed
-        columns = np.zeros((len(speed), 2, 15))
-        columns[..., :12] = -drag_rate[..., None] * (to_body @ self.slopes(rot_w))[:, :2]
+        per = drag[:2] + drag[2] * speed
+        count = len(self.prior)
+        columns = np.zeros((len(speed), 2, count + 3))
+        columns[..., :count] = -per[..., None] * (to_body @ self.slopes(rot_w))[:, :2]
         columns[:, [0, 1], [9, 10]] += 1.0
-        columns[:, [0, 1], [12, 13]] = -vel_b
-        columns[..., 14] = -speed * vel_b
-        design = self.means(columns).reshape(-1, 15) / noise
-        right_side = self.off(drag).reshape(-1) / noise
-        prior = np.eye(12, 15) / self.prior[:, None]
-        return np.concatenate([design, prior]), np.append(right_side, -self.numbers / self.prior)
+        columns[:, [0, 1], [count, count + 1]] = -vel_b
+        columns[..., -1] = -speed * vel_b
+        design = self.means(columns).reshape(-1, count + 3) / noise
+        left = self.off(drag).reshape(-1) / noise
+        prior = np.eye(count, count + 3) / self.prior[:, None]
+        return np.concatenate([design, prior]), np.append(left, -self.numbers / self.prior)
+
+    def velocity_error(self, rot_w: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return a draw of the velocity's error (N, 3) by the random walk of the tilt."""
+        walk = float(self.prior[12]) if len(self.knots) else 0.0
+        step = float(np.median(self.span))
+        steps = walk * np.sqrt(step / KNOT_S) * rng.normal(size=(len(self.time_s), 3))
+        return self._integral(np.cross(np.cumsum(steps, axis=0), self._force_w(rot_w)))
 
     def _integral(self, values: np.ndarray) -> np.ndarray:
-        """Return the integral (N, ...) over time of `values` (N, ...), from the first row on."""
+        """Return the integral (N, ...) of `values` (N, ...) from the first row."""
         return np.asarray(cumulative_trapezoid(values, self.time_s, axis=0, initial=0))
 
     def _force_w(self, rot_w: np.ndarray) -> np.ndarray:
-        """Return the specific force (N, 3) in the world, less the accelerometer's bias."""
-        return (rot_w @ (self.acc_b - self.numbers[9:])[..., None])[..., 0]
+        return (rot_w @ (self.acc_b - self.numbers[9:12])[..., None])[..., 0]
 
     def slopes(self, rot_w: np.ndarray) -> np.ndarray:
-        """Return the derivative (N, 3, 12) of the velocity in the world by the 12 numbers."""
+        """Return how the velocity changes with the P numbers (N, 3, P)."""
         count = len(self.time_s)
-        identity = np.broadcast_to(np.eye(3), (count, 3, 3))
+        each = np.broadcast_to(np.eye(3), (count, 3, 3))
         force_w = self._force_w(rot_w)[:, :, None]
-        # The attitude's change by the tilt at the start, and by the bias of the gyro.
-        tilts = np.concatenate([identity, -self._integral(rot_w)], axis=2)
+        tilts = np.concatenate([each, -self._integral(rot_w)], axis=2)  # by tilt and gyro bias
         by_tilt, by_gyro = np.split(self._integral(np.cross(tilts, force_w, axis=1)), 2, axis=2)
-        return np.concatenate([by_tilt, identity, by_gyro, -self._integral(rot_w)], axis=2)
+        by_walk = [
+            np.where((np.arange(count) >= knot)[:, None, None], by_tilt - by_tilt[knot], 0.0)[
+                ..., :2
+            ]
+            for knot in self.knots
+        ]
+        by_bias = -self._integral(rot_w)
+        return np.concatenate([by_tilt, each, by_gyro, by_bias, *by_walk], axis=2)
 
 
-def _start_attitude(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:
-    """Return the attitude (3, 3) in which the first specific force points up."""
+def _start(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:
+    """Return the attitude (3, 3) in which the first specific force is up."""
     up = acc_b[time_s <= time_s[0] + START_S].mean(axis=0)
     size = float(np.linalg.norm(up))
     if abs(size - GRAVITY) > LIKE_GRAVITY:

@@ -22,8 +22,15 @@ import numpy as np
 from suite.diagnose.data.view import WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
 from suite.diagnose.identify.drive import DrivenVehicle, TrialVehicle
-from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit
-from suite.diagnose.identify.grid import IMU_ACC, LEANING, ROTOR_NOISE, FlightGrid
+from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit, unexplained
+from suite.diagnose.identify.grid import (
+    IMU_ACC,
+    LEANING,
+    POSE_SLOPE,
+    ROTOR_NOISE,
+    VELOCITY_NOISE,
+    FlightGrid,
+)
 
 FORCE_WIDTH_S = 0.4
 """Width of the windows over which forces are averaged [s]."""
@@ -36,6 +43,10 @@ TORQUE_SIGNALS = {**THRUST_SIGNALS, "torques": "torque_cmd_b"}
 SLOW_M_S = 2.0
 """Largest speed of the windows that are used without an attitude. A drag across the thrust would
 add to the thrust's size, by 0.3 % at this speed and a drag of 0.4 1/s [m/s]."""
+MOST_ERROR = 0.2
+"""Largest share of an estimated velocity's variance that is error, for an identifiable drag."""
+FORCE_ERROR = 0.05
+"""Usual error of a force averaged over a window [m/s^2]."""
 FORCE_OFFSETS = np.array([True, True, False])
 """Body axes along which each flight has a free constant, for its trim (error of the attitude).
 Along z a constant would be mistaken for thrust."""
@@ -82,7 +93,33 @@ def fit_force(
         NoWholeWindow: if no window has all signals.
     """
     residuals = [_force_residuals(flight, driven) for flight in flights]
-    return fit(stacked_residuals(residuals, unknowns, fixed, driven.at), unknowns)
+    held = _without_motion(flights, driven)
+    held = [unknown.name for unknown in unknowns if unknown.name in held]
+    return fit(stacked_residuals(residuals, unknowns, fixed, driven.at), unknowns, held)
+
+
+def _without_motion(flights: Sequence[FlightGrid], driven: DrivenVehicle) -> list[str]:
+    """Return the drags along x and y that flights without a pose do not show, by name.
+
+    An estimated velocity that is mostly error has no relation to the force, so its drag would be 0
+    (errors in variables; Fuller 1987, Sec. 1.1). The variances of velocity and error are compared
+    after what the uncertainties of the pose explain is removed from both.
+    """
+    error, total = np.zeros(2), np.zeros(2)
+    for flight in (one for one in flights if one.has(POSE_SLOPE)):
+        needs = (IMU_ACC, "rot_w", THRUST_SIGNALS.get(driven.drive, "thrust_cmd"))
+        form = flight.form(FORCE_WIDTH_S, needs)
+        vel_b = flight.rows(attitude_of_path=True).vel_b[..., None]
+        draws, slopes = (
+            flight.signals[name].reshape(len(vel_b), 3, -1) for name in (VELOCITY_NOISE, POSE_SLOPE)
+        )
+        both = np.concatenate([vel_b, draws, slopes], axis=-1)[:, :2]
+        both = (form.mean @ both.reshape(len(both), -1)).reshape(-1, *both.shape[1:])
+        values, slopes = np.split(both - both.mean(axis=0), [1 + draws.shape[2]], axis=2)
+        values = unexplained(slopes, values, np.full(values.shape[:2], FORCE_ERROR**-2))
+        total += (values[..., 0] ** 2).sum(axis=0)
+        error += (values[..., 1:] ** 2).mean(axis=-1).sum(axis=0)
+    return [f"drag_{axis}" for k, axis in enumerate("xy") if error[k] > MOST_ERROR * total[k]]
 
 
 Model = TypeVar("Model")
@@ -134,10 +171,15 @@ def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResidual
     to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
     axes = slice(2 if leaning else 0, 3)  # without an attitude only body z, along the thrust
 
+    nuisance = None
+    if flight.has(POSE_SLOPE):
+        slopes = form.mean @ flight.signals[POSE_SLOPE]
+        nuisance = slopes.reshape(len(slopes), 3, -1)[:, axes]
+
     def residuals(vehicle: TrialVehicle) -> Rows:
         acc_w, _ = vehicle.accelerations(flight, rows)
         error_b = (to_body @ (measured_w - form.mean @ acc_w)[..., None])[..., 0]
-        return Rows(error_b[:, axes], block_of(form), FORCE_OFFSETS[axes])
+        return Rows(error_b[:, axes], block_of(form), FORCE_OFFSETS[axes], nuisance)
 
     return residuals
 

@@ -70,6 +70,9 @@ class Rows(NamedTuple):
     """(N,) number of the window's block; errors of different blocks are independent."""
     offset: np.ndarray
     """(C,) bool: channels in which the flight has a free constant, such as a trim."""
+    nuisance: np.ndarray | None = None
+    """(N, C, K) change of the residuals by nuisance parameters, each by its standard deviation
+    before the flight; None for none."""
 
 
 Residuals = Callable[[np.ndarray], Sequence[Rows]]
@@ -180,6 +183,9 @@ class ResidualEvidence:
         for flight, (row, weight) in enumerate(zip(rows, self.weights, strict=True)):
             columns = [row.value, *(-difference[flight] for difference in differences)]
             centred = _without_mean(np.stack(columns, axis=-1), weight, row.offset)
+            if row.nuisance is not None:
+                slopes_of_it = _without_mean(row.nuisance, weight, row.offset)
+                centred = unexplained(slopes_of_it, centred, weight)
             white = np.sqrt(weight)[..., None] * centred
             values.append(white[..., 0])
             slopes.append(white[..., 1:])
@@ -254,6 +260,19 @@ def _without_mean(values: np.ndarray, weight: np.ndarray, offset: np.ndarray) ->
     total = np.maximum(weight.sum(axis=0), LEAST_WEIGHT)[:, None]
     mean = (weight[..., None] * values).sum(axis=0) / total
     return values - np.where(offset[:, None], mean, 0.0)
+
+
+def unexplained(nuisance: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return values (N, C, K) minus what nuisance parameters (N, C, L) of unit variance explain.
+
+    `weight` (N, C) is the inverse of the residuals' variance.
+    """
+    root = np.sqrt(weight)[..., None]
+    design = (root * nuisance).reshape(-1, nuisance.shape[2])
+    target = (root * values).reshape(-1, values.shape[2])
+    normal = design.T @ design + np.eye(design.shape[1])
+    explained = np.linalg.solve(normal, design.T @ target)
+    return values - np.tensordot(nuisance, explained, axes=1)
 
 
 def _errors(

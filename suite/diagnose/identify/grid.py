@@ -17,7 +17,7 @@ from eval.importers.rows import held
 from eval.importers.signals import Signal
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
-from suite.diagnose.data.inertial import specific_force_w
+from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.noise import noise_like
 from suite.diagnose.data.sampling import sign_continuous
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
@@ -36,6 +36,10 @@ LEANING = "leaning"
 """Name of a signal: the attitude that the path's acceleration requires, if none was measured."""
 IMU_ACC = "imu_acc_w"
 """Name of a signal: acceleration by the accelerometer, if no position was measured."""
+POSE_SLOPE = "pose_slope_b"
+"""Signal: change of the drag by each uncertainty of a pose by inertia, (G, 3 K): `InertialLog`."""
+VELOCITY_NOISE = "vel_noise_b"
+"""Signal: draws of the error of a velocity by inertia, (G, 3 D): `InertialLog`."""
 PATH_VELOCITY = "path_velocity"
 """Name of a signal: velocity by differences of the position, if none was measured."""
 PATH_SLOPE_S = 0.05
@@ -122,6 +126,11 @@ def grid_of(log: FlightLog) -> FlightGrid:
     signals: dict[str, np.ndarray] = {}
     for name, values in logged.items():
         signals[name] = (interpolated if name in measured else _held)(time_s, values, grid_s)
+    if isinstance(log, InertialLog):
+        for name, of_pose in ((POSE_SLOPE, log.pose_slope_b), (VELOCITY_NOISE, log.vel_noise_b)):
+            assert of_pose is not None
+            flat = of_pose.reshape(len(time_s), -1)
+            signals[name] = np.nan_to_num(interpolated(time_s, flat, grid_s))
     if "rotor_speed" in logged:
         signals[ROTOR_NOISE] = interpolated(time_s, noise_like(logged["rotor_speed"]), grid_s)
     if "pos_w" in signals and "vel_w" not in signals:

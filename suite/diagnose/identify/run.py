@@ -22,6 +22,8 @@ SCHEMA = 1
 """Version of the JSON that `suite identify` prints."""
 PARTS = ("drag", "motors", "inertia", "lag", "loop")
 """Allowed values of `--leave`."""
+ESTIMATED = ("motor_map", "battery_scaling")
+"""Faults of a vehicle file that an identification repairs, so it does not refuse them."""
 MADE_BY = "by suite identify"
 """Mark in the first line of a vehicle file that this command wrote."""
 
@@ -59,7 +61,7 @@ def identify_files(
     start = load_vehicle(vehicle)
     refuse_own_motion(start)
     logs, warnings = read_flights(flight_files(flights), partial=True)
-    findings = check_before_diagnosis(logs, CheckContext(start), accept)
+    findings = check_before_diagnosis(logs, CheckContext(start), [*accept, *ESTIMATED])
     logs, slow = without_slow_rotors(logs)
     warnings = [*warnings, *lines_of(findings), *slow]
     console.say(f"{_counted(len(logs))}, {sum(log.duration_s for log in logs):.0f} s in all")

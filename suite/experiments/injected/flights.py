@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.columns import GROUPS
 from eval.logs.flight_log import FlightLog, log_from_columns
 from eval.logs.velocity import velocity_from_position
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle
 
 TRUE_EFFECTS = {"com_offset": EFFECTS["com_offset"].values((0.006, -0.003, 0.0))}
 """Effects of the vehicle that flies (an offset of the centre of mass [m]); the nominal vehicle,
@@ -21,8 +22,16 @@ with which the logs are compared, lacks them."""
 NOISE = {"pos": 0.002, "vel": 0.02, "quat": 0.001, "rate": 0.03, "acc": 0.3, "motor": 3.0,
          "voltage": 0.05, "baro": 0.05}  # fmt: skip
 """Signal -> standard deviation of its white noise, in SI units."""
+REAL_MOTORS = {"nanobench": MotorMap((0.0644, 0.0199), 3.7, 0.61)}
+"""Real logs whose motors are not those of the shipped file -> their map, by `suite identify`
+(docs/results/real.md)."""
 LOGS = ("nanobench/*.csv", "crazyswarm2/log*", "crazypad/*/*log*")
 """Patterns of the real logs' files."""
+
+
+def with_linear_motors(vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle with the `[motors]` that `flight_signals` has: linear, no battery."""
+    return replace(vehicle, motors=MotorMap((vehicle.rotors.thrust_max, 0.0), 16.0, 0.0))
 
 
 def flight_signals(
@@ -51,6 +60,7 @@ def flight_signals(
         "cmd_thrust": log.thrust_cmd[:, None],
         "cmd_rate": log.rate_cmd_b,
         "motor": log.rotor_speed,
+        "pwm": (log.rotor_speed / vehicle.rotors.speed_max) ** 2,
         "throttle": log.thrust_cmd[:, None] / vehicle.full_thrust,
         "voltage": (16.0 - 0.05 * log.time_s)[:, None],
         "baro": log.pos_w[:, 2:],

@@ -15,7 +15,7 @@ import numpy as np
 from eval.effects.interface import GRAVITY
 from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.reading import parse_readings, read_rows
-from eval.vehicles.vehicle import Vehicle
+from eval.vehicles.vehicle import MotorMap, Vehicle
 
 Signals = dict[str, np.ndarray]
 """Signal -> (T, C) values at T times in C components, in SI units and the suite's frames; `time` is
@@ -61,6 +61,8 @@ def inject(kind: Kind, signals: Mapping[str, np.ndarray], vehicle: Vehicle) -> S
     """Return the signals of a correct flight of `vehicle`, with the fault."""
     faulty = dict(signals)
     use_pwm = kind.accepts_pwm and "motor" not in faulty
+    if kind.accepts_pwm and not use_pwm:
+        faulty.pop("pwm", None)  # it would have the same fault
     if use_pwm:
         faulty["motor"] = faulty.pop("pwm")
     faulty = read_rows(faulty, parse_readings(kind.readings))
@@ -151,6 +153,38 @@ def _drop_barometer(signals: Signals, _: Vehicle) -> Signals:
     return joined
 
 
+def _unlinearised(signals: Signals, _: Vehicle) -> Signals:
+    """The firmware does not linearise the throttle: thrust grows with its square."""
+    share = np.sqrt(np.clip(signals["throttle"], 0.0, None))
+    full = np.median(signals["cmd_thrust"]) / np.median(signals["throttle"])
+    return {**signals, "throttle": share, "cmd_thrust": full * share}
+
+
+def _drained(signals: Signals, _: Vehicle) -> Signals:
+    """A flight to an empty battery, which the firmware compensates."""
+    time_s = signals["time"]
+    left = np.interp(time_s, (time_s[0], time_s[-1]), (1.05, 0.8))
+    return {**signals, "voltage": signals["voltage"] * left[:, None]}
+
+
+def _map_of(vehicle: Vehicle) -> MotorMap:
+    assert vehicle.motors is not None
+    return vehicle.motors
+
+
+def _motors(vehicle: Vehicle, **changes: object) -> Vehicle:
+    return replace(vehicle, motors=replace(_map_of(vehicle), **changes))
+
+
+def _other_curve(vehicle: Vehicle) -> Vehicle:
+    """A linear curve in place of a quadratic one or the reverse, equal at half command."""
+    linear, square = _map_of(vehicle).thrust
+    half = 0.5 * linear + 0.25 * square
+    return _motors(
+        vehicle, thrust=(0.0, 4.0 * half) if linear > 0.5 * square else (2.0 * half, 0.0)
+    )
+
+
 def _with_rotors(vehicle: Vehicle, **changes: object) -> Vehicle:
     """Return `vehicle` with other values for fields of its rotors."""
     return replace(vehicle, rotors=replace(vehicle.rotors, **changes))
@@ -204,6 +238,7 @@ KINDS: dict[str, Kind] = {
     ),
     "body forward-right-down": Kind(("body_frame",), ("quat=frd", *ALL_FRD)),
     "quaternion xyzw": Kind(("quaternion_order",), ("quat=xyzw+xyzw+xyzw",)),
+    "quaternion wxyz, read as xyzw": Kind(("quaternion_order",), ("quat=xyzw",)),
     "quaternion world to body": Kind(("quaternion_direction",), ("quat=inverse",)),
     "attitude's pitch and odometry's roll inverted": Kind(
         ("attitude_sign",), ("quat=-pitch", "rate=-x,y,z"), race=True
@@ -252,6 +287,21 @@ KINDS: dict[str, Kind] = {
         ("controller_rate",), change=_hold_commands, race=True, needs=("cmd_rate", "throttle")
     ),
     "time in ms": Kind(("time_unit",), change=lambda p, _: {**p, "time": 1e3 * p["time"]}),
+    "throttle is a share of the motors' speed": Kind(
+        ("throttle_curve",), change=_unlinearised, needs=("throttle", "cmd_thrust")
+    ),
+    "motor map of another curve": Kind(("motor_map",), vehicle=_other_curve, needs=("pwm",)),
+    "motor map of twice the thrust": Kind(
+        ("motor_map",),
+        vehicle=lambda v: _motors(v, thrust=tuple(2.0 * t for t in _map_of(v).thrust)),
+        needs=("pwm",),
+    ),
+    "battery compensated twice": Kind(
+        ("battery_scaling",),
+        change=_drained,
+        vehicle=lambda v: _motors(v, voltage_exponent=_map_of(v).voltage_exponent + 1.5),
+        needs=("pwm", "voltage"),
+    ),
     "voltage in mV": Kind(("voltage",), ("voltage=1000",)),
     "battery of 0.1 V": Kind(("voltage",), ("voltage=0.00625",)),
     "mass on five links": Kind(

@@ -15,6 +15,7 @@ from zlib import crc32
 
 import numpy as np
 
+from eval.importers.formats.betaflight import DSHOT
 from eval.importers.frames import QUAT_HALF_TURN
 from eval.importers.options import ImportOptions
 
@@ -99,6 +100,7 @@ def write_usd(folder: Path, signals: Signals, full_thrust: float) -> Written:
         columns[f"controller.{name}(f)"] = signals["cmd_rate"][:, k] * DEG * [1.0, -1.0, 1.0][k]
     for k in range(4):
         columns[f"rpm.m{k + 1}(f)"] = signals["motor"][:, k] * RPM
+        columns[f"pwm.m{k + 1}_pwm(f)"] = signals["pwm"][:, k] * 65535.0
     columns["pm.vbat(f)"] = signals["voltage"][:, 0]
     # Header with one event type (number 7) and the names of its columns; then the rows; then a
     # checksum.
@@ -128,6 +130,7 @@ def write_blackbox(folder: Path, signals: Signals, full_thrust: float) -> Writte
     columns["vbatLatest (V)"] = np.round(signals["voltage"][:, 0], 2)
     for k, motor in enumerate((1, 0, 2, 3)):
         columns[f"eRPM[{k}]"] = np.round(signals["motor"][:, motor] * RPM * 7.0 / 100.0)
+        columns[f"motor[{k}]"] = np.round(DSHOT[0] + signals["pwm"][:, motor] * np.ptp(DSHOT))
     names = ["time", "pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"]
     pose = np.column_stack([signals["time"] + 3.0, signals["pos"], signals["quat"]])
     _csv(folder / "pose.csv", dict(zip(names, pose.T, strict=True)))
@@ -155,6 +158,7 @@ def write_table(folder: Path, signals: Signals, full_thrust: float) -> Written:
         "acc": signals["acc"] * FLIP,
         "cmd_rate": signals["cmd_rate"] * FLIP,
         "motor": signals["motor"][:, [0, 2, 3, 1]] * RPM,
+        "pwm": signals["pwm"][:, [0, 2, 3, 1]],
         "throttle": signals["throttle"],
         "voltage": signals["voltage"],
     }

@@ -36,12 +36,6 @@ def test_full_throttle_is_what_is_told_or_built_or_felt(felt, options, full, by)
     assert finding.status == "note" and by in finding.evidence
 
 
-def test_a_vehicle_that_does_not_fit_what_was_felt_is_doubted():
-    findings = thrust_command(thrust_rows(37.632 / 2), ImportOptions(vehicle=PLAIN))
-    assert [finding.status for finding in findings] == ["note", "doubt"]
-    assert "2.00 times the accelerometer's mean" in findings[1].evidence
-
-
 @pytest.mark.parametrize("found", [thrust_rows(), thrust_rows(25.0, count=50)])
 def test_where_nothing_tells_the_scale_thrust_is_left_out(found):
     (finding,) = thrust_command(found, ImportOptions())

@@ -5,16 +5,18 @@ from functools import cache
 import numpy as np
 import pytest
 
-from eval.logs.faults import commands
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, check_files, run_checks
 from eval.logs.faults.clock import check_clock
-from eval.logs.faults.commands import check_controller_rate
+from eval.logs.faults.drive import commands
+from eval.logs.faults.drive.commands import check_controller_rate
 from eval.logs.faults.reading import parse_readings, read_rows
+from suite.experiments.injected.flights import with_linear_motors
 from suite.experiments.injected.kinds import KINDS, inject
 from tests.support import known_flight
 from tests.support.vehicles import PLAIN
 
+VEHICLE = with_linear_motors(PLAIN)
 HZ, POLICY_HZ = 100.0, 30.0
 NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "motor": 3.0}
 
@@ -34,6 +36,7 @@ def logged(seed, end):
         "time": truth.time, "pos": truth.pos, "quat": truth.quat, "vel": truth.vel,
         "rate": truth.rate, "acc": truth.acc, "motor": truth.motor, "cmd_thrust": thrust,
         "cmd_rate": wanted, "throttle": thrust / PLAIN.full_thrust,
+        "pwm": (truth.motor / PLAIN.rotors.speed_max) ** 2,
         "voltage": truth.voltage[:, None], "baro": truth.pos[:, 2:].copy(),
     }  # fmt: skip
     rng = np.random.default_rng(seed)
@@ -43,7 +46,7 @@ def logged(seed, end):
     return parts
 
 
-def checked(parts, vehicle=PLAIN, fov=1.0):
+def checked(parts, vehicle=VEHICLE, fov=1.0):
     against = CheckContext(
         vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg)
     )
@@ -61,8 +64,8 @@ def named(findings):
 @pytest.mark.parametrize("name", KINDS)
 def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
     kind, right = KINDS[name], good()
-    wrong = inject(kind, right, PLAIN)
-    vehicle = PLAIN if kind.vehicle is None else kind.vehicle(PLAIN)
+    wrong = inject(kind, right, VEHICLE)
+    vehicle = VEHICLE if kind.vehicle is None else kind.vehicle(VEHICLE)
     findings, readings = checked(wrong, vehicle, kind.fov)
     assert named(findings) & set(kind.names)
     corrected = [f for f in findings if f.fault in kind.names and f.status == "corrected"]
@@ -93,6 +96,7 @@ def test_a_good_flight_has_no_fault(seed):
         (("acc=z,y,-x",), {"accelerometer_axes"}),
         (("rate=938.7",), {"gyro_scale"}),
         (("rate=57.3",), {"gyro_scale"}),
+        (("rate=0.01745329252",), {"gyro_scale"}),
         (("motor=1,2,4,3",), {"motor_order"}),
         (("cmd_rate=x,-y,z",), {"rate_command_sign"}),
     ],
@@ -104,6 +108,25 @@ def test_without_a_pose_a_second_witness_decides_which_signal_is_wrong(wrong, na
     if any(text.startswith("rate=") for text in wrong):
         fixed = read_rows(read_rows(right, parse_readings(wrong)), readings)["rate"]
         np.testing.assert_allclose(fixed, right["rate"], rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "lost", "name", "fix"),
+    [
+        ("rate=1.2", (), "gyro_scale", 1.0 / 1.2),
+        ("rate=0.8", (), "gyro_scale", 1.25),
+        ("rate=1.2", ("motor", "pwm"), "rate_curve", 1.2),
+        ("cmd_rate=0.8", (), "rate_curve", 1.25),
+    ],
+)
+def test_without_a_pose_a_rate_loops_gain_shows_a_wrong_scale(wrong, lost, name, fix):
+    """No other fault is named after it, and the motors' torques tell a gyro from a stick map."""
+    right = {n: v for n, v in good().items() if n not in ("pos", "quat", "vel", *lost)}
+    findings, _ = checked(read_rows(right, parse_readings((wrong,))))
+    assert named(findings) == {name}
+    (finding,) = (f for f in findings if f.fault == name and f.status == "doubt")
+    assert finding.is_open
+    assert float(finding.fix.split("=")[-1]) == pytest.approx(fix, rel=0.03)
 
 
 def test_a_calm_flight_says_what_it_does_not_show():

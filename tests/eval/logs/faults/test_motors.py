@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.logs.faults.motors import check_lift, check_motors
+from eval.logs.faults.drive.motors import check_lift, check_motors
 from tests.support.vehicles import PLAIN
 
 HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))

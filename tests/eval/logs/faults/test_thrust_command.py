@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.logs.faults.commands import check_thrust_command
+from eval.logs.faults.drive.commands import check_thrust_command
 from tests.support.vehicles import PLAIN
 
 

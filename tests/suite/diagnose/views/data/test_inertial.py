@@ -23,12 +23,16 @@ DRAG = 0.4
 LACKS = {"partial": ["pos", "quat"]}
 
 
-def flown(seed=0, end_s=10.0, bias=1.0):
-    """A flight from rest along smooth curves under the same drag along all axes; its velocity."""
+def flown(seed=0, end_s=10.0, bias=1.0, speed=1.0, gyro_walk=0.0, acc_noise=0.2):
+    """A flight from rest along smooth curves under the same drag along all axes; its velocity.
+
+    `speed` scales the path; `gyro_walk` is the deviation of a gyro error held for 0.1 s [rad/s].
+    """
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, end_s, 0.01)
     phase = 2.0 * np.pi * (np.array([0.21, 0.17, 0.13]) + 0.02 * seed) * time_s[:, None]
     vel_w = np.array([4.0, 3.0, 1.0]) * np.sin(phase) ** 2 * np.tanh(time_s)[:, None]
+    vel_w = speed * vel_w
     force_w = np.gradient(vel_w, time_s, axis=0) + [0.0, 0.0, 9.81] + DRAG * vel_w
     thrust = np.linalg.norm(force_w, axis=1)
     up = force_w / thrust[:, None]
@@ -39,7 +43,9 @@ def flown(seed=0, end_s=10.0, bias=1.0):
     rate_b = np.concatenate([turns[:1], 0.5 * (turns[1:] + turns[:-1]), turns[-1:]])
     acc_b = rot.inv().apply(force_w - DRAG * vel_w)
     rate_b = rate_b + bias * 0.005 * rng.normal(size=3) + 0.02 * rng.normal(size=rate_b.shape)
-    acc_b = acc_b + bias * 0.05 * rng.normal(size=3) + 0.2 * rng.normal(size=acc_b.shape)
+    slow = np.repeat(rng.normal(size=(len(time_s) // 10 + 1, 3)), 10, axis=0)[: len(time_s)]
+    rate_b = rate_b + gyro_walk * slow
+    acc_b = acc_b + bias * 0.05 * rng.normal(size=3) + acc_noise * rng.normal(size=acc_b.shape)
     each = np.sqrt(VEHICLE.mass * thrust / 4.0 / VEHICLE.rotors.thrust_coefficient)
     lost = np.full((len(time_s), 4), np.nan)
     log = FlightLog(
@@ -94,6 +100,22 @@ def test_thrust_and_drag_are_identified_without_a_pose():
     drag = numbers["effects.linear_drag.coefficient"].value
     assert drag == pytest.approx([DRAG] * 3, abs=0.05)
     assert any("heading" in line for line in found.not_identified)
+
+
+def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts():
+    """As in logs whose gyro was sampled too rarely: the tilt drifts by 0.03 rad a second."""
+    slow = {"end_s": 30.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
+    found = identify([flown(seed, **slow)[0] for seed in range(3)], VEHICLE)
+    drag = next(n for n in found.numbers if n.key == "effects.linear_drag.coefficient")
+    spans = [span for span in drag.ci95[:2] if span is not None]
+    assert spans and all(low < DRAG < high for low, high in spans)
+
+
+def test_a_drag_of_a_hover_is_not_identified():
+    still = {"end_s": 20.0, "speed": 0.003, "gyro_walk": 0.1}
+    found = identify([flown(seed, **still)[0] for seed in range(3)], VEHICLE)
+    drag = [span for n in found.numbers if "linear_drag" in n.key for span in n.ci95[:2]]
+    assert not any(drag), drag
 
 
 def test_views_are_of_what_a_log_has():

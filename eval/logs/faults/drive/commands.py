@@ -5,25 +5,32 @@ from __future__ import annotations
 import numpy as np
 
 from eval.effects.interface import GRAVITY
+from eval.logs.faults.drive.motors import over_force, torque_correlations, turn_scale, within
+from eval.logs.faults.drive.rate_following import bend, delayed, loop_gain
 from eval.logs.faults.finding import Finding, unseen
-from eval.logs.faults.motors import over_force, torque_correlations, within
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows
 from eval.logs.faults.reading import option
 from eval.logs.faults.relation import match, pooled_scale, rms, smooth
 from eval.logs.faults.vectors import DEG, RATES, UPWARDS, upwards
 from eval.vehicles.vehicle import Vehicle
 
-REACH_S, STEP_S = 0.3, 0.01
-"""Largest delay that is tried, and the step between trials [s]."""
 LATE_S = 0.06
 """Allowed delay beyond that of rate loop, rotors and usual link [s]."""
-STEADY_S = 0.1
-"""Time before and after within which a steady command changes little [s]."""
 USUAL_S = 0.08
 """Usual delay of loop, rotors and link without a vehicle file [s]."""
 GAIN = (0.8, 1.25)
 """Correct range of body rate over steady rate command."""
 UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
+LOOP_GAIN = (0.87, 1.1)
+"""Correct range of the rate loop's gain at low frequency. Motors at their limits lower it."""
+EQUAL = 1.2
+"""Factor within which the gains of all axes are one gain."""
+SAME_UNIT = 1.15
+"""Factor around a unit's within which a gain is that unit."""
+FASTEST_RMS = 8.0
+"""Root mean square that rate commands do not exceed over a flight [rad/s]."""
+MAPS = 3.0
+"""Factor within which a gain is another map from sticks, and no unit."""
 OPPOSITE, FOLLOWED, BENT = -0.5, 0.92, 0.4
 """Correlations of commands and gyro: with a wrong sign below the first, with a reliable gain above
 the second. The third is the least bend of a rates curve."""
@@ -118,7 +125,7 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         still = "it" if rms(rows["cmd_rate"][both]) == 0.0 else "the gyro"
         return [Finding("note", subject, f"{still} is 0 throughout")]
     rate = smooth(time_s, rows["rate"], WIDTH_S)
-    delay, command = _delayed(time_s, rows["cmd_rate"], rate)
+    delay, command = delayed(time_s, rows["cmd_rate"], rate)
     if rms(rate) < CALM_RATE:
         text = f"turns of {rms(rate):.2g} rad/s are too small to check it by"
         return [Finding("not identifiable", subject, text, "rate_curve")]
@@ -176,7 +183,7 @@ def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
     rate = smooth(rows["time"], rows["rate"], WIDTH_S)
     if torque is None or rms(rate) < CALM_RATE:
         return []
-    _, command = _delayed(rows["time"], rows["cmd_rate"], rate)
+    _, command = delayed(rows["time"], rows["cmd_rate"], rate)
     followed = match(command, rate).as_given
     if not (np.minimum(np.abs(followed), np.abs(torque)) > -OPPOSITE).all():
         return []
@@ -196,62 +203,47 @@ def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
     return [Finding("corrected", "gyro", text, frame, None, 0.95, fix)]
 
 
+def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
+    """Return a wrong scale of the gyro in a log without an attitude, by the rate loop's gain.
+
+    The loop makes the body rate equal to a steady command, so another ratio is a wrong gyro or a
+    wrong command. Their units or the motors' torques decide which.
+    """
+    if "quat" in rows or not {"cmd_rate", "rate"} <= rows.keys():
+        return []
+    found = loop_gain(rows["time"], rows["cmd_rate"], rows["rate"])
+    if found is None or LOOP_GAIN[0] < found[0] < LOOP_GAIN[1]:
+        return []
+    gain, between_axes = found
+    text = f"it is {gain:.3g} times a steady rate command"
+    unit = next((w for w, f in RATES.items() if abs(np.log(gain / f)) < np.log(SAME_UNIT)), None)
+    if unit is not None and rms(rows["cmd_rate"]) < FASTEST_RMS:
+        fix = option(("rate", f"{1.0 / RATES[unit]:.10g}"))
+        text = f"{text}: {unit}"
+        return [Finding("corrected", "gyro", text, "gyro_scale", RATES[unit], 0.95, fix)]
+    if between_axes > EQUAL:
+        return []
+    scale = turn_scale(rows, vehicle)
+    if scale is not None:
+        text += f", and {scale:.3g} times what the motors' torques give by the vehicle file"
+    if scale is not None and abs(np.log(scale / gain)) < abs(np.log(scale)):
+        fix = option(("rate", f"{1.0 / gain:.4g}"))
+        return [Finding("doubt", "gyro", text, "gyro_scale", gain, 0.93, fix)]
+    if gain < 1.0 / MAPS or gain > MAPS:
+        return []  # `check_rate_command` names units
+    text = f"the gyro is {text.removeprefix('it is ')}: another map from sticks to rates"
+    text += "" if scale is not None else ", or the gyro's scale"
+    fix = "the firmware's rates curve for the map from sticks, or " + option(
+        ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
+    return [Finding("doubt", "rate command", text, "rate_curve", gain, 0.9, fix)]
+
+
 def _response(vehicle: Vehicle) -> float:
     """Return the expected delay from rate command to body rate by the vehicle file [s]."""
     known = vehicle.effects.get("command_delay")
     loop = 0.0 if vehicle.controller.settings is not None else vehicle.controller.rate_gain[0]
     late = 0.03 if known is None else float(known.delay)
     return late + vehicle.rotors.time_constant + (1.0 / loop if loop else 0.05)
-
-
-def _delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay [s] with the best correlation of command and rates, and that command."""
-    step = float(np.median(np.diff(time_s)))
-    value = smooth(time_s, command, WIDTH_S)
-    best, delay, kept = -1.0, 0.0, value
-    for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
-        count = round(late / step)
-        moved = np.full_like(value, np.nan)
-        moved[count:] = value[: len(value) - count]
-        both = np.isfinite(moved).all(axis=1) & np.isfinite(rate).all(axis=1)
-        if both.sum() < 30:
-            break
-        a, b = moved[both] - moved[both].mean(axis=0), rate[both] - rate[both].mean(axis=0)
-        size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
-        alike = float(
-            np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-12))
-        )
-        if alike > best + 1e-6:
-            best, delay, kept = alike, float(late), moved
-    return delay, kept
-
-
-def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
-    """Return by what share the gain of large commands exceeds that of small ones.
-
-    Only commands that hardly change within the loop's response count, since the body never reaches
-    short large ones. The result is the least over moving axes and both halves of the flight. It is
-    0 where one of them has too few commands, or less gain for large ones (motors at their limits).
-    """
-    both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
-    time_s, command, rate = time_s[both], command[both], rate[both]
-    before, after = (
-        np.column_stack([np.interp(time_s + shift, time_s, c) for c in command.T])
-        for shift in (-STEADY_S, STEADY_S)
-    )
-    steady, half = np.abs(after - before) < 0.3 * np.abs(command), len(time_s) // 2
-    limits = np.quantile(np.abs(command), 0.9, axis=0)
-    bends = []
-    for axis in np.flatnonzero(limits > 3.0 * CALM_RATE):
-        for part in (slice(None, half), slice(half, None)):
-            c, r = command[part, axis][steady[part, axis]], rate[part, axis][steady[part, axis]]
-            share = np.abs(c) / limits[axis]
-            large, small = share > 0.6, (share > 0.15) & (share < 0.4)
-            if min(large.sum(), small.sum()) < 30:
-                return 0.0
-            slopes = [float(np.median(r[m] / c[m])) for m in (large, small)]
-            bends.append(slopes[0] / slopes[1] - 1.0 if slopes[1] > 0.0 else 0.0)
-    return max(0.0, min(bends, default=0.0))
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:

@@ -95,6 +95,29 @@ def torque_correlations(rows: Rows, vehicle: Vehicle | None) -> np.ndarray | Non
     return None if isinstance(found, str) else _scores(*found)[AS_GIVEN]
 
 
+def turn_scale(rows: Rows, vehicle: Vehicle | None) -> float | None:
+    """Return the gyro's angular acceleration over that of the motors' torques by the vehicle file.
+
+    It is 1 for a correct gyro and vehicle file. None where the log or the file lacks what it needs.
+    """
+    name = _drive(rows)
+    if vehicle is None or name is None or "rate" not in rows:
+        return None
+    found = _torques(rows, name, vehicle)
+    if isinstance(found, str) or (name == "pwm" and vehicle.motors is None):
+        return None
+    mean, turning, mixer = found
+    newtons = 1.0 if name == "pwm" else vehicle.rotors.thrust_coefficient
+    torque = newtons * mean @ mixer[:2].T  # the mixer's third row has no unit
+    good = np.isfinite(torque).all(axis=1) & np.isfinite(turning).all(axis=1)
+    a, b = (v[good] - v[good].mean(axis=0) for v in (torque, turning[:, :2]))
+    slope = np.sum(a * b, axis=0) / np.maximum(np.sum(a * a, axis=0), 1e-18)
+    alike = _correlations(mean @ mixer[:2].T, turning[:, :2]).diagonal()
+    if not (slope > 0.0).all() or alike.min() < SURELY:
+        return None
+    return float(np.sqrt(slope.prod()))
+
+
 def _drive(rows: Rows) -> str | None:
     return next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
 
@@ -249,6 +272,27 @@ def over_force(rows: Rows, thrust: np.ndarray) -> float:
 
     A thrust in newtons gives a mass [kg], one in m/s^2 a ratio [1].
     """
+    _, share = _force_and_share(rows, thrust)
+    return 1.0 / share if share > 0.0 else 0.0
+
+
+def force_without_drag(rows: Rows, thrust: np.ndarray) -> np.ndarray | None:
+    """Return the specific force (T,) along body z, averaged over `WIDTH_S`, without drag [m/s^2].
+
+    None where it is unknown.
+
+    Args:
+        rows: see `check.run_checks`.
+        thrust: (T,) in any unit; the drag is fitted next to it.
+    """
+    if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
+        return None
+    force, share = _force_and_share(rows, thrust)
+    return force if share > 0.0 else None
+
+
+def _force_and_share(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the specific force (T,) along body z without drag, and force over thrust."""
     time_s = rows["time"]
     drag = np.zeros((len(time_s), 0))
     need = np.full(len(time_s), GRAVITY)
@@ -259,13 +303,13 @@ def over_force(rows: Rows, thrust: np.ndarray) -> float:
         along = rotate(quat, vel)[:, 2:]
         drag = np.concatenate([along, along * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
     elif "acc" in rows:
-        need = rows["acc"][:, 2]
+        need = smooth(time_s, rows["acc"][:, 2:], WIDTH_S)[:, 0]
     columns = np.concatenate([thrust[:, None], drag], axis=1)
     good = np.isfinite(need) & np.isfinite(columns).all(axis=1)
     if not good.any() or not np.any(thrust[good]):
-        return 0.0
-    share = float(np.linalg.lstsq(columns[good], need[good], rcond=None)[0][0])
-    return 1.0 / share if share > 0.0 else 0.0
+        return need, 0.0
+    found = np.linalg.lstsq(columns[good], need[good], rcond=None)[0]
+    return need - drag @ found[1:], float(found[0])
 
 
 def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:

@@ -1,0 +1,1 @@
+"""Checks of what drives the vehicle: motors, motor commands, throttle and rate commands."""

@@ -1,0 +1,314 @@
+"""Check of the map from motor commands or a throttle to thrust: its size, its curve, the battery.
+
+The measured thrust T is that of the rotors by their speeds. Without these it is the mass times the
+force along body z, by the path or the accelerometer. F is the vehicle file's thrust for the same
+commands. Least squares over the flight fits
+
+    log(T / F) = size + curve (log F - mean) + battery (log V - mean)
+
+with the battery's voltage V. All three coefficients are 0 where the file is correct. Their errors
+come from leaving out blocks of the flight in turn (jackknife).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from eval.logs.faults.drive.motors import FITS, force_without_drag
+from eval.logs.faults.finding import Finding, unseen
+from eval.logs.faults.pose import WIDTH_S, Rows
+from eval.logs.faults.relation import jackknife_error, smooth
+from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
+
+LATE_S, STEP_S = 0.16, 0.01
+"""Largest delay from command to thrust that is tried, and the step between trials [s]."""
+BLOCKS = 8
+LEAST_ROWS = 200
+USED = (0.02, 0.97)
+"""Commands outside are at a limit, where the thrust does not follow them."""
+CURVE, BATTERY, SURE = 0.3, 0.8, 4.0
+"""Least relative error of the exponent of thrust over command, and least error of the exponent of
+thrust over voltage, that are a fault; in standard errors, the least of both."""
+FOLLOWS = 0.5
+"""Least correlation of commanded and measured thrust."""
+SPAN = 0.2
+"""Least range of the thrust in which its curve is identifiable, as a difference of logarithms."""
+SWUNG = 1.6
+"""Factor by which a battery's voltage changes the thrust: a size is not identifiable within it
+where the voltage was not logged [1]."""
+FLAT = 0.005
+"""A voltage with a smaller standard deviation of its logarithm counts as constant."""
+
+
+class Drive(NamedTuple):
+    """Commands of a log, and how they give thrust by the vehicle file."""
+
+    name: str
+    """`pwm`, `throttle` or `cmd_thrust`."""
+    subject: str
+    fault: str
+    """The fault's name where size or curve is wrong."""
+    motors: MotorMap | None
+    """None: thrust is proportional to the command."""
+    command: np.ndarray
+    """(T, C) from 0 to 1; C = 1 for a throttle, which all four motors share."""
+    full: float
+    """Thrust of all motors at full command without a `[motors]` [N]; 1 without a vehicle file."""
+
+    def thrust(self, motors: MotorMap | None, volts: np.ndarray | None) -> np.ndarray:
+        """Return the thrust (T, C) of the commands: of one motor each, or of all four [N]."""
+        if motors is None:
+            return self.full * self.command
+        share = 4.0 if self.command.shape[1] == 1 else 1.0
+        return share * np.asarray(motor_thrust(motors, self.command, volts))
+
+
+class Ratio(NamedTuple):
+    """Coefficients of log(T / F), and their standard errors."""
+
+    size: float
+    curve: float
+    curve_error: float
+    battery: float
+    battery_error: float
+    """Infinite where the voltage is unknown or constant."""
+    exponent: float
+    """Exponent of the file's thrust over the command, at the usual command."""
+    low: float
+    """Smallest and ..."""
+    high: float
+    """... largest of nine tenths of the commands."""
+    span: float
+    """Difference of the logarithms of F at these."""
+    late: int
+    """Delay from command to thrust, in rows."""
+
+
+def check_motor_map(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
+    """Return the faults of `[motors]`, and of a throttle's curve and linearisation.
+
+    Args:
+        rows: see `check.run_checks`.
+        vehicle: the vehicle file; None: only a throttle's curve is checked.
+    """
+    return [one for drive in _drives(rows, vehicle) for one in _check(rows, drive, vehicle)]
+
+
+def _check(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
+    """Return the findings on one kind of command."""
+    measured = _measured(rows, drive, vehicle)
+    if measured is None:
+        text = "neither rotor speeds, nor an accelerometer, nor a pose show the thrust"
+        return unseen(drive.subject, text, drive.fault, "battery_scaling")
+    volts = rows["voltage"][:, 0] if "voltage" in rows else None
+    ratio = _ratio(rows["time"], drive, measured, volts)
+    if ratio is None:
+        text = "too few commands between the limits, or the thrust does not follow them"
+        return unseen(drive.subject, text, drive.fault, "battery_scaling")
+    fix = _fix(rows["time"], drive, measured, volts, ratio, vehicle)
+    return _findings(ratio, drive, vehicle, fix)
+
+
+def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
+    """Yield the commands whose thrust the vehicle file gives."""
+    full = 1.0 if vehicle is None else vehicle.full_thrust * vehicle.mass
+    motors = None if vehicle is None else vehicle.motors
+    if "pwm" in rows and motors is not None:
+        yield Drive("pwm", "motor map", "motor_map", motors, rows["pwm"], full)
+    if "throttle" in rows:
+        yield Drive("throttle", "throttle", "throttle_curve", motors, rows["throttle"], full)
+    elif "cmd_thrust" in rows and vehicle is not None:
+        share = rows["cmd_thrust"] / vehicle.full_thrust
+        yield Drive("cmd_thrust", "thrust command", "throttle_curve", None, share, full)
+
+
+def _measured(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> np.ndarray | None:
+    """Return the measured thrust: (T, 4) of each motor, or (T, 1) of all [N]; None: unknown.
+
+    Without a vehicle file it is in units of the mass.
+    """
+    if drive.name == "pwm" and "motor" in rows and vehicle is not None:
+        return vehicle.rotors.thrust_coefficient * rows["motor"] ** 2
+    total = np.sum(drive.thrust(drive.motors, None), axis=1)
+    force = force_without_drag(rows, total)
+    return None if force is None else force[:, None] * (1.0 if vehicle is None else vehicle.mass)
+
+
+def _ratio(
+    time_s: np.ndarray, drive: Drive, measured: np.ndarray, volts: np.ndarray | None
+) -> Ratio | None:
+    """Return how the measured thrust differs from the file's; None where it shows too little."""
+    wanted = _averaged(time_s, drive, drive.thrust(drive.motors, volts), measured)
+    thrust = smooth_columns(time_s, measured)
+    thrust = np.where(thrust > 0.1 * np.nanmedian(thrust), thrust, np.nan)
+    log_wanted, log_thrust = np.log(wanted), np.log(thrust)
+    late = _delay_rows(time_s, log_wanted, log_thrust)
+    log_wanted = _shifted(log_wanted, late)
+    log_volts = np.zeros(len(time_s)) if volts is None else np.log(np.maximum(volts, 0.1))
+    log_volts = np.broadcast_to(log_volts[:, None], log_wanted.shape)
+    block = np.broadcast_to(((np.arange(len(time_s)) * BLOCKS) // len(time_s))[:, None],
+                            log_wanted.shape)  # fmt: skip
+    good = np.isfinite(log_wanted) & np.isfinite(log_thrust) & np.isfinite(log_volts)
+    if good.sum() < LEAST_ROWS:
+        return None
+    x, y, v, block = log_wanted[good], log_thrust[good], log_volts[good], block[good]
+    design = np.column_stack([np.ones_like(x), x - x.mean(), v - v.mean()])
+    columns = [0, 1, 2] if np.std(v) > FLAT else [0, 1]
+    battery = design[:, [0, 2]]  # a wrong exponent may hide that the thrust follows
+    both = np.column_stack([x, y])
+    changes = both - battery @ np.linalg.lstsq(battery, both, rcond=None)[0]
+    if _correlation(*changes.T) < FOLLOWS:
+        return None
+
+    def fitted(keep: np.ndarray) -> np.ndarray:
+        found = np.zeros(3)
+        a, b = design[keep][:, columns], (y - x)[keep]
+        found[columns] = np.linalg.lstsq(a, b, rcond=None)[0]
+        return found
+
+    off = np.abs(y - x - design @ fitted(np.ones(len(x), dtype=bool)))
+    usual = off < 4.0 * np.median(off) + 1e-9
+    whole = fitted(usual)
+    parts = np.array([fitted(usual & (block != k)) for k in range(BLOCKS)])
+    errors = [jackknife_error(parts[:, k]) for k in range(3)]
+    errors[2] = errors[2] if len(columns) == 3 else np.inf
+    command = np.asarray(drive.command[np.isfinite(drive.command)])
+    span = float(np.ptp(np.quantile(x, (0.05, 0.95))))
+    low, middle, high = (float(q) for q in np.quantile(command, (0.05, 0.5, 0.95)))
+    return Ratio(float(whole[0]), float(whole[1]), errors[1], float(whole[2]), errors[2],
+                 _exponent(drive.motors, middle), low, high, span, late)  # fmt: skip
+
+
+def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> list[Finding]:
+    """Return the findings of size, curve and battery, with one fix for all."""
+    findings = []
+    true, error = ratio.exponent * (1.0 + ratio.curve), ratio.exponent * ratio.curve_error
+    figures = (
+        f"thrust grows with the command to the power {true:.2f} (± {error:.2f}) from "
+        f"{ratio.low:.2f} to {ratio.high:.2f}, to {ratio.exponent:.2f} by the file"
+    )
+    if SURE * ratio.curve_error > CURVE or ratio.span < SPAN:
+        why = "too uncertain" if ratio.span >= SPAN else "the commands hardly change"
+        findings += unseen(drive.subject, f"{figures}: {why}", drive.fault)
+    elif abs(ratio.curve) > max(CURVE, SURE * ratio.curve_error):
+        about = (drive.fault, true, 0.95, fix)
+        text = f"{figures}: the curve or its linearisation is another"
+        findings.append(Finding("doubt", drive.subject, text, *about))
+    had = 0.0 if drive.motors is None else drive.motors.voltage_exponent
+    per_volt = had * ratio.exponent + ratio.battery
+    figures_of_battery = (
+        f"thrust at one command grows with the voltage to the power {per_volt:.2f} "
+        f"(± {ratio.battery_error:.2f}), to {had * ratio.exponent:.2f} by the file"
+    )
+    if not SURE * ratio.battery_error < BATTERY:
+        known = np.isfinite(ratio.battery_error)
+        text = f"{figures_of_battery}: too uncertain" if known else "no voltage that changes"
+        findings += unseen(drive.subject, text, "battery_scaling")
+    elif abs(ratio.battery) > max(BATTERY, SURE * ratio.battery_error):
+        about = ("battery_scaling", per_volt, 0.95, fix)
+        text = f"{figures_of_battery}: the battery is taken into account twice, or not at all"
+        findings.append(Finding("doubt", drive.subject, text, *about))
+    if vehicle is None:
+        return findings
+    # `check_thrust_command` reports the size of a command in m/s^2.
+    times, reach = float(np.exp(-ratio.size)), np.inf if drive.name == "cmd_thrust" else FITS
+    if had and not np.isfinite(ratio.battery_error):
+        reach = max(reach, SWUNG)
+    if not 1.0 / reach < times < reach and not any(f.status == "doubt" for f in findings):
+        text = f"the file gives {times:.3g} times the measured thrust"
+        text += "" if drive.name == "pwm" else ", or its mass is wrong"
+        findings.append(Finding("doubt", drive.subject, text, drive.fault, times, 0.93, fix))
+    if any(f.status != "not identifiable" for f in findings):
+        return findings
+    return [*findings, Finding("ok", drive.subject, figures)]
+
+
+def _fix(
+    time_s: np.ndarray,
+    drive: Drive,
+    measured: np.ndarray,
+    volts: np.ndarray | None,
+    ratio: Ratio,
+    vehicle: Vehicle | None,
+) -> str:
+    """Return `[motors]` of the vehicle file with the values that fit the flight."""
+    if vehicle is None:
+        return "[motors] of a vehicle file, with --vehicle"
+    from scipy.optimize import nnls
+
+    nominal = drive.motors or MotorMap((0.0, 1.0), 1.0, 0.0)
+    exponent, voltage = nominal.voltage_exponent, nominal.voltage
+    if SURE * ratio.battery_error < BATTERY and volts is not None:
+        voltage = voltage if exponent else float(np.nanmedian(volts))
+        found = exponent + ratio.battery / max(ratio.exponent * (1.0 + ratio.curve), 0.5)
+        exponent = round(float(np.clip(found, 0.0, 4.0)), 2)
+    parts = [
+        _shifted(_averaged(time_s, drive, drive.thrust(motors, volts), measured), ratio.late)
+        for motors in (MotorMap(t, voltage, exponent) for t in ((1.0, 0.0), (0.0, 1.0)))
+    ]
+    columns = np.stack([part.ravel() for part in parts], axis=1)
+    thrust = smooth_columns(time_s, measured).ravel()
+    good = np.isfinite(columns).all(axis=1) & np.isfinite(thrust)
+    (first, second), _ = nnls(columns[good], thrust[good])
+    return (
+        f"motors.thrust = [{first:.4g}, {second:.4g}], motors.voltage = {voltage:.4g} and "
+        f"motors.voltage_exponent = {exponent:g} in the vehicle file"
+    )
+
+
+def _exponent(motors: MotorMap | None, command: float) -> float:
+    """Return d log(thrust) / d log(command) of a map at a command."""
+    if motors is None:
+        return 1.0
+    linear, square = motors.thrust[0] * command, motors.thrust[1] * command**2
+    return (linear + 2.0 * square) / (linear + square)
+
+
+def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> int:
+    """Return the delay with the best correlation of wanted and measured thrust, in rows."""
+    step = float(np.median(np.diff(time_s)))
+    trials = dict.fromkeys(round(late / step) for late in np.arange(0.0, LATE_S, STEP_S))
+
+    def alike(count: int) -> float:
+        moved = _shifted(wanted, count)
+        good = np.isfinite(moved) & np.isfinite(thrust)
+        return _correlation(moved[good], thrust[good])
+
+    return max(trials, key=alike)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two (N,); 0 where one is constant or they are too short."""
+    if len(a) < LEAST_ROWS or not np.std(a) * np.std(b) > 1e-12:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _shifted(values: np.ndarray, count: int) -> np.ndarray:
+    """Return `values` (T, C) moved to `count` rows later; NaN before the first."""
+    moved = np.full_like(values, np.nan)
+    moved[count:] = values[: len(values) - count]
+    return moved
+
+
+def _averaged(
+    time_s: np.ndarray, drive: Drive, thrust: np.ndarray, measured: np.ndarray
+) -> np.ndarray:
+    """Return the file's thrust between the limits, summed and averaged as the measured one is.
+
+    A measured force was averaged once before (`force_without_drag`), so its command is, too.
+    """
+    at_limit = (drive.command < USED[0]) | (drive.command > USED[1])
+    if measured.shape[1] > 1:
+        return smooth_columns(time_s, np.where(at_limit, np.nan, thrust))
+    total = np.where(at_limit.any(axis=1), np.nan, thrust.sum(axis=1))
+    return smooth_columns(time_s, smooth_columns(time_s, total[:, None]))
+
+
+def smooth_columns(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the mean of each column of (T, C) over `WIDTH_S`; columns have their own gaps."""
+    columns = (smooth(time_s, column[:, None], WIDTH_S) for column in values.T)
+    return np.concatenate(list(columns), axis=1)

@@ -1,0 +1,142 @@
+"""Logs and mappings with one mistake: corrected exactly, or refused by name before a diagnosis.
+
+A PX4-like table, north-east-down and forward-right-down, with measurement noise. Each case flies
+with and without rotor speeds and a pose, where the mistake can then be made at all.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.importers import import_log
+from eval.logs.faults.check import CheckContext, check_before_diagnosis
+from eval.logs.flight_log import FlightLog
+from suite.experiments.injected.flights import flight_signals
+from suite.experiments.injected.kinds import KINDS
+from suite.experiments.injected.writers import write_table
+from tests.support import known_flight
+from tests.support.vehicles import PLAIN
+
+pytestmark = pytest.mark.slow
+DEG = 180.0 / np.pi
+ROTORS, POSE = ("motor", "pwm"), ("pos", "quat", "vel")
+LACKS = {
+    "whole": (),
+    "no rotor speeds": ROTORS,
+    "no pose": POSE,
+    "no pose and no rotor speeds": (*POSE, *ROTORS),
+}
+COMPARED = ("pos_w", "vel_w", "quat_wxyz", "rate_b", "acc_b", "rotor_speed", "thrust_cmd",
+            "rate_cmd_b")  # fmt: skip
+
+
+def scaled(name, factor):
+    return lambda parts: {**parts, name: parts[name] * factor}
+
+
+def ordered(*order):
+    return lambda parts: {**parts, "motor": parts["motor"][:, list(order)]}
+
+
+SIGNALS = {
+    "gyro in counts, declared deg/s": (scaled("rate", 16.384), "rate", "gyro_scale"),
+    "gyro in rad/s, declared deg/s": (scaled("rate", 1.0 / DEG), "rate", "gyro_scale"),
+    "gyro 20 % too large": (scaled("rate", 1.2), "rate", "gyro_scale rate_curve"),
+    "motors 2, 1, 4, 3": (ordered(1, 0, 3, 2), "motor", "motor_order"),
+    "motors 4, 1, 2, 3": (ordered(3, 0, 1, 2), "motor", "motor_order"),
+    "motors 1, 2, 4, 3": (ordered(0, 1, 3, 2), "motor", "motor_order"),
+    "motors 3, 4, 1, 2": (ordered(2, 3, 0, 1), "motor", "motor_order"),
+    "12 poles declared, 14 true": (scaled("motor", 14 / 12), "motor", "motor_poles"),
+    "sign of the yaw command": (scaled("cmd_rate", [1.0, 1.0, -1.0]), "", "rate_command_sign"),
+    "throttle from 0 to 1000": (scaled("throttle", 1000.0), "", "throttle_range"),
+    "all lengths in cm": (
+        lambda parts: {**parts, "pos": 100 * parts["pos"], "vel": 100 * parts["vel"]},
+        "pos", "position_unit velocity_unit",
+    ),
+    "positions in cm": (scaled("pos", 100.0), "pos", "position_unit"),
+}  # fmt: skip
+"""Mistake -> change of the flight, the signal without which there is none, and names of it."""
+MAPPINGS = {
+    "z-up declared, north-east-down": ('world = "ned"', 'world = "z-up"', "pos", "world_frame"),
+    "FLU declared, forward-right-down": (
+        'body = "frd"', 'body = "flu"', "", "body_frame accelerometer_axes",
+    ),
+    "xyzw declared, wxyz": ("[quat]\n", '[quat]\norder = "xyzw"\n', "pos", "quaternion_order"),
+}  # fmt: skip
+"""Mistake -> text of the mapping, what stands there instead, and the same as in `SIGNALS`."""
+VEHICLES = {
+    "arms in mm": "vehicle_arms",
+    "speed_max in rpm": "vehicle_thrust",
+    "inertia x 1000": "vehicle_inertia",
+}
+
+
+def imported(folder, lacks, change=lambda parts: parts, mapping=("", ""), vehicle=PLAIN):
+    """Import such a flight; return its log and the findings."""
+    truth = known_flight.fly(np.arange(0.0, 16.0, 0.01))
+    log = FlightLog("known", truth.time, truth.pos, truth.quat, truth.vel, truth.rate, truth.thrust,
+                    known_flight.fly(truth.time + 0.05).cmd_rate, truth.motor)  # fmt: skip
+    written = write_table(folder, change(flight_signals(log, PLAIN, np.random.default_rng(1))), 0.0)
+    tables = written.options.map.read_text(encoding="utf-8").replace(*mapping).split("\n[")
+    text = "\n[".join(t for t in tables if t.split("]")[0] not in lacks)
+    written.options.map.write_text(text, encoding="utf-8")
+    options = replace(written.options, vehicle=vehicle, partial=bool(lacks))
+    return import_log(written.path, "table", options)
+
+
+def same(one, other):
+    """Whether two imports hold the same flight."""
+    for name in COMPARED:
+        a, b = getattr(one, name), getattr(other, name)
+        if name == "quat_wxyz":
+            a, b = a * np.sign(a[:, :1]), b * np.sign(b[:, :1])
+        if (a is None) != (b is None) or (
+            a is not None and not np.allclose(a, b, rtol=1e-3, atol=1e-3, equal_nan=True)
+        ):
+            return False
+    return True
+
+
+def refused_by(log, vehicle=PLAIN):
+    """The faults for which a diagnosis refuses a log."""
+    try:
+        check_before_diagnosis([log], CheckContext(vehicle))
+    except ValueError as error:
+        return set(str(error).splitlines()[-1].partition("--accept ")[2].split())
+    return set()
+
+
+@pytest.mark.parametrize("lacks", LACKS)
+@pytest.mark.parametrize("mistake", [*SIGNALS, *MAPPINGS])
+def test_a_mistake_is_corrected_exactly_or_stops_a_diagnosis_by_its_name(tmp_path, mistake, lacks):
+    if mistake in SIGNALS:
+        change, signal, names = SIGNALS[mistake]
+        wrong = {"change": change}
+    else:
+        *mapping, signal, names = MAPPINGS[mistake]
+        wrong = {"mapping": mapping}
+    if signal in LACKS[lacks]:
+        pytest.skip("such a log does not hold the signal")
+    log, findings = imported(tmp_path, LACKS[lacks], **wrong)
+    good, _ = imported(tmp_path, LACKS[lacks])
+    told = {f.fault for f in findings if f.status in ("corrected", "doubt")}
+    stops = refused_by(log)
+    assert told & set(names.split())
+    assert stops <= set(names.split()), "no wrong name"
+    assert stops or same(log, good)
+
+
+@pytest.mark.parametrize("lacks", LACKS)
+@pytest.mark.parametrize("mistake", VEHICLES)
+def test_a_wrong_vehicle_file_stops_a_diagnosis_by_its_name(tmp_path, mistake, lacks):
+    vehicle = KINDS[mistake].vehicle(PLAIN)
+    log, _ = imported(tmp_path, LACKS[lacks], vehicle=vehicle)
+    assert refused_by(log, vehicle) == {VEHICLES[mistake]}
+
+
+@pytest.mark.parametrize("lacks", LACKS)
+def test_a_correct_log_is_accepted(tmp_path, lacks):
+    log, findings = imported(tmp_path, LACKS[lacks])
+    assert not refused_by(log)
+    assert not [f for f in findings if f.fault and f.status in ("corrected", "doubt")]
