@@ -59,15 +59,16 @@ class Kind:
 
 def inject(kind: Kind, signals: Mapping[str, np.ndarray], vehicle: Vehicle) -> Signals:
     """Return the signals of a correct flight of `vehicle`, with the fault."""
-    faulty = dict(signals)
-    use_pwm = kind.accepts_pwm and "motor" not in faulty
-    if kind.accepts_pwm and not use_pwm:
-        faulty.pop("pwm", None)  # it would have the same fault
-    if use_pwm:
+    faulty, readings = dict(signals), parse_readings(kind.readings)
+    only_pwm = kind.accepts_pwm and "motor" not in faulty
+    if only_pwm:
         faulty["motor"] = faulty.pop("pwm")
-    faulty = read_rows(faulty, parse_readings(kind.readings))
+    elif kind.accepts_pwm and "pwm" in faulty:
+        # A log has the commands of the motors in the same order as their speeds.
+        faulty["pwm"] = read_rows({**faulty, "motor": faulty["pwm"]}, readings)["motor"]
+    faulty = read_rows(faulty, readings)
     faulty = kind.change(faulty, vehicle) if kind.change is not None else faulty
-    if use_pwm:
+    if only_pwm:
         faulty["pwm"] = faulty.pop("motor")
     return faulty
 
