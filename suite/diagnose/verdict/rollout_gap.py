@@ -2,10 +2,11 @@
 
 A rollout is a simulated stretch of a flight, from a measured start state. Its start state is fitted
 within the measurement noise. The gap is the slow part of the remaining errors, divided by the slow
-errors that measurement noise alone gives; so 1 means noise only. "Slow" errors are those averaged
-over many rows, in which a wrong model shows and white noise does not. The plain errors from the
-measured start states are reported as well, in metres and so on. Their noise floor is the noise of
-the start states, carried through the rollout by the model's Jacobian.
+errors that measurement noise alone gives; so 1 means noise only. "Slow" errors are the projections
+of a rollout's errors on Legendre polynomials of time, in which a wrong model shows more than white
+noise. The plain errors from the measured start states are reported as well, in metres and so on.
+Their noise floor is the noise of the start states, carried through the rollout by the model's
+Jacobian.
 
 The numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec. II.4). A
 rollout with time steps of twice the length, and with every second rotor speed, differs from the
