@@ -1,12 +1,13 @@
-"""Flights without a pose: attitude and velocity by gyro and accelerometer from where they start.
+"""Flights without a pose: attitude and velocity are computed from gyro and accelerometer.
 
-A log begins at rest or in hover, so its first specific force points up. From there the gyro is
-integrated to the attitude, and the specific force less gravity to the velocity. The drift depends
-on few numbers: tilt and velocity at the start, and the biases of gyro and accelerometer. Drag makes
-them observable, as the force across the thrust is opposite to the velocity (Leishman et al. 2014,
-doi 10.1109/MCS.2013.2287362). The drag coefficients are estimated too, since the vehicle file may
-lack them; all flights of a vehicle share them. Least squares with usual sizes as priors is done for
-pieces of `PIECE_S` of a flight. Yaw and position start at 0, far above any ground.
+Such a log (here: inertial log) begins at rest or in hover, so its first specific force points up.
+From there the gyro is integrated to the attitude, and the specific force minus gravity to the
+velocity. The drift depends on a few parameters: tilt and velocity at the start, biases of gyro and
+accelerometer, and later changes of the tilt. Drag makes them observable, as the force across the
+thrust is opposite to the velocity (Leishman et al. 2014, doi 10.1109/MCS.2013.2287362). The drag
+coefficients are estimated too, since the vehicle file may lack them; all flights of a vehicle share
+them. The estimate is least squares with priors, for pieces of a flight of about `PIECE_S`. Yaw
+and horizontal position start at 0, far above any ground.
 
 In such flights the model is compared with the accelerometer, not with a derivative of the velocity.
 """
@@ -27,34 +28,39 @@ from suite.diagnose.data.sampling import interpolate
 from tracks.geometry.rotation import rot_to_quat
 
 PIECE_S = 12.0
-"""Tilt, velocity and biases are estimated anew after this [s]."""
+"""Duration of a piece: tilt, velocity and biases are estimated anew for each [s]."""
 WIDTH_S = 0.2
 """Forces are compared as means over this time [s]."""
 KNOT_S = 1.0
-"""The tilt error may change after each of this: errors of the gyro make it a random walk [s]."""
+"""Time between knots, at which the estimated tilt may change: errors of the gyro make the tilt
+error a random walk [s]."""
 WALK, LEAST_WALK = 0.02, 0.001
-"""Standard deviation of such a change, before it is estimated and at least [rad]. Rows of a gyro
-that were sampled without a filter, or interpolated, have far more than its noise."""
+"""Standard deviation of the tilt's change at a knot: value before it is estimated, and smallest
+value [rad]. A gyro that was sampled without a filter, or interpolated, drifts far more than its
+noise alone would cause."""
 DRAWS = 8
-"""Of the velocity's error."""
+"""Number of random draws of the velocity's error."""
 START_S = 0.1
 """The first specific force is the mean over this time [s]."""
 LIKE_GRAVITY = 1.0
-"""It is up where it is within this of gravity [m/s^2]; the body starts level otherwise."""
+"""The first specific force shows which way is up if its size is within this of gravity [m/s^2].
+Otherwise the body is assumed to start level."""
 PRIOR = np.repeat([0.03, 0.1, 0.005, 0.1], 3)
-"""Standard deviations: tilt [rad] and velocity [m/s] at the start, biases of gyro [rad/s] and
-accelerometer [m/s^2], three each."""
+"""(12,) prior standard deviations for a flight's first piece, three axes each: tilt at the start
+[rad], velocity at the start [m/s], bias of gyro [rad/s], bias of accelerometer [m/s^2]."""
 LATER = np.repeat([0.1, 1.0, 0.005, 0.1], 3)
-"""The same of later pieces."""
+"""(12,) the same standard deviations for later pieces, whose start is less certain."""
 DRAG, DRAG_PRIOR = np.array([0.3, 0.3, 0.0]), np.array([0.4, 0.4, 0.02])
-"""Usual drag across the thrust and its standard deviation: linear along x and y [1/s], and with the
-speed [1/m]."""
+"""Prior mean and standard deviation of the drag's coefficients: linear drag along body x and y
+[1/s], and drag along both that grows with the speed [1/m]."""
 FORCE_NOISE, LEAST_NOISE = 0.2, 0.02
-"""What a mean force is off such a drag by, before it is estimated and at least [m/s^2]."""
+"""Standard deviation of the residual between a mean force and the drag: value before it is
+estimated, and smallest value [m/s^2]."""
 ROUNDS, SETTLED = 20, 0.003
-"""Most rounds of the fit; a round that changes drag [1/s] and noise by less is the last."""
+"""Largest number of rounds of the fit, and tolerance: the fit ends after a round that changes the
+drag [1/s] and the relative noise by less than this."""
 HIGH_M = 1000.0
-"""Height of the start: nothing near."""
+"""Height of the start, so high that the ground has no effect [m]."""
 UNSEEN = (
     "position, heading and height: wind, ground, and faults of pose or velocity",
     "the accelerometer's own scale, which has the same effect as thrust over mass",
@@ -64,20 +70,21 @@ UNSEEN = (
 
 
 def is_inertial(log: FlightLog) -> bool:
-    """Return whether `log` has no position, and an accelerometer and a gyro in its place."""
-    has = log.acc_b is not None and np.isfinite(log.acc_b).any(axis=0).all()
-    return "pos" in log.partial and "rate" not in log.partial and bool(has)
+    """Return whether `log` has no position, but an accelerometer and a gyro."""
+    has_acc = log.acc_b is not None and np.isfinite(log.acc_b).any(axis=0).all()
+    return "pos" in log.partial and "rate" not in log.partial and bool(has_acc)
 
 
 @dataclass(frozen=True)
 class InertialLog(FlightLog):
-    """A flight whose pose is by inertia."""
+    """A flight whose pose is integrated from gyro and accelerometer."""
 
     pose_slope_b: np.ndarray | None = None
-    """(N, 3, K) how the drag's acceleration changes with what is not known of the pose, each by its
-    standard deviation before the flight [m/s^2]."""
+    """(N, 3, K) change of the drag's acceleration, in body axes, if one of the K parameters of the
+    pose changes by its prior standard deviation [m/s^2]."""
     vel_noise_b: np.ndarray | None = None
-    """(N, 3, `DRAWS`) draws of the velocity's error by the tilt's random walk [m/s]."""
+    """(N, 3, `DRAWS`) random draws of the velocity's error in body axes [m/s]. The tilt's random
+    walk causes this error."""
 
 
 def specific_force_w(log: FlightLog) -> np.ndarray | None:
@@ -101,51 +108,54 @@ def by_inertia(logs: Sequence[FlightLog]) -> list[InertialLog]:
 
 
 def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:
-    """Fit the numbers of all pieces and the drag that they share, and return that (3,).
+    """Fit the parameters of all pieces in place, and return the drag (3,) that they share.
 
-    A piece starts where it stands, whatever the piece before it changes: coupled starts make the
-    rounds diverge in long flights. The noise of the force and the random walk of the tilt are
-    estimated as well, the walk by expectation maximisation (Dempster et al. 1977).
+    The start of a piece stays fixed while the parameters of the previous piece change: coupled
+    starts make the rounds diverge in long flights. The noise of the force and the random walk of
+    the tilt are estimated as well, the walk by expectation maximisation (Dempster et al. 1977).
     """
     drag, noise = DRAG, FORCE_NOISE
     pieces = [piece for flight in flights for piece in flight]
     for _ in range(ROUNDS):
         hessian, gradient = np.diag(DRAG_PRIOR**-2), (DRAG - drag) / DRAG_PRIOR**2
-        eliminated, variances = [], []
+        eliminated_pieces, variances = [], []
         for piece in pieces:
-            design, left = piece.sides(drag, noise)
-            own, shared = design[:, :-3], np.column_stack([left, design[:, -3:]])
+            design, right_side = piece.sides(drag, noise)
+            own, shared = design[:, :-3], np.column_stack([right_side, design[:, -3:]])
             covariance = np.linalg.inv(own.T @ own)
             to_own = covariance @ (own.T @ shared)
-            # What its own numbers do not explain is information on the drag that all share.
-            rest = shared - own @ to_own
-            hessian = hessian + rest[:, 1:].T @ rest[:, 1:]
-            gradient = gradient + rest[:, 1:].T @ rest[:, 0]
-            eliminated.append((piece, to_own))
+            # What the piece's own parameters do not explain is information on the shared drag
+            # (Schur complement).
+            unexplained = shared - own @ to_own
+            hessian = hessian + unexplained[:, 1:].T @ unexplained[:, 1:]
+            gradient = gradient + unexplained[:, 1:].T @ unexplained[:, 0]
+            eliminated_pieces.append((piece, to_own))
             variances.append(np.diag(covariance)[12:])
         change = np.maximum(np.linalg.solve(hessian, gradient), -drag)
-        for piece, to_own in eliminated:
+        # Back-substitution: the change of the drag gives the changes of each piece's parameters.
+        for piece, to_own in eliminated_pieces:
             piece.numbers = piece.numbers + to_own[:, 0] - to_own[:, 1:] @ change
         drag = drag + change
-        off = np.concatenate([piece.off(drag) for piece in pieces])
-        before, noise = noise, max(float(np.sqrt((off**2).mean())), LEAST_NOISE)
+        # New estimates of the noise and of the tilt's random walk.
+        residuals = np.concatenate([piece.off(drag) for piece in pieces])
+        old_noise, noise = noise, max(float(np.sqrt((residuals**2).mean())), LEAST_NOISE)
         changes = np.concatenate([piece.numbers[12:] for piece in pieces])
         if len(changes):
             walk = float(np.sqrt(np.mean(changes**2 + np.concatenate(variances))))
             for piece in pieces:
                 piece.prior[12:] = max(walk, LEAST_WALK)
-        if np.abs(change).max() < SETTLED and abs(noise / before - 1.0) < SETTLED:
+        if np.abs(change).max() < SETTLED and abs(noise / old_noise - 1.0) < SETTLED:
             break
     return drag
 
 
 def _pieces(log: FlightLog) -> list[_Piece]:
-    """Return the pieces of a flight, each fitted alone where the one before it ends."""
+    """Return the pieces of a flight, each fitted alone; a piece starts where the previous ends."""
     assert log.acc_b is not None
     time_s = log.time_s
     rate_b, acc_b = (interpolate(time_s, time_s, value) for value in (log.rate_b, log.acc_b))
     known = np.flatnonzero(np.isfinite(log.quat_wxyz).all(axis=1))
-    # An attitude is within moments of the first row.
+    # If the log has an attitude, its first value is within a few rows of the log's first row.
     rot = log.rot_w[known[0]] if len(known) else _start(time_s, acc_b)
     count = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S))
     edges = np.linspace(0, len(time_s) - 1, count + 1).astype(int)
@@ -162,7 +172,7 @@ def _pieces(log: FlightLog) -> list[_Piece]:
 
 
 def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> InertialLog:
-    """Return `log` with the pose of its `pieces`, which share the row between two of them."""
+    """Return `log` with the pose of its `pieces`; neighbouring pieces share one row."""
     rot_w, vel_w = np.empty((len(log.time_s), 3, 3)), np.zeros((len(log.time_s), 3))
     pose_slope_b = np.zeros((len(log.time_s), 3, sum(len(piece.prior) for piece in pieces)))
     vel_noise_b, rng = np.zeros((*vel_w.shape, DRAWS)), np.random.default_rng(0)
@@ -174,24 +184,25 @@ def _whole(log: FlightLog, pieces: Sequence[_Piece], drag: np.ndarray) -> Inerti
         slopes = np.swapaxes(rot_w[part], 1, 2) @ piece.slopes(rot_w[part])
         errors_w = [piece.velocity_error(rot_w[part], rng) for _ in range(DRAWS)]
         vel_noise_b[part] = np.swapaxes(rot_w[part], 1, 2) @ np.stack(errors_w, axis=-1)
-        usual = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
-        along = np.append(usual, usual.mean())[:, None]
+        drag_xy = drag[:2] + drag[2] * float(np.linalg.norm(vel_w[part], axis=1).mean())
+        drag_xyz = np.append(drag_xy, drag_xy.mean())[:, None]
         columns = slice(column, column + len(piece.prior))
         column = columns.stop
-        pose_slope_b[part, :, columns] = -along * slopes * piece.prior
+        pose_slope_b[part, :, columns] = -drag_xyz * slopes * piece.prior
     pos_w = np.zeros_like(vel_w)
     pos_w[1:] = np.cumsum(vel_w[1:] * np.diff(log.time_s)[:, None], axis=0)
     pos_w[:, 2] += HIGH_M
     quat = np.asarray(rot_to_quat(rot_w))
-    about = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
-    about["velocity_derived"] = False
-    return InertialLog(**about, pose_slope_b=pose_slope_b, vel_noise_b=vel_noise_b)
+    fields = {**vars(log), "pos_w": pos_w, "quat_wxyz": quat, "vel_w": vel_w}
+    fields["velocity_derived"] = False
+    return InertialLog(**fields, pose_slope_b=pose_slope_b, vel_noise_b=vel_noise_b)
 
 
 class _Piece:
-    """A piece of a flight, what it starts from, and its numbers (12 + 2 K,).
+    """A piece of a flight: its signals, its start, and its parameters `numbers` (P,).
 
-    These are those of `PRIOR`, and the change of the tilt about x and y at K knots.
+    The P = 12 + 2 K parameters are the 12 of `PRIOR`, and the change of the tilt about x and y at
+    each of K knots. The signals have N rows, which form M groups of `WIDTH_S`.
     """
 
     def __init__(self, time_s: np.ndarray, rate_b: np.ndarray, acc_b: np.ndarray,
@@ -207,12 +218,12 @@ class _Piece:
         self.rows = np.diff(np.append(self.first, len(time_s)))
 
     def means(self, values: np.ndarray) -> np.ndarray:
-        """Return the means (M, ...) of `values` (N, ...)."""
+        """Return the means (M, ...) of `values` (N, ...) over each group of rows."""
         sums = np.add.reduceat(values, self.first, axis=0)
         return sums / self.rows.reshape(-1, *[1] * (values.ndim - 1))
 
     def flown(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return attitude (N, 3, 3) and velocity (N, 3)."""
+        """Return attitude (N, 3, 3) and velocity (N, 3) in the world by the present parameters."""
         tilt, vel, gyro, _ = self.numbers[:12].reshape(4, 3)
         rate_b = self.rate_b - gyro
         turns = Rotation.from_rotvec(0.5 * (rate_b[1:] + rate_b[:-1]) * self.span[:, None])
@@ -233,49 +244,54 @@ class _Piece:
         self.rot, self.vel = rot_w[-1], vel_w[-1]
 
     def off(self, drag: np.ndarray) -> np.ndarray:
-        """Return by what the mean forces (M, 2) along x and y are off `drag` (3,) [m/s^2]."""
+        """Return the residuals (M, 2) of the mean forces along body x and y for `drag` [m/s^2].
+
+        A residual is the measured mean force minus the force of the drag at the computed velocity.
+        """
         rot_w, vel_w = self.flown()
         vel_b = (np.swapaxes(rot_w, 1, 2) @ vel_w[..., None])[:, :2, 0]
-        per = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
-        return self.means(self.acc_b[:, :2] - self.numbers[9:11] + per * vel_b)
+        drag_xy = drag[:2] + drag[2] * np.linalg.norm(vel_w, axis=1)[:, None]
+        return self.means(self.acc_b[:, :2] - self.numbers[9:11] + drag_xy * vel_b)
 
     def sides(self, drag: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the equations (R, P + 3) of its P numbers and the drag, and what they leave.
+        """Return the linear equations of a round: their matrix (R, P + 3) and right side (R,).
 
-        The first are those of the mean forces, the last its own numbers' priors.
+        Their unknowns are the changes of the P parameters and of the three coefficients of the
+        drag. The first rows are the mean forces, the last P rows the priors of the parameters.
         """
         rot_w, vel_w = self.flown()
         to_body = np.swapaxes(rot_w, 1, 2)
         vel_b = (to_body @ vel_w[..., None])[:, :2, 0]
         speed = np.linalg.norm(vel_w, axis=1)[:, None]
-        per = drag[:2] + drag[2] * speed
+        drag_xy = drag[:2] + drag[2] * speed
         count = len(self.prior)
         columns = np.zeros((len(speed), 2, count + 3))
-        columns[..., :count] = -per[..., None] * (to_body @ self.slopes(rot_w))[:, :2]
+        columns[..., :count] = -drag_xy[..., None] * (to_body @ self.slopes(rot_w))[:, :2]
         columns[:, [0, 1], [9, 10]] += 1.0
         columns[:, [0, 1], [count, count + 1]] = -vel_b
         columns[..., -1] = -speed * vel_b
         design = self.means(columns).reshape(-1, count + 3) / noise
-        left = self.off(drag).reshape(-1) / noise
+        residual = self.off(drag).reshape(-1) / noise
         prior = np.eye(count, count + 3) / self.prior[:, None]
-        return np.concatenate([design, prior]), np.append(left, -self.numbers / self.prior)
+        return np.concatenate([design, prior]), np.append(residual, -self.numbers / self.prior)
 
     def velocity_error(self, rot_w: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return a draw of the velocity's error (N, 3) by the random walk of the tilt."""
+        """Return a random draw (N, 3) of the velocity's error from the tilt's random walk."""
         walk = float(self.prior[12]) if len(self.knots) else 0.0
         step = float(np.median(self.span))
         steps = walk * np.sqrt(step / KNOT_S) * rng.normal(size=(len(self.time_s), 3))
         return self._integral(np.cross(np.cumsum(steps, axis=0), self._force_w(rot_w)))
 
     def _integral(self, values: np.ndarray) -> np.ndarray:
-        """Return the integral (N, ...) of `values` (N, ...) from the first row."""
+        """Return the integral (N, ...) over time of `values` (N, ...), from the first row on."""
         return np.asarray(cumulative_trapezoid(values, self.time_s, axis=0, initial=0))
 
     def _force_w(self, rot_w: np.ndarray) -> np.ndarray:
+        """Return the specific force (N, 3) in the world, without the accelerometer's bias."""
         return (rot_w @ (self.acc_b - self.numbers[9:12])[..., None])[..., 0]
 
     def slopes(self, rot_w: np.ndarray) -> np.ndarray:
-        """Return how the velocity changes with the P numbers (N, 3, P)."""
+        """Return the derivative (N, 3, P) of the velocity by the P parameters."""
         count = len(self.time_s)
         each = np.broadcast_to(np.eye(3), (count, 3, 3))
         force_w = self._force_w(rot_w)[:, :, None]
@@ -292,7 +308,7 @@ class _Piece:
 
 
 def _start(time_s: np.ndarray, acc_b: np.ndarray) -> np.ndarray:
-    """Return the attitude (3, 3) in which the first specific force is up."""
+    """Return the attitude (3, 3) in which the first specific force points up."""
     up = acc_b[time_s <= time_s[0] + START_S].mean(axis=0)
     size = float(np.linalg.norm(up))
     if abs(size - GRAVITY) > LIKE_GRAVITY:

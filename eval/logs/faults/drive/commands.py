@@ -1,4 +1,9 @@
-"""Checks of commands: unit, signs and curve of rates, throttle range, delay, update rate."""
+"""Checks of commands: unit, signs and curve of rates, throttle range, delay, update rate.
+
+*Rate loop*: the controller that makes the body follow a commanded body rate. *Rates curve*: the
+map from a pilot's stick to a commanded body rate in the firmware. *Gain*: body rate over commanded
+rate.
+"""
 
 from __future__ import annotations
 
@@ -15,25 +20,27 @@ from eval.logs.faults.vectors import DEG, RATES, UPWARDS, upwards
 from eval.vehicles.vehicle import Vehicle
 
 LATE_S = 0.06
-"""Allowed delay beyond that of rate loop, rotors and usual link [s]."""
+"""Allowed delay in addition to the delay of rate loop, rotors and a usual radio link [s]."""
 USUAL_S = 0.08
-"""Usual delay of loop, rotors and link without a vehicle file [s]."""
+"""Delay of rate loop, rotors and radio link that is assumed without a vehicle file [s]."""
 GAIN = (0.8, 1.25)
-"""Correct range of body rate over steady rate command."""
+"""Correct range of the gain."""
 UNITS = {"in degrees per second": 1.0 / DEG, "ten times too large (blackbox_high_resolution)": 10.0}
+"""Wrong unit -> factor by which rate commands are then too large."""
 LOOP_GAIN = (0.87, 1.1)
 """Correct range of the rate loop's gain at low frequency. Motors at their limits lower it."""
 EQUAL = 1.2
-"""Factor within which the gains of all axes are one gain."""
+"""The gains of the axes count as equal if the largest is within this factor of the smallest."""
 SAME_UNIT = 1.15
-"""Factor around a unit's within which a gain is that unit."""
+"""A gain within this factor of a unit's conversion factor is explained by that unit."""
 FASTEST_RMS = 8.0
-"""Root mean square that rate commands do not exceed over a flight [rad/s]."""
+"""Root mean square that correct rate commands do not exceed over a flight [rad/s]."""
 MAPS = 3.0
-"""Factor within which a gain is another map from sticks, and no unit."""
+"""A gain within this factor of 1 is explained by another rates curve, a larger one by a unit."""
 OPPOSITE, FOLLOWED, BENT = -0.5, 0.92, 0.4
-"""Correlations of commands and gyro: with a wrong sign below the first, with a reliable gain above
-the second. The third is the least bend of a rates curve."""
+"""The first two are correlations of command and gyro: below the first the sign is wrong, above the
+second the gain is reliable. The third is the least growth of the gain from small to large commands
+(`bend`) that shows another rates curve."""
 RANGES = (
     ("0 to 1", 1.0, (0.03, 0.97), ""),
     ("percent", 100.0, (8.0, 90.0), "0.01"),
@@ -41,17 +48,19 @@ RANGES = (
     ("1000 to 2000 us", 1000.0, (1080.0, 1920.0), "1000-2000"),
     ("0 to 65535", 65535.0, (6000.0, 62000.0), f"{1.0 / 65535.0:.10g}"),
 )
-"""Range of a throttle, its span, its usual median in flight, and the step to 0 to 1."""
+"""Range of a throttle in words, its span, limits of its usual median in flight, and the step of
+`--read` that converts it to 0 to 1 (empty where it is correct)."""
 THRUST_FITS, THRUST_EFFECT, THRUST_SAME = 1.35, 2.0, 1.15
-"""A ratio within the first factor of a unit's is that unit. One within the second factor of 1 may
-be a physical effect or a wrong mass, one within the third is m/s^2 whatever the mass."""
+"""Limits of the commanded thrust over the force that the path needs. Within the first factor of a
+unit's conversion factor, the ratio is explained by that unit. Within the second factor of 1 it may
+be a physical effect or a wrong mass, and within the third it is m/s^2, whatever the mass is."""
 RATE_OFF = 0.1
 """Largest relative error of a controller's rate."""
 
 
 def check_throttle(rows: Rows) -> list[Finding]:
-    """Return the range of throttle and motor commands where it is not 0 to 1."""
-    found = []
+    """Return a finding for throttle and for motor commands whose range is not 0 to 1."""
+    findings = []
     for name, subject in (("throttle", "throttle"), ("pwm", "motor commands")):
         value = rows.get(name)
         if value is None or not np.isfinite(value).any():
@@ -64,17 +73,20 @@ def check_throttle(rows: Rows) -> list[Finding]:
         figures = f"half of its values are below {middle:.4g} and all below {top:.4g}"
         if not fits:
             text = f"{figures}: no range from 0 to 1, percent, 1000 or 65535"
-            found.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))
+            findings.append(Finding("doubt", subject, text, "throttle_range", top, 0.95))
             continue
-        words, span, _, steps = fits[0]
-        text = f"{figures}: it goes from {words}, not from 0 to 1"
-        found.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
-                             option((name, steps))))  # fmt: skip
-    return found
+        range_in_words, span, _, reading = fits[0]
+        text = f"{figures}: it goes from {range_in_words}, not from 0 to 1"
+        findings.append(Finding("corrected", subject, text, "throttle_range", span, 0.98,
+                             option((name, reading))))  # fmt: skip
+    return findings
 
 
 def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return a wrong unit or sign of the commanded thrust, by the force that the path needs."""
+    """Return a wrong unit or sign of the commanded thrust.
+
+    The command is compared with the force that the measured motion needs.
+    """
     subject, value = "thrust command", rows.get("cmd_thrust")
     if value is None or not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
         return []
@@ -88,15 +100,25 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
-    near = within(units, THRUST_FITS, ratio)
-    nearest = min(near, key=lambda n: abs(np.log(ratio / units[n])), default="")
-    far = abs(np.log(ratio)) > np.log(THRUST_SAME)
-    if far and nearest == "in newtons" and "in m/s^2" in near and sign > 0.0:
+    # Units that explain the ratio. Newtons and m/s^2 are ambiguous for a mass possible_units 1 kg.
+    possible_units = within(units, THRUST_FITS, ratio)
+    nearest_unit = min(possible_units, key=lambda n: abs(np.log(ratio / units[n])), default="")
+    surely_not_m_s2 = abs(np.log(ratio)) > np.log(THRUST_SAME)
+    if (
+        surely_not_m_s2
+        and nearest_unit == "in newtons"
+        and "in m/s^2" in possible_units
+        and sign > 0.0
+    ):
         text = f"{figures}: it may be in newtons, as the mass is {units['in newtons']:.3g} kg, or "
         text += "thrust is off by so much"
         fix = option(("cmd_thrust", f"{1.0 / units['in newtons']:.6g}"))
         return [Finding("doubt", subject, text, "thrust_command_unit", ratio, 0.6, fix)]
-    name = near[0] if near and (len(near) == 1 or near[0] == "in m/s^2") else ""
+    name = (
+        possible_units[0]
+        if possible_units and (len(possible_units) == 1 or possible_units[0] == "in m/s^2")
+        else ""
+    )
     if name != "in m/s^2" and abs(np.log(ratio)) < np.log(THRUST_EFFECT):
         text = f"{figures}: an effect, or a mass that is off"
         return [Finding("note", subject, text, "thrust_scale", ratio, 0.9)]
@@ -114,7 +136,10 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
 
 
 def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return the faults of the commanded rates, compared with the gyro."""
+    """Return the findings on the commanded rates: sign, unit, rates curve and delay.
+
+    The gyro is the reference, except where the gain is the factor of a wrong unit of the gyro.
+    """
     if not {"cmd_rate", "rate"} <= rows.keys():
         return []
     time_s, subject = rows["time"], "rate command"
@@ -122,27 +147,29 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
     if both.sum() < 30:
         return [Finding("note", subject, "too few to check")]
     if min(rms(rows["cmd_rate"][both]), rms(rows["rate"][both])) == 0.0:
-        still = "it" if rms(rows["cmd_rate"][both]) == 0.0 else "the gyro"
-        return [Finding("note", subject, f"{still} is 0 throughout")]
+        constant_signal = "it" if rms(rows["cmd_rate"][both]) == 0.0 else "the gyro"
+        return [Finding("note", subject, f"{constant_signal} is 0 throughout")]
     rate = smooth(time_s, rows["rate"], WIDTH_S)
     delay, command = delayed(time_s, rows["cmd_rate"], rate)
     if rms(rate) < CALM_RATE:
         text = f"turns of {rms(rate):.2g} rad/s are too small to check it by"
         return [Finding("not identifiable", subject, text, "rate_curve")]
-    found = match(command, rate)
-    alike = ", ".join(f"{v:+.2f}" for v in found.as_given)
-    figures = f"the gyro follows it after {1e3 * delay:.0f} ms with correlations {alike}"
-    if not found.seen.any():
+    # Signs and order of the axes.
+    matched = match(command, rate)
+    correlations = ", ".join(f"{v:+.2f}" for v in matched.as_given)
+    figures = f"the gyro follows it after {1e3 * delay:.0f} ms with correlations {correlations}"
+    if not matched.seen.any():
         text = f"{figures}: the gyro does not follow it"
         return [Finding("doubt", subject, text, "rate_command_sign", None, 0.9)]
-    if found.is_turned or (found.as_given < OPPOSITE).any():
-        sign = [("-" if v < OPPOSITE else "") + "xyz"[k] for k, v in enumerate(found.as_given)]
-        axes = found.axes if found.is_turned else ",".join(sign)
+    if matched.is_turned or (matched.as_given < OPPOSITE).any():
+        sign = [("-" if v < OPPOSITE else "") + "xyz"[k] for k, v in enumerate(matched.as_given)]
+        axes = matched.axes if matched.is_turned else ",".join(sign)
         text = f"{figures}; its axes are {axes}: check the signs"
-        sure = 0.98 if found.is_turned else 0.9
+        sure = 0.98 if matched.is_turned else 0.9
         return [Finding("doubt" if sure < 0.95 else "corrected", subject, text,
                         "rate_command_sign", None, sure, option(("cmd_rate", axes)))]  # fmt: skip
-    gain, low, high = pooled_scale(found)
+    # Unit of the command, then unit of the gyro.
+    gain, low, high = pooled_scale(matched)
     for words, factor in UNITS.items():
         if abs(np.log(gain * factor)) < np.log(1.4):
             text = f"{figures}, by {gain:.3g} of it: it is {words}"
@@ -162,7 +189,7 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
         text += "a rates curve that the log's commands do not have"
         fix = "the firmware's rates curve for the map from sticks, or " + option(
             ("cmd_rate", f"{gain:.4g}"))  # fmt: skip
-        sure = 0.93 if found.alike[found.seen].min() > FOLLOWED else 0.7
+        sure = 0.93 if matched.alike[matched.seen].min() > FOLLOWED else 0.7
         findings.append(Finding("doubt", subject, text, "rate_curve", gain, sure, fix))
     if delay > LATE_S + (USUAL_S if vehicle is None else _response(vehicle)):
         text = f"{figures}: later than the rate loop, rotors and a link make it"
@@ -172,10 +199,11 @@ def check_rate_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Findi
 
 
 def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
-    """Return inverted axes of a log without an attitude, by two witnesses.
+    """Return inverted axes of the gyro in a log without an attitude.
 
-    A gyro is inverted where commands and motors' torques contradict it; each of them alone could be
-    wrong itself. All are forward-right-down where the accelerometer and the torques contradict it.
+    An axis of the gyro is inverted where both the rate commands and the motors' torques contradict
+    it; one of these alone could be wrong itself. All body axes are forward-right-down where the
+    torques contradict y and z, and the accelerometer measures thrust downwards.
     """
     if "quat" in rows or not {"cmd_rate", "rate"} <= rows.keys():
         return []
@@ -187,16 +215,16 @@ def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
     followed = match(command, rate).as_given
     if not (np.minimum(np.abs(followed), np.abs(torque)) > -OPPOSITE).all():
         return []
-    alike = ", ".join(f"{c:+.2f} and {t:+.2f}" for c, t in zip(followed, torque, strict=True))
-    text = f"its correlations with commands and with the motors' torques are {alike} about x, y, z"
-    wrong, signals = (followed < 0.0) & (torque < 0.0), ["rate"]
-    axes = ",".join(("-" if w else "") + "xyz"[k] for k, w in enumerate(wrong))
+    pairs = ", ".join(f"{c:+.2f} and {t:+.2f}" for c, t in zip(followed, torque, strict=True))
+    text = f"its correlations with commands and with the motors' torques are {pairs} about x, y, z"
+    inverted, signals = (followed < 0.0) & (torque < 0.0), ["rate"]
+    axes = ",".join(("-" if w else "") + "xyz"[k] for k, w in enumerate(inverted))
     upside_down = "acc" in rows and upwards(rows["acc"])[1] < -UPWARDS
     if upside_down and (np.sign(torque) == [1.0, -1.0, -1.0]).all():
         axes, signals = "x,-y,-z", ["rate", "acc"]
         signals += ["cmd_rate"] if (followed > 0.0).all() else []
         text += ", and the accelerometer reads thrust downwards"
-    elif not wrong.any():
+    elif not inverted.any():
         return []
     frame = "body_frame" if axes == "x,-y,-z" else "gyro_axes"
     fix = option(*((signal, axes) for signal in signals))
@@ -206,15 +234,15 @@ def check_gyro_signs(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
 def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding]:
     """Return a wrong scale of the gyro in a log without an attitude, by the rate loop's gain.
 
-    The loop makes the body rate equal to a steady command, so another ratio is a wrong gyro or a
-    wrong command. Their units or the motors' torques decide which.
+    The loop makes the body rate equal to a steady command. Where it does not, the scale of the gyro
+    or of the command is wrong. A known factor of a unit, or the motors' torques, decide which.
     """
     if "quat" in rows or not {"cmd_rate", "rate"} <= rows.keys():
         return []
-    found = loop_gain(rows["time"], rows["cmd_rate"], rows["rate"])
-    if found is None or LOOP_GAIN[0] < found[0] < LOOP_GAIN[1]:
+    gains = loop_gain(rows["time"], rows["cmd_rate"], rows["rate"])
+    if gains is None or LOOP_GAIN[0] < gains[0] < LOOP_GAIN[1]:
         return []
-    gain, between_axes = found
+    gain, between_axes = gains
     text = f"it is {gain:.3g} times a steady rate command"
     unit = next((w for w, f in RATES.items() if abs(np.log(gain / f)) < np.log(SAME_UNIT)), None)
     if unit is not None and rms(rows["cmd_rate"]) < FASTEST_RMS:
@@ -239,7 +267,10 @@ def check_gyro_scale(rows: Rows, vehicle: Vehicle | None = None) -> list[Finding
 
 
 def _response(vehicle: Vehicle) -> float:
-    """Return the expected delay from rate command to body rate by the vehicle file [s]."""
+    """Return the expected delay from rate command to body rate by the vehicle file [s].
+
+    It is the sum of the link's delay, the rotors' time constant and that of the rate loop.
+    """
     known = vehicle.effects.get("command_delay")
     loop = 0.0 if vehicle.controller.settings is not None else vehicle.controller.rate_gain[0]
     late = 0.03 if known is None else float(known.delay)
@@ -247,7 +278,10 @@ def _response(vehicle: Vehicle) -> float:
 
 
 def check_controller_rate(rows: Rows, wanted_hz: float | None, whose: str) -> list[Finding]:
-    """Return whether commands change at the rate of a policy or a file."""
+    """Return a finding on whether commands change `wanted_hz` times a second.
+
+    `whose` names in words what requires this rate: the policy or the vehicle file.
+    """
     name = next((n for n in ("action", "cmd_rate", "cmd_thrust", "motor_cmd", "pwm")
                  if n in rows), None)  # fmt: skip
     if wanted_hz is None or name is None:

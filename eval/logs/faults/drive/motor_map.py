@@ -1,13 +1,14 @@
 """Check of the map from motor commands or a throttle to thrust: its size, its curve, the battery.
 
-The measured thrust T is that of the rotors by their speeds. Without these it is the mass times the
-force along body z, by the path or the accelerometer. F is the vehicle file's thrust for the same
-commands. Least squares over the flight fits
+The measured thrust T is computed from the rotor speeds. Without rotor speeds it is the mass times
+the force per mass along body z, from the logged path (pose) or the accelerometer. F is the thrust
+that the vehicle file's table `[motors]` gives for the same commands. Least squares over the flight
+fits
 
     log(T / F) = size + curve (log F - mean) + battery (log V - mean)
 
-with the battery's voltage V. All three coefficients are 0 where the file is correct. Their errors
-come from leaving out blocks of the flight in turn (jackknife).
+with the battery's voltage V. All three coefficients are 0 where the file is correct. Their standard
+errors come from fits that leave out one block of the flight at a time (jackknife).
 """
 
 from __future__ import annotations
@@ -26,40 +27,45 @@ from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 LATE_S, STEP_S = 0.16, 0.01
 """Largest delay from command to thrust that is tried, and the step between trials [s]."""
 BLOCKS = 8
+"""Number of blocks of the jackknife."""
 LEAST_ROWS = 200
+"""Least number of rows for the fit and for a correlation."""
 USED = (0.02, 0.97)
-"""Commands outside are at a limit, where the thrust does not follow them."""
+"""Range of commands that the fit uses. Commands outside are at a limit, where the thrust does not
+follow them."""
 CURVE, BATTERY, SURE = 0.3, 0.8, 4.0
-"""Least relative error of the exponent of thrust over command, and least error of the exponent of
-thrust over voltage, that are a fault; in standard errors, the least of both."""
+"""What counts as a fault: least relative error of the exponent of thrust over command, and least
+error of the exponent of thrust over voltage. Each must also exceed `SURE` standard errors."""
 FOLLOWS = 0.5
 """Least correlation of commanded and measured thrust."""
 SPAN = 0.2
 """Least range of the thrust in which its curve is identifiable, as a difference of logarithms."""
 SWUNG = 1.6
-"""Factor by which a battery's voltage changes the thrust: a size is not identifiable within it
-where the voltage was not logged [1]."""
+"""Factor by which a battery's voltage can change the thrust. A wrong size within this factor is not
+identifiable where the voltage was not logged."""
 FLAT = 0.005
-"""A voltage with a smaller standard deviation of its logarithm counts as constant."""
+"""Standard deviation of the voltage's logarithm below which the voltage counts as constant."""
 
 
 class Drive(NamedTuple):
-    """Commands of a log, and how they give thrust by the vehicle file."""
+    """One kind of command in a log, and the vehicle file's map from it to thrust."""
 
     name: str
-    """`pwm`, `throttle` or `cmd_thrust`."""
+    """Name of the signal: `pwm`, `throttle` or `cmd_thrust`."""
     subject: str
+    """Subject of the findings, in words."""
     fault: str
-    """The fault's name where size or curve is wrong."""
+    """Name of the fault to report where size or curve is wrong."""
     motors: MotorMap | None
-    """None: thrust is proportional to the command."""
+    """`[motors]` of the vehicle file; None: thrust is proportional to the command."""
     command: np.ndarray
-    """(T, C) from 0 to 1; C = 1 for a throttle, which all four motors share."""
+    """(T, C) commands from 0 to 1; C = 4 motors, or 1 for a throttle, which all motors share."""
     full: float
-    """Thrust of all motors at full command without a `[motors]` [N]; 1 without a vehicle file."""
+    """Thrust of all motors at full command, used where `motors` is None [N]; 1 without a vehicle
+    file."""
 
     def thrust(self, motors: MotorMap | None, volts: np.ndarray | None) -> np.ndarray:
-        """Return the thrust (T, C) of the commands: of one motor each, or of all four [N]."""
+        """Return the thrust (T, C) that the map gives: per motor, or for C = 1 of all four [N]."""
         if motors is None:
             return self.full * self.command
         share = 4.0 if self.command.shape[1] == 1 else 1.0
@@ -67,32 +73,36 @@ class Drive(NamedTuple):
 
 
 class Ratio(NamedTuple):
-    """Coefficients of log(T / F), and their standard errors."""
+    """Result of the fit of log(T / F), see the module's docstring."""
 
     size: float
+    """Coefficient `size`."""
     curve: float
+    """Coefficient `curve`."""
     curve_error: float
+    """Standard error of `curve`."""
     battery: float
+    """Coefficient `battery`; 0 where the voltage is unknown or constant."""
     battery_error: float
-    """Infinite where the voltage is unknown or constant."""
+    """Standard error of `battery`; infinite where the voltage is unknown or constant."""
     exponent: float
-    """Exponent of the file's thrust over the command, at the usual command."""
+    """Exponent of the file's thrust over the command, at the median command."""
     low: float
-    """Smallest and ..."""
+    """5 % quantile of the commands."""
     high: float
-    """... largest of nine tenths of the commands."""
+    """95 % quantile of the commands."""
     span: float
-    """Difference of the logarithms of F at these."""
+    """Difference of the 95 % and the 5 % quantile of log F."""
     late: int
     """Delay from command to thrust, in rows."""
 
 
 def check_motor_map(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
-    """Return the faults of `[motors]`, and of a throttle's curve and linearisation.
+    """Return the findings on `[motors]`, and on a throttle's curve and linearisation.
 
     Args:
         rows: see `check.run_checks`.
-        vehicle: the vehicle file; None: only a throttle's curve is checked.
+        vehicle: the vehicle file; without one (None), only a throttle's curve is checked.
     """
     return [one for drive in _drives(rows, vehicle) for one in _check(rows, drive, vehicle)]
 
@@ -113,7 +123,7 @@ def _check(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
 
 
 def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
-    """Yield the commands whose thrust the vehicle file gives."""
+    """Yield each kind of command in the log whose thrust can be computed."""
     full = 1.0 if vehicle is None else vehicle.full_thrust * vehicle.mass
     motors = None if vehicle is None else vehicle.motors
     if "pwm" in rows and motors is not None:
@@ -128,7 +138,7 @@ def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
 def _measured(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> np.ndarray | None:
     """Return the measured thrust: (T, 4) of each motor, or (T, 1) of all [N]; None: unknown.
 
-    Without a vehicle file it is in units of the mass.
+    Without a vehicle file the mass is unknown, so the result is thrust per mass [m/s^2].
     """
     if drive.name == "pwm" and "motor" in rows and vehicle is not None:
         return vehicle.rotors.thrust_coefficient * rows["motor"] ** 2
@@ -140,10 +150,11 @@ def _measured(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> np.ndarray |
 def _ratio(
     time_s: np.ndarray, drive: Drive, measured: np.ndarray, volts: np.ndarray | None
 ) -> Ratio | None:
-    """Return how the measured thrust differs from the file's; None where it shows too little."""
+    """Return how the measured thrust differs from the file's; None where it is not identifiable."""
     wanted = _averaged(time_s, drive, drive.thrust(drive.motors, volts), measured)
     thrust = smooth_columns(time_s, measured)
     thrust = np.where(thrust > 0.1 * np.nanmedian(thrust), thrust, np.nan)
+    # Logarithms of the file's thrust (moved by the delay), the measured thrust and the voltage.
     log_wanted, log_thrust = np.log(wanted), np.log(thrust)
     late = _delay_rows(time_s, log_wanted, log_thrust)
     log_wanted = _shifted(log_wanted, late)
@@ -157,33 +168,36 @@ def _ratio(
     x, y, v, block = log_wanted[good], log_thrust[good], log_volts[good], block[good]
     design = np.column_stack([np.ones_like(x), x - x.mean(), v - v.mean()])
     columns = [0, 1, 2] if np.std(v) > FLAT else [0, 1]
-    battery = design[:, [0, 2]]  # a wrong exponent may hide that the thrust follows
+    # The thrust must follow the commands. The battery's part is removed from both first, since a
+    # wrong voltage exponent may hide that they agree.
+    battery = design[:, [0, 2]]
     both = np.column_stack([x, y])
     changes = both - battery @ np.linalg.lstsq(battery, both, rcond=None)[0]
     if _correlation(*changes.T) < FOLLOWS:
         return None
 
     def fitted(keep: np.ndarray) -> np.ndarray:
-        found = np.zeros(3)
+        coefficients = np.zeros(3)
         a, b = design[keep][:, columns], (y - x)[keep]
-        found[columns] = np.linalg.lstsq(a, b, rcond=None)[0]
-        return found
+        coefficients[columns] = np.linalg.lstsq(a, b, rcond=None)[0]
+        return coefficients
 
-    off = np.abs(y - x - design @ fitted(np.ones(len(x), dtype=bool)))
-    usual = off < 4.0 * np.median(off) + 1e-9
-    whole = fitted(usual)
-    parts = np.array([fitted(usual & (block != k)) for k in range(BLOCKS)])
-    errors = [jackknife_error(parts[:, k]) for k in range(3)]
+    # Fit once with all rows, drop outliers, and fit again: with all blocks, and without each.
+    residual = np.abs(y - x - design @ fitted(np.ones(len(x), dtype=bool)))
+    usual = residual < 4.0 * np.median(residual) + 1e-9
+    estimate = fitted(usual)
+    without_block = np.array([fitted(usual & (block != k)) for k in range(BLOCKS)])
+    errors = [jackknife_error(without_block[:, k]) for k in range(3)]
     errors[2] = errors[2] if len(columns) == 3 else np.inf
     command = np.asarray(drive.command[np.isfinite(drive.command)])
     span = float(np.ptp(np.quantile(x, (0.05, 0.95))))
     low, middle, high = (float(q) for q in np.quantile(command, (0.05, 0.5, 0.95)))
-    return Ratio(float(whole[0]), float(whole[1]), errors[1], float(whole[2]), errors[2],
+    return Ratio(float(estimate[0]), float(estimate[1]), errors[1], float(estimate[2]), errors[2],
                  _exponent(drive.motors, middle), low, high, span, late)  # fmt: skip
 
 
 def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> list[Finding]:
-    """Return the findings of size, curve and battery, with one fix for all."""
+    """Return the findings on size, curve and battery, which share the text `fix`."""
     findings = []
     true, error = ratio.exponent * (1.0 + ratio.curve), ratio.exponent * ratio.curve_error
     figures = (
@@ -213,7 +227,7 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> 
         findings.append(Finding("doubt", drive.subject, text, *about))
     if vehicle is None:
         return findings
-    # `check_thrust_command` reports the size of a command in m/s^2.
+    # Size: `check_thrust_command` reports it for a command in m/s^2, so there is no limit here.
     times, reach = float(np.exp(-ratio.size)), np.inf if drive.name == "cmd_thrust" else FITS
     if had and not np.isfinite(ratio.battery_error):
         reach = max(reach, SWUNG)
@@ -234,7 +248,7 @@ def _fix(
     ratio: Ratio,
     vehicle: Vehicle | None,
 ) -> str:
-    """Return `[motors]` of the vehicle file with the values that fit the flight."""
+    """Return the fix in words: `[motors]` of the vehicle file, with values that fit the flight."""
     if vehicle is None:
         return "[motors] of a vehicle file, with --vehicle"
     from scipy.optimize import nnls
@@ -243,18 +257,18 @@ def _fix(
     exponent, voltage = nominal.voltage_exponent, nominal.voltage
     if SURE * ratio.battery_error < BATTERY and volts is not None:
         voltage = voltage if exponent else float(np.nanmedian(volts))
-        found = exponent + ratio.battery / max(ratio.exponent * (1.0 + ratio.curve), 0.5)
-        exponent = round(float(np.clip(found, 0.0, 4.0)), 2)
-    parts = [
+        true_exponent = exponent + ratio.battery / max(ratio.exponent * (1.0 + ratio.curve), 0.5)
+        exponent = round(float(np.clip(true_exponent, 0.0, 4.0)), 2)
+    thrust_of_terms = [
         _shifted(_averaged(time_s, drive, drive.thrust(motors, volts), measured), ratio.late)
         for motors in (MotorMap(t, voltage, exponent) for t in ((1.0, 0.0), (0.0, 1.0)))
     ]
-    columns = np.stack([part.ravel() for part in parts], axis=1)
+    columns = np.stack([term.ravel() for term in thrust_of_terms], axis=1)
     thrust = smooth_columns(time_s, measured).ravel()
     good = np.isfinite(columns).all(axis=1) & np.isfinite(thrust)
-    (first, second), _ = nnls(columns[good], thrust[good])
+    (linear, square), _ = nnls(columns[good], thrust[good])
     return (
-        f"motors.thrust = [{first:.4g}, {second:.4g}], motors.voltage = {voltage:.4g} and "
+        f"motors.thrust = [{linear:.4g}, {square:.4g}], motors.voltage = {voltage:.4g} and "
         f"motors.voltage_exponent = {exponent:g} in the vehicle file"
     )
 
@@ -268,7 +282,7 @@ def _exponent(motors: MotorMap | None, command: float) -> float:
 
 
 def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> int:
-    """Return the delay with the best correlation of wanted and measured thrust, in rows."""
+    """Return the delay with the best correlation of the file's and the measured thrust, in rows."""
     step = float(np.median(np.diff(time_s)))
     trials = dict.fromkeys(round(late / step) for late in np.arange(0.0, LATE_S, STEP_S))
 
@@ -281,7 +295,7 @@ def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> i
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the correlation of two (N,); 0 where one is constant or they are too short."""
+    """Return the correlation of `a` and `b` (N,); 0 where one is constant or N is too small."""
     if len(a) < LEAST_ROWS or not np.std(a) * np.std(b) > 1e-12:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])
@@ -297,9 +311,10 @@ def _shifted(values: np.ndarray, count: int) -> np.ndarray:
 def _averaged(
     time_s: np.ndarray, drive: Drive, thrust: np.ndarray, measured: np.ndarray
 ) -> np.ndarray:
-    """Return the file's thrust between the limits, summed and averaged as the measured one is.
+    """Return the file's thrust, summed and averaged in the same way as the measured thrust.
 
-    A measured force was averaged once before (`force_without_drag`), so its command is, too.
+    It is NaN where a command is at a limit. A measured total force is already averaged once by
+    `force_without_drag`, so the file's total is averaged twice as well.
     """
     at_limit = (drive.command < USED[0]) | (drive.command > USED[1])
     if measured.shape[1] > 1:
@@ -309,6 +324,9 @@ def _averaged(
 
 
 def smooth_columns(time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the mean of each column of (T, C) over `WIDTH_S`; columns have their own gaps."""
+    """Return the moving mean of each column of `values` (T, C) over `WIDTH_S`.
+
+    Each column is averaged alone, since its NaN may be at other rows than those of its neighbours.
+    """
     columns = (smooth(time_s, column[:, None], WIDTH_S) for column in values.T)
     return np.concatenate(list(columns), axis=1)

@@ -1,4 +1,8 @@
-"""Checks of the motors: number, order, spin, the unit of their speeds, and their lift."""
+"""Checks of the motors: number, order, spin, the unit of their speeds, and their lift.
+
+*Lift*: thrust by the rotor speeds and the vehicle file, over the force that the measured motion
+needs; 1 is correct. *Mixer*: matrix from the thrusts of the motors to torques about x, y and z.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +21,22 @@ from eval.logs.velocity import velocity_from_position
 from eval.vehicles.vehicle import Vehicle, motor_thrust
 
 SPAN_S = 0.08
-"""Body rates are differenced, and torques averaged, over this time [s]."""
+"""Angular accelerations are differences of the body rate over this time; torques are averaged over
+it [s]."""
 LAGS_S = (0.0, 0.02, 0.04, 0.06)
 """Possible delays from commands to torques [s]."""
 CALM_TURN = 0.3
 """Smallest usable angular acceleration, root mean square [rad/s^2]."""
 RIGHT, SURELY, WRONG, CLEAR = 0.3, 0.5, -0.3, 0.4
-"""Correlations of torque and angular acceleration about roll and pitch: an order is possible above
-the first, certain above the second, wrong below the third. It must exceed the given order's by the
-fourth, in both halves of a flight."""
+"""Limits of the correlation of torque and angular acceleration about roll and pitch. An order of
+motors is possible above the first, certain above the second and wrong below the third. The sum of
+its two correlations must exceed that of the log's order by the fourth."""
 AS_GIVEN = (0, 1, 2, 3)
+"""The order of the motors in the log."""
 TURNING = 0.05
 """A motor that never reaches this share of the fastest one counts as stopped."""
 FITS = 1.35
-"""Lift within this factor of the weight may be a physical effect, which a diagnosis names."""
+"""A lift within this factor of 1 may be a physical effect, which a diagnosis names."""
 UNITS = {
     "rpm in place of rad/s": 60.0 / (2.0 * np.pi),
     "revolutions a second in place of rad/s": 1.0 / (2.0 * np.pi),
@@ -40,27 +46,33 @@ UNITS = {
         for pairs in (6, 7, 11)
     },
 }
-"""Mistake of unit -> factor by which rotor speeds are then too large."""
+"""Wrong unit -> factor by which rotor speeds are then too large."""
 NEAR, ALONE = 1.2, 1.1
-"""A factor within the first ratio of the measured one is possible; a single one within the second
-ratio is certain."""
+"""A wrong unit is possible if its factor is within the first ratio of the measured factor. It is
+certain if it is the only one within the second ratio."""
 SAME = 1.07
-"""Lift within this factor of the weight agrees with the vehicle file."""
+"""A lift within this factor of 1 agrees with the vehicle file."""
 MAGNETS = (12, 14, 16, 22, 24, 28)
+"""Usual numbers of poles (magnets) of a motor."""
 POLES = {
     f"{mine} poles were declared of {true}": true / mine
     for mine in MAGNETS
     for true in MAGNETS
     if 0.5 <= mine / true <= 2.0 and mine != true
 }
-"""Wrong number of poles -> factor by which speeds from eRPM are then too large."""
+"""Wrong number of poles -> factor by which speeds from electrical rpm (eRPM) are then too large."""
 X_SHAPE = ((1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
-"""Front right, rear right, rear left, front left: the order of the shipped vehicles."""
+"""Positions (x, y) without a vehicle file, in the order of the shipped vehicles: front right, rear
+right, rear left, front left."""
 X_SPIN = (1, -1, 1, -1)
+"""Directions of rotation in the same order."""
 
 
 def check_count(turning: int, whose: str) -> list[Finding]:
-    """Return a finding where the number of turning motors is not four."""
+    """Return a finding where the number of turning motors is not four.
+
+    `whose` completes the sentence "N motors ... turn", such as the name of the log's source.
+    """
     if turning == 4 or turning == 0:
         return []
     text = f"{turning} motors {whose} turn; four are read, and the models here have four"
@@ -74,11 +86,11 @@ def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
     if name is None:
         return []
     speed = rows[name]
-    top = np.nanmax(np.abs(speed), axis=0) if np.isfinite(speed).any() else np.zeros(4)
-    still = [str(k + 1) for k in range(4) if not top[k] > TURNING * np.max(top)]
-    if still:
-        text = f"motors {', '.join(still)} of 4 never turn: a dead motor, or a wrong column"
-        return [Finding("doubt", "motors", text, "motor_dead", float(len(still)), 0.97,
+    fastest = np.nanmax(np.abs(speed), axis=0) if np.isfinite(speed).any() else np.zeros(4)
+    stopped = [str(k + 1) for k in range(4) if not fastest[k] > TURNING * np.max(fastest)]
+    if stopped:
+        text = f"motors {', '.join(stopped)} of 4 never turn: a dead motor, or a wrong column"
+        return [Finding("doubt", "motors", text, "motor_dead", float(len(stopped)), 0.97,
                         "the columns of the motors in --map")]  # fmt: skip
     if "rate" not in rows:
         return unseen("motors", "the log has no gyro", "motor_order", "motor_spin")
@@ -86,50 +98,57 @@ def check_motors(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
 
 
 def torque_correlations(rows: Rows, vehicle: Vehicle | None) -> np.ndarray | None:
-    """Return the correlations of torque and angular acceleration about x, y, z in the given order.
+    """Return the correlations (3,) of torque and angular acceleration for the log's motor order.
 
-    None where the flight does not show them.
+    The result is None where the log lacks a signal or the vehicle hardly turns.
     """
     name = _drive(rows)
-    found = "" if name is None or "rate" not in rows else _torques(rows, name, vehicle)
-    return None if isinstance(found, str) else _scores(*found)[AS_GIVEN]
+    torques = "" if name is None or "rate" not in rows else _torques(rows, name, vehicle)
+    return None if isinstance(torques, str) else _scores(*torques)[AS_GIVEN]
 
 
 def turn_scale(rows: Rows, vehicle: Vehicle | None) -> float | None:
-    """Return the gyro's angular acceleration over that of the motors' torques by the vehicle file.
+    """Return the gyro's angular acceleration over the one that the motors' torques give.
 
-    It is 1 for a correct gyro and vehicle file. None where the log or the file lacks what it needs.
+    The vehicle file gives these torques. The ratio is 1 for a correct gyro and vehicle file. It is
+    None where the log or the file lacks a value, or the torques hardly explain the turns.
     """
     name = _drive(rows)
     if vehicle is None or name is None or "rate" not in rows:
         return None
-    found = _torques(rows, name, vehicle)
-    if isinstance(found, str) or (name == "pwm" and vehicle.motors is None):
+    torques = _torques(rows, name, vehicle)
+    if isinstance(torques, str) or (name == "pwm" and vehicle.motors is None):
         return None
-    mean, turning, mixer = found
+    mean, turning, mixer = torques
     newtons = 1.0 if name == "pwm" else vehicle.rotors.thrust_coefficient
     torque = newtons * mean @ mixer[:2].T  # the mixer's third row has no unit
     good = np.isfinite(torque).all(axis=1) & np.isfinite(turning).all(axis=1)
     a, b = (v[good] - v[good].mean(axis=0) for v in (torque, turning[:, :2]))
     slope = np.sum(a * b, axis=0) / np.maximum(np.sum(a * a, axis=0), 1e-18)
-    alike = _correlations(mean @ mixer[:2].T, turning[:, :2]).diagonal()
-    if not (slope > 0.0).all() or alike.min() < SURELY:
+    correlations = _correlations(mean @ mixer[:2].T, turning[:, :2]).diagonal()
+    if not (slope > 0.0).all() or correlations.min() < SURELY:
         return None
     return float(np.sqrt(slope.prod()))
 
 
 def _drive(rows: Rows) -> str | None:
+    """Return the name of the best signal of the motors in the log: speeds before commands."""
     return next((n for n in ("motor", "pwm", "motor_cmd") if n in rows), None)
 
 
 def _torques(
     rows: Rows, name: str, vehicle: Vehicle | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | str:
-    """Return thrusts (N, 4), angular momentum's changes (N, 3) and mixer (3, 4), or why not."""
+    """Return the motors' mean thrusts (N, 4), the torques by the gyro (N, 3) and the mixer (3, 4).
+
+    The torque by the gyro is the change of the angular momentum. Without a vehicle file the inertia
+    is set to 1. If the flight is too short or too calm, the result is the reason in words.
+    """
     hubs = np.array(X_SHAPE if vehicle is None else [h[:2] for h in vehicle.rotors.position])
     spin = np.array(X_SPIN if vehicle is None else vehicle.rotors.spin, dtype=float)
     mixer = np.stack([hubs[:, 1], -hubs[:, 0], -spin * np.abs(hubs).max()], axis=0)
     time_s, rate = rows["time"], rows["rate"]
+    # The square of speed or command stands for the thrust where no map is known.
     motors = vehicle.motors if vehicle is not None and name == "pwm" else None
     thrust = rows[name] ** 2 if motors is None else np.asarray(motor_thrust(motors, rows[name]))
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
@@ -143,31 +162,38 @@ def _torques(
     size = rms(turning / inertia)
     if size < CALM_TURN:
         return f"turns change by {size:.2g} rad/s^2 only, too little to check their order by"
-    full = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
-    mean = (full[count:-1] - full[: -1 - count]) / count
+    # Mean thrust over the same time, with the delay that correlates best.
+    thrust_sums = np.concatenate([np.zeros((1, 4)), np.cumsum(thrust, axis=0)])
+    mean = (thrust_sums[count:-1] - thrust_sums[: -1 - count]) / count
     step = float(np.median(np.diff(time_s)))
-    late = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
-    mean = max(late, key=lambda one: float(np.sum(_correlations(one, turning) ** 2)))
+    delayed_means = [np.roll(mean, round(lag / step), axis=0) for lag in LAGS_S]
+    mean = max(
+        delayed_means, key=lambda delayed: float(np.sum(_correlations(delayed, turning) ** 2))
+    )
     return mean, turning, mixer
 
 
 def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
-    """Return whether the motors' torques agree with the angular accelerations, in any order."""
-    found = _torques(rows, name, vehicle)
-    if isinstance(found, str):
-        return unseen("motors", found, "motor_order", "motor_spin")
-    mean, turning, mixer = found
+    """Return the findings on the order and spin of the motors.
+
+    The torques in every order of the four motors are compared with the angular accelerations.
+    """
+    torques = _torques(rows, name, vehicle)
+    if isinstance(torques, str):
+        return unseen("motors", torques, "motor_order", "motor_spin")
+    mean, turning, mixer = torques
     scores = _scores(mean, turning, mixer)
     half = len(mean) // 2
     halves = [
         _scores(mean[part], turning[part], mixer) for part in (slice(half), slice(half, None))
     ]
-    given, best = scores[AS_GIVEN], _best(scores)
+    as_given, best = scores[AS_GIVEN], _best(scores)
     values = ", ".join(
-        f"{axis} {value:+.2f}" for axis, value in zip(("roll", "pitch", "yaw"), given, strict=True)
+        f"{axis} {value:+.2f}"
+        for axis, value in zip(("roll", "pitch", "yaw"), as_given, strict=True)
     )
     figures = f"correlations of their torques with how the body turns are {values}"
-    gain = float(scores[best][:2].sum() - given[:2].sum())
+    gain = float(scores[best][:2].sum() - as_given[:2].sum())
     if gain > CLEAR and scores[best][:2].min() > RIGHT and all(best == _best(h) for h in halves):
         order = ",".join(str(k + 1) for k in best)
         text = f"{figures}; {scores[best][0]:+.2f}, {scores[best][1]:+.2f} in the order {order}"
@@ -176,19 +202,19 @@ def _order(rows: Rows, name: str, vehicle: Vehicle | None) -> list[Finding]:
         status, sure = ("corrected", 0.99) if clear else ("doubt", 0.92)
         fix = option(*((n, order) for n in names))
         return [Finding(status, "motors", text, "motor_order", None, sure, fix)]
-    if given[:2].min() < WRONG:
-        sure, fix = (0.9, "the motors' columns") if given[:2].max() < RIGHT else (0.6, "")
+    if as_given[:2].min() < WRONG:
+        sure, fix = (0.9, "the motors' columns") if as_given[:2].max() < RIGHT else (0.6, "")
         text = f"{figures}: no order of them fits"
         return [Finding("doubt", "motors", text, "motor_order", None, sure, fix)]
-    if given[:2].min() < RIGHT:
+    if as_given[:2].min() < RIGHT:
         text = f"{figures}, too little to check their order by"
         return unseen("motors", text, "motor_order", "motor_spin")
-    if given[2] < WRONG and all(h[AS_GIVEN][2] < WRONG for h in halves):
+    if as_given[2] < WRONG and all(h[AS_GIVEN][2] < WRONG for h in halves):
         text = f"{figures}: all of them turn the other way round"
         fix = "rotors.spin of the vehicle file, with the other signs"
         return [Finding("doubt", "motors", text, "motor_spin", -1.0, 0.95, fix)]
     text = f"{figures}: yaw shows too little of their spin"
-    weak = [] if given[2] > RIGHT else unseen("motors", text, "motor_spin")
+    weak = [] if as_given[2] > RIGHT else unseen("motors", text, "motor_spin")
     return [Finding("ok", "motors", figures), *weak]
 
 
@@ -197,6 +223,7 @@ Scores = dict[tuple[int, ...], np.ndarray]
 
 
 def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
+    """Return the correlations of every order of the motors."""
     return {
         order: _correlations(mean[:, order] @ mixer.T, turning).diagonal()
         for order in permutations(range(4))
@@ -204,6 +231,7 @@ def _scores(mean: np.ndarray, turning: np.ndarray, mixer: np.ndarray) -> Scores:
 
 
 def _best(scores: Scores) -> tuple[int, ...]:
+    """Return the order with the largest sum of the correlations about roll and pitch."""
     return max(scores, key=lambda order: float(scores[order][:2].sum()))
 
 
@@ -236,12 +264,15 @@ def check_lift(rows: Rows, vehicle: Vehicle | None) -> list[Finding]:
 
 
 def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Finding:
-    """Return the finding for rotor speeds whose lift is `factor`^2 times the weight."""
+    """Return the finding for a lift of `factor`^2, as speeds `factor` times too large give.
+
+    Causes are tried in this order: wrong unit, mass entered per link, wrong number of poles.
+    """
     near = within(UNITS, NEAR, factor)
-    clear = within(UNITS, ALONE, factor)
+    certain = within(UNITS, ALONE, factor)
     names = [n for n in ("motor", "motor_cmd") if n in rows]
-    if len(clear) == 1:
-        (words,) = clear
+    if len(certain) == 1:
+        (words,) = certain
         text = f"{figures}: they are {UNITS[words]:.3g} times too large ({words})"
         others = " or ".join(name for name in near if name != words)
         text += f"; if the vehicle file is far off, it may be {others}" if others else ""
@@ -253,10 +284,10 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
         fix = option(*((n, f"{1.0 / factor:.4g}") for n in names))
         return Finding("doubt", "rotor speeds", text, "motor_unit", factor, 0.95, fix)
     poles = sorted(within(POLES, 1.05, factor), key=lambda n: abs(np.log(factor / POLES[n])))
-    whole = [n for n in range(2, 9) if abs(np.log(factor**-2 / n)) < np.log(1.1)]
-    if whole:
-        text = f"{figures}: {vehicle.mass:g} kg may be the mass of {whole[0]} links, entered each"
-        fix = f"mass = {vehicle.mass / whole[0]:.3g} in the vehicle file"
+    links = [n for n in range(2, 9) if abs(np.log(factor**-2 / n)) < np.log(1.1)]
+    if links:
+        text = f"{figures}: {vehicle.mass:g} kg may be the mass of {links[0]} links, entered each"
+        fix = f"mass = {vehicle.mass / links[0]:.3g} in the vehicle file"
         return Finding("doubt", "mass", text, "vehicle_mass", factor**-2, 0.9, fix)
     if poles:
         text = f"{figures}: {poles[0]}, or the mass or the thrust coefficient is wrong"
@@ -268,9 +299,9 @@ def _of_factor(rows: Rows, vehicle: Vehicle, factor: float, figures: str) -> Fin
 
 
 def over_force(rows: Rows, thrust: np.ndarray) -> float:
-    """Return thrust (T,) over the path's specific force along body z, drag removed; 0: unknown.
+    """Return `thrust` (T,) over the specific force along body z, without drag; 0 where unknown.
 
-    A thrust in newtons gives a mass [kg], one in m/s^2 a ratio [1].
+    A thrust in newtons gives a mass [kg], a thrust in m/s^2 a dimensionless ratio.
     """
     _, share = _force_and_share(rows, thrust)
     return 1.0 / share if share > 0.0 else 0.0
@@ -283,7 +314,7 @@ def force_without_drag(rows: Rows, thrust: np.ndarray) -> np.ndarray | None:
 
     Args:
         rows: see `check.run_checks`.
-        thrust: (T,) in any unit; the drag is fitted next to it.
+        thrust: (T,) thrust in any unit; its factor is fitted together with the drag.
     """
     if not ({"quat", "pos"} <= rows.keys() or "acc" in rows):
         return None
@@ -292,26 +323,30 @@ def force_without_drag(rows: Rows, thrust: np.ndarray) -> np.ndarray | None:
 
 
 def _force_and_share(rows: Rows, thrust: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the specific force (T,) along body z without drag, and force over thrust."""
+    """Return the specific force (T,) along body z without drag, and its fitted ratio to `thrust`.
+
+    The force comes from the path where the log has a pose, and from the accelerometer otherwise
+    (then without a correction for drag). A ratio of 0 means that nothing could be fitted.
+    """
     time_s = rows["time"]
     drag = np.zeros((len(time_s), 0))
-    need = np.full(len(time_s), GRAVITY)
+    force = np.full(len(time_s), GRAVITY)
     if "quat" in rows and "pos" in rows:
         quat, vel = conjugate(rows["quat"]), velocity_from_position(time_s, rows["pos"])
         acc = smooth(time_s, velocity_from_position(time_s, vel), WIDTH_S)
-        need = rotate(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
-        along = rotate(quat, vel)[:, 2:]
-        drag = np.concatenate([along, along * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
+        force = rotate(quat, acc + [0.0, 0.0, GRAVITY])[:, 2]
+        vel_z = rotate(quat, vel)[:, 2:]
+        drag = np.concatenate([vel_z, vel_z * np.linalg.norm(vel, axis=1, keepdims=True)], axis=1)
     elif "acc" in rows:
-        need = smooth(time_s, rows["acc"][:, 2:], WIDTH_S)[:, 0]
+        force = smooth(time_s, rows["acc"][:, 2:], WIDTH_S)[:, 0]
     columns = np.concatenate([thrust[:, None], drag], axis=1)
-    good = np.isfinite(need) & np.isfinite(columns).all(axis=1)
+    good = np.isfinite(force) & np.isfinite(columns).all(axis=1)
     if not good.any() or not np.any(thrust[good]):
-        return need, 0.0
-    found = np.linalg.lstsq(columns[good], need[good], rcond=None)[0]
-    return need - drag @ found[1:], float(found[0])
+        return force, 0.0
+    coefficients = np.linalg.lstsq(columns[good], force[good], rcond=None)[0]
+    return force - drag @ coefficients[1:], float(coefficients[0])
 
 
 def within(table: Mapping[str, float], limit: float, factor: float) -> list[str]:
-    """Return the entries of `table` within the ratio `limit` of the measured `factor`."""
+    """Return the names in `table` whose value is within the ratio `limit` of `factor`."""
     return [n for n, wrong in table.items() if abs(np.log(factor / wrong)) < np.log(limit)]

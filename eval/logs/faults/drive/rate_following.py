@@ -1,4 +1,8 @@
-"""How a gyro follows commanded rates: delay, gain at low frequency, and bend of the gain."""
+"""How the gyro follows commanded body rates: delay, gain, and change of the gain with the command.
+
+The gain is the measured rate over the commanded one. The *rate loop* is the controller that makes
+the body follow a commanded rate; it is modelled as a delay and a second-order filter.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +16,26 @@ from eval.logs.faults.relation import smooth
 REACH_S, STEP_S = 0.3, 0.01
 """Largest delay that is tried, and the step between trials [s]."""
 STEADY_S = 0.1
-"""Time before and after within which a steady command changes little [s]."""
+"""A command is steady if it changes little between this long before and after a row [s]."""
 LOOP_HZ = (1.2, 2.0, 3.0, 4.5, 7.0, 12.0)
 """Natural frequencies of a rate loop that are tried [Hz] ..."""
 DAMPING = (0.5, 0.7, 1.0, 1.5)
-"""... and its damping ratios."""
+"""... and damping ratios that are tried."""
 LOOP_LATE_S = (0.0, 0.02, 0.04, 0.06, 0.09, 0.13)
 """Delays before the loop that are tried [s]."""
 EXPLAINED = 0.9
-"""Least share of a rate's variance that a loop explains, for its gain to be reliable."""
+"""Share of the measured rate's variance that the fitted rate loop must explain for its gain to be
+reliable."""
 
 
 def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay [s] with the best correlation of command and rates, and that command."""
+    """Return the delay [s] with the best correlation of command and rate, and the delayed command.
+
+    The command (T, 3) is also averaged over `WIDTH_S`; `rate` (T, 3) must already be averaged.
+    """
     step = float(np.median(np.diff(time_s)))
     value = smooth(time_s, command, WIDTH_S)
-    best, delay, kept = -1.0, 0.0, value
+    best, delay, best_command = -1.0, 0.0, value
     for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
         count = round(late / step)
         moved = np.full_like(value, np.nan)
@@ -35,35 +43,43 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
         both = np.isfinite(moved).all(axis=1) & np.isfinite(rate).all(axis=1)
         if both.sum() < 30:
             break
+        # Correlation of each axis, weighted by how much the axis turns.
         a, b = moved[both] - moved[both].mean(axis=0), rate[both] - rate[both].mean(axis=0)
-        size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
-        alike = float(
-            np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-12))
+        norms = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
+        correlation = float(
+            np.sum(b.std(axis=0) * np.abs(np.sum(a * b, axis=0)) / np.maximum(norms, 1e-12))
         )
-        if alike > best + 1e-6:
-            best, delay, kept = alike, float(late), moved
-    return delay, kept
+        if correlation > best + 1e-6:
+            best, delay, best_command = correlation, float(late), moved
+    return delay, best_command
 
 
 def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
-    """Return by what share the gain of large commands exceeds that of small ones.
+    """Return by what share the gain of large commands exceeds the gain of small commands.
 
-    Only commands that hardly change within the loop's response count, since the body never reaches
-    short large ones. The result is the least over moving axes and both halves of the flight. It is
-    0 where one of them has too few commands, or less gain for large ones (motors at their limits).
+    Only steady commands count, since the body never reaches a large command that is short. The
+    result is the smallest share over the axes that turn and over both halves of the flight. It is 0
+    where one of these has too few commands, or a smaller gain for large commands than for small
+    ones (motors at their limits).
     """
     both = np.isfinite(command).all(axis=1) & np.isfinite(rate).all(axis=1)
     time_s, command, rate = time_s[both], command[both], rate[both]
-    before, after = (
+    command_before, command_after = (
         np.column_stack([np.interp(time_s + shift, time_s, c) for c in command.T])
         for shift in (-STEADY_S, STEADY_S)
     )
-    steady, half = np.abs(after - before) < 0.3 * np.abs(command), len(time_s) // 2
+    steady, middle = (
+        np.abs(command_after - command_before) < 0.3 * np.abs(command),
+        len(time_s) // 2,
+    )
     limits = np.quantile(np.abs(command), 0.9, axis=0)
     bends = []
     for axis in np.flatnonzero(limits > 3.0 * CALM_RATE):
-        for part in (slice(None, half), slice(half, None)):
-            c, r = command[part, axis][steady[part, axis]], rate[part, axis][steady[part, axis]]
+        for half_rows in (slice(None, middle), slice(middle, None)):
+            c, r = (
+                command[half_rows, axis][steady[half_rows, axis]],
+                rate[half_rows, axis][steady[half_rows, axis]],
+            )
             share = np.abs(c) / limits[axis]
             large, small = share > 0.6, (share > 0.15) & (share < 0.4)
             if min(large.sum(), small.sum()) < 30:
@@ -76,17 +92,18 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
 def loop_gain(
     time_s: np.ndarray, command: np.ndarray, rate: np.ndarray
 ) -> tuple[float, float] | None:
-    """Return by which factor the gyro exceeds a steady rate command, and the ratio between axes.
+    """Return the gain at low frequency (median of the axes), and how far the axes' gains differ.
 
-    The second is the largest gain of an axis over the smallest. None where no axis shows it.
+    The second value is the largest gain of an axis over the smallest. The result is None where no
+    axis has a reliable gain.
 
-    A rate loop has a gain of 1 at low frequency. The gain is fitted with a delay and a loop of
-    second order, as most commands are too short for a steady rate.
+    A correct rate loop has a gain of 1 at low frequency. Most commands are too short for a steady
+    rate, so the gain is fitted together with a delay and a second-order filter.
 
     Args:
-        time_s: (T,) [s].
+        time_s: (T,) time [s].
         command: (T, 3) commanded body rates [rad/s].
-        rate: (T, 3) of the gyro [rad/s].
+        rate: (T, 3) body rates of the gyro [rad/s].
     """
     from scipy.signal import bilinear, lfilter
 
@@ -94,6 +111,7 @@ def loop_gain(
     step = float(np.median(np.diff(time_s)))
     if known.sum() < 200:
         return None
+    # Both signals on even steps, and only the axes that are commanded to turn.
     grid = np.arange(time_s[known][0], time_s[known][-1], step)
     command, rate = (
         np.column_stack([np.interp(grid, time_s[known], column) for column in value[known].T])
@@ -103,7 +121,9 @@ def loop_gain(
     if not len(axes):
         return None
     command, rate = command[:, axes], rate[:, axes] - rate[:, axes].mean(axis=0)
-    least, gains = np.full(len(axes), np.inf), np.zeros(len(axes))
+    least_residual, gains = np.full(len(axes), np.inf), np.zeros(len(axes))
+    # Try every loop on a grid, and keep each axis' best gain. The first 0.5 s do not count: the
+    # filter starts there.
     settled = slice(min(round(0.5 / step), len(grid) // 4), None)
     for hz, ratio, late_s in product(LOOP_HZ, DAMPING, LOOP_LATE_S):
         omega, count = 2.0 * np.pi * hz, round(late_s / step)
@@ -112,11 +132,11 @@ def loop_gain(
         wanted = np.asarray(lfilter(*filters, late - command[0], axis=0))[settled]
         wanted = wanted - wanted.mean(axis=0)
         gain = np.sum(wanted * rate[settled], axis=0) / np.sum(wanted**2, axis=0)
-        left = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)
-        gains = np.where(left < least, gain, gains)
-        least = np.minimum(left, least)
-    sure = least < (1.0 - EXPLAINED) * np.sum(rate[settled] ** 2, axis=0)
-    if not sure.any() or (gains[sure] <= 0.0).any():
+        residual = np.sum((rate[settled] - gain * wanted) ** 2, axis=0)
+        gains = np.where(residual < least_residual, gain, gains)
+        least_residual = np.minimum(residual, least_residual)
+    reliable = least_residual < (1.0 - EXPLAINED) * np.sum(rate[settled] ** 2, axis=0)
+    if not reliable.any() or (gains[reliable] <= 0.0).any():
         return None
-    logs = np.log(gains[sure])
+    logs = np.log(gains[reliable])
     return float(np.exp(np.median(logs))), float(np.exp(np.ptp(logs)))
