@@ -1,4 +1,7 @@
-"""The faults that checks can name, each with a manoeuvre that makes it identifiable."""
+"""The faults that checks of a log can name, each with a manoeuvre that makes it identifiable.
+
+A manoeuvre is an instruction in words for a new flight or a new log.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "camera_fov": ("the policy saw with another camera", ""),
     "file": ("the file is damaged, or of another kind", "log again"),
 }
-"""Name -> description, and the manoeuvre that makes it identifiable."""
+"""Name of a fault -> its description, and the manoeuvre that makes it identifiable."""
 
 
 def manoeuvre(fault: str) -> str:

@@ -38,11 +38,14 @@ LEAST_ROWS = 50
 
 @dataclass(frozen=True)
 class CheckContext:
-    """References for the checks of a log."""
+    """References for the checks of a log: what the log is compared with."""
 
     vehicle: Vehicle | None = None
+    """The vehicle file; None: checks that need it are skipped."""
     policy_hz: float | None = None
+    """Rate of the policy that flew [Hz]."""
     policy_fov: tuple[float, float] | None = None
+    """Horizontal and vertical field of view of the policy's camera [deg]."""
     found: frozenset[str] = frozenset()
     """Faults that earlier checks of the log found."""
 
@@ -87,7 +90,7 @@ SIGNALS = {
     "thrust command": "cmd_thrust",
     "voltage": "voltage",
 }
-"""Subject of a finding -> its signal."""
+"""Subject of a finding (`Finding.signal`) -> name of the signal in the rows."""
 
 
 def run_checks(
@@ -100,16 +103,17 @@ def run_checks(
     """Return the findings, the readings that correct certain faults, and the corrected rows.
 
     Args:
-        rows: signal to (T, C), `time` to (T,); NaN where unknown.
-        checks: in order; each gets the rows that those before it corrected.
+        rows: name of a signal -> samples (T, C), and `time` -> (T,); NaN where unknown.
+        checks: checks in their order; each gets the rows after the corrections of earlier checks.
         against: the references.
-        fix: report corrections as made; otherwise as doubts. Later checks get corrected rows.
+        fix: report corrections as made; otherwise as doubts. Later checks get corrected rows in
+            both cases.
         before: findings of earlier checks on the same rows.
     """
     findings, readings, rows = [], (), dict(rows)
     if len(rows["time"]) < LEAST_ROWS:
         return findings, readings, rows
-    # No vehicle has such a full thrust: its file is reported, and nothing compared with it.
+    # No vehicle has such a full thrust: `check_files` reports the file, and no check uses it.
     implausible = against.vehicle is not None and against.vehicle.full_thrust > LIFT[1] * GRAVITY
     against = replace(against, vehicle=None) if implausible else against
     trusted = dict(rows)
@@ -120,9 +124,9 @@ def run_checks(
     for check in checks:
         for finding in check(trusted, against):
             if finding.status == "corrected":
-                more = readings_in(finding.fix)
-                rows, trusted = read_rows(rows, more), read_rows(trusted, more)
-                readings += more
+                new_readings = readings_in(finding.fix)
+                rows, trusted = read_rows(rows, new_readings), read_rows(trusted, new_readings)
+                readings += new_readings
                 finding = finding if fix else finding._replace(status="doubt")
             else:
                 trusted = _without_doubted(trusted, finding)
@@ -133,13 +137,14 @@ def run_checks(
 
 
 def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str, np.ndarray]:
-    """Return the rows for later checks, which would name a second fault for an open one.
+    """Return the rows for later checks, without the error of an open finding.
 
-    A signal with an open doubt is read as its fix says, or left out where the fix is no reading.
+    Otherwise a later check would name a second fault for the same error. A signal with an open
+    doubt is read as its fix says, or left out where the fix is no reading.
     """
     signal = SIGNALS.get(finding.signal)
     if finding.fault == "accelerometer_axes":
-        return rows  # `check_gyro_signs` decides whether all axes of the body are others
+        return rows  # `check_gyro_signs` needs it to decide on the axes of the whole body
     if not finding.is_open or signal not in rows:
         return rows
     if readings := readings_in(finding.fix):
@@ -170,16 +175,18 @@ def with_fixes(log: FlightLog, readings: Readings) -> FlightLog:
     for group, names in GROUPS.items():
         if group != "time" and all(name in columns for name in names):
             rows[group] = np.stack([columns[name] for name in names], axis=1)
-    pose = filled(log.time_s, rows["quat"]) if "quat" in rows else None
-    turned = read_rows({**rows, "quat": pose} if pose is not None else rows, readings)
-    if pose is not None:
-        turned["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
+    filled_quat = filled(log.time_s, rows["quat"]) if "quat" in rows else None
+    corrected = read_rows(
+        {**rows, "quat": filled_quat} if filled_quat is not None else rows, readings
+    )
+    if filled_quat is not None:
+        corrected["quat"] = read_rows({"time": log.time_s, "quat": rows["quat"]}, readings)["quat"]
     for group, names in GROUPS.items():
-        if group in rows and group not in turned:
+        if group in rows and group not in corrected:
             columns = {name: value for name, value in columns.items() if name not in names}
         elif group in rows and group != "time":
-            columns |= dict(zip(names, turned[group].T, strict=True))
-    columns["time"] = turned["time"]
+            columns |= dict(zip(names, corrected[group].T, strict=True))
+    columns["time"] = corrected["time"]
     return log_from_columns(columns, log.about, log.name, limits=False)
 
 
@@ -214,7 +221,7 @@ def check_before_diagnosis(
 
 
 def not_examined(logs: Sequence[FlightLog]) -> list[str]:
-    """Return the parts of the dynamics that no log can test: `force`, `torque`."""
+    """Return the views (parts of the dynamics) that no log allows to test: `force`, `torque`."""
     drives = ("rotor_speed", "pwm")
     force = any(
         (not {"pos", "quat"} & set(log.partial) or (log.acc_b is not None and "pos" in log.partial))
@@ -230,7 +237,10 @@ def not_examined(logs: Sequence[FlightLog]) -> list[str]:
 
 
 def lines_of(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the records with a fault and status doubt or note, as warnings of a report."""
+    """Return lines of text for the records with a fault and status doubt or note.
+
+    A report prints them as warnings.
+    """
     return [
         f"{record['flight'] or 'vehicle file'}: {record['fault']}: {record['evidence']}"
         for record in records
@@ -253,7 +263,10 @@ def not_identifiable(findings: Sequence[Finding]) -> list[dict[str, str]]:
 
 
 def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
-    """Return a log's signals on its rows; gaps of slower signals are interpolated linearly."""
+    """Return a log's signals on its rows (see `run_checks`).
+
+    Missing values of slower signals are interpolated linearly.
+    """
     columns = columns_from_log(log)
     rows = {"time": log.time_s}
     for group, names in GROUPS.items():
@@ -268,18 +281,19 @@ def rows_of(log: FlightLog) -> dict[str, np.ndarray]:
 
 
 def filled(time_s: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return `value` (T, C) with gaps below 0.5 s interpolated linearly."""
+    """Return `value` (T, C); missing values over less than 0.5 s are interpolated linearly."""
     known = np.isfinite(value).all(axis=1)
     if known.all() or known.sum() < 2:
         return value
-    at = time_s[known]
-    out = np.stack([np.interp(time_s, at, column[known]) for column in value.T], axis=1)
-    after = np.clip(np.searchsorted(at, time_s), 1, len(at) - 1)
-    far = (at[after] - at[after - 1] > 0.5) & ~known
-    out[far | (time_s < at[0]) | (time_s > at[-1])] = np.nan
-    return out
+    known_time = time_s[known]
+    result = np.stack([np.interp(time_s, known_time, column[known]) for column in value.T], axis=1)
+    after = np.clip(np.searchsorted(known_time, time_s), 1, len(known_time) - 1)
+    too_far = (known_time[after] - known_time[after - 1] > 0.5) & ~known
+    result[too_far | (time_s < known_time[0]) | (time_s > known_time[-1])] = np.nan
+    return result
 
 
 def _action_rows(log: FlightLog) -> Mapping[str, np.ndarray]:
+    """Return the policy's action as a signal `action`, where the log has one."""
     action = log.action_b
     return {} if action is None else {"action": action}

@@ -1,8 +1,8 @@
 """Checks of clocks: the unit of time, and the delay and drift of the pose against the gyro.
 
-The attitude's rate over 60 ms is compared with the gyro's mean over the same time, shifted by trial
-delays; the least difference gives the delay. Its error comes from leaving out blocks of the flight
-in turn (jackknife).
+The body rate from the attitude over 60 ms is compared with the gyro's mean over the same time,
+shifted by trial delays. The least difference gives the delay. Its standard error comes from
+estimates that leave out one block of the flight at a time (jackknife).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ STEPS_S = (5e-5, 0.25)
 REACH_S, STEP_S = 0.1, 0.002
 """Largest delay that is tried, in both directions, and the step between trials [s]."""
 BLOCKS = 8
+"""Number of blocks of the jackknife."""
 CALM = 0.2
 """Smallest usable body rate, root mean square [rad/s]."""
 LEAST_S, SURE = 0.002, 4.0
@@ -30,33 +31,35 @@ GROWN_S, DRIFT, SURE_DRIFT = 0.005, 3e-4, 5.0
 """Least drift that is reported: over a flight [s], relative (two crystals differ by less than
 200 ppm), and in standard errors."""
 LIKELY = 2.5
-"""A drift of this many standard errors is removed before its error is estimated."""
+"""A drift above this many standard errors is removed, and its error is estimated again."""
 SEEN = 0.005
-"""The drift is not identifiable where its error exceeds this."""
+"""The drift is not identifiable where `SURE_DRIFT` standard errors exceed this."""
 LATE_S = 0.025
-"""A diagnosis estimates smaller offsets itself (the effect clock_offset) [s]."""
+"""Least delay that is a fault [s]. A diagnosis estimates smaller ones itself (effect
+`clock_offset`)."""
 
 
 class Late(NamedTuple):
-    """Delay of an attitude against a gyro."""
+    """Delay of an attitude against a gyro, which may drift over the flight."""
 
     delay_s: float
+    """Delay at the time `middle_s`; positive if the attitude is late [s]."""
     error_s: float
-    """Standard error [s]."""
+    """Standard error of `delay_s` [s]."""
     drift: float
     """Growth of the delay per second of flight."""
     drift_error: float
     """Standard error of the drift."""
     middle_s: float
-    """Time at which the delay is `delay_s` [s]."""
+    """Middle of the flight [s]."""
     duration_s: float
-    """Of the flight [s]."""
+    """Duration of the flight [s]."""
 
     @property
     def drifts(self) -> bool:
-        """Whether the drift exceeds that of crystals and its own error."""
-        grown = abs(self.drift) * self.duration_s
-        return grown > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
+        """Whether the drift exceeds what two crystals cause, and what its own error can cause."""
+        growth_s = abs(self.drift) * self.duration_s
+        return growth_s > GROWN_S and abs(self.drift) > max(DRIFT, SURE_DRIFT * self.drift_error)
 
     def drift_figures(self) -> str:
         """Return the drift as text."""
@@ -67,22 +70,22 @@ class Late(NamedTuple):
 
 
 def check_time(rows: Rows) -> list[Finding]:
-    """Return the unit of the time, where the rows are impossibly far apart in seconds."""
+    """Return a finding where the time between rows is impossible in seconds."""
     step = float(np.median(np.diff(rows["time"])))
     low, high = STEPS_S
     if low <= step <= high:
         return []
-    fits = [unit for unit, factor in TIMES.items() if low <= step * factor <= high]
+    possible_units = [unit for unit, factor in TIMES.items() if low <= step * factor <= high]
     figures = f"rows are {step:.3g} apart, which is no distance in s"
-    if len(fits) != 1:
+    if len(possible_units) != 1:
         return [Finding("doubt", "time", f"{figures}, ms, us or ns", "time_unit", step, 0.95)]
-    text = f"{figures}: time is in {fits[0]}"
-    return [Finding("corrected", "time", text, "time_unit", 1.0 / TIMES[fits[0]], 0.99,
-                    option(("time", fits[0])))]  # fmt: skip
+    text = f"{figures}: time is in {possible_units[0]}"
+    return [Finding("corrected", "time", text, "time_unit", 1.0 / TIMES[possible_units[0]], 0.99,
+                    option(("time", possible_units[0])))]  # fmt: skip
 
 
 def check_clock(rows: Rows) -> list[Finding]:
-    """Return whether the pose's delay exceeds what a diagnosis can estimate."""
+    """Return findings on the pose's delay against the gyro, and on the drift of this delay."""
     if not {"quat", "rate"} <= rows.keys():
         return []
     known = [np.isfinite(rows[name]).all(axis=1) for name in ("quat", "rate")]
@@ -90,22 +93,22 @@ def check_clock(rows: Rows) -> list[Finding]:
         (rows["time"][good], rows[name][good])
         for name, good in zip(("quat", "rate"), known, strict=True)
     )
-    found = delay_of(quat_time, quat, rate_time, rate)
-    if found is None:
+    late = delay_of(quat_time, quat, rate_time, rate)
+    if late is None:
         text = "the flight turns too little to hold its clocks against each other"
         return unseen("pose clock", text, "clock_offset", "clock_drift")
     drift = []
-    if not found.drifts and not SURE_DRIFT * found.drift_error < SEEN:
-        drift = unseen("pose clock", found.drift_figures(), "clock_drift")
-    if found.drifts:
+    if not late.drifts and not SURE_DRIFT * late.drift_error < SEEN:
+        drift = unseen("pose clock", late.drift_figures(), "clock_drift")
+    if late.drifts:
         fix = "suite import of the log that it was made of: the pose is moved"
-        about = ("clock_drift", found.drift, 0.95, fix)
-        drift = [Finding("doubt", "pose clock", found.drift_figures(), *about)]
-    figures = f"it is {1e3 * found.delay_s:+.1f} ms (± {1e3 * found.error_s:.1f} ms) late"
-    if abs(found.delay_s) < max(LATE_S, SURE * found.error_s):
+        about = ("clock_drift", late.drift, 0.95, fix)
+        drift = [Finding("doubt", "pose clock", late.drift_figures(), *about)]
+    figures = f"it is {1e3 * late.delay_s:+.1f} ms (± {1e3 * late.error_s:.1f} ms) late"
+    if abs(late.delay_s) < max(LATE_S, SURE * late.error_s):
         return [Finding("ok", "pose delay", figures + " against the gyro"), *drift]
     fix = "suite import moves it; or [effects.clock_offset] of the vehicle file"
-    about = ("clock_offset", found.delay_s, 0.95, fix)
+    about = ("clock_offset", late.delay_s, 0.95, fix)
     return [Finding("doubt", "pose delay", figures + " against the gyro", *about), *drift]
 
 
@@ -114,12 +117,14 @@ def delay_of(
 ) -> Late | None:
     """Return the delay of the attitude `quat` (N, 4) against the gyro `rate` (M, 3).
 
-    None where body rates are too small, or where the best delay is the largest that is tried.
+    The result is None where the flight is too short or the body rates are too small, or where the
+    best delay is the largest that is tried.
     """
     step = float(np.median(np.diff(quat_time))) if len(quat_time) > 1 else np.inf
     count = max(1, round(SPAN_S / step)) if np.isfinite(step) else 0
     if count == 0 or len(quat_time) < 20 * count or len(rate_time) < 100:
         return None
+    # Body rates from the attitude: rotations from `first` to `last`, where no rows are missing.
     unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     first, last = quat_time[:-count], quat_time[count:]
     span = last - first
@@ -132,15 +137,17 @@ def delay_of(
         return None
     turns = rotation_vector(multiply(conjugate(unit[:-count]), unit[count:])) / span[:, None]
     first, last, turns = first[inside], last[inside], turns[inside]
+    # Integral of the gyro, from which its mean over any time follows by interpolation.
     area = 0.5 * np.diff(rate_time)[:, None] * (rate[1:] + rate[:-1])
-    full = np.concatenate([np.zeros((1, 3)), np.cumsum(area, axis=0)])
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(area, axis=0)])
 
     middle, duration = 0.5 * float(last[-1] + first[0]), float(last[-1] - first[0])
 
     def gyro(late_s: float, drift: float) -> np.ndarray:
+        """Return the gyro's mean rates over the same times for a trial delay and drift."""
         at = [
             np.stack(
-                [np.interp(t - late_s - drift * (t - middle), rate_time, c) for c in full.T], 1
+                [np.interp(t - late_s - drift * (t - middle), rate_time, c) for c in integral.T], 1
             )
             for t in (first, last)
         ]
@@ -152,10 +159,11 @@ def delay_of(
     block = np.minimum((np.arange(len(first)) * BLOCKS) // len(first), BLOCKS - 1)
 
     def costs(drift: float) -> np.ndarray:
+        """Return the misfit (BLOCKS, trials) of every block and trial delay."""
         cost = np.empty((BLOCKS, len(trials)))
         for k, late_s in enumerate(trials):
-            off = turns - gyro(late_s, drift)
-            size = np.linalg.norm(off - np.median(off, axis=0), axis=1)
+            residual = turns - gyro(late_s, drift)
+            size = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
             # Huber's loss limits the influence of outliers.
             limit = 3.0 * np.median(size)
             loss = np.where(size < limit, 0.5 * size**2, limit * (size - 0.5 * limit))
@@ -163,30 +171,34 @@ def delay_of(
         return cost
 
     cost = costs(0.0)
-    first_drift, (more, drift_error) = 0.0, _drift(trials, cost, duration)
-    if abs(more) > LIKELY * drift_error:  # inside a block a drift would count as scatter
-        first_drift, cost = more, costs(more)
-        more, drift_error = _drift(trials, cost, duration)
-    whole = _lowest(trials, cost.sum(axis=0))
-    parts = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
-    if whole is None or any(part is None for part in parts):
+    first_drift, (rest_of_drift, drift_error) = 0.0, _drift(trials, cost, duration)
+    if abs(rest_of_drift) > LIKELY * drift_error:  # inside a block a drift would count as scatter
+        first_drift, cost = rest_of_drift, costs(rest_of_drift)
+        rest_of_drift, drift_error = _drift(trials, cost, duration)
+    delay_s = _lowest(trials, cost.sum(axis=0))
+    without_block = [_lowest(trials, cost.sum(axis=0) - cost[b]) for b in range(BLOCKS)]
+    if delay_s is None or any(one is None for one in without_block):
         return None
-    error = jackknife_error(np.array(parts, dtype=np.float64))
-    return Late(whole, error, first_drift + more, drift_error, middle, duration)
+    error = jackknife_error(np.array(without_block, dtype=np.float64))
+    return Late(delay_s, error, first_drift + rest_of_drift, drift_error, middle, duration)
 
 
 def _drift(trials: np.ndarray, cost: np.ndarray, duration_s: float) -> tuple[float, float]:
-    """Return the growth of the delay per second between the two halves, and its error."""
+    """Return the drift (growth of the delay per second of flight), and its standard error.
+
+    It is the difference of the delays of the two halves of the flight, whose middles are half the
+    flight apart.
+    """
     half = BLOCKS // 2
     halves = [
-        [_lowest(trials, part.sum(axis=0) - gone) for gone in (0.0, *part)]
+        [_lowest(trials, part.sum(axis=0) - left_out) for left_out in (0.0, *part)]
         for part in (cost[:half], cost[half:])
     ]
     if any(part is None for each in halves for part in each):
         return 0.0, np.inf
-    both = np.array(halves, dtype=np.float64)
-    error = float(np.hypot(jackknife_error(both[0, 1:]), jackknife_error(both[1, 1:])))
-    return float(both[1, 0] - both[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
+    delays = np.array(halves, dtype=np.float64)
+    error = float(np.hypot(jackknife_error(delays[0, 1:]), jackknife_error(delays[1, 1:])))
+    return float(delays[1, 0] - delays[0, 0]) / (0.5 * duration_s), error / (0.5 * duration_s)
 
 
 def _lowest(trials: np.ndarray, cost: np.ndarray) -> float | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 STATUSES = ("corrected", "doubt", "not identifiable", "note", "ok")
-"""Most serious first."""
+"""All statuses of a finding, the most serious first; `Finding.status` defines them."""
 SURE = 0.9
 """A doubt with at least this confidence is open: a diagnosis refuses its log."""
 
@@ -18,17 +18,17 @@ class Finding(NamedTuple):
     """`ok` (checked, correct), `note` (information), `corrected` (wrong, was corrected), `doubt`
     (probably wrong, unchanged), `not identifiable` (this flight contains no evidence)."""
     signal: str
-    """Subject: `time`, `attitude`, `velocity`, `thrust`, ..."""
+    """What was checked: `time`, `attitude`, `velocity`, `thrust`, ..."""
     evidence: str
     """One sentence with the measured figures."""
     fault: str = ""
-    """A name of `catalogue.FAULTS`; empty for none."""
+    """Name of the fault, from `catalogue.FAULTS`; empty for none."""
     size: float | None = None
     """Size of the fault, such as the factor of a wrong unit or a delay [s]."""
     confidence: float | None = None
     """Probability of this fault, 0 to 1."""
     fix: str = ""
-    """Options of `suite import`, or keys of the vehicle file, that correct it."""
+    """How to correct the fault: options of `suite import`, keys of the vehicle file, or words."""
 
     @property
     def is_open(self) -> bool:
@@ -42,7 +42,10 @@ def unseen(signal: str, evidence: str, *faults: str) -> list[Finding]:
 
 
 def finding_lines(findings: Iterable[Finding]) -> list[str]:
-    """Return the findings as lines of text, the most serious first."""
+    """Return the findings as lines of text, the most serious first.
+
+    Findings that differ only in their fault share a line.
+    """
     ranked = sorted(findings, key=lambda finding: STATUSES.index(finding.status))
     together: dict[tuple[str, str, str], list[Finding]] = {}
     for finding in ranked:
@@ -61,15 +64,18 @@ def line(finding: Finding) -> str:
 
 
 def findings_of(about: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings in a log's metadata; invalid records are left out."""
-    old = {"level": "status", "subject": "signal", "text": "evidence"}
-    found = []
+    """Return the findings in a log's metadata `about`; invalid records are left out.
+
+    Older logs use other names for the fields, which are translated.
+    """
+    new_names = {"level": "status", "subject": "signal", "text": "evidence"}
+    findings = []
     records = about.get("findings")
     for record in records if isinstance(records, list) else ():
         if not isinstance(record, dict):
             continue
-        fields = {old.get(key, key): value for key, value in record.items()}
+        fields = {new_names.get(key, key): value for key, value in record.items()}
         fields = {key: value for key, value in fields.items() if key in Finding._fields}
         if {"status", "signal", "evidence"} <= fields.keys() and fields["status"] in STATUSES:
-            found.append(Finding(**fields))
-    return tuple(found)
+            findings.append(Finding(**fields))
+    return tuple(findings)

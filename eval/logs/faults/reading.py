@@ -32,12 +32,15 @@ from eval.importers.frames import QUAT_HALF_TURN, conjugate, from_euler, multipl
 
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Unit of time -> seconds."""
+# Signals by what they contain, since each step applies to one group only.
 QUATS = ("quat", "cmd_quat")
 VECTORS = ("pos", "vel", "rate", "acc", "cmd_rate", "cmd_torque")
 MOTORS = ("motor", "motor_cmd", "pwm")
 SCALARS = ("throttle", "cmd_thrust", "voltage")
 _HALF = np.array([0.0, 1.0, 0.0, 0.0])
-"""Half a turn about x."""
+"""Quaternion (wxyz) of half a turn about x, which maps between forward-right-down and
+forward-left-up axes."""
+# How the texts of steps look: axes such as `x,-y,-z`, and an order of motors such as `2,1,4,3`.
 _AXES = re.compile(r"^-?[xyz],-?[xyz],-?[xyz]$")
 _ORDER = re.compile(r"^[1-4](,[1-4]){3}$")
 _ANGLES = ("-roll", "-pitch", "-yaw")
@@ -52,9 +55,9 @@ def parse_readings(texts: Sequence[str]) -> Readings:
     """Return the readings of options such as `rate=x,-y,-z`.
 
     Raises:
-        ValueError: naming the option, and what is allowed.
+        ValueError: for an invalid option; the message names it, and what is allowed.
     """
-    found = []
+    readings = []
     for text in texts:
         signal, equals, steps = text.partition("=")
         if not equals or signal not in (*QUATS, *VECTORS, *MOTORS, *SCALARS, "time"):
@@ -66,8 +69,8 @@ def parse_readings(texts: Sequence[str]) -> Readings:
                     f"--read {text!r}: {step!r} is no step of {signal}; allowed are a factor, "
                     "x,-y,-z for vectors, 2,1,4,3 for motors, and what docs/import.md lists"
                 )
-        found.append((signal, steps))
-    return tuple(found)
+        readings.append((signal, steps))
+    return tuple(readings)
 
 
 def option(*readings: tuple[str, str]) -> str:
@@ -84,14 +87,14 @@ def readings_in(fix: str) -> Readings:
 def read_as(
     signal: str, value: np.ndarray, steps: str, quat: Callable[[], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Return samples (N, C) of a signal in another reading.
+    """Return samples (N, C) of a signal after the steps of a reading.
 
     Args:
-        signal: its name.
-        value: (N, C).
-        steps: see the table in this module's docstring.
-        quat: gives the attitude (N, 4) wxyz at the same times; needed by `from-body` and others
-            that turn.
+        signal: name of the signal.
+        value: (N, C) samples of the signal.
+        steps: the steps, see the table in this module's docstring.
+        quat: function that returns the attitude (N, 4) wxyz at the same times; needed by
+            `from-body`, `from-world` and `plus-gravity`.
     """
     for step in steps.split("+"):
         if step in ("from-body", "from-world", "plus-gravity"):
@@ -132,6 +135,7 @@ def axes_matrix(step: str) -> np.ndarray:
 
 
 def _allowed(signal: str, step: str) -> bool:
+    """Return whether `step` is a step of `signal`."""
     if signal == "time" or step == "drop":
         return step in TIMES or (step == "drop" and signal != "time")
     if signal in QUATS:
@@ -151,12 +155,14 @@ def _allowed(signal: str, step: str) -> bool:
 
 
 def _turned(value: np.ndarray, step: str, quat: np.ndarray) -> np.ndarray:
+    """Return vectors (N, 3) after a step that needs the attitude `quat` (N, 4)."""
     if step == "plus-gravity":
         return value + rotate(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
     return rotate(quat if step == "from-body" else conjugate(quat), value)
 
 
 def _quat_as(value: np.ndarray, step: str) -> np.ndarray:
+    """Return quaternions (N, 4) wxyz after a step."""
     if step == "xyzw":
         return value[:, [3, 0, 1, 2]]
     if step == "wxyz":

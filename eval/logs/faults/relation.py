@@ -1,4 +1,8 @@
-"""Compare two noisy measurements of one vector: their axes, signs and scale."""
+"""Compare two noisy measurements of one vector: their axes, signs and scale.
+
+One measurement is the reference (`wanted`), such as the body rates from the attitude. The other is
+the signal to check (`given`), such as the gyro, whose axes may be swapped or inverted.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 ALIKE = 0.8
-"""Axes with a higher correlation are the same."""
+"""Two axes with a higher correlation measure the same."""
 UNLIKE = 0.5
-"""An axis is another one if the best correlation exceeds that with its own axis by this."""
+"""An axis is swapped or inverted if the best correlation exceeds the one as given by this."""
 LEFT, TIMES_LEFT = 0.5, 20.0
-"""So it is if its own axis leaves more than the first share of its variance unexplained, and more
-than the second factor times what the best axis leaves."""
+"""An axis is also swapped or inverted if the unexplained share of its variance, as given, exceeds
+the first value and is more than the second factor times the share with the best axis."""
 CLEAR = 0.1
-"""Another order of axes is taken where its squared correlations exceed those of the given order by
-this in all: on a straight line two axes are proportional, and noise alone would decide."""
+"""Another order of axes is chosen only if the sum of its squared correlations exceeds that of the
+given order by this: on a straight line two axes are proportional, and noise alone would decide."""
 LEAST = 20
 """Least rows for a comparison."""
 SEEN = 0.5
@@ -31,25 +35,26 @@ class Match(NamedTuple):
     seen: np.ndarray
     """(3,) bool: identifiable axes of `wanted`."""
     alike: np.ndarray
-    """(3,) correlation in the axes `axes`."""
+    """(3,) correlation of each axis after `given` is read in the axes `axes`."""
     as_given: np.ndarray
-    """(3,) correlation in the given axes."""
+    """(3,) correlation of each axis without a change."""
     scale: np.ndarray
-    """(3,) given divided by wanted, in the axes `axes`."""
+    """(3,) ratio of `given` to `wanted`, in the axes `axes`."""
     low: np.ndarray
-    """(3,) smallest and ..."""
+    """(3,) smallest scale that is consistent with noise in either measurement (Frisch 1934)."""
     high: np.ndarray
-    """... largest scale consistent with noise in either of them (Frisch 1934)."""
+    """(3,) largest scale that is consistent with noise in either measurement."""
     level: np.ndarray
     """(3,) standard deviation of `wanted`."""
     rival: str
-    """Other axes that fit about as well, since two of them move in proportion; "" for none."""
+    """Alternative order of the axes that fits about as well, since two axes move in proportion; ""
+    for none."""
 
     @property
     def is_turned(self) -> bool:
         """Whether the evidence for other axes than the given ones is overwhelming."""
-        left, left_as_given = 1.0 - self.alike**2, 1.0 - self.as_given**2
-        far = (left_as_given > LEFT) & (left_as_given > TIMES_LEFT * left)
+        unexplained, unexplained_as_given = 1.0 - self.alike**2, 1.0 - self.as_given**2
+        far = (unexplained_as_given > LEFT) & (unexplained_as_given > TIMES_LEFT * unexplained)
         worse = self.seen & ((self.alike - self.as_given > UNLIKE) | far)
         changed = np.array([axis != "xyz"[k] for k, axis in enumerate(self.axes.split(","))])
         return bool((worse & changed).any() and (self.alike[changed & self.seen] > ALIKE).all())
@@ -71,10 +76,11 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
     wanted, given = _clear(wanted, given)
     if len(wanted) < LEAST:
         wanted = given = np.zeros((LEAST, 3))
+    # Correlation of every axis with every other, and the order of axes with the largest ones.
     level, other = wanted.std(axis=0), given.std(axis=0)
     wanted, given = wanted - wanted.mean(axis=0), given - given.mean(axis=0)
-    size = np.outer(np.maximum(level, 1e-12), np.maximum(other, 1e-12)) * max(len(wanted), 1)
-    corr = (wanted.T @ given) / size
+    norms = np.outer(np.maximum(level, 1e-12), np.maximum(other, 1e-12)) * max(len(wanted), 1)
+    corr = (wanted.T @ given) / norms
     score = {p: float(np.sum(corr[range(3), p] ** 2)) for p in permutations(range(3))}
     order = max(score, key=lambda p: score[p] + CLEAR * (p == (0, 1, 2)))
     best = corr[range(3), order]
@@ -84,14 +90,19 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
         seen = np.abs(best) > SEEN
     sign = np.where(seen & (best < 0.0), -1.0, 1.0)
     names = [("-" if s < 0 else "") + "xyz"[k] for k, s in zip(order, sign, strict=True)]
-    rivals = [
+    # Alternative orders, whose changed axes correlate well with both.
+    alternatives = [
         p
         for p in score
         if p != order
         and score[p] > score[order] - CLEAR
         and all(abs(corr[k, p[k]]) > ALIKE for k in range(3) if p[k] != order[k])
     ]
-    rival = ",".join("xyz"[k] for k in max(rivals, key=lambda p: score[p])) if rivals else ""
+    rival = (
+        ",".join("xyz"[k] for k in max(alternatives, key=lambda p: score[p]))
+        if alternatives
+        else ""
+    )
     ratio = other[list(order)] / np.maximum(level, 1e-12)
     r = np.clip(np.abs(best), 1e-3, 1.0)
     alike = best * sign
@@ -100,7 +111,10 @@ def match(wanted: np.ndarray, given: np.ndarray) -> Match:
 
 
 def pooled_scale(found: Match) -> tuple[float, float, float]:
-    """Return the common scale of the identifiable axes, and its least and largest value."""
+    """Return the common scale of the identifiable axes, and its least and largest value.
+
+    All three are weighted geometric means over the axes; NaN where no axis is identifiable.
+    """
     weight = np.where(found.seen, found.level**2 * found.alike**4, 0.0)
     if weight.sum() == 0.0:
         return np.nan, np.nan, np.nan
@@ -112,21 +126,21 @@ def pooled_scale(found: Match) -> tuple[float, float, float]:
 
 
 def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
-    """Return the mean (T, C) of `value` over `width_s` around each time; NaN in gaps."""
+    """Return the moving mean (T, C) of `value` over `width_s`; NaN where many are missing."""
     first = np.searchsorted(time_s, time_s - 0.5 * width_s)
     stop = np.searchsorted(time_s, time_s + 0.5 * width_s, side="right")
     known = np.asarray(np.isfinite(value).all(axis=1))
-    full = np.concatenate(
+    sums = np.concatenate(
         [np.zeros((1, value.shape[1])), np.cumsum(np.where(known[:, None], value, 0.0), 0)]
     )
     count = np.concatenate([[0], np.cumsum(known)])
     inside = (count[stop] - count[first])[:, None]
     enough = np.asarray(inside > 0.6 * (stop - first)[:, None])
-    return np.where(enough, (full[stop] - full[first]) / np.maximum(inside, 1), np.nan)
+    return np.where(enough, (sums[stop] - sums[first]) / np.maximum(inside, 1), np.nan)
 
 
 def rms(value: np.ndarray) -> float:
-    """Return the root mean square of the smallest 95 %, so that glitches have no influence."""
+    """Return the root mean square of the smallest 95 % of rows, so that glitches do not count."""
     squared = np.sum(np.atleast_2d(value.T).T ** 2, axis=1)
     squared = np.sort(squared[np.isfinite(squared)])
     squared = squared[: max(1, int(0.95 * len(squared)))]
@@ -134,13 +148,13 @@ def rms(value: np.ndarray) -> float:
 
 
 def jackknife_error(left_out: np.ndarray) -> float:
-    """Return the standard error from estimates (B,) that leave out one block each."""
+    """Return the jackknife's standard error from estimates (B,), each without one of B blocks."""
     count = len(left_out)
     return float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
 
 
 def _clear(wanted: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows in which both are finite and neither is an outlier."""
+    """Return both measurements in the rows in which both are finite and neither is an outlier."""
     good = np.isfinite(wanted).all(axis=1) & np.isfinite(given).all(axis=1)
     for value in (wanted, given):
         size = np.linalg.norm(value, axis=1)

@@ -16,19 +16,20 @@ LEAST_V, MOST_V = 2.5, 70.0
 SUNK_M, SUNK_SHARE = 0.5, 0.6
 """Least fall of the height as the motors start [m]."""
 SPAN_S = 0.6
+"""Time over which changes of the vertical speed are compared [s]."""
 BIAS, ALIKE = 0.15, 0.6
-"""Least median error of the accelerometer due to the throttle [m/s^2], and least correlation of its
-error with the squared throttle."""
+"""Least median error of the accelerometer that the throttle causes [m/s^2], and least size of the
+correlation of the accelerometer's error with the squared throttle."""
 
 
 def check_voltage_fails(value: np.ndarray) -> bool:
-    """Return whether the median of a voltage [V] is impossible for a battery."""
+    """Return whether the median of `value` [V] is impossible for a battery, or unknown."""
     known = value[np.isfinite(value)]
     return not len(known) or not LEAST_V <= float(np.median(known)) <= MOST_V
 
 
 def check_voltage(rows: Rows) -> list[Finding]:
-    """Return whether the battery's voltage is possible, and its unit."""
+    """Return a finding on whether the battery's voltage is possible, and on its unit."""
     value = rows.get("voltage")
     if value is None or not np.isfinite(value).any():
         return []
@@ -47,9 +48,10 @@ def check_voltage(rows: Rows) -> list[Finding]:
 
 
 def check_accelerometer_bias(rows: Rows) -> list[Finding]:
-    """Return whether the accelerometer's error along body z grows with the throttle squared.
+    """Return a finding where the accelerometer's error along z grows with the throttle squared.
 
-    Changes of the vertical speed over `SPAN_S` are compared with the integrated accelerometer.
+    The true acceleration is the change of the vertical speed over `SPAN_S`. The error of the
+    accelerometer's mean over the same time is fitted by a line over the throttle squared.
     """
     drive = next((n for n in ("throttle", "pwm", "motor", "cmd_thrust") if n in rows), None)
     if not {"acc", "pos", "quat"} <= rows.keys() or drive is None:
@@ -59,31 +61,31 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
     load = np.mean(np.abs(rows[drive]), axis=1)
     load = load / (1.0 if drive in ("throttle", "pwm") else np.nanquantile(load, 0.99))
     up = rotate(rows["quat"], np.array([0.0, 0.0, 1.0]))[:, 2]
-    felt = rotate(rows["quat"], rows["acc"])[:, 2] - GRAVITY
-    both = np.stack([felt, up * load**2], axis=1)
+    acc_up = rotate(rows["quat"], rows["acc"])[:, 2] - GRAVITY
+    both = np.stack([acc_up, up * load**2], axis=1)
     count = max(1, round(SPAN_S / float(np.median(np.diff(time_s)))))
-    full = np.cumsum(both, axis=0)
-    felt, power = ((full[count:] - full[:-count]) / count).T
-    off = felt - (vel[count:, 2] - vel[:-count, 2]) / (time_s[count:] - time_s[:-count])
-    good = np.isfinite(off) & np.isfinite(power)
-    if good.sum() < 5 * count or min(np.std(power[good]), np.std(off[good])) < 1e-6:
+    sums = np.cumsum(both, axis=0)
+    acc_up, power = ((sums[count:] - sums[:-count]) / count).T
+    error_up = acc_up - (vel[count:, 2] - vel[:-count, 2]) / (time_s[count:] - time_s[:-count])
+    good = np.isfinite(error_up) & np.isfinite(power)
+    if good.sum() < 5 * count or min(np.std(power[good]), np.std(error_up[good])) < 1e-6:
         return []
-    slope, level = np.polyfit(power[good], off[good], 1)
-    alike = float(np.corrcoef(power[good], off[good])[0, 1])
-    middle = float(np.median(off[good]))
-    usual = float(np.median(power[good]))
-    left = off[good] - np.polyval((slope, level), power[good])
+    slope, level = np.polyfit(power[good], error_up[good], 1)
+    correlation = float(np.corrcoef(power[good], error_up[good])[0, 1])
+    median_error = float(np.median(error_up[good]))
+    usual_power = float(np.median(power[good]))
+    residual = error_up[good] - np.polyval((slope, level), power[good])
     independent = max((time_s[-1] - time_s[0]) / SPAN_S, 3.0)
-    error = float(left.std() / (power[good].std() * np.sqrt(independent)))
-    if 2.0 * error * usual > 2.0 * BIAS:
+    error = float(residual.std() / (power[good].std() * np.sqrt(independent)))
+    if 2.0 * error * usual_power > 2.0 * BIAS:
         text = f"its bias at full throttle is {slope:+.1f} m/s^2 with an error of {error:.1f}"
         return unseen("accelerometer", text, "accelerometer_throttle_bias")
-    share = slope * usual
-    if share > -BIAS or middle > 0.5 * share or alike > -ALIKE:
+    share = slope * usual_power
+    if share > -BIAS or median_error > 0.5 * share or correlation > -ALIKE:
         return []
     text = (
-        f"it reads {middle:+.2f} m/s^2 too much along body z and {slope:+.2f} more at full "
-        f"throttle (correlation {alike:+.2f}): vibration biases it"
+        f"it reads {median_error:+.2f} m/s^2 too much along body z and {slope:+.2f} more at full "
+        f"throttle (correlation {correlation:+.2f}): vibration biases it"
     )
     fix = "soft mounting or a wider range; do not scale thrust by it"
     about = ("accelerometer_throttle_bias", float(slope), 0.92, fix)
@@ -91,7 +93,7 @@ def check_accelerometer_bias(rows: Rows) -> list[Finding]:
 
 
 def check_barometer(rows: Rows) -> list[Finding]:
-    """Return whether a barometer's height falls as the motors spin up."""
+    """Return a finding on whether the barometer's height falls as the motors spin up."""
     height = rows.get("baro")
     drive = next((n for n in ("throttle", "pwm", "motor") if n in rows), None)
     if height is None or drive is None:

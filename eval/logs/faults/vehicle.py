@@ -1,4 +1,4 @@
-"""Checks of a vehicle file for implausible numbers, and of a policy's camera."""
+"""Checks of a vehicle file for implausible parameters, and of a policy's camera."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from eval.vehicles.vehicle import Vehicle
 ARM_M = (0.012, 1.5)
 """Usual distance from the centre to a rotor [m]."""
 LIFT = (1.15, 20.0)
-"""Usual full thrust over weight."""
+"""Usual ratio of full thrust to weight."""
 ROUND = (0.015, 2.5)
-"""Usual inertia about x and y over mass times arm squared (mass at the centre or at the rotors)."""
+"""Usual inertia about x and y over mass times arm squared: small where the mass is near the centre,
+large where it is at the rotors or beyond."""
 FOV_DEG = 2.0
-"""Largest difference of fields of view of one camera [deg]."""
+"""Fields of view that differ by at most this belong to the same camera [deg]."""
 
 
 def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
-    """Return implausible combinations of numbers in the vehicle file."""
+    """Return findings on implausible parameters: arm length, full thrust over weight, inertia."""
     found = []
     hubs = np.asarray(vehicle.rotors.position)
     arm = float(np.mean(np.hypot(hubs[:, 0], hubs[:, 1])))
@@ -27,6 +28,7 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
         text = f"rotors are {arm:.3g} m from the middle; usual are {ARM_M[0]:g} to {ARM_M[1]:g}"
         fix = "rotors.position in m" + (": divide by 1000" if arm / 1000.0 >= ARM_M[0] else "")
         found.append(Finding("doubt", "vehicle", text, "vehicle_arms", arm, 0.97, fix))
+        # Positions in mm would make the inertia below implausible as well: one finding is enough.
         arm = arm / 1000.0 if arm > ARM_M[1] else arm
     lift = vehicle.full_thrust / GRAVITY
     if not LIFT[0] <= lift <= LIFT[1]:
@@ -47,7 +49,7 @@ def check_vehicle_numbers(vehicle: Vehicle) -> list[Finding]:
 
 
 def check_camera(policy_fov: tuple[float, float] | None, vehicle: Vehicle | None) -> list[Finding]:
-    """Return whether a policy's camera agrees with the vehicle's."""
+    """Return a finding on whether a policy's field of view agrees with the vehicle's camera."""
     if policy_fov is None or vehicle is None:
         return []
     here = vehicle.camera.fov_deg
