@@ -76,6 +76,7 @@ QUATERNION_TOLERANCE = 0.05
 DURATION_MIN = 1.0
 """Shorter flights are refused [s]."""
 
+# Column -> usual names of other programs, which a message proposes to rename.
 _OTHER_NAMES = {
     "time": ("t", "timestamp", "time_s", "stamp"),
     "cmd_thrust": ("thrust", "thrust_cmd", "c"),
@@ -104,7 +105,7 @@ class FlightLogError(ValueError):
 
 
 def quoted(error: Exception) -> str:
-    """Return what a reader says of a damaged file, whose bytes may stand in it, in one line."""
+    """Return a reader's error in one line, without unprintable bytes of the damaged file."""
     return f"{type(error).__name__}: {printable(str(error), keep='')}"
 
 
@@ -114,7 +115,7 @@ def check_columns(
     """Check `columns` (column name to values, one a row) by the rules of a flight log.
 
     Args:
-        columns: by name.
+        columns: column name -> values, one a row.
         name: the file, for messages.
         partial: accept a log without position, attitude, rates or commands.
         limits: refuse values that no flight has. Checks of a log read it without, to name the
@@ -214,7 +215,7 @@ def as_numbers(values: np.ndarray, column: str, name: str) -> np.ndarray:
     """Return the cells (N,) of a column as numbers, NaN where one is empty.
 
     Raises:
-        FlightLogError: where they are something else.
+        FlightLogError: where a cell is neither a number nor empty.
     """
     values = np.asarray(values)
     if values.ndim == 1 and values.dtype.kind in "fiub":

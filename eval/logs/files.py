@@ -29,7 +29,7 @@ MOST_CELLS = 100_000_000
 """Most cells of a flight log, rows times columns: all defined columns at `MOST_ROWS`."""
 PARQUET_MAGIC = b"PAR1"
 MOST_BEFORE = 500
-"""Most lines before a CSV's header."""
+"""Most lines of a CSV that are searched for its header."""
 OTHERS = {
     "FMT": "an ArduPilot text log, whose messages have columns of their own; export the messages "
     "that you need (ATT, IMU, RATE, RCOU, XKF1) as one table with a time, and describe it by --map",
@@ -98,7 +98,7 @@ def _read_parquet(path: Path) -> tuple[dict[str, np.ndarray], str | None, list[s
         # Texts stay dictionary-encoded: a long text in every row would not fit in memory.
         with pyarrow.parquet.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read(wanted)
-    except MemoryError:  # Arrow's own is one as well
+    except MemoryError:  # before Arrow's errors: one of them is a `MemoryError` as well
         raise
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         first = str(error).splitlines()[0]
@@ -238,9 +238,10 @@ def _csv_header(path: Path) -> tuple[list[str], int]:
 
 
 def _lines_before(lines: list[list[str]]) -> int:
-    """Return the header's line: names above two rows of equal width, most of them numbers.
+    """Return the number of lines before the header.
 
-    0 where the first line may be the header, so that errors refer to it.
+    A header is a line of names above two rows of the same width, most of them numbers. The result
+    is 0 where the first line may be the header, so that errors refer to it.
     """
     if len(lines) < 4 or len(lines[0]) == len(lines[1]) == len(lines[-2]):
         return 0
@@ -266,6 +267,7 @@ def _numbers(row: list[str]) -> float:
 
 
 def _arrays(table: pa.Table, path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a table as arrays; texts are arrays of objects."""
     columns: dict[str, np.ndarray] = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if name in columns:
@@ -285,7 +287,7 @@ def read_head(path: Path) -> bytes:
     """Return the first bytes of the file at `path`.
 
     Raises:
-        FlightLogError: where it cannot be read or is empty.
+        FlightLogError: where the file cannot be read or is empty.
     """
     try:
         check_file(path, LOG_BYTES)

@@ -16,21 +16,21 @@ class Flight(NamedTuple):
     """
 
     time_s: np.ndarray
-    """(T,) increasing, from 0 [s]."""
+    """(T,) increasing time, from 0 [s]."""
     pos_w: np.ndarray
-    """(T, 3) centre of mass [m]."""
+    """(T, 3) position of the centre of mass in the world [m]."""
     quat_wxyz: np.ndarray
-    """(T, 4) body to world."""
+    """(T, 4) attitude, quaternion from body to world."""
     vel_w: np.ndarray
-    """(T, 3) [m/s]."""
+    """(T, 3) velocity of the centre of mass in the world [m/s]."""
     rate_b: np.ndarray
-    """(T, 3) [rad/s]."""
+    """(T, 3) body rates [rad/s]."""
     thrust_cmd: np.ndarray
     """(T,) commanded collective thrust per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray
     """(T, 3) commanded body rates [rad/s]."""
     rotor_speed: np.ndarray
-    """(T, 4) in the vehicle file's order [rad/s]."""
+    """(T, 4) rotor speeds in the vehicle file's order [rad/s]."""
     action_b: np.ndarray
     """(T, 3) the policy's action in use, after the guard [m/s^2]."""
     policy_step: np.ndarray

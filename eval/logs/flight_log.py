@@ -41,27 +41,27 @@ class FlightLog:
     name: str
     """The file's path, or another name for messages."""
     time_s: np.ndarray
-    """(T,) increasing; sampling may jitter and rows may be missing [s]."""
+    """(T,) increasing time; sampling may jitter and rows may be missing [s]."""
     pos_w: np.ndarray
-    """(T, 3) centre of mass [m]."""
+    """(T, 3) position of the centre of mass in the world [m]."""
     quat_wxyz: np.ndarray
-    """(T, 4) body to world, unit norm."""
+    """(T, 4) attitude, quaternion of unit norm from body to world."""
     vel_w: np.ndarray
-    """(T, 3) centre of mass [m/s]."""
+    """(T, 3) velocity of the centre of mass in the world [m/s]."""
     rate_b: np.ndarray
-    """(T, 3) [rad/s]."""
+    """(T, 3) body rates [rad/s]."""
     thrust_cmd: np.ndarray | None = None
     """(T,) commanded collective thrust per nominal mass [m/s^2]."""
     rate_cmd_b: np.ndarray | None = None
     """(T, 3) commanded body rates [rad/s]; comes with `thrust_cmd`, unless `torque_cmd_b` does."""
     rotor_speed: np.ndarray | None = None
-    """(T, 4) measured, in the vehicle file's order [rad/s]."""
+    """(T, 4) measured rotor speeds, in the vehicle file's order [rad/s]."""
     rotor_speed_cmd: np.ndarray | None = None
-    """(T, 4) commanded [rad/s]."""
+    """(T, 4) commanded rotor speeds, in the same order [rad/s]."""
     acc_b: np.ndarray | None = None
     """(T, 3) specific force measured by an accelerometer [m/s^2]."""
     voltage: np.ndarray | None = None
-    """(T,) battery [V]."""
+    """(T,) voltage of the battery [V]."""
     torque_cmd_b: np.ndarray | None = None
     """(T, 3) commanded body torques [N m]; comes with `thrust_cmd`."""
     pwm: np.ndarray | None = None
@@ -156,6 +156,7 @@ class FlightLog:
         return np.stack(numbers, axis=1) if len(numbers) == len(names) else None
 
 
+# Group of columns (`columns.GROUPS`) -> field of `FlightLog`.
 _FIELDS = {
     "pos": "pos_w",
     "quat": "quat_wxyz",
@@ -293,7 +294,7 @@ def read_flights(
     """Read many flights; the warnings name files that cannot be used.
 
     Args:
-        paths: of the files.
+        paths: paths of the files.
         partial: accept partial logs as well.
         limits: as in `log_from_columns`.
 

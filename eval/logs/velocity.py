@@ -21,12 +21,12 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
     """Return the velocity at each row, (T, 3) [m/s].
 
     Args:
-        time_s: (T,) increasing [s].
-        pos_w: (T, 3) [m]; a row with a NaN gets the fit of its neighbours.
+        time_s: (T,) increasing time [s].
+        pos_w: (T, 3) position [m]; a row with a NaN gets the fit of its neighbours.
 
     Returns:
-        (T, 3); where fewer than four positions are near, the fit has a lower degree, and where
-        fewer than two are, NaN.
+        (T, 3) velocity. Where fewer than four positions are near, the fit has a lower degree;
+        where fewer than two are near, the velocity is NaN.
     """
     good = np.flatnonzero(np.isfinite(pos_w).all(axis=1))
     velocity = np.full(pos_w.shape, np.nan)
@@ -43,6 +43,7 @@ def velocity_from_position(time_s: np.ndarray, pos_w: np.ndarray) -> np.ndarray:
     right = np.zeros((4, len(time_s), 3))
     used = np.zeros(len(time_s))
     origin = pos[np.clip(nearest, 0, len(time) - 1)]  # keeps digits where positions are large
+    # Sums of the normal equations, in u = time from the row over `reach` (from -1 to 1).
     for offset in range(min(count, len(time))):
         k = first + offset
         u = (time[k] - time_s) / reach

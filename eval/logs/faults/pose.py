@@ -1,8 +1,9 @@
 """Checks of attitude and position: order, direction, frames, signs and the unit of length.
 
-All readings (ways to interpret the columns) are compared by two conditions. First, acceleration
-minus gravity is thrust, so it points along body z and upwards, except for drag. Second, the
-attitude turns at the gyro's rates, in any axes and unit of the gyro.
+A *reading* is one way to interpret the columns; the *given* reading is that of the log. Its
+*misfit* is the relative violation of two conditions; 0 is a perfect fit, 1 and more is none. First,
+acceleration minus gravity is thrust, so it points along body z and upwards, except for drag.
+Second, the attitude rotates at the gyro's rates, in any axes and unit of the gyro.
 """
 
 from __future__ import annotations
@@ -20,21 +21,23 @@ from eval.logs.faults.relation import Match, match, rms, smooth
 from eval.logs.velocity import velocity_from_position
 
 Rows = Mapping[str, np.ndarray]
+"""Name of a signal -> samples (T, C), and `time` -> (T,); NaN where unknown."""
 WIDTH_S, SPAN_S = 0.2, 0.06
 """Averaging time of all signals; time over which the attitude is differenced [s]."""
 POINTS = 400
-"""Most rows that are used."""
+"""The rows are thinned to about this number to compare readings."""
 CALM_RATE, CALM_ACC = 0.15, 0.5
 """Smallest usable body rates [rad/s] and accelerations [m/s^2], root mean square."""
 GOOD, BAD, TIMES_BETTER = 0.45, 0.6, 2.0
 """A reading is good below the first misfit and bad above the second. The evidence is overwhelming
 where a good reading's misfit is lower by the third factor."""
 RIGHT = 0.25
-"""Misfit below which no other reading is tried."""
+"""Misfit of the given reading below which no other reading is tried."""
 EACH = 0.06
 """Penalty on the misfit for each step of a reading, so that the simplest good one is chosen."""
 DRAG, BIAS = 1.2, 1.0
 """Largest drag [1/s] and constant side force [m/s^2] that are removed from a measured force."""
+# Steps of a reading of the attitude (see `reading`), "" for none: direction, frames, signs.
 _SENSES = ("", "inverse")
 _FRAMES = ("", "ned", "frd", "ned+frd")
 _ANGLES = ("-roll", "-pitch", "-yaw")
@@ -54,7 +57,7 @@ POSITIONS = (
     ("y,-x,z", "y,-x,z"),
     ("-x,-y,z", "-x,-y,z"),
 )
-"""Readings of a position, and their axes."""
+"""Readings of a position: the step, and the axes as text for `axes_matrix`."""
 LENGTHS = (1.0, 0.01, 0.001)
 """Possible units of a position [m]."""
 
@@ -63,35 +66,42 @@ class Reading(NamedTuple):
     """One way to interpret the attitude and the position."""
 
     quat: str
-    """Steps of `reading.read_as`, "" for unchanged."""
+    """Steps of `reading.read_as` for the attitude, "" for unchanged."""
     pos: str
+    """Axes of the position, such as `x,-y,-z`, "" for unchanged."""
     length: float
+    """Unit of the position [m]."""
     steps: int
-    """Number of changes."""
+    """Number of changes from the given reading."""
     misfit: float
-    """Of force and body rates together; 0 is a perfect fit, 1 and more is none."""
+    """Misfit of force and body rates together (root mean square of both)."""
     force: float | None
+    """Misfit of the force; None where the log has no position."""
     turns: float | None
+    """Misfit of the body rates; None where the log has no gyro."""
     gyro: Match | None
+    """Relation of the gyro to the body rates from the attitude."""
 
 
 class PoseFits(NamedTuple):
     """Result of the comparison of all readings of a pose."""
 
     given: Reading
+    """The reading of the log."""
     best: Reading
+    """The reading with the least misfit, with a penalty for each change."""
     second: float
-    """Misfit of the second best reading."""
+    """Misfit of the second best reading, with a penalty for changes that the best does not need."""
     rivals: tuple[Reading, ...]
-    """Other readings than the given one that fit about as well as the best."""
+    """Alternatives: readings other than the given and the best that fit about as well."""
     level: float
     """Horizontal acceleration or tilt times gravity, root mean square [m/s^2]."""
     rate: float
-    """Body rates of the gyro, root mean square [its unit]."""
+    """Body rates of the gyro, root mean square, in the gyro's unit."""
 
 
 def fit_pose_readings(rows: Rows) -> PoseFits | None:
-    """Return the fits of all readings; None where the rows have no attitude."""
+    """Return the misfits of all readings; None where the rows have no attitude."""
     if "quat" not in rows:
         return None
     time_s, quat = rows["time"], _unit(rows["quat"])
@@ -142,7 +152,7 @@ def _is_right(one: Reading) -> bool:
 
 
 def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
-    """Return the faults of attitude and position."""
+    """Return the findings on attitude and position."""
     if fits is None:
         return unseen("attitude", "the log has no attitude", *SHOWN) if "pos" in rows else []
     given, best = fits.given, fits.best
@@ -184,14 +194,14 @@ def check_pose(rows: Rows, fits: PoseFits | None) -> list[Finding]:
 
 
 def _same_fit(rivals: Sequence[Reading]) -> list[Finding]:
-    """Return the names of readings that fit as well, which the flight does not distinguish."""
+    """Return "not identifiable" findings for the faults of readings that fit as well."""
     words = {name: _words(one) for one in rivals for name, *_ in _names(one)}
     text = "it fits as well if {}"
     return [one for name, w in words.items() for one in unseen("attitude", text.format(w), name)]
 
 
 def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield (fault, signal, signals to correct) of a reading that differs from the given one."""
+    """Yield (fault, subject, signals to correct) for each change of a reading."""
     steps = set(best.quat.split("+")) - {""}
     pose, world = ("quat", "cmd_quat"), ("pos", "vel")
     if steps:
@@ -212,6 +222,7 @@ def _names(best: Reading) -> Iterator[tuple[str, str, tuple[str, ...]]]:
 
 
 def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
+    """Return (signal, steps) of a reading, for options of `suite import`."""
     found = [(name, best.quat) for name in ("quat", "cmd_quat") if best.quat and name in rows]
     steps = [best.pos] if best.pos else []
     steps += [f"{best.length:g}"] if best.length != 1.0 else []
@@ -221,6 +232,7 @@ def _readings(best: Reading, rows: Rows) -> list[tuple[str, str]]:
 
 
 def _words(best: Reading) -> str:
+    """Return the changes of a reading in words."""
     words = {
         "xyzw": "the quaternion is xyzw",
         "wxyz": "the quaternion is wxyz",
@@ -240,6 +252,7 @@ def _words(best: Reading) -> str:
 
 
 def _figures(one: Reading) -> str:
+    """Return the misfits of a reading in words."""
     parts = []
     if one.force is not None:
         parts.append(f"the force off body z is {100 * one.force:.0f} % of the acceleration")
@@ -249,11 +262,13 @@ def _figures(one: Reading) -> str:
 
 
 def _bases() -> Iterator[str]:
+    """Yield the attitude's readings without frames, which do not change the size of a rotation."""
     yield from ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES)
     yield from _ANGLES
 
 
 def _attitudes() -> Iterator[str]:
+    """Yield all readings of the attitude, the given one ("") first."""
     for base in ("+".join(s for s in (o, i) if s) for o in ("", *ORDERS) for i in _SENSES):
         for frames in _FRAMES:
             yield "+".join(s for s in (base, frames) if s)
@@ -272,13 +287,13 @@ def _unit(quat: np.ndarray) -> np.ndarray:
 def turns_of(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """Return the body rates (T, 3) from the attitude, over `SPAN_S` around each row [rad/s]."""
     count = max(1, round(0.5 * SPAN_S / float(np.median(np.diff(time_s)))))
-    out = np.full((len(time_s), 3), np.nan)
+    rates = np.full((len(time_s), 3), np.nan)
     if len(time_s) > 2 * count:
         step = (time_s[2 * count :] - time_s[: -2 * count])[:, None]
         relative = multiply(conjugate(quat[: -2 * count]), quat[2 * count :])
-        whole = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
-        out[count:-count] = np.where(whole, rotation_vector(relative) / step, np.nan)
-    return out
+        no_row_missing = step < 1.5 * (2 * count) * float(np.median(np.diff(time_s)))
+        rates[count:-count] = np.where(no_row_missing, rotation_vector(relative) / step, np.nan)
+    return rates
 
 
 def _turns(time_s: np.ndarray, quat: np.ndarray) -> np.ndarray:
@@ -292,18 +307,19 @@ def _gyro_match(turns: np.ndarray, gyro: np.ndarray, frd: bool) -> Match:
 def _misfit_of(seen: Match) -> float:
     """Return the share of the attitude's body rates that the gyro's best axes do not explain."""
     weight = seen.level**2
-    left = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
-    return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))
+    unexplained = weight * (1.0 - np.clip(seen.alike, 0.0, 1.0) ** 2)
+    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _axes_of(time_s: np.ndarray, quat: np.ndarray, every: int) -> np.ndarray:
-    """Return the body's axes in the world, averaged, (N, 3, 3): [:, :, k] is axis k."""
+    """Return the averaged body axes in the world (N, 3, 3); `[:, :, k]` is body axis k."""
     columns = [rotate(quat, np.eye(3)[k]) for k in range(3)]
     flat = smooth(time_s, np.concatenate(columns, axis=1), WIDTH_S)[::every]
     return np.moveaxis(flat.reshape(-1, 3, 3), 1, 2)
 
 
 def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the averaged velocity and acceleration (N, 3) of a position, at every n-th row."""
     vel = velocity_from_position(time_s, pos)
     acc = velocity_from_position(time_s, vel)
     return smooth(time_s, vel, WIDTH_S)[::every], smooth(time_s, acc, WIDTH_S)[::every]
@@ -312,33 +328,34 @@ def _path(time_s: np.ndarray, pos: np.ndarray, every: int) -> tuple[np.ndarray, 
 def _force_misfit(
     axes: np.ndarray, path: tuple[np.ndarray, np.ndarray], change: np.ndarray
 ) -> tuple[float, float]:
-    """Return the share of the force that is not along body z, drag removed.
+    """Return the misfit of the force: the share that is not along body z, without drag.
 
     Args:
-        axes: (N, 3, 3) of the body in the world.
+        axes: (N, 3, 3) body axes in the world.
         path: velocity and acceleration (N, 3) in the given reading.
-        change: (3, 3) from these to the reading's axes and unit.
+        change: (3, 3) matrix from the given reading to the reading's axes and unit.
 
     Returns:
-        The share, and the level to which it refers [m/s^2].
+        The misfit, and the level to which it is relative: the larger of horizontal acceleration
+        and tilt times gravity [m/s^2].
     """
     vel, acc = path[0] @ change.T, path[1] @ change.T
     good = np.isfinite(axes).all(axis=(1, 2)) & np.isfinite(acc).all(axis=1)
     if good.sum() < 20:
         return 0.0, 0.0
     axes, vel, acc = axes[good], vel[good], acc[good]
-    fast = np.linalg.norm(acc, axis=1)
-    usual = fast <= 4.0 * np.median(fast) + 1.0
+    acc_size = np.linalg.norm(acc, axis=1)
+    usual = acc_size <= 4.0 * np.median(acc_size) + 1.0
     axes, vel, acc = axes[usual], vel[usual], acc[usual]
     force = np.einsum("nik,ni->nk", axes, acc + [0.0, 0.0, GRAVITY])
-    wind = np.einsum("nik,ni->nk", axes, vel)
-    left = force.copy()
-    left[:, 2] = np.minimum(force[:, 2], 0.0)  # thrust only pushes
+    vel_b = np.einsum("nik,ni->nk", axes, vel)
+    residual = force.copy()
+    residual[:, 2] = np.minimum(force[:, 2], 0.0)  # thrust only pushes
     for k in range(2):
-        speed = wind[:, k] - wind[:, k].mean()
+        speed = vel_b[:, k] - vel_b[:, k].mean()
         slope = float(speed @ force[:, k]) / max(float(speed @ speed), 1e-9)
-        left[:, k] -= np.clip(slope, -DRAG, 0.0) * speed
-        left[:, k] -= np.clip(left[:, k].mean(), -BIAS, BIAS)
+        residual[:, k] -= np.clip(slope, -DRAG, 0.0) * speed
+        residual[:, k] -= np.clip(residual[:, k].mean(), -BIAS, BIAS)
     tilt = GRAVITY * axes[:, :2, 2]
     level = float(np.sqrt(max(rms(acc[:, :2]) ** 2, rms(tilt - tilt.mean(axis=0)) ** 2)))
-    return rms(left) / max(level, CALM_ACC), level
+    return rms(residual) / max(level, CALM_ACC), level

@@ -1,4 +1,8 @@
-"""Checks of gyro, velocity and accelerometer against the pose: axes, signs, frames and units."""
+"""Checks of gyro, velocity and accelerometer against the pose: axes, signs, frames and units.
+
+The *path* is the logged position over time; its derivatives are the reference for velocity and
+accelerometer. The rotations of the attitude are the reference for the gyro.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +29,11 @@ RATES = {
     "rad/s, read as deg/s": DEG,
     "mrad/s": 1000.0,
 }
-"""Unit -> factor by which its numbers are too large."""
+"""Wrong unit of the gyro -> factor by which its values are then too large."""
 GYRO_TOP = 75.0
 """Largest body rate that a gyro of a drone measures: a range of 4000 deg/s [rad/s]."""
 SPEEDS = {"cm/s": 100.0, "mm/s": 1000.0, "km/h": 3.6, "knots": 1.0 / 0.514444}
+"""Wrong unit of the velocity -> factor by which its values are then too large."""
 FORCES = {
     "g": 1.0 / GRAVITY,
     "mg": 1000.0 / GRAVITY,
@@ -36,29 +41,33 @@ FORCES = {
     "m/s^2, taken for raw counts of 2048 per g": GRAVITY / 2048.0,
     "g, taken for raw counts of 2048 per g": 1.0 / 2048.0,
 } | {f"raw counts of {per_g} per g": per_g / GRAVITY for per_g in (512, 2048, 4096, 8192, 16384)}
+"""Wrong unit of the accelerometer -> factor by which its values are then too large."""
 NEAR = 1.06
-"""Factor around a unit's scale within which a scale counts as that unit."""
+"""A scale within this factor of a unit's factor is explained by that unit."""
 SAME = 1.1
-"""Factor around 1 within which a scale is correct."""
+"""A scale within this factor of 1 is correct."""
 FAR = 1.15
-"""Factor around 1 within which a scale is only a note: attitude filters cause as much."""
+"""A scale within this factor of 1 is no fault but a note: attitude filters cause as much."""
 SLOW = 1.25
-"""The same for a velocity, whose filters change it more."""
+"""The same as `SAME` for a velocity, whose filters change it more."""
 CALM_SPEED = 0.3
 """Smallest usable speed, root mean square [m/s]."""
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
+"""Relative residuals: a signal fits below the first and does not fit above the second. Another
+reading must lower the residual by the third factor."""
 SIMPLER = 0.03
-"""Advantage of the first choices among readings of an accelerometer, as a relative residual."""
+"""Penalty on the relative residual of an accelerometer's unusual readings, so that the usual ones
+are chosen where both fit."""
 OK = 0.3
-"""Largest relative error of a correct signal."""
+"""Largest relative residual of a correct signal."""
 UPWARDS = 0.5
-"""Least share of an accelerometer's median that is along body z, as thrust is."""
+"""Least share of an accelerometer's median that must be along body z, the direction of thrust."""
 APART = 0.5
 """Least relative difference of two frames at which they are distinguishable."""
 
 
 def check_gyro(rows: Rows) -> list[Finding]:
-    """Return the faults of the gyro's axes, frame and unit, compared with the attitude's rates."""
+    """Return the findings on the gyro's axes, frame and unit, by the body rates of the attitude."""
     if "rate" not in rows:
         return []
     if "quat" not in rows:
@@ -100,7 +109,10 @@ def check_gyro(rows: Rows) -> list[Finding]:
 
 
 def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
-    """Return a gyro's scale where no attitude shows it: rates that no vehicle has are a fault."""
+    """Return the finding on the gyro's scale without an attitude to compare it with.
+
+    Rates that no vehicle reaches are a fault; others are not identifiable for the reason `why`.
+    """
     size = np.linalg.norm(rows["rate"], axis=1)
     known = size[np.isfinite(size)]
     top = float(np.quantile(known, 0.99)) if len(known) else 0.0
@@ -119,6 +131,7 @@ def _gyro_scale_alone(rows: Rows, why: str) -> list[Finding]:
 
 
 def _turned(found: Match, signal: str, subject: str) -> Finding:
+    """Return the finding for a signal whose axes are swapped or inverted."""
     alike = ", ".join(
         f"{axis} {value:+.2f}" for axis, value in zip("xyz", found.as_given, strict=True)
     )
@@ -131,7 +144,7 @@ def _turned(found: Match, signal: str, subject: str) -> Finding:
 
 
 def _unseen_axes(found: Match, subject: str, *faults: str) -> list[Finding]:
-    """Return findings for axes without motion of their own, which cannot be checked."""
+    """Return findings for axes that cannot be checked: with too little motion, or in proportion."""
     axes = " and ".join(axis for axis, seen in zip("xyz", found.seen, strict=True) if not seen)
     text = f"along {axes} there is too little to check its sign by"
     findings = unseen(subject, text, *faults) if axes else []
@@ -148,7 +161,10 @@ def _unit(
     of: str,
     same: float = SAME,
 ) -> list[Finding]:
-    """Return the finding for a scale: a wrong unit, another factor, or correct."""
+    """Return the findings on a signal's scale: correct, a wrong unit, or an unknown factor.
+
+    `of` names the reference in words; a scale within the factor `same` of 1 is correct.
+    """
     scale, low, high = pooled_scale(found)
     figures = f"it is {scale:.3g} times {of} ({low:.3g} to {high:.3g})"
     if not np.isfinite(scale) or low < 1.0 < high or 1.0 / same < scale < same:
@@ -156,10 +172,10 @@ def _unit(
     if low / max(FAR, same) < 1.0 < high * max(FAR, same):
         text = f"{figures}: filters of the log may cause as much"
         return [Finding("note", subject, text), *unseen(subject, text, fault)]
-    off = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
-    words, *others = sorted(off, key=lambda name: off[name])
-    if low / NEAR < units[words] < high * NEAR and off[words] < np.log(1.3):
-        clear = off[words] < 0.5 * min((off[name] for name in others), default=np.inf)
+    distance = {words: abs(np.log(scale / factor)) for words, factor in units.items()}
+    words, *others = sorted(distance, key=lambda name: distance[name])
+    if low / NEAR < units[words] < high * NEAR and distance[words] < np.log(1.3):
+        clear = distance[words] < 0.5 * min((distance[name] for name in others), default=np.inf)
         fix = option((signal, f"{1.0 / units[words]:.10g}"))
         status, sure = ("corrected", 0.99) if clear else ("doubt", 0.9)
         return [Finding(status, subject, f"{figures}: {words}", fault, scale, sure, fix)]
@@ -170,7 +186,7 @@ def _unit(
 
 
 def check_velocity(rows: Rows) -> list[Finding]:
-    """Return the faults of the velocity's frame and unit, compared with the path's derivative."""
+    """Return the findings on the velocity's frame and unit, by the path's derivative."""
     if "vel" not in rows or "pos" not in rows:
         return []
     time_s = rows["time"]
@@ -181,45 +197,51 @@ def check_velocity(rows: Rows) -> list[Finding]:
         return unseen("velocity", text, "velocity_frame", "velocity_unit")
     quat = rows.get("quat")
     ways = ["", "from-body", "x,-y,-z+from-body", "from-world"] if quat is not None else [""]
-    found = {}
+    matches = {}
     for way in ways:
         value = read_as("vel", rows["vel"], way, lambda: rows["quat"]) if way else rows["vel"]
-        found[way] = match(path, smooth(time_s, value, WIDTH_S))
-    left = {way: _left(one) for way, one in found.items()}
-    best = min(left, key=lambda way: left[way])
-    here = found[""]
-    figures = f"it is off the path's derivative by {100 * left['']:.0f} %, its scale left out"
-    if best and left[best] < GOOD and left[""] > TIMES_BETTER * left[best] and left[""] > 0.3:
+        matches[way] = match(path, smooth(time_s, value, WIDTH_S))
+    residual = {way: _left(matched) for way, matched in matches.items()}
+    best = min(residual, key=lambda way: residual[way])
+    here = matches[""]
+    figures = f"it is off the path's derivative by {100 * residual['']:.0f} %, its scale left out"
+    if (
+        best
+        and residual[best] < GOOD
+        and residual[""] > TIMES_BETTER * residual[best]
+        and residual[""] > 0.3
+    ):
         words = {
             "from-body": "in body axes",
             "x,-y,-z+from-body": "in forward-right-down body axes",
             "from-world": "in world axes already, and was turned by the attitude",
         }[best]
-        text = f"{figures}, but by {100 * left[best]:.0f} % if it is {words}"
+        text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {words}"
         findings = [Finding("corrected", "velocity", text, "velocity_frame", None, 0.98,
                             option(("vel", best)))]  # fmt: skip
-        here = found[best]
+        here = matches[best]
     elif here.is_turned or here.is_mirrored:
         findings = [_turned(here, "vel", "velocity")._replace(fault="velocity_frame")]
-    elif left[""] > BAD:
+    elif residual[""] > BAD:
         text = f"{figures}, and no other frame of it fits"
-        sure = 0.9 if left[""] > 0.9 else 0.6
-        return [Finding("doubt", "velocity", text, "velocity_frame", left[""], sure)]
+        sure = 0.9 if residual[""] > 0.9 else 0.6
+        return [Finding("doubt", "velocity", text, "velocity_frame", residual[""], sure)]
     else:
-        findings = [Finding("note" if left[""] > OK else "ok", "velocity", figures)]
+        findings = [Finding("note" if residual[""] > OK else "ok", "velocity", figures)]
         apart = 1.0 if quat is None else rms(rotate(quat, path) - path) / speed
         if apart < APART:
             text = f"body and world axes are {100 * apart:.0f} % of it apart only"
             findings.append(Finding("not identifiable", "velocity", text, "velocity_frame"))
         findings += _unseen_axes(here, "velocity", "velocity_frame")
     unit = _unit(here, SPEEDS, "vel", "velocity", "velocity_unit", "the path's derivative", SLOW)
-    return findings + [one for one in unit if one.status != "ok"]
+    return findings + [matched for matched in unit if matched.status != "ok"]
 
 
 def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
-    """Return the faults of the accelerometer, compared with the path's acceleration.
+    """Return the findings on the accelerometer, by the path's acceleration.
 
-    Without a path only its unit is checked: in flight it reads about one g.
+    Without a path only its unit and direction are checked: in flight it measures about one g,
+    upwards.
 
     Args:
         rows: see `check.run_checks`.
@@ -235,6 +257,7 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     quat, acc = rows["quat"], rows["acc"]
     down = rotate(conjugate(quat), np.array([0.0, 0.0, GRAVITY]))
     force = smooth(time_s, rotate(conjugate(quat), acc_w) + down, WIDTH_S)
+    # Every combination of axes, frame and unit that a mistake could have made.
     ratio = _middle(smooth(time_s, acc, WIDTH_S)) / max(_middle(force), 1e-9)
     unit, factor = _unit_of(ratio, 1.2)
     readings = {
@@ -286,7 +309,10 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
 
 
 def _unit_of(ratio: float, within: float) -> tuple[str, float]:
-    """Return unit and factor of an accelerometer that reads `ratio` times the force."""
+    """Return unit and factor of an accelerometer that measures `ratio` times the force.
+
+    The unit is m/s^2 where no unit's factor is within the ratio `within` of `ratio`.
+    """
     units = {"m/s^2": 1.0, **FORCES}
     unit = min(units, key=lambda name: abs(np.log(max(ratio, 1e-9) / units[name])))
     near = abs(np.log(max(ratio, 1e-9) / units[unit])) < np.log(within)
@@ -294,7 +320,10 @@ def _unit_of(ratio: float, within: float) -> tuple[str, float]:
 
 
 def _unit_alone(rows: Rows) -> list[Finding]:
-    """Return unit and direction of an accelerometer without a path: thrust is one g, upwards."""
+    """Return the finding on the accelerometer's unit and direction without a path.
+
+    The usual specific force in flight is that of thrust: about one g, upwards.
+    """
     acc = smooth(rows["time"], rows["acc"], WIDTH_S)
     ratio = _middle(acc) / GRAVITY
     figures = f"half of the flight it reads below {GRAVITY * ratio:.3g} m/s^2"
@@ -316,25 +345,27 @@ def _unit_alone(rows: Rows) -> list[Finding]:
 
 
 def upwards(acc: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return an accelerometer's median (3,), and its share along body z: 1 if it is upwards."""
+    """Return the accelerometer's median (3,), and the cosine between it and body z (1: upwards)."""
     known = acc[np.isfinite(acc).all(axis=1)]
     mean = np.median(known, axis=0) if len(known) else np.array([0.0, 0.0, 1.0])
     return mean, float(mean[2]) / max(float(np.linalg.norm(mean)), 1e-9)
 
 
 def _sideways(acc: np.ndarray, force: np.ndarray) -> str:
+    """Return the accelerometer's error along body x and y as text."""
     off = rms((acc - force)[:, :2])
     return f" ({off:.2g} m/s^2 sideways)"
 
 
 def _left(found: Match) -> float:
-    """Return the relative residual in the given axes, for the best scale."""
+    """Return the relative residual of a signal in the axes as given, after its scale is fitted."""
     weight = found.level**2
-    left = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
-    return float(np.sqrt(left.sum() / max(weight.sum(), 1e-12)))
+    unexplained = weight * (1.0 - np.clip(found.as_given, 0.0, 1.0) ** 2)
+    return float(np.sqrt(unexplained.sum() / max(weight.sum(), 1e-12)))
 
 
 def _middle(value: np.ndarray) -> float:
+    """Return the median length of the vectors `value` (N, 3)."""
     size = np.linalg.norm(value, axis=1)
     known = size[np.isfinite(size)]
     return float(np.median(known)) if len(known) else 0.0
