@@ -100,7 +100,7 @@ def check_thrust_command(rows: Rows, vehicle: Vehicle | None = None) -> list[Fin
     units = {"in m/s^2": 1.0, "in multiples of gravity (g)": 1.0 / GRAVITY}
     if vehicle is not None:
         units["in newtons"] = vehicle.mass
-    # Units that explain the ratio. Newtons and m/s^2 are ambiguous for a mass possible_units 1 kg.
+    # Units that explain the ratio. Newtons and m/s^2 are ambiguous for a mass near 1 kg.
     possible_units = within(units, THRUST_FITS, ratio)
     nearest_unit = min(possible_units, key=lambda n: abs(np.log(ratio / units[n])), default="")
     surely_not_m_s2 = abs(np.log(ratio)) > np.log(THRUST_SAME)
