@@ -69,10 +69,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     # 1. Every preset at its usual size, on all tracks and levels.
     vehicle, presets, models = load_vehicle(config.vehicle), *select_sensor_sets(config.only)
     policies = judging.named_policies(config.policy)
-    trials, sweep_config = (
-        judging.judged_trials(config),
-        replace(config, trials=config.growing_trials),
-    )
+    trials = judging.judged_trials(config)
     base = Condition("perfect", 0.0, "", vehicle)
     preset_conditions = [
         Condition(name, 1.0, "", vehicle, sensors) for name, sensors in presets.items()
@@ -82,6 +79,7 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
     )
 
     # 2. Presets and single models at several magnitudes, on level 3.
+    sweep_config = replace(config, trials=config.growing_trials)
     sweep_trials = judging.judged_trials(sweep_config, [3])
 
     def fly_sweeps(
@@ -90,9 +88,10 @@ def document(config: Config, workspace: Workspace, console: Console) -> PageCont
         """Return the results of each of `sets` at each of `magnitudes`."""
         sweeps = magnitude_sweeps(sets, magnitudes)
         conditions = {sweep: sweep_conditions(vehicle, sweep) for sweep in sweeps}
-        return disturbed.fly_conditions([], conditions, policies, sweep_trials, workspace, console)[
-            1
-        ]
+        _, results = disturbed.fly_conditions(
+            [], conditions, policies, sweep_trials, workspace, console
+        )
+        return results
 
     first_policy = dict([next(iter(policies.items()))])
     preset_sweeps = fly_sweeps(presets, PRESET_MAGNITUDES, policies)
