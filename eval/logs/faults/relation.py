@@ -139,6 +139,13 @@ def smooth(time_s: np.ndarray, value: np.ndarray, width_s: float) -> np.ndarray:
     return np.where(enough, (sums[stop] - sums[first]) / np.maximum(inside, 1), np.nan)
 
 
+def shift_rows(values: np.ndarray, count: int) -> np.ndarray:
+    """Return `values` (T, C) moved to `count` rows later; NaN before the first."""
+    moved = np.full_like(values, np.nan)
+    moved[count:] = values[: len(values) - count]
+    return moved
+
+
 def rms(value: np.ndarray) -> float:
     """Return the root mean square of the smallest 95 % of rows, so that glitches do not count."""
     squared = np.sum(np.atleast_2d(value.T).T ** 2, axis=1)

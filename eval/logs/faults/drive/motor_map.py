@@ -21,7 +21,7 @@ import numpy as np
 from eval.logs.faults.drive.motors import FITS, force_without_drag
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import WIDTH_S, Rows
-from eval.logs.faults.relation import jackknife_error, smooth
+from eval.logs.faults.relation import jackknife_error, shift_rows, smooth
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_thrust
 
 LATE_S, STEP_S = 0.16, 0.01
@@ -118,8 +118,12 @@ def _check(rows: Rows, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
     if ratio is None:
         text = "too few commands between the limits, or the thrust does not follow them"
         return unseen(drive.subject, text, drive.fault, "battery_scaling")
+    findings = _findings(ratio, drive, vehicle)
+    if not any(finding.status == "doubt" for finding in findings):
+        return findings
+    # One fix repairs size, curve and battery together. It is only computed where it is needed.
     fix = _fix(rows["time"], drive, measured, volts, ratio, vehicle)
-    return _findings(ratio, drive, vehicle, fix)
+    return [f._replace(fix=fix) if f.status == "doubt" else f for f in findings]
 
 
 def _drives(rows: Rows, vehicle: Vehicle | None) -> Iterator[Drive]:
@@ -157,7 +161,7 @@ def _ratio(
     # Logarithms of the file's thrust (moved by the delay), the measured thrust and the voltage.
     log_wanted, log_thrust = np.log(wanted), np.log(thrust)
     late = _delay_rows(time_s, log_wanted, log_thrust)
-    log_wanted = _shifted(log_wanted, late)
+    log_wanted = shift_rows(log_wanted, late)
     log_volts = np.zeros(len(time_s)) if volts is None else np.log(np.maximum(volts, 0.1))
     log_volts = np.broadcast_to(log_volts[:, None], log_wanted.shape)
     block = np.broadcast_to(((np.arange(len(time_s)) * BLOCKS) // len(time_s))[:, None],
@@ -196,8 +200,8 @@ def _ratio(
                  _exponent(drive.motors, middle), low, high, span, late)  # fmt: skip
 
 
-def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> list[Finding]:
-    """Return the findings on size, curve and battery, which share the text `fix`."""
+def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None) -> list[Finding]:
+    """Return the findings on size, curve and battery, without their fix."""
     findings = []
     true, error = ratio.exponent * (1.0 + ratio.curve), ratio.exponent * ratio.curve_error
     figures = (
@@ -208,7 +212,7 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> 
         why = "too uncertain" if ratio.span >= SPAN else "the commands hardly change"
         findings += unseen(drive.subject, f"{figures}: {why}", drive.fault)
     elif abs(ratio.curve) > max(CURVE, SURE * ratio.curve_error):
-        about = (drive.fault, true, 0.95, fix)
+        about = (drive.fault, true, 0.95)
         text = f"{figures}: the curve or its linearisation is another"
         findings.append(Finding("doubt", drive.subject, text, *about))
     had = 0.0 if drive.motors is None else drive.motors.voltage_exponent
@@ -222,7 +226,7 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> 
         text = f"{figures_of_battery}: too uncertain" if known else "no voltage that changes"
         findings += unseen(drive.subject, text, "battery_scaling")
     elif abs(ratio.battery) > max(BATTERY, SURE * ratio.battery_error):
-        about = ("battery_scaling", per_volt, 0.95, fix)
+        about = ("battery_scaling", per_volt, 0.95)
         text = f"{figures_of_battery}: the battery is taken into account twice, or not at all"
         findings.append(Finding("doubt", drive.subject, text, *about))
     if vehicle is None:
@@ -234,7 +238,7 @@ def _findings(ratio: Ratio, drive: Drive, vehicle: Vehicle | None, fix: str) -> 
     if not 1.0 / reach < times < reach and not any(f.status == "doubt" for f in findings):
         text = f"the file gives {times:.3g} times the measured thrust"
         text += "" if drive.name == "pwm" else ", or its mass is wrong"
-        findings.append(Finding("doubt", drive.subject, text, drive.fault, times, 0.93, fix))
+        findings.append(Finding("doubt", drive.subject, text, drive.fault, times, 0.93))
     if any(f.status != "not identifiable" for f in findings):
         return findings
     return [*findings, Finding("ok", drive.subject, figures)]
@@ -260,7 +264,7 @@ def _fix(
         true_exponent = exponent + ratio.battery / max(ratio.exponent * (1.0 + ratio.curve), 0.5)
         exponent = round(float(np.clip(true_exponent, 0.0, 4.0)), 2)
     thrust_of_terms = [
-        _shifted(_averaged(time_s, drive, drive.thrust(motors, volts), measured), ratio.late)
+        shift_rows(_averaged(time_s, drive, drive.thrust(motors, volts), measured), ratio.late)
         for motors in (MotorMap(t, voltage, exponent) for t in ((1.0, 0.0), (0.0, 1.0)))
     ]
     columns = np.stack([term.ravel() for term in thrust_of_terms], axis=1)
@@ -287,7 +291,7 @@ def _delay_rows(time_s: np.ndarray, wanted: np.ndarray, thrust: np.ndarray) -> i
     trials = dict.fromkeys(round(late / step) for late in np.arange(0.0, LATE_S, STEP_S))
 
     def alike(count: int) -> float:
-        moved = _shifted(wanted, count)
+        moved = shift_rows(wanted, count)
         good = np.isfinite(moved) & np.isfinite(thrust)
         return _correlation(moved[good], thrust[good])
 
@@ -299,13 +303,6 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     if len(a) < LEAST_ROWS or not np.std(a) * np.std(b) > 1e-12:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])
-
-
-def _shifted(values: np.ndarray, count: int) -> np.ndarray:
-    """Return `values` (T, C) moved to `count` rows later; NaN before the first."""
-    moved = np.full_like(values, np.nan)
-    moved[count:] = values[: len(values) - count]
-    return moved
 
 
 def _averaged(

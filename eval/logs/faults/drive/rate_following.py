@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S
-from eval.logs.faults.relation import smooth
+from eval.logs.faults.relation import shift_rows, smooth
 
 REACH_S, STEP_S = 0.3, 0.01
 """Largest delay that is tried, and the step between trials [s]."""
@@ -38,8 +38,7 @@ def delayed(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> tuple[
     best, delay, best_command = -1.0, 0.0, value
     for late in np.arange(0.0, REACH_S + 1e-9, max(STEP_S, step)):
         count = round(late / step)
-        moved = np.full_like(value, np.nan)
-        moved[count:] = value[: len(value) - count]
+        moved = shift_rows(value, count)
         both = np.isfinite(moved).all(axis=1) & np.isfinite(rate).all(axis=1)
         if both.sum() < 30:
             break
@@ -68,18 +67,14 @@ def bend(time_s: np.ndarray, command: np.ndarray, rate: np.ndarray) -> float:
         np.column_stack([np.interp(time_s + shift, time_s, c) for c in command.T])
         for shift in (-STEADY_S, STEADY_S)
     )
-    steady, middle = (
-        np.abs(command_after - command_before) < 0.3 * np.abs(command),
-        len(time_s) // 2,
-    )
+    steady = np.abs(command_after - command_before) < 0.3 * np.abs(command)
+    middle = len(time_s) // 2
     limits = np.quantile(np.abs(command), 0.9, axis=0)
     bends = []
     for axis in np.flatnonzero(limits > 3.0 * CALM_RATE):
         for half_rows in (slice(None, middle), slice(middle, None)):
-            c, r = (
-                command[half_rows, axis][steady[half_rows, axis]],
-                rate[half_rows, axis][steady[half_rows, axis]],
-            )
+            used = steady[half_rows, axis]
+            c, r = command[half_rows, axis][used], rate[half_rows, axis][used]
             share = np.abs(c) / limits[axis]
             large, small = share > 0.6, (share > 0.15) & (share < 0.4)
             if min(large.sum(), small.sum()) < 30:
