@@ -250,10 +250,8 @@ def over_seeds(
             / (seed_count * trial_count)
         )
         variance += seed_variance - noise_variance
-        variances, part_degrees = (
-            [*variances, seed_variance, noise_variance],
-            [*part_degrees, seed_count - 1.0, (seed_count - 1.0) * (trial_count - 1.0)],
-        )
+        variances = [*variances, seed_variance, noise_variance]
+        part_degrees = [*part_degrees, seed_count - 1.0, (seed_count - 1.0) * (trial_count - 1.0)]
         seeds = rng.multinomial(seed_count, np.full(seed_count, 1 / seed_count), draws) / seed_count
         resampled += sign * np.einsum("ds,st,dt->d", seeds, group, trials, optimize=True)
     largest = max(variance, max(variances))

@@ -132,10 +132,8 @@ def fly_trial(
             )
             action_b = guarded.action_b[:1]
             outputs.add(Guarded(*(part[:1] for part in guarded)), state.astype(np.float32))
-            bad_count, limited_count = (
-                bad_count + int(guarded.bad[0]),
-                limited_count + int(guarded.limited[0]),
-            )
+            bad_count += int(guarded.bad[0])
+            limited_count += int(guarded.limited[0])
             decisions += 1
             if guarded.late[0]:
                 ended_by, late_count = "timeout", 1

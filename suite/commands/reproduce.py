@@ -110,10 +110,8 @@ def _make_page(config: Any, console: Console) -> dict[str, Any]:
 
     workers = read_workers_option(config.workers, whole_cores=True)
     check(config.experiment)
-    workspace, module = (
-        Workspace(config.out, config.cache, workers),
-        type(config.experiment).__module__,
-    )
+    workspace = Workspace(config.out, config.cache, workers)
+    module = type(config.experiment).__module__
     name, document = module.rpartition(".")[2], importlib.import_module(module).document
     check_page(workspace.out, name)
     contents = document(config.experiment, workspace, console)

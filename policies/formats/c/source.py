@@ -91,11 +91,8 @@ def work_sizes(spec: PolicySpec) -> tuple[int, int, int]:
     rows, columns = spec.camera.height // 4, spec.camera.width // 4
     first = rows * columns * spec.channels[0]
     second = (rows - 2) * (columns - 2) * spec.channels[1]
-    third, hidden_padded, gates = (
-        flat_features(spec),
-        padded(spec.hidden_size),
-        padded(3 * spec.hidden_size),
-    )
+    third = flat_features(spec)
+    hidden_padded, gates = padded(spec.hidden_size), padded(3 * spec.hidden_size)
     return (
         max(first, third, gates),
         max(4 * rows * columns, second, hidden_padded),

@@ -142,10 +142,8 @@ def permutation_test(
         if not places:
             return total
         for (fit_hessian, test_hessian), (fit_part, test_part) in zip(hessians, drawn, strict=True):
-            fit_hessian, test_hessian = (
-                fit_hessian[np.ix_(places, places)],
-                test_hessian[np.ix_(places, places)],
-            )
+            chosen = np.ix_(places, places)
+            fit_hessian, test_hessian = fit_hessian[chosen], test_hessian[chosen]
             damping = 1e-9 * np.diag(np.diag(fit_hessian)) + 1e-30 * np.eye(len(places))
             change = np.linalg.solve(fit_hessian + damping, fit_part[:, places].T).T
             slope = test_part[:, places]

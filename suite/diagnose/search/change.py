@@ -315,10 +315,8 @@ def _error_falls(
     falls, total = [], 0.0
     for place, number in enumerate(np.unique(inside.flight)):
         rows = inside.flight == number
-        slope, by_others = (
-            inside.slope[rows][..., indices],
-            np.delete(after, place, axis=0).mean(axis=0),
-        )
+        slope = inside.slope[rows][..., indices]
+        by_others = np.delete(after, place, axis=0).mean(axis=0)
         errors = [
             float((((inside.residual[rows] - slope @ change) / scatter) ** 2).sum())
             for change in (before, by_others)
