@@ -3,6 +3,7 @@
 import gc
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -68,10 +69,19 @@ def folder_of(path: Path) -> str:
     return max(inside, key=len, default=folder)
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run a folder's tests in one process (`--dist loadgroup`), the longest folders first."""
+    """Run the folders that take longest first."""
     order = {name: number for number, name in enumerate(TOGETHER)}
     items.sort(key=lambda item: order.get(folder_of(item.path), len(order)))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(folder_of(item.path)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Run a folder's tests in one process with `--dist loadgroup`; pytest 9.2 ignores marks."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class FolderScheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return folder_of(ROOT / nodeid.partition("::")[0])
+
+    return FolderScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
