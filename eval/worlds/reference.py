@@ -39,7 +39,7 @@ def fly_trial(
     rows: int = 64,
     sensor_set: SensorSet = PERFECT,
 ) -> TrialResult:
-    """Fly one trial and return its outcome.
+    """Fly one trial as a plain loop, the slow and simple check of the other simulators.
 
     Args:
         policy: the policy.
@@ -51,6 +51,9 @@ def fly_trial(
         rows: number of rows of the policy's inputs; all rows but the first are zero. It should be
             that of the batched simulators, because the output of some policies depends on it.
         sensor_set: errors of the policy's observations.
+
+    Returns:
+        The outcome of the trial.
 
     Raises:
         ValueError: for delayed or filtered observations, which this simulator does not have.

@@ -5,6 +5,7 @@ A change of an input or of the code gives another name, so outdated results are 
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ def digest(value: Any) -> str:
 def code_digest(*folders: str) -> str:
     """Return a digest (16 hex digits) of the code in `folders`, without that of `NO_RESULT`.
 
+    Docstrings, comments and layout do not change it.
+
     Args:
         folders: folders of the project, such as "tracks" or "suite/train".
     """
@@ -60,8 +63,32 @@ def code_digest(*folders: str) -> str:
         for path in sorted((ROOT / folder).rglob("*.py")):
             name = path.relative_to(ROOT)
             if not set(name.parts) & set(NO_RESULT):
-                sha256.update(f"{name.as_posix()}\0".encode() + path.read_bytes())
+                tree = _tree_text(ast.parse(path.read_bytes()))
+                sha256.update(f"{name.as_posix()}\0{tree}\0".encode())
     return sha256.hexdigest()[:16]
+
+
+def _tree_text(node: Any) -> str:
+    """Return a syntax tree as text, without docstrings; the same for all versions of Python.
+
+    `ast.dump` also prints fields without a value, whose number grows from version to version.
+    """
+    if isinstance(node, list):
+        return f"[{','.join(_tree_text(item) for item in node if not _is_docstring(item))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = [(name, getattr(node, name, None)) for name in node._fields]
+    words = [f"{name}={_tree_text(value)}" for name, value in fields if value not in (None, [])]
+    return f"{type(node).__name__}({','.join(words)})"
+
+
+def _is_docstring(node: Any) -> bool:
+    """Return whether a statement is a bare string."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 @functools.cache

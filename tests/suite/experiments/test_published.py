@@ -1,7 +1,9 @@
 """The published pages: all of them made in order, and what is newer than a page."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 from policies import shipped
 from suite.cli import parse
@@ -22,12 +24,12 @@ def test_a_page_is_older_than_another_policy_or_other_code(tmp_path, capsys):
     code, current = code_digest(*FLIES), policy_digest(shipped.DEFAULT)
     write_page(tmp_path, "table2", (shipped.DEFAULT, current), code)
     write_page(tmp_path, "simulators", (shipped.DEFAULT, "0" * 16), code)
-    write_page(tmp_path, "robustness", ("gone-policy", current), "another")
+    write_page(tmp_path, "robustness", ("runs/mine", current), "another")
     _, config = parse("reproduce", ["status", "--out", str(tmp_path)])
     pages = command.run(config, Console())["pages"]
     assert pages["table2"] == {"commit": "f8502435b6b42b44", "newer": []}
     assert pages["simulators"]["newer"] == ["policy"]
-    assert pages["robustness"]["newer"] == ["policy", "code"]
+    assert pages["robustness"]["newer"] == ["code"]
     assert pages["ablation"]["newer"] is None
     assert "not made" in capsys.readouterr().out
 
@@ -42,3 +44,17 @@ def test_all_makes_every_page_with_its_own_options(tmp_path, monkeypatch):
     )
     assert set(published.PUBLISHED) <= set(EXPERIMENTS)
     assert all(replace(c, experiment=None) == replace(config, experiment=None) for c in asked)
+
+
+def test_all_repeats_the_commands_of_the_published_pages():
+    results = Path(__file__).parents[3] / "docs" / "results"
+    compared = []
+    for name, options in published.PUBLISHED.items():
+        if not (page := results / f"{name}.json").is_file():
+            continue
+        command_line = json.loads(page.read_text())["made_by"]["command"].strip("`")
+        assert command_line.startswith(f"suite reproduce {name} "), name
+        given = re.sub(r"--(out|workers|policy) \S+", "", command_line).split()[3:]
+        assert sorted(given) == sorted(options.split()), name
+        compared.append(name)
+    assert len(compared) >= 6

@@ -80,7 +80,7 @@ def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
     for room, name in (("eval", "judge.py"), ("eval", "view/video.py"), ("suite", "cli.py")):
         path = tmp_path / room / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("one")
+        path.write_text("a = 1")
     monkeypatch.setattr(cache, "ROOT", tmp_path)
     code_digest.cache_clear()
 
@@ -89,10 +89,12 @@ def test_the_cache_is_named_by_all_code_that_flies(tmp_path, monkeypatch):
         return code_digest("eval")
 
     first = now()
-    (tmp_path / "suite" / "cli.py").write_text("two")
-    (tmp_path / "eval" / "view" / "video.py").write_text("two")
+    (tmp_path / "suite" / "cli.py").write_text("a = 2")
+    (tmp_path / "eval" / "view" / "video.py").write_text("a = 2")
     assert now() == first, "neither flies"
-    (tmp_path / "eval" / "judge.py").write_text("two")
+    (tmp_path / "eval" / "judge.py").write_text('"""Words."""\na = (1)  # one')
+    assert now() == first, "the statements are the same"
+    (tmp_path / "eval" / "judge.py").write_text("a = 2")
     second = now()
     (tmp_path / "eval" / "judge.py").rename(tmp_path / "eval" / "jury.py")
     assert len({first, second, now()}) == 3
