@@ -1,23 +1,11 @@
 """A policy with actions of the size that racing has, saved and exported once for all tests."""
 
-import jax
-import numpy as np
 import pytest
 
+from policies.formats import onnx_file, torch_file
 from policies.formats.export import export_policy
 from policies.formats.policy_file import save_policy
-from policies.networks import network
-from policies.spec import PolicySpec
-from tracks.geometry.camera import Camera
-
-SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=64)
-
-
-def lively(spec, seed):
-    """Return fresh parameters whose actions are of the size that racing has."""
-    scale = {"action.weight": 20.0, "state.bias": 5.0}
-    made = network.init(jax.random.key(seed), spec)
-    return {name: np.asarray(value) * scale.get(name, 1.0) for name, value in made.items()}
+from tests.support.policy_files import SPEC, InProcess, lively
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +24,10 @@ def exported(tmp_path_factory, checkpoint):
     folder = tmp_path_factory.mktemp("exported")
     export_policy(checkpoint, folder)
     return folder
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Engines load models in this process, where they are imported already."""
+    for where in (torch_file, onnx_file):
+        monkeypatch.setattr(where, "ModelProcess", InProcess)

@@ -8,14 +8,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from policies.block_policy import BlockPolicy, for_one_row, verify_rows
+from policies.formats import torch_file
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError, PolicySpec
+from tests.support.policy_files import InProcess
 
 
 @pytest.fixture(scope="module", params=["native", "torch", "onnx"])
 def policy(request, checkpoint, exported):
     files = {"native": checkpoint, "torch": "tiny.pt2", "onnx": "tiny.onnx"}
-    return load_policy(exported / files[request.param], trust=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch_file, "ModelProcess", InProcess)
+        return load_policy(exported / files[request.param], trust=True)
 
 
 def observe(seed, n):

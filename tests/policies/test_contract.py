@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of, summary
+from policies.contract import KEY, contract_of, read_contract, refuse_differences, spec_of
 from policies.formats.export import export_module
 from policies.formats.policy_file import load_policy_checkpoint
+from policies.formats.spec_json import KEY as SPEC_KEY
 from policies.policy import load_policy
 from policies.spec import ActionSpec, DepthEncoding, PolicyError, PolicySpec
+from tests.support.policy_files import action_of
 
 SPECS = [
     PolicySpec(),
@@ -40,9 +42,9 @@ def test_the_digest_is_one_for_one_meaning():
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        ((("state", 2), "frame"), "FRD", r"state\[2\].frame is 'FRD', the suite provides 'body"),
-        ((("state", 0), "scale"), 0.1, r"state\[0\].scale is 0.1, the suite provides 1.0"),
-        ((("state", 0), "name"), "rates", r"state\[0\].name is 'rates'"),
+        (("state", 2, "frame"), "FRD", r"state\[2\].frame is 'FRD', the suite provides 'body"),
+        (("state", 0, "scale"), 0.1, r"state\[0\].scale is 0.1, the suite provides 1.0"),
+        (("state", 0, "name"), "rates", r"state\[0\].name is 'rates'"),
         (("action", "frame"), "FRD", "action.frame is 'FRD'"),
         (("action", "unit"), ["g"] * 3, "action.unit"),
         (("image", "encoding"), "depth", "image.encoding is 'depth'"),
@@ -51,14 +53,12 @@ def test_the_digest_is_one_for_one_meaning():
     ],
 )
 def test_what_the_suite_does_not_provide_is_refused_by_its_place(path, value, said):
-    data = contract_of(PolicySpec()).to_json()
+    data = json.loads(contract_of(PolicySpec()).text)
     del data["digest"]
-    first, last = path
-    part = data[first] if isinstance(first, str) else data[first[0]][first[1]]
-    if isinstance(first, tuple):
-        data["state"] = [dict(entry) for entry in data["state"]]
-        part = data["state"][first[1]]
-    part[last] = value
+    part = data
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
     with pytest.raises(PolicyError, match=said):
         spec_of(read_contract(json.dumps(data), "here"), "here")
 
@@ -80,17 +80,19 @@ def test_memories_differ_only_where_both_are_known():
         refuse_differences(contract_of(spec, (3,)), contract_of(spec, (4,)), "here", "that")
 
 
-def test_it_travels_in_checkpoint_onnx_torch_and_c(checkpoint, exported):
+def test_it_travels_in_checkpoint_onnx_and_torch_with_where_it_comes_from(checkpoint, exported):
     spec = load_policy_checkpoint(checkpoint).spec
     digest = contract_of(spec).digest
     stored = json.loads((checkpoint / "config.json").read_text())[KEY]
     assert read_contract(stored, "config").memory == (64,)
-    proto = onnx.load(exported / "tiny.onnx")
-    entry = next(each.value for each in proto.metadata_props if each.key == KEY)
-    assert read_contract(entry, "onnx").digest == digest
-    extra = {KEY: ""}
+    props = onnx.load(exported / "tiny.onnx").metadata_props
+    extra = dict.fromkeys((KEY, SPEC_KEY), "")
     torch.export.load(exported / "tiny.pt2", extra_files=extra)
-    assert read_contract(extra[KEY], "torch").digest == digest
+    for texts in ({each.key: each.value for each in props}, extra):
+        assert read_contract(texts[KEY], "here").digest == digest
+        data = json.loads(texts[SPEC_KEY])
+        assert {"schema", "suite_version", "git_commit", "seed", "name", "spec"} <= data.keys()
+        assert (data["name"], data["seed"]) == ("tiny", 1)
 
 
 class Module(torch.nn.Module):
@@ -99,26 +101,20 @@ class Module(torch.nn.Module):
     def __init__(self, norm=False, size=3):
         super().__init__()
         self.norm, self.size = torch.nn.BatchNorm1d(12) if norm else None, size
-        self.seen = 0.0
 
     def forward(self, state, image):
         state = state if self.norm is None else self.norm(state)
         return state[:, : self.size] + image.mean((1, 2))[:, None]
 
 
-def test_a_module_flies_with_the_contract_it_was_exported_with(tmp_path):
+def test_a_module_flies_in_evaluation_mode_with_the_contract_it_was_exported_with(tmp_path):
     spec = PolicySpec(rate_hz=50.0, action=ActionSpec(scale=(20.0,)))
-    policy = load_policy(export_module(Module(), tmp_path / "it.onnx", contract_of(spec)))
-    assert policy.spec == spec and isinstance(policy, BlockPolicy) and not policy.notes
-    state, image = np.ones((1, 12), np.float32), np.zeros((1, 24, 32), np.float32)
-    action, _ = policy.act(policy.start(1), state, image, np.zeros(1, bool))
-    assert (spec.action.to_si(action) == 20.0).all()
-
-
-def test_batch_norm_left_in_training_mode_is_exported_in_evaluation_mode(tmp_path):
     module = Module(norm=True).train()
-    export_module(module, tmp_path / "it.onnx", PolicySpec())
+    policy = load_policy(export_module(module, tmp_path / "it.onnx", contract_of(spec)))
+    assert policy.spec == spec and isinstance(policy, BlockPolicy) and not policy.notes
     assert module.training
+    action = spec.action.to_si(action_of(policy, np.ones((1, 12))))
+    np.testing.assert_allclose(action, 20.0, rtol=1e-4)  # the norm divides by sqrt(1 + 1e-5)
 
 
 def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
@@ -131,11 +127,6 @@ def test_an_export_that_does_not_fit_its_contract_is_refused(tmp_path):
     onnx.save(proto, tmp_path / "it.onnx")
     with pytest.raises(PolicyError, match=r"'state' has shape .*expected \(batch, 13\)"):
         load_policy(tmp_path / "it.onnx")
-
-
-def test_the_summary_names_what_matters():
-    text = summary(contract_of(PolicySpec(rate_hz=50.0)))
-    assert "50 Hz" in text and "15 deg" in text and "acceleration [m/s^2], unscaled" in text
 
 
 def test_weights_without_a_program_are_named(tmp_path):

@@ -57,18 +57,9 @@ class UlogWriter:
 
 
 def write_ulog(
-    path,
-    span=(0.0, 8.0),
-    rate=200.0,
-    esc=True,
-    full_thrust=30.0,
-    start_us=5_000_000,
-    pos_hz=None,
-    gyro_hz=None,
-    command_hz=100.0,
-    odometry=None,
-    source=fly,
-):
+    path, span=(0.0, 8.0), rate=200.0, esc=True, full_thrust=30.0, start_us=5_000_000,
+    pos_hz=None, gyro_hz=None, command_hz=100.0, odometry=None, source=fly,
+):  # fmt: skip
     """PX4 with attitude at `rate`, positions at half of it, commands at 100 Hz, ESCs at 50 Hz.
 
     `odometry` (new format, frame of the velocity) takes the place of vehicle_local_position.
@@ -207,15 +198,9 @@ def write_mocap(
 
 
 def write_usd(
-    path,
-    span=(0.0, 8.0),
-    rate=100.0,
-    version=2,
-    compressed=False,
-    crc=True,
-    full_thrust=30.0,
+    path, span=(0.0, 8.0), rate=100.0, version=2, compressed=False, crc=True, full_thrust=30.0,
     source=fly,
-):
+):  # fmt: skip
     """A log of the uSD deck: one event at a fixed rate, one rare one, CRC at the end."""
     truth = source(np.arange(span[0], span[1], 1 / rate))
     degrees = np.rad2deg(1.0)
@@ -273,24 +258,13 @@ def pack_quaternion(wxyz):
 
 
 def write_mcap(
-    path,
-    span=(0.0, 6.0),
-    imu=200.0,
-    odometry=100.0,
-    command=50.0,
-    full_thrust=30.0,
-    motion=True,
-    source=fly,
-    mask=0,
-):
+    path, span=(0.0, 6.0), imu=200.0, odometry=100.0, command=50.0, full_thrust=30.0, motion=True,
+    source=fly, mask=0,
+):  # fmt: skip
     """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP."""
     from mcap_ros2.writer import Writer
 
     origin = 1_700_000_000 * 10**9
-
-    def header(t):
-        when = origin + round(t * 1e9)
-        return {"stamp": {"sec": when // 10**9, "nanosec": when % 10**9}, "frame_id": "odom"}
 
     def xyz(v):
         return dict(zip("xyz", map(float, v), strict=True))
@@ -300,48 +274,53 @@ def write_mcap(
 
     with path.open("wb") as file:
         writer = Writer(file)
-        schema = writer.register_msgdef("nav_msgs/msg/Odometry", ODOMETRY + DEFINITIONS)
-        truth = source(np.arange(span[0], span[1], 1 / odometry))
-        for k, t in enumerate(truth.time if motion else ()):
+
+        def send(topics, name, definition, rate, message_of):
+            """Write a topic at a rate; each further topic has every tenth message of it."""
+            schema = writer.register_msgdef(name, definition + DEFINITIONS)
+            truth = source(np.arange(span[0], span[1], 1 / rate))
+            for k, t in enumerate(truth.time):
+                when = origin + round(t * 1e9)
+                stamp = {"sec": when // 10**9, "nanosec": when % 10**9}
+                message = {"header": {"stamp": stamp, "frame_id": "odom"}, **message_of(truth, k)}
+                for topic in topics[: None if k % 10 == 0 else 1]:
+                    writer.write_message(topic, schema, message, when)
+
+        def moving(truth, k):
             body = truth.rot[k].T @ truth.vel[k]
             pose = {"position": xyz(truth.pos[k]), "orientation": quaternion(truth.quat[k])}
             twist = {"linear": xyz(body), "angular": xyz(truth.rate[k])}
-            message = {
-                "header": header(t),
+            return {
                 "child_frame_id": "base_link",
                 "pose": {"pose": pose, "covariance": [0.0] * 36},
                 "twist": {"twist": twist, "covariance": [0.0] * 36},
             }
-            writer.write_message("/odom", schema, message, origin + round(t * 1e9))
-            if k % 10 == 0:
-                writer.write_message("/odom_slow", schema, message, origin + round(t * 1e9))
-        schema = writer.register_msgdef("sensor_msgs/msg/Imu", IMU + DEFINITIONS)
-        truth = source(np.arange(span[0], span[1], 1 / imu))
-        for k, t in enumerate(truth.time):
-            message = {
-                "header": header(t),
+
+        def measured(truth, k):
+            names = ("orientation", "angular_velocity", "linear_acceleration")
+            return {
                 "orientation": quaternion([1, 0, 0, 0]),
-                "orientation_covariance": [0.0] * 9,
                 "angular_velocity": xyz(truth.rate[k]),
-                "angular_velocity_covariance": [0.0] * 9,
                 "linear_acceleration": xyz(truth.acc[k]),
-                "linear_acceleration_covariance": [0.0] * 9,
+                **{f"{name}_covariance": [0.0] * 9 for name in names},
             }
-            writer.write_message("/imu", schema, message, origin + round(t * 1e9))
-        schema = writer.register_msgdef("mavros_msgs/msg/AttitudeTarget", TARGET + DEFINITIONS)
-        truth = source(np.arange(span[0], span[1], 1 / command))
-        for k, t in enumerate(truth.time):
-            message = {
-                "header": header(t),
+
+        def wanted(truth, k):
+            return {
                 "type_mask": mask,
                 "orientation": quaternion(truth.quat[k]),
                 "body_rate": xyz(truth.cmd_rate[k]),
                 "thrust": float(truth.thrust[k] / full_thrust),
             }
-            writer.write_message("/target", schema, message, origin + round(t * 1e9))
-        schema = writer.register_msgdef("actuator_msgs/msg/Actuators", ACTUATORS + DEFINITIONS)
-        for k, t in enumerate(truth.time):
-            message = {"header": header(t), "velocity": [float(speed) for speed in truth.motor[k]]}
-            writer.write_message("/motors", schema, message, origin + round(t * 1e9))
+
+        def turning(truth, k):
+            return {"velocity": [float(speed) for speed in truth.motor[k]]}
+
+        if motion:
+            topics = ["/odom", "/odom_slow"]
+            send(topics, "nav_msgs/msg/Odometry", ODOMETRY, odometry, moving)
+        send(["/imu"], "sensor_msgs/msg/Imu", IMU, imu, measured)
+        send(["/target"], "mavros_msgs/msg/AttitudeTarget", TARGET, command, wanted)
+        send(["/motors"], "actuator_msgs/msg/Actuators", ACTUATORS, command, turning)
         writer.finish()
     return path

@@ -1,7 +1,7 @@
 """A small policy of ours as a checkpoint, for tests outside of policies/."""
 
 from policies.formats.policy_file import save_policy
-from tests.policies.conftest import SPEC, lively
+from tests.support.policy_files import SPEC, lively
 
 
 def small_checkpoint(folder):

@@ -21,7 +21,7 @@ def save(folder, arrays=ARRAYS, **extra):
     return save_arrays(folder, arrays, kind="policy", seed=3, extra=extra)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15)
 @given(
     st.dictionaries(
         st.text("abc.'[]µ", min_size=1, max_size=8),
@@ -60,7 +60,7 @@ def test_the_config_says_what_the_weights_are(tmp_path):
         save(tmp_path / "c", kind="delta")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20)
 @given(file=st.sampled_from([WEIGHTS, CONFIG]), keep=st.floats(0, 1, exclude_max=True))
 def test_a_file_cut_anywhere_is_refused_by_name(tmp_path_factory, file, keep):
     folder = save(tmp_path_factory.mktemp("cut") / "c")
@@ -73,7 +73,7 @@ def test_a_file_cut_anywhere_is_refused_by_name(tmp_path_factory, file, keep):
     assert file == CONFIG or "incomplete or of another" in str(caught.value)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20)
 @given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
 def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
     folder = save(tmp_path_factory.mktemp("flip") / "c")
@@ -84,7 +84,7 @@ def test_a_changed_byte_of_the_weights_is_refused(tmp_path_factory, at, flip):
         load_arrays(folder, kind="policy")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25)
 @given(
     key=st.sampled_from(["schema", "kind", "weights", "weights.sha256", "weights.bytes"]),
     value=st.one_of(st.none(), st.booleans(), st.floats(allow_nan=False), st.text(), st.just([])),
@@ -101,39 +101,30 @@ def test_a_damaged_config_is_refused_by_key(tmp_path_factory, key, value):
         load_arrays(folder, kind="policy")
 
 
-@pytest.mark.parametrize("file", [WEIGHTS, CONFIG])
-def test_a_missing_file_is_named(tmp_path, file):
-    (save(tmp_path / "c") / file).unlink()
-    with pytest.raises(PolicyError, match=f"{file}: missing"):
-        load_arrays(tmp_path / "c", kind="policy")
-
-
-def test_another_kind_a_newer_schema_and_a_wrong_top_level_are_refused(tmp_path):
+def test_a_missing_file_another_kind_and_a_newer_schema_are_refused(tmp_path):
+    for file in (WEIGHTS, CONFIG):
+        (save(tmp_path / "c") / file).unlink()
+        with pytest.raises(PolicyError, match=f"{file}: missing"):
+            load_arrays(tmp_path / "c", kind="policy")
     folder = save(tmp_path / "c")
     with pytest.raises(PolicyError, match="kind is 'policy', expected 'delta'"):
         load_arrays(folder, kind="delta")
     config = json.loads((folder / CONFIG).read_text())
-    (folder / CONFIG).write_text(json.dumps(config | {"schema": 2}))
-    with pytest.raises(PolicyError, match="schema is 2"):
-        load_arrays(folder, kind="policy")
-    (folder / CONFIG).write_text("[1]")
-    with pytest.raises(PolicyError, match="expected an object"):
-        load_arrays(folder, kind="policy")
+    for data, said in ((config | {"schema": 2}, "schema is 2"), ([1], "expected an object")):
+        (folder / CONFIG).write_text(json.dumps(data))
+        with pytest.raises(PolicyError, match=said):
+            load_arrays(folder, kind="policy")
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_weights_that_are_not_finite_are_refused_unless_asked_for(tmp_path, bad):
-    save(tmp_path / "c", {"w": np.array([1.0, bad], np.float32)})
-    with pytest.raises(PolicyError, match="'w' has 1 of 2"):
+def test_weights_that_are_not_finite_are_refused_unless_asked_for(tmp_path):
+    save(tmp_path / "c", {"w": np.array([1.0, np.nan, -np.inf], np.float32)})
+    with pytest.raises(PolicyError, match="'w' has 2 of 3"):
         load_arrays(tmp_path / "c", kind="policy")
     load_arrays(tmp_path / "c", kind="policy", finite=False)
 
 
 @pytest.mark.parametrize("fail_at", range(1, 12))
-@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_a_stop_at_any_system_call_leaves_one_whole_checkpoint(
-    tmp_path, monkeypatch, fail_at, error
-):
+def test_a_stop_at_any_system_call_leaves_one_whole_checkpoint(tmp_path, monkeypatch, fail_at):
     folder = tmp_path / "c"
     save(folder, note=1)
     calls = 0
@@ -143,7 +134,7 @@ def test_a_stop_at_any_system_call_leaves_one_whole_checkpoint(
             nonlocal calls
             calls += 1
             if calls == fail_at:
-                raise error
+                raise KeyboardInterrupt
             return real(*arguments, **options)
 
         return call
@@ -155,7 +146,7 @@ def test_a_stop_at_any_system_call_leaves_one_whole_checkpoint(
         patch.setattr(type(folder), "write_text", stopping(type(folder).write_text))
         try:
             save(folder, {"a": np.ones(2)}, note=2)
-        except (OSError, KeyboardInterrupt):
+        except KeyboardInterrupt:
             pass
         else:
             assert fail_at > calls

@@ -8,7 +8,6 @@ import sys
 import time
 
 import numpy as np
-import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
@@ -16,69 +15,51 @@ from policies.formats import model_process as process
 from policies.formats.model_process import ModelProcess
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
+from tests.support.policy_files import WEIGHT, onnx_model, port, save_onnx
 
-FLOAT = TensorProto.FLOAT
-
-
-def _proto(nodes, tensors=(), outputs=None, rows="n"):
-    inputs = [
-        helper.make_tensor_value_info("state", FLOAT, (rows, 12)),
-        helper.make_tensor_value_info("image", FLOAT, (rows, 24, 32)),
-    ]
-    outputs = outputs or [helper.make_tensor_value_info("action", FLOAT, (rows, 3))]
-    graph = helper.make_graph(nodes, "g", inputs, outputs, list(tensors))
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+PRODUCT = helper.make_node("MatMul", ["state", "w"], ["u"])
+FEED = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
 
 
-W = numpy_helper.from_array(np.eye(12, 3, dtype=np.float32), "w")
+def plain():
+    return ModelProcess(onnx_model().SerializeToString(), "it", "onnx")
 
-PLAIN = _proto([helper.make_node("MatMul", ["state", "w"], ["action"])], [W])
+
+def tensor(name, value):
+    return numpy_helper.from_array(np.array(value), name)
 
 
-def _endless(start, rounds="rounds"):
-    """Return nodes and tensors of a loop of 2^62 rounds over `start`, added to the action."""
+def endless(start):
+    """Return a model with a loop of 2^62 rounds over `start`, added to the action."""
+    number, flag = TensorProto.INT64, TensorProto.BOOL
     body = helper.make_graph(
         [
             helper.make_node("Identity", ["go_in"], ["go_out"]),
             helper.make_node("Sin", ["x_in"], ["x_out"]),
         ],
         "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, ()),
-            helper.make_tensor_value_info("go_in", TensorProto.BOOL, ()),
-            helper.make_tensor_value_info("x_in", FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("go_out", TensorProto.BOOL, ()),
-            helper.make_tensor_value_info("x_out", FLOAT, None),
-        ],
+        [port("i", kind=number), port("go_in", kind=flag), no_shape("x_in")],
+        [port("go_out", kind=flag), no_shape("x_out")],
     )
     nodes = [
-        helper.make_node("MatMul", ["state", "w"], ["u"]),
-        helper.make_node("Loop", [rounds, "go", start], ["x"], body=body),
+        PRODUCT,
+        helper.make_node("Loop", ["rounds", "go", start], ["x"], body=body),
         helper.make_node("ReduceMax", ["x"], ["most"], keepdims=0),
         helper.make_node("Add", ["u", "most"], ["action"]),
     ]
-    tensors = [
-        W,
-        numpy_helper.from_array(np.array(2**62, np.int64), "rounds"),
-        numpy_helper.from_array(np.array(True), "go"),
-        numpy_helper.from_array(np.ones(3, np.float32), "constant"),
-    ]
-    return _proto(nodes, tensors)
+    constant = tensor("constant", np.ones(3, np.float32))
+    return onnx_model(nodes, [WEIGHT, tensor("rounds", 2**62), tensor("go", True), constant])
 
 
-def _save(folder, proto):
-    path = folder / "it.onnx"
-    onnx.save(proto, path)
-    return path
+def no_shape(name):
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
 
 
 @pytest.mark.parametrize("start", ["constant", "state"])
 def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "LOAD_S", 2.0)
     monkeypatch.setattr(process, "ANSWER_S", 1.0)
-    path = _save(tmp_path, _endless(start))
+    path = save_onnx(tmp_path, endless(start))
     began = time.monotonic()
     with pytest.raises(PolicyError, match="it.onnx: onnxruntime does not come to an end with it"):
         load_policy(path)
@@ -88,14 +69,14 @@ def test_a_loop_without_an_end_is_refused_in_time(start, tmp_path, monkeypatch):
 def test_the_process_ends_itself_where_its_parent_is_gone(monkeypatch):
     monkeypatch.setattr(process, "GRACE_S", -1.5)
     monkeypatch.setattr(process, "ANSWER_S", 2.0)
-    model = ModelProcess(_endless("state").SerializeToString(), "it", "onnx")
+    model = ModelProcess(endless("state").SerializeToString(), "it", "onnx")
     with pytest.raises(PolicyError, match="it ended by SIGALRM"):
         model.run({"state": np.ones((1, 12)), "image": np.ones((1, 24, 32))})
 
 
 @pytest.mark.parametrize("rows", [0, 10**6])
 def test_a_batch_of_none_or_of_millions_is_refused(rows, tmp_path):
-    path = _save(tmp_path, _proto(PLAIN.graph.node, [W], rows=rows))
+    path = save_onnx(tmp_path, onnx_model(rows=rows))
     with pytest.raises(PolicyError, match="allowed are batches of 1 to 4096 rows|cannot load it"):
         load_policy(path)
 
@@ -105,17 +86,16 @@ def test_a_model_that_wants_all_memory_is_refused(tmp_path):
     nodes = [
         helper.make_node("Expand", ["state", "large"], ["x"]),
         helper.make_node("ReduceMax", ["x"], ["most"], keepdims=0),
-        helper.make_node("MatMul", ["state", "w"], ["u"]),
+        PRODUCT,
         helper.make_node("Add", ["u", "most"], ["action"]),
     ]
-    large = numpy_helper.from_array(np.array([2**24, 1, 12], np.int64), "large")
+    path = save_onnx(tmp_path, onnx_model(nodes, [WEIGHT, tensor("large", [2**24, 1, 12])]))
     with pytest.raises(PolicyError, match="it.onnx: .*(fails while it runs|come to an end)"):
-        load_policy(_save(tmp_path, _proto(nodes, [W, large])))
+        load_policy(path)
 
 
 def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
-    path = tmp_path / "policy.onnx"
-    onnx.save(PLAIN, path)
+    path = save_onnx(tmp_path, onnx_model())
     # Below what the engine has already and may have besides.
     script = (
         "import resource, sys\n"
@@ -134,36 +114,32 @@ def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
         helper.make_node("Reshape", ["state", "shape"], ["x"]),
         helper.make_node("MatMul", ["x", "w"], ["action"]),
     ]
-    shape = numpy_helper.from_array(np.array([7, 12], np.int64), "shape")
+    path = save_onnx(tmp_path, onnx_model(nodes, [WEIGHT, tensor("shape", [7, 12])]))
     with pytest.raises(PolicyError, match="it.onnx: fails while it runs") as refused:
-        load_policy(_save(tmp_path, _proto(nodes, [W, shape])))
+        load_policy(path)
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_a_process_that_dies_is_told_of_and_one_that_is_not_needed_ends():
-    model = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
-    feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
-    np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
-    child = model._process.pid
-    os.kill(child, signal.SIGABRT)
+def test_after_a_death_or_no_answer_the_next_question_goes_to_a_fresh_process(monkeypatch):
+    model = plain()
+    np.testing.assert_array_equal(model.run(FEED)[0], np.ones((2, 3)))
+    os.kill(model._process.pid, signal.SIGABRT)
     with pytest.raises(PolicyError, match="it ended by SIGABRT"):
-        model.run(feed)
-    other = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
-    child = other._process.pid
-    del other
-    gc.collect()
-    with pytest.raises(ProcessLookupError):
-        os.kill(child, 0)
-
-
-def test_after_a_question_without_an_answer_the_next_goes_to_a_fresh_process(monkeypatch):
+        model.run(FEED)
+    np.testing.assert_array_equal(model.run(FEED)[0], np.ones((2, 3)))
     monkeypatch.setattr(process, "ANSWER_S", 0.5)
-    model = ModelProcess(PLAIN.SerializeToString(), "it", "onnx")
-    feed = {"state": np.ones((2, 12)), "image": np.ones((2, 24, 32))}
     stopped = model._process.pid
     os.kill(stopped, signal.SIGSTOP)
     with pytest.raises(NoAnswer, match="was not answered within 0.5 s"):
-        model.run(feed)
+        model.run(FEED)
     with pytest.raises(ProcessLookupError):
         os.kill(stopped, 0)
-    np.testing.assert_array_equal(model.run(feed)[0], np.ones((2, 3)))
+
+
+def test_a_process_that_is_not_needed_ends():
+    model = plain()
+    child = model._process.pid
+    del model
+    gc.collect()
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)

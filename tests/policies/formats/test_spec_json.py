@@ -1,6 +1,5 @@
 """A spec comes back from JSON and from inside a torch or ONNX file, or is refused by key."""
 
-import dataclasses
 import json
 from dataclasses import replace
 
@@ -8,17 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policies.formats.spec_json import (
-    KEY,
-    SCHEMA,
-    embed,
-    extract,
-    labels,
-    spec_from_json,
-    spec_to_json,
-)
+from policies.formats import spec_json
+from policies.formats.spec_json import KEY, extract, labels, spec_from_json, spec_to_json
 from policies.spec import DepthEncoding, PolicyError, PolicySpec
-from tests.policies.conftest import SPEC
+from tests.support.policy_files import SPEC
 from tracks.geometry.camera import Camera
 
 
@@ -36,23 +28,14 @@ def test_a_spec_survives_json(spec):
     assert spec_from_json(json.loads(json.dumps(spec_to_json(spec))), "here") == spec
 
 
-def test_keys_left_out_of_a_spec_take_the_default():
-    assert spec_from_json({"camera": {"width": 64}}, "here") == PolicySpec(
-        camera=dataclasses.replace(Camera(), width=64)
-    )
-
-
-def test_a_checkpoint_without_the_keys_sees_one_gate_with_the_usual_channels():
+def test_keys_left_out_of_a_spec_take_the_default_and_another_type_is_refused():
+    assert spec_from_json({"camera": {"width": 64}}, "here") == PolicySpec(camera=Camera(width=64))
     stored = spec_to_json(SPEC)
     del stored["second_gate"], stored["gate_axis"], stored["channels"]
     assert spec_from_json(stored, "here") == SPEC
-
-
-@pytest.mark.parametrize("value", [1, "yes", None])
-def test_the_key_is_true_or_false(value):
-    stored = json.loads(json.dumps({**spec_to_json(SPEC), "second_gate": value}))
-    with pytest.raises(PolicyError, match=r"second_gate is .*allowed is true or false"):
-        spec_from_json(stored, "here")
+    for value in (1, "yes", None):
+        with pytest.raises(PolicyError, match=r"second_gate is .*allowed is true or false"):
+            spec_from_json({**stored, "second_gate": value}, "here")
 
 
 def test_what_is_embedded_comes_back():
@@ -62,7 +45,7 @@ def test_what_is_embedded_comes_back():
     assert extract(alone, "here").spec == replace(SPEC, hidden_size=192)  # nothing says it there
     assert not extract(alone, "here").notes
     data = json.loads(text)
-    assert (data["schema"], data["name"], data["seed"]) == (SCHEMA, "tiny", 7)
+    assert (data["schema"], data["name"], data["seed"]) == (spec_json.SCHEMA, "tiny", 7)
 
 
 @pytest.mark.parametrize("text", [None, "", b"", "{}"])
@@ -92,4 +75,4 @@ def test_a_damaged_one_is_refused(text, said):
 def test_a_contract_and_a_spec_that_contradict_are_refused():
     other = labels(replace(SPEC, rate_hz=50.0), "tiny", 7)
     with pytest.raises(PolicyError, match="contract has rate_hz 50.0, the spec in policy.json 33"):
-        extract({KEY: embed(SPEC, "tiny", 7), "contract": other["contract"]}, "here")
+        extract({KEY: spec_json.embed(SPEC, "tiny", 7), "contract": other["contract"]}, "here")

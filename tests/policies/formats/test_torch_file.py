@@ -12,23 +12,16 @@ import pytest
 import torch
 
 from policies.block_policy import BlockPolicy
-from policies.formats import torch_file
 from policies.formats.spec_json import KEY
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
-from tests.support.in_process import InProcess
+from tests.support.policy_files import action_of
 
 PROGRAM = "models/model.json"
 
 WEIGHTS = "data/weights/model_weights_config.json"
 
 SAMPLES = "data/sample_inputs/model.pt"
-
-
-@pytest.fixture
-def here(monkeypatch):
-    """Torch loads the file in this process, where it is imported already."""
-    monkeypatch.setattr(torch_file, "ModelProcess", InProcess)
 
 
 def rewrite(source, target, change):
@@ -53,14 +46,11 @@ class Payload:
         return os.mkdir, (str(self.path),)
 
 
-def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path, here):
+def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path, in_process):
     mark, pickled = tmp_path / "it_ran", io.BytesIO()
     torch.save((Payload(mark),), pickled, pickle_module=pickle)
-    path = rewrite(
-        exported / "tiny.pt2",
-        tmp_path / "bad.pt2",
-        lambda files: files.update({SAMPLES: pickled.getvalue()}),
-    )
+    bad = {SAMPLES: pickled.getvalue()}
+    path = rewrite(exported / "tiny.pt2", tmp_path / "bad.pt2", lambda files: files.update(bad))
     with pytest.raises(PolicyError, match=r"bad\.pt2: .*any code.*--trust.*\.onnx"):
         load_policy(path)
     assert not mark.exists()
@@ -80,7 +70,7 @@ def test_without_trust_nothing_of_a_file_reaches_torch(exported, tmp_path, here)
         (lambda files: files.update({"extra/policy.json": b"{"}), "policy.json: not JSON"),
     ],
 )
-def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, here):
+def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, in_process):
     path = rewrite(exported / "tiny.pt2", tmp_path / "bad.pt2", change)
     with pytest.raises(PolicyError, match=said):
         load_policy(path, trust=True)
@@ -91,18 +81,11 @@ class Everything(torch.nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.encoder = torch.nn.Sequential(
-            torch.nn.Conv2d(1, 4, 3, stride=2, padding=1),
-            torch.nn.BatchNorm2d(4),
-            torch.nn.ELU(),
-            torch.nn.AdaptiveAvgPool2d(2),
-            torch.nn.Flatten(),
-        )
-        self.mlp = torch.nn.Sequential(
-            torch.nn.Linear(28, 16), torch.nn.LayerNorm(16), torch.nn.SiLU(), torch.nn.Dropout(0.1)
-        )
-        self.gru = torch.nn.GRU(16, 8)
-        self.head = torch.nn.Linear(8, 6)
+        nn = torch.nn
+        conv = nn.Conv2d(1, 4, 3, stride=2, padding=1), nn.BatchNorm2d(4), nn.ELU()
+        self.encoder = nn.Sequential(*conv, nn.AdaptiveAvgPool2d(2), nn.Flatten())
+        dense = nn.Linear(28, 16), nn.LayerNorm(16), nn.SiLU(), nn.Dropout(0.1)
+        self.mlp, self.gru, self.head = nn.Sequential(*dense), nn.GRU(16, 8), nn.Linear(8, 6)
 
     def forward(self, state, image, hidden):
         features = self.mlp(torch.cat([state, self.encoder(image[:, None])], -1))
@@ -112,13 +95,10 @@ class Everything(torch.nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore:The tensor attributes:UserWarning")
-def test_common_layers_pass_and_answer_as_torch_does(tmp_path, here):
+def test_common_layers_pass_and_answer_as_torch_does(tmp_path, in_process):
     module = Everything().eval()
     inputs = (torch.randn(2, 12), torch.randn(2, 24, 32), torch.randn(2, 8))
-    batch = {0: torch.export.Dim("batch")}
-    program = torch.export.export(module, inputs, dynamic_shapes=(batch, batch, batch))
-    torch.export.save(program, tmp_path / "it.pt2")
-    policy = load_policy(tmp_path / "it.pt2", trust=True)
+    policy = load_policy(program(tmp_path, module, *inputs), trust=True)
     state, image, hidden = (x.numpy() for x in inputs)
     found = policy.act(hidden, state, image, np.zeros(2, bool))
     with torch.no_grad():
@@ -134,26 +114,26 @@ class Reactive(torch.nn.Module):
         return state[:, 6:9] - state[:, 0:3] + 0.0 * image.mean((1, 2))[:, None]
 
 
-def program(folder, module, *shapes, free=True):
-    inputs = tuple(torch.zeros(shape) for shape in shapes)
-    batch = torch.export.Dim("batch")
-    dynamic = tuple({0: batch} for _ in shapes) if free else None
+def program(folder, module, *inputs, free=True):
+    """Save a module as a torch exported program."""
+    dynamic = tuple({0: torch.export.Dim("batch")} for _ in inputs) if free else None
     made = torch.export.export(module, inputs, dynamic_shapes=dynamic)
     torch.export.save(made, folder / "it.pt2")
     return folder / "it.pt2"
 
 
+def zeros(rows, *more):
+    return (torch.zeros(rows, 12), torch.zeros(rows, 24, 32), *more)
+
+
 @pytest.mark.parametrize(("rows", "free"), [(2, True), (5, False), (1, False)])
-def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free, here):
-    path = program(tmp_path, Reactive(), (rows, 12), (rows, 24, 32), free=free)
-    policy = load_policy(path, trust=True)
+def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free, in_process):
+    policy = load_policy(program(tmp_path, Reactive(), *zeros(rows), free=free), trust=True)
     assert isinstance(policy, BlockPolicy)
     assert policy.block == (64 if free else rows)
     state = np.random.default_rng(0).normal(size=(7, 12)).astype(np.float32)
-    image = np.zeros((7, 24, 32), np.float32)
-    action, hidden = policy.act(policy.start(7), state, image, np.zeros(7, bool))
-    np.testing.assert_array_equal(action, state[:, 6:9] - state[:, :3])
-    assert hidden.shape == (7, 0)
+    np.testing.assert_array_equal(action_of(policy, state), state[:, 6:9] - state[:, :3])
+    assert policy.hidden_shape == (0,)
 
 
 class Renamed(torch.nn.Module):
@@ -172,31 +152,17 @@ class TooFew(torch.nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("module", "shapes", "said"),
+    ("module", "inputs", "said"),
     [
-        (Renamed(), [(2, 12), (2, 24, 32)], "inputs are obs, image; expected state, image"),
-        (TooMany(), [(2, 12), (2, 24, 32)], "gives 2 outputs"),
-        (TooFew(), [(2, 12), (2, 24, 32), (2, 4)], "gives 1 outputs"),
-        (Reactive(), [(2, 13), (2, 24, 32)], r"'state' has shape .*13.*expected \(batch, 12\)"),
+        (Renamed(), zeros(2), "inputs are obs, image; expected state, image"),
+        (TooMany(), zeros(2), "gives 2 outputs"),
+        (TooFew(), zeros(2, torch.zeros(2, 4)), "gives 1 outputs"),
+        (Reactive(), (torch.zeros(2, 13), torch.zeros(2, 24, 32)), r"'state'.*\(batch, 12\)"),
     ],
 )
-def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, shapes, said, here):
+def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, inputs, said, in_process):
     with pytest.raises(PolicyError, match=said):
-        load_policy(program(tmp_path, module, *shapes), trust=True)
-
-
-def test_torchscript_needs_trust_and_then_flies(tmp_path):
-    path = tmp_path / "it.pt"
-    spec = json.dumps({"spec": {"rate_hz": 50.0}})
-    with pytest.warns(DeprecationWarning):
-        torch.jit.save(torch.jit.script(Reactive()), str(path), _extra_files={KEY: spec})
-    with pytest.raises(PolicyError, match="TorchScript can run any code.*--trust"):
-        load_policy(path)
-    policy = load_policy(path, trust=True)
-    assert policy.spec.rate_hz == 50.0
-    state = np.ones((2, 12), np.float32)
-    action, _ = policy.act(policy.start(2), state, np.zeros((2, 24, 32)), np.zeros(2, bool))
-    np.testing.assert_array_equal(action, np.zeros((2, 3)))
+        load_policy(program(tmp_path, module, *inputs), trust=True)
 
 
 class Failing(torch.nn.Module):
@@ -208,20 +174,18 @@ class Failing(torch.nn.Module):
         return state[:, :3]
 
 
-def script(folder, module):
-    """Save a module as TorchScript."""
-    with pytest.warns(DeprecationWarning):
-        torch.jit.save(torch.jit.script(module), str(folder / "it.pt"), _extra_files={KEY: "{}"})
-    return folder / "it.pt"
-
-
-def test_a_module_that_fails_while_it_flies_gives_no_answer_and_flies_on(tmp_path):
-    policy = load_policy(script(tmp_path, Failing()), trust=True)
-    image, fresh = np.zeros((2, 24, 32)), np.zeros(2, bool)
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_torchscript_needs_trust_and_flies_on_after_a_failure(tmp_path):
+    path, spec = tmp_path / "it.pt", json.dumps({"spec": {"rate_hz": 50.0}})
+    torch.jit.save(torch.jit.script(Failing()), str(path), _extra_files={KEY: spec})
+    with pytest.raises(PolicyError, match="TorchScript can run any code.*--trust"):
+        load_policy(path)
+    policy = load_policy(path, trust=True)
+    assert policy.spec.rate_hz == 50.0
     with pytest.raises(NoAnswer, match="it.pt: fails while it runs .*too far") as refused:
-        policy.act(policy.start(2), np.full((2, 12), 1e4), image, fresh)
+        action_of(policy, np.full((2, 12), 1e4))
     assert len(str(refused.value).splitlines()) == 1
-    assert policy.act(policy.start(2), np.ones((2, 12)), image, fresh)[0].all()
+    np.testing.assert_array_equal(action_of(policy, np.ones((2, 12))), np.ones((2, 3)))
 
 
 def test_answers_are_those_of_torch_here_to_the_bit(exported):

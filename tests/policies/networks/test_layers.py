@@ -12,15 +12,8 @@ import torch
 from policies.formats.checkpoint import load_arrays, save_arrays
 from policies.networks import network
 from policies.networks.layers import conv_valid, gru_update, patch_product, uniform
-from policies.networks.tree_arrays import (
-    image_weight,
-    kernel_oihw,
-    rows_are_outputs,
-    tree_from_arrays,
-    tree_to_arrays,
-)
+from policies.networks.tree_arrays import tree_from_arrays, tree_to_arrays
 from policies.spec import PolicyError, PolicySpec
-from tracks.geometry.camera import Camera
 
 
 @partial(jax.jit, static_argnums=0)
@@ -76,14 +69,6 @@ def test_the_gated_recurrent_unit_is_torchs_cell():
     )
 
 
-def test_an_open_update_gate_keeps_and_a_shut_one_replaces():
-    hidden = jnp.asarray([0.3, -0.7])
-    for update, expected in ((100.0, [0.3, -0.7]), (-100.0, np.tanh([0.5, 0.5]))):
-        gates = jnp.asarray([0.0, 0.0, update, update, 0.5, 0.5])
-        found = gru_update(gates, jnp.zeros(6), hidden)
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
 def test_every_array_is_what_its_own_key_gives():
     shapes = {"long": (40, 7), "short": (3,), "one": ()}
     key = jax.random.key(5)
@@ -92,14 +77,6 @@ def test_every_array_is_what_its_own_key_gives():
     assert list(found) == list(shapes)
     for (name, shape), own in zip(shapes.items(), keys, strict=True):
         np.testing.assert_array_equal(found[name], jax.random.uniform(own, shape))
-
-
-SPEC = PolicySpec(rate_hz=33.0, camera=Camera(pitch_deg=20.0), hidden_size=16)
-
-
-@pytest.fixture
-def params():
-    return network.init(jax.random.key(1), SPEC)
 
 
 def training_state(params, seed):
@@ -131,26 +108,3 @@ def test_a_training_state_of_another_shape_is_refused(params):
         tree_from_arrays(other, arrays, "here")
     with pytest.raises(PolicyError, match="missing arrays"):
         tree_from_arrays({"params": params, "more": jnp.zeros(1)}, arrays, "here")
-
-
-def test_a_matrix_has_its_outputs_as_rows():
-    found = rows_are_outputs(np.arange(6.0).reshape(2, 3))
-    np.testing.assert_array_equal(found, [[0, 3], [1, 4], [2, 5]])
-    assert found.dtype == np.float32 and found.flags.c_contiguous
-
-
-def test_a_kernel_has_its_channels_first():
-    kernel = np.arange(2 * 3 * 4 * 5).reshape(2, 3, 4, 5)
-    found = kernel_oihw(kernel)
-    assert found.shape == (5, 4, 2, 3) and found.flags.c_contiguous
-    assert found[4, 2, 1, 0] == kernel[1, 0, 2, 4]
-
-
-def test_features_of_an_image_are_told_channel_by_channel():
-    spec = PolicySpec(camera=Camera(width=28, height=24), hidden_size=2, channels=(2, 32, 64))
-    rows, columns = 24 // 4 - 4, 28 // 4 - 4
-    number = np.arange(rows * columns * 64)
-    found = image_weight({"image.weight": np.stack([number, -number], 1)}, spec)
-    # Ours runs over rows, columns and then channels; torch's over channels first.
-    expected = number.reshape(rows * columns, 64).T.ravel()
-    np.testing.assert_array_equal(found, [expected, -expected])

@@ -1,11 +1,15 @@
-"""Names, tables, text of every kind, and the registries that others can add to."""
+"""Names, tables, rows by masks, text of every kind, and registries that others can add to."""
 
 import io
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import EntryPoint
+from dataclasses import replace
+from importlib.metadata import EntryPoint, EntryPoints
+from types import SimpleNamespace
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,6 +18,7 @@ from rich.console import Console
 from tracks.common import names as registry
 from tracks.common import provenance
 from tracks.common.grid import Cell, html_table, markdown, rich_table, table
+from tracks.common.masks import everywhere, make_contiguous, nowhere, select
 from tracks.common.names import Registry, closest, unknown_name
 from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.toml_table import read_toml, to_toml
@@ -36,11 +41,16 @@ TABLES = st.recursive(
 )
 
 
+EFFECTS = ("linear_drag", "quadratic_drag", "rotor_drag", "motor_lag", "gusts")
+
+
 def test_a_wrong_name_is_answered_with_the_nearest_and_the_list():
     assert closest("ELIPSE", ["zigzag", "ellipse"]) == "ellipse"
-    assert closest("quadcopter", ["zigzag", "ellipse"]) is None
     error = unknown_name("track", "elipse", ["zigzag", "ellipse"])
     assert str(error) == ("unknown track 'elipse'. Did you mean 'ellipse'? Known: zigzag, ellipse.")
+    part, none = (str(unknown_name("effect", name, EFFECTS)) for name in ("drag", "xy"))
+    assert "Did you mean 'linear_drag', 'quadratic_drag', 'rotor_drag'?" in part
+    assert "Did you mean" not in none and "Known: linear_drag" in none
 
 
 def test_every_header_says_schema_version_commit_and_seed():
@@ -68,41 +78,43 @@ def test_a_table_names_the_file_and_the_key_that_is_wrong(tmp_path):
         table.text("name")
 
 
-EFFECTS = ("linear_drag", "quadratic_drag", "rotor_drag", "motor_lag", "gusts")
-
-
-def test_a_part_of_names_has_those_that_hold_it():
-    part, none = (str(unknown_name("effect", name, EFFECTS)) for name in ("drag", "xy"))
-    assert "Did you mean 'linear_drag', 'quadratic_drag', 'rotor_drag'?" in part
-    assert "Did you mean" not in none and "Known: linear_drag" in none
-
-
 GRID = table(
     ["name", "v [m/s]"], [["a|b", Cell("<3>", "bad")], ["all", "5 [4, 6]"]], "Title", "Below."
 )
 
 
-def test_markdown():
+def test_a_table_is_written_as_markdown_html_and_on_a_terminal():
     assert markdown(GRID) == (
         "Title\n\n| name | v [m/s] |\n| --- | --- |\n"
         "| a\\|b | <3> |\n| all | 5 [4, 6] |\n\nBelow.\n"
     )
-
-
-def test_a_terminal_shows_brackets_and_notes_as_they_are():
     file = io.StringIO()
-    screen = Console(width=80, file=file)
-    screen.print(rich_table(GRID))
-    said = file.getvalue()
-    assert all(text in said for text in ("Title", "v [m/s]", "<3>", "5 [4, 6]", "Below."))
-
-
-def test_html_is_escaped_and_sums_up_where_it_is_told_to():
+    Console(width=80, file=file).print(rich_table(GRID))
+    assert all(text in file.getvalue() for text in ("Title", "v [m/s]", "<3>", "5 [4, 6]"))
     page = html_table(GRID)
     assert "<caption>Title</caption>" in page and '<td class="bad">&lt;3&gt;</td>' in page
     assert 'class="sum"' not in page and '<p class="note">Below.</p>' in page
-    summed = html_table(GRID.__class__("", GRID.headers, GRID.rows, strong_last=True))
+    summed = html_table(replace(GRID, strong_last=True))
     assert '<tr class="sum"><td>all</td>' in summed and summed.count("sum") == 1
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.parametrize("mask", [[True] * 3, [False] * 3, [True, False, True]])
+def test_rows_are_chosen_by_a_mask_through_tuples_and_dicts(xp, mask):
+    old = {"a": (xp.zeros((3, 2)), -xp.arange(3.0))}
+    chosen = select(xp.asarray(mask), {"a": (xp.ones((3, 2)), xp.arange(3.0))}, old)["a"]
+    np.testing.assert_array_equal(chosen[0], np.repeat(np.asarray(mask, float)[:, None], 2, 1))
+    np.testing.assert_array_equal(chosen[1], np.where(mask, 1.0, -1.0) * np.arange(3.0))
+    # Nothing is known of a mask of JAX: its program is the same whatever the mask holds.
+    known = [everywhere(xp.asarray(mask)), nowhere(xp.asarray(mask))]
+    assert known == ([all(mask), not any(mask)] if xp is np else [False, False])
+
+
+def test_packed_lays_rows_one_after_another():
+    across = np.arange(6.0).reshape(2, 3).T
+    (again,) = make_contiguous((across,))
+    np.testing.assert_array_equal(again, across)
+    assert again.flags.c_contiguous and not across.flags.c_contiguous
 
 
 def git(root, *what):
@@ -142,26 +154,14 @@ def test_what_differs_from_the_commit_is_in_its_name(checkout):
     assert name() == clean
 
 
-class Package:
-    """Where an entry point says that it comes from."""
-
-    def __init__(self, name):
-        self.name = name
-
-
 def installed(monkeypatch, **values):
     """Let packages have entry points: name -> (package, value)."""
     found = []
     for name, (package, value) in values.items():
         entry = EntryPoint(name, value, "things")
-        vars(entry).update(dist=Package(package))
+        vars(entry).update(dist=SimpleNamespace(name=package))
         found.append(entry)
-
-    class Found(list):
-        def select(self, group):
-            return [entry for entry in self if entry.group == group]
-
-    monkeypatch.setattr(registry, "_installed", lambda: Found(found))
+    monkeypatch.setattr(registry, "_installed", lambda: EntryPoints(found))
 
 
 def registry_of(**own):

@@ -27,8 +27,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
 def test_the_path_beside_keeps_the_suffix_and_missing_folders_are_made(tmp_path):
     target = tmp_path / "deep" / "b.parquet"
     with files.replacing_file(target) as beside:
-        assert beside.suffix == ".parquet"
-        assert not target.exists()
+        assert beside.suffix == ".parquet" and not target.exists()
         beside.write_bytes(b"x")
     assert target.read_bytes() == b"x"
 
@@ -39,17 +38,6 @@ def test_a_folder_is_replaced_whole(tmp_path):
         with files.replacing_folder(target) as beside:
             (beside / f"step_{step}").write_text(step)
     assert [p.name for p in target.iterdir()] == ["step_2"]
-    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
-
-
-def test_a_folder_that_fails_leaves_the_old_one(tmp_path):
-    target = tmp_path / "checkpoint"
-    with files.replacing_folder(target) as beside:
-        (beside / "weights").write_text("good")
-    with pytest.raises(KeyboardInterrupt), files.replacing_folder(target) as beside:
-        (beside / "weights").write_text("ba")
-        raise KeyboardInterrupt
-    assert (target / "weights").read_text() == "good"
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
 
 
@@ -82,38 +70,34 @@ def test_json_is_strict_and_takes_what_the_suite_holds():
     }
 
 
-def _part(folder, name, writer):
+DEAD = 2**22 + 1
+"""A process number that no process has."""
+
+
+def part_of(folder, name, writer, *inside):
+    """Make what the process `writer` is writing, or left: a folder with folders `inside`."""
     part = folder / f".{name}-{writer}abcdefg_.part"
-    part.mkdir(parents=True)
-    (part / name).write_text("half")
+    for each in inside or ("half",):
+        (part / each).mkdir(parents=True)
     return part
 
 
 def test_what_killed_processes_left_is_swept_and_what_is_being_written_stays(tmp_path):
-    dead = _part(tmp_path, "a.json", f"{2**22 + 1}-")
-    older = _part(tmp_path / "deep" / "er", "b.json", "")
-    alive = _part(tmp_path, "c.json", f"{os.getpid()}-")
+    dead = part_of(tmp_path, "a.json", f"{DEAD}-")
+    older = part_of(tmp_path / "deep" / "er", "b.json", "")
+    alive = part_of(tmp_path, "c.json", f"{os.getpid()}-")
     other = tmp_path / ".hidden.part"
     other.mkdir()
     assert set(files.sweep_parts(tmp_path)) == {dead, older}
     assert alive.exists() and other.exists() and not dead.exists() and not older.exists()
 
 
-def test_a_whole_folder_that_a_kill_left_aside_is_put_in_place(tmp_path):
-    part = tmp_path / f".state-{2**22 + 1}-abcdefgh.part"
-    (part / "replaced").mkdir(parents=True)
-    (part / "state").mkdir()
-    (part / "state" / "new").touch()
+@pytest.mark.parametrize(("writer", "alive"), [(DEAD, False), (os.getpid(), True)])
+def test_a_whole_folder_left_aside_is_put_in_place_unless_its_writer_lives(tmp_path, writer, alive):
+    part = part_of(tmp_path, "state", f"{writer}-", "replaced", "state/new")
     files.sweep_parts(tmp_path)
-    assert (tmp_path / "state" / "new").exists() and not part.exists()
-
-
-def test_a_reader_takes_no_folder_from_who_is_putting_it_in_place(tmp_path):
-    part = tmp_path / f".state-{os.getpid()}-abcdefgh.part"
-    for name in ("replaced", "state"):
-        (part / name).mkdir(parents=True)
     files.recover_folder(tmp_path / "state")
-    assert (part / "state").exists() and not (tmp_path / "state").exists()
+    assert part.exists() == alive and (tmp_path / "state" / "new").exists() != alive
 
 
 def test_a_place_is_tried_before_the_work_and_left_as_it_was(tmp_path):

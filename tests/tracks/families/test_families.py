@@ -36,26 +36,20 @@ def test_a_track_comes_from_its_name_alone(family):
 
 GOLDEN = {
     ("zigzag", 0, 0): -28.07574721,
-    ("zigzag", 5, 1): -28.72496547,
     ("zigzag", 9, 7): -1.76599018,
-    ("circular", 0, 2): 19.43255764,
     ("circular", 3, 1): -6.85258334,
     ("circular", 9, 4): -17.67413879,
-    ("ellipse", 0, 6): -15.02192482,
     ("ellipse", 6, 2): 39.92945288,
     ("ellipse", 9, 3): -49.71468475,
     ("random", 1, 5): -46.53382366,
-    ("random", 5, 3): 4.45124481,
     ("random", 9, 8): 18.36345052,
 }
 
 
-@pytest.mark.parametrize(("family", "level", "seed"), GOLDEN)
-def test_tracks_never_change(family, level, seed):
-    track = make_track(family, level, seed)
-    flat = np.concatenate([a.ravel() for a in arrays(track)])
-    weighted = flat @ np.cos(np.arange(flat.size))
-    assert weighted == pytest.approx(GOLDEN[family, level, seed], abs=1e-7)
+def test_tracks_never_change():
+    for name, expected in GOLDEN.items():
+        flat = np.concatenate([a.ravel() for a in arrays(make_track(*name))])
+        assert flat @ np.cos(np.arange(flat.size)) == pytest.approx(expected, abs=1e-7), name
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -75,11 +69,9 @@ def test_every_track_is_well_formed(family):
         assert np.allclose(eye, np.eye(3), atol=1e-12)
         for rods in (scene.cylinders, scene.capsules):
             assert np.allclose(np.linalg.norm(rods.axis_w, axis=-1), 1)
-        ahead = gates.center_w[0] - track.start_pos_w
-        assert np.allclose(
-            [np.cos(track.start_yaw), np.sin(track.start_yaw)],
-            ahead[:2] / np.linalg.norm(ahead[:2]),
-        )
+        ahead = (gates.center_w[0] - track.start_pos_w)[:2]
+        facing = [np.cos(track.start_yaw), np.sin(track.start_yaw)]
+        assert np.allclose(facing, ahead / np.linalg.norm(ahead))
 
 
 def test_the_bound_on_solids_is_tight():
@@ -104,19 +96,18 @@ def test_the_closed_tracks_start_between_two_gates(family, near, far):
 
 
 @pytest.mark.parametrize(
-    ("family", "level", "seed", "said"),
+    ("level", "seed", "said"),
     [
-        ("zigzak", 0, 0, "did you mean 'zigzag'"),
-        ("zigzag", 10, 0, "level is 10.*0 to 9"),
-        ("zigzag", -1, 0, "level is -1"),
-        ("zigzag", 1.5, 0, "level is 1.5"),
-        ("zigzag", 1, -3, "seed is -3"),
-        ("zigzag", 1, 0.5, "seed is 0.5"),
+        (10, 0, "level is 10.*0 to 9"),
+        (-1, 0, "level is -1"),
+        (1.5, 0, "level is 1.5"),
+        (1, -3, "seed is -3"),
+        (1, 0.5, "seed is 0.5"),
     ],
 )
-def test_what_no_track_can_be_made_of_is_refused(family, level, seed, said):
+def test_what_no_track_can_be_made_of_is_refused(level, seed, said):
     with pytest.raises(ValueError, match=f"(?i){said}"):
-        make_track(family, level, seed)
+        make_track("zigzag", level, seed)
 
 
 def test_random_tracks_take_a_difficulty_and_advance_the_generator():
@@ -144,11 +135,9 @@ def test_gate_sizes_heights_and_frames(family):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_gate_can_be_reached_by_a_body_of_20_cm(family):
-    assert unreachable_gates(make_track(family, 9, 4)) == []
-
-
-def unreachable_gates(track, step=0.2, body=0.2):
-    """Return the gates to which no connected free cells lead from the one before."""
+    """Connected free cells lead to it from the gate before."""
+    step = body = 0.2
+    track = make_track(family, 9, 4)
     gates = track.scene.gates
     normal = gates.rot_w[:, :, 0]
     leave = np.concatenate([track.start_pos_w[None], gates.center_w[:-1] + 0.6 * normal[:-1]])
@@ -174,10 +163,8 @@ def unreachable_gates(track, step=0.2, body=0.2):
     labels = np.zeros(free.shape, np.int32)
     ndimage.label(free, output=labels)
 
-    def label(point):
-        return int(labels[tuple(np.round((point - low) / step).astype(int))])
-
-    return [i for i in range(8) if label(leave[i]) != label(reach[i]) or not label(reach[i])]
+    begun, ended = (labels[tuple(np.round((p - low) / step).astype(int).T)] for p in (leave, reach))
+    assert (begun == ended).all() and ended.all()
 
 
 def yaw_of(track: Track) -> np.ndarray:
@@ -232,19 +219,15 @@ def test_ellipse_has_two_apexes_and_two_straights_flown_along_the_tangent():
         assert np.all(np.abs(off) <= np.deg2rad(30) * d + 1e-9)
 
 
-def surface_points(track):
-    """Return points on every obstacle."""
-    meshes = [mesh for _, mesh in solid_meshes(track)[32:]]
-    return np.concatenate([part for m in meshes for part in (m.vertices, m.triangles_center)])
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_gates_and_start_are_free_of_obstacles(family):
     for level, seed in ((0, 1), (5, 2), (9, 3), (9, 6)):
         track = make_track(family, level, seed)
         if len(track.names) == 32:
             continue
-        gates, points = track.scene.gates, surface_points(track)
+        gates = track.scene.gates
+        meshes = [mesh for _, mesh in solid_meshes(track)[32:]]
+        points = np.concatenate([part for m in meshes for part in (m.vertices, m.triangles_center)])
         for center, rot in zip(gates.center_w, gates.rot_w, strict=True):
             local = (points - center) @ rot
             near = np.abs(local[:, 0]) < 1.5
@@ -275,22 +258,20 @@ def test_the_first_gates_of_a_track(count):
         np.testing.assert_array_equal(field, whole[:count])
     have, had = counts(short.scene), counts(track.scene)
     assert had.boxes - have.boxes == 4 * (8 - count) and have[1:] == had[1:]
-    boxes = short.scene.boxes.center_w
-    np.testing.assert_array_equal(boxes[: 4 * count], track.scene.boxes.center_w[: 4 * count])
-    np.testing.assert_array_equal(boxes[4 * count :], track.scene.boxes.center_w[32:])
+    boxes, kept = track.scene.boxes.center_w, np.r_[: 4 * count, 32 : had.boxes]
+    np.testing.assert_array_equal(short.scene.boxes.center_w, boxes[kept])
+    assert short.names == (*track.names[: 4 * count], *track.names[32:])
     assert len(short.names) == sum(have) and "gate 0 frame" in short.names[0]
-    assert short.names[4 * count :] == track.names[32:]
-
-
-@pytest.mark.parametrize("count", [0, 9])
-def test_more_gates_than_there_are_or_none(count):
-    with pytest.raises(ValueError, match=f"{count} gates of a track that has 8"):
-        first_gates(make_track("random", 0, 0), count)
+    for none_or_more in (0, 9):
+        with pytest.raises(ValueError, match=f"{none_or_more} gates of a track that has 8"):
+            first_gates(track, none_or_more)
 
 
 def test_a_family_that_returns_no_layout_is_refused_by_name(monkeypatch):
     monkeypatch.setitem(FAMILIES._entries, "hole", lambda d, rng: None)
     with pytest.raises(ValueError, match="'hole' returns NoneType, must return a Layout"):
         make_track("hole", 0, 0)
-    with pytest.raises(ValueError, match="Another one comes with its package"):
-        make_track("holes", 0, 0)
+    with pytest.raises(
+        ValueError, match="Did you mean .zigzag.*comes with its package"
+    ):
+        make_track("zigzak", 0, 0)

@@ -11,7 +11,7 @@ from tracks.geometry.obstacles import segment_distance
 @pytest.fixture(scope="module")
 def tracks():
     rng = np.random.default_rng(5)
-    return [random_track(d, rng) for d in np.linspace(0, 1, 600)]
+    return [random_track(d, rng) for d in np.linspace(0, 1, 400)]
 
 
 def shape_numbers(track):
@@ -27,14 +27,14 @@ def shape_numbers(track):
 
 
 def test_no_stretch_runs_through_another_gates_frame(tracks):
+    share = np.linspace(0, 1, 30)[:, None]
     for track in tracks[::4]:
         gates = track.scene.gates
         point = np.concatenate([track.start_pos_w[None], gates.center_w])[:, :2]
         for k, (begin, end) in enumerate(zip(point, point[1:], strict=False)):
-            for share in np.linspace(0, 1, 30):
-                gap = np.linalg.norm(begin + share * (end - begin) - gates.center_w[:, :2], axis=-1)
-                others = np.setdiff1d(np.arange(8), [k - 1, k])
-                assert gap[others].min() > 1.5
+            others = np.delete(point[1:], [max(k - 1, 0), k], axis=0)
+            way = begin + share * (end - begin)
+            assert np.linalg.norm(way[:, None] - others, axis=-1).min() > 1.5
         assert is_free(gates, track.start_pos_w)
 
 
@@ -80,7 +80,7 @@ def test_density_runs_from_none_to_beyond_level_9(tracks):
     assert np.mean(numbers == 0) > 0.1
     in_air = [sum("ground" not in n for n in t.names[32:]) for t in tracks]
     assert max(in_air) > 49 > hardest - 30
-    easy, hard = numbers[:150], numbers[-150:]
+    easy, hard = numbers[:100], numbers[-100:]
     assert hard.mean() > 1.4 * easy.mean()
 
 

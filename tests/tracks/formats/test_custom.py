@@ -25,14 +25,11 @@ def test_the_example_is_read_as_it_says(root):
     gates = track.scene.gates
     assert (track.family, track.level, track.seed) == ("yard", 0, 0)
     assert gates.opening_g.shape == (4, 12, 2)
-    assert np.allclose(
-        gates.opening_g[0, :4], [[-0.55, -0.5], [0.55, -0.5], [0.55, 0.5], [-0.55, 0.5]]
-    )
-    assert np.allclose(gates.opening_g[0, 4:], gates.opening_g[0, 3])
+    square = [[-0.55, -0.5], [0.55, -0.5], [0.55, 0.5], [-0.55, 0.5]]
+    assert np.allclose(gates.opening_g[0], [*square, *(8 * square[3:])])
     yaw, pitch = np.deg2rad([15, 5])
     ahead = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
-    assert np.allclose(gates.rot_w[1, :, 0], ahead)
-    assert np.allclose(gates.rot_w[3, :, 0], [-1, 0, 0])
+    assert np.allclose(gates.rot_w[[1, 3], :, 0], [ahead, [-1, 0, 0]])
     assert np.allclose(np.linalg.det(gates.rot_w), 1)
     assert track.names[48:] == (
         "crate", "pole", "capsule 0", "ball", "yard mesh part 0", "yard mesh part 1",
@@ -45,12 +42,9 @@ def test_the_example_is_read_as_it_says(root):
     assert track.mesh_sizes == (8, 6) and len(track.scene.triangles) == 14
 
 
-def test_roll_is_right_side_down(tmp_path):
+def test_roll_is_right_side_down_and_a_start_left_out_is_before_gate_0_and_faces_it(tmp_path):
     track = load_track(write(tmp_path, GATE + "roll_deg = 10\n"))
     assert track.scene.gates.rot_w[0, 2, 1] == pytest.approx(np.sin(np.deg2rad(10)))
-
-
-def test_a_start_left_out_is_before_gate_0_and_faces_it(tmp_path):
     track = load_track(write(tmp_path, GATE + "yaw_deg = 90\n"))
     assert np.allclose(track.start_pos_w, [0, -2.5, 1.5])
     assert track.start_yaw == pytest.approx(np.pi / 2)
@@ -73,45 +67,32 @@ def with_polygon(corners):
     return GATE.replace(BOX, f"polygon = {corners}")
 
 
+CAPSULE = "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n"
 BAD = [
     ("schema = 1\n", "has no gate"),
     ("gates = [\n", "is not TOML"),
     ("gate = 3\n" + GATE, "key 'gate'.*Did you mean 'gates'"),
     (GATE + "yaw = 3\n", r"key 'yaw' in \[gates\[0\]\].*Did you mean 'yaw_deg'"),
     ("schema = 2\n" + GATE, "schema is 2, allowed is"),
-    ("[[gates]]\nwidth = 1\nheight = 1\n", r"\[gates\[0\]\] has no 'center'"),
     ("[[gates]]\ncenter=[0,0,1]\nwidth = 1\n", r"has no 'height'"),
     ("[[gates]]\ncenter = [0, 0, 1]\n", "allowed is one of: width and height"),
     (GATE + "radius = 0.5\n", r"\['width', 'radius'\], allowed is one of"),
     (GATE.replace("width = 1.0", 'width = "1"'), "width is '1'.*a number from 0.001"),
-    (GATE.replace("width = 1.0", "width = true"), "width is True"),
     (GATE.replace("1.5]", "nan]"), r"gates\[0\].center.*allowed is a list of 3 numbers"),
-    (GATE.replace(", 1.5]", "]"), "center is .0, 0.*list of 3 numbers"),
     (GATE + "frame_width = -0.1\n", "frame_width is -0.1.*from 0.001"),
     (GATE.replace("1.5]", "1e300]"), "each from -100000 to"),
-    (GATE.replace("width = 1.0", "width = 1e-300"), "width is 1e-300"),
     (GATE.replace("1.5]", "9" * 400 + "]"), r"characters\), allowed is a list of 3"),
     (GATE.replace("1.5]", "0.3]"), "at least 0.20 m higher"),
     (GATE.replace(BOX, "radius = 1\ncorners = 2"), "corners is 2.*from 3 to 64"),
     (with_polygon("[[-1, -1], [1, -1], [0.1, 0], [1, 1], [-1, 1]]"), "polygon is.*convex"),
-    (
-        with_polygon("[[0, 1], [-0.6, -0.8], [0.95, 0.3], [-0.95, 0.3], [0.6, -0.8]]"),
-        "polygon is.*convex",
-    ),
+    (with_polygon("[[0, 1], [-0.6, -0.8], [0.95, 0.3], [-0.95, 0.3], [0.6, -0.8]]"), "convex"),
     (with_polygon("[[1, -1], [2, -1], [2, 1], [1, 1]]"), "around"),
-    (
-        with_polygon("[[0, 1e-10], [1e-10, -1e-10], [-1e-10, -1e-10]]"),
-        "polygon is.*sides of 0.001 m at least",
-    ),
+    (with_polygon("[[0, 1e-10], [1e-10, -1e-10], [-1e-10, -1e-10]]"), "sides of 0.001 m at least"),
     (with_polygon("[[0, 1], [0, 2]]"), "list of 3 or more"),
     ("spheres = 3\n" + GATE, "spheres is 3, allowed is tables"),
     (GATE + "[[spheres]]\ncenter=[0,0,0]\nradius=0\n", r"spheres\[0\].radius is 0"),
     (GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[1,1,0]\n", r"boxes\[0\].size is \[1, 1, 0\]"),
-    (
-        GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\naxis=[0,0,0]\n",
-        "of a length from 1e-06",
-    ),
-    (GATE + "quat_wxyz = [0, 0, 0, 0]\n", "quat_wxyz.*of a length from 1e-06"),
+    (GATE + CAPSULE + "axis=[0,0,0]\n", "of a length from 1e-06"),
     (GATE + "quat_wxyz = [1e200, 0, 0, 0]\n", r"quat_wxyz is .*to 1e\+06"),
     (GATE + "quat_wxyz = [1, 0, 0, 0]\nyaw_deg = 3\n", "key 'yaw_deg'"),
     (NAMED % "x" + NAMED[len(GATE) :] % "x", r"spheres\[1\].name is 'x'"),
@@ -119,11 +100,8 @@ BAD = [
     (NAMED % "quadrotor box", "none of 'ground', 'parked', 'quadrotor box'"),
     (NAMED % "a\\u0000b", "a printable"),
     ("[start]\nposition = [0, 0, -1]\n" + GATE, "start.position.*above the ground"),
-    (
-        START + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n",
-        "start.position is .*inside 'box 0'",
-    ),
-    (START + GATE + "[[capsules]]\ncenter=[0,0,0]\nradius=1\nlength=1\n", "inside 'capsule 0'"),
+    (START + GATE + "[[boxes]]\ncenter=[0,0,0]\nsize=[3,3,3]\n", "start.position.*inside 'box 0'"),
+    (START + GATE + CAPSULE, "inside 'capsule 0'"),
     (GATE + "pitch_deg = 90\n", "start.position is None.*straight up"),
     ("[start]\nyaw = 1\n" + GATE, r"key 'yaw' in \[start\]"),
     (GATE + '[[meshes]]\nfile = "none.stl"\n', "none.stl: no such mesh file"),
@@ -160,11 +138,6 @@ def test_parts_of_a_mesh_have_names_of_their_own(tmp_path):
         load_track(write(tmp_path, GATE + box + mesh))
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match="none.toml: cannot be read"):
-        load_track(tmp_path / "none.toml")
-
-
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
 def test_meshes_come_from_any_common_file(tmp_path, suffix):
     two = [trimesh.creation.box((1, 1, 1)), trimesh.creation.icosphere(2, 0.5)]
@@ -178,21 +151,16 @@ def test_meshes_come_from_any_common_file(tmp_path, suffix):
     )
 
 
-def as_objects(meshes):
-    """Return an OBJ file's text with an object for each mesh, as a decomposition writes it."""
-    lines, first = [], 1
-    for number, mesh in enumerate(meshes):
-        lines += [f"o part {number}", *("v {} {} {}".format(*v) for v in mesh.vertices)]
-        lines += ["f {} {} {}".format(*(face + first)) for face in mesh.faces]
-        first += len(mesh.vertices)
-    return "\n".join(lines) + "\n"
-
-
 def test_parts_that_touch_are_objects_of_their_own(tmp_path):
+    """As a decomposition into convex parts writes them."""
     left, right = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 1))
     right.apply_translation([1, 0, 0])
+    lines = []
+    for number, mesh in enumerate([left, right]):
+        lines += [f"o part {number}", *("v {} {} {}".format(*v) for v in mesh.vertices)]
+        lines += ["f {} {} {}".format(*(face + 1 + 8 * number)) for face in mesh.faces]
+    (tmp_path / "two.obj").write_text("\n".join(lines) + "\n")
     path = write(tmp_path, GATE + '[[meshes]]\nfile = "two.obj"\nposition = [0, 0, 1]\n')
-    (tmp_path / "two.obj").write_text(as_objects([left, right]))
     assert load_track(path).mesh_sizes == (12, 12)
 
 
@@ -215,7 +183,7 @@ def test_a_triangle_without_an_area_is_none(tmp_path):
         load_track(write(tmp_path, path.read_text() + inside))
 
 
-def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
+def test_meshes_that_are_not_convex_open_flat_or_broken_are_refused(tmp_path):
     path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\n')
     good = trimesh.creation.box((1, 1, 1))
     dented = good.subdivide()
@@ -228,6 +196,11 @@ def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
     trimesh.Trimesh(good.vertices, good.faces[:-1]).export(tmp_path / "part.stl")
     with pytest.raises(ValueError, match=r"part 0 of 1 .11 triangles. is not closed"):
         load_track(path)
+    trimesh.Trimesh(good.vertices * [1, 1, 0], good.faces, process=False).export(
+        tmp_path / "part.stl"
+    )
+    with pytest.raises(ValueError, match=r"part.stl: part \d of \d .* is flat; give it"):
+        load_track(path)
     (tmp_path / "part.stl").write_bytes(b"nothing of the kind")
     with pytest.raises(ValueError, match="part.stl"):
         load_track(path)
@@ -237,6 +210,7 @@ def test_meshes_that_are_not_convex_open_or_broken_are_refused(tmp_path):
     ("size", "keys", "said"),
     [
         ((1, 1, 1e-7), "", "0.001 m thick .*; part 0 has "),
+        ((1, 1, 1), "scale = 1e-4", "0.001 m thick .* part 0 has 0.0001"),
         ((1, 1, 1), "scale = 0.002\nposition = [9e4, 9e4, 9e4]", "thick at its position; part 0"),
         ((1, 1, 1), "scale = 1e6", r"within 100000 m .*; part 0 reaches 5e\+05"),
     ],
@@ -249,36 +223,16 @@ def test_meshes_that_mujoco_finds_no_body_are_refused(tmp_path, size, keys, said
         load_track(path)
 
 
-def test_flat_and_tiny_meshes_are_refused(tmp_path):
-    path = write(tmp_path, GATE + '[[meshes]]\nfile = "part.stl"\nscale = 1e-4\n')
-    box = trimesh.creation.box((1, 1, 1))
-    box.export(tmp_path / "part.stl")
-    with pytest.raises(ValueError, match=r"scale is 0.0001, .* part 0 has 0.0001"):
-        load_track(path)
-    trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False).export(
-        tmp_path / "part.stl"
-    )
-    with pytest.raises(ValueError, match=r"part.stl: part \d of \d .* is flat; give it"):
-        load_track(path)
-
-
 def test_a_gate_inside_a_solid_is_refused(tmp_path):
     """It can be flown by nobody; one whose opening stands out of the solid can."""
-    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
-    gate += "[start]\nposition = [-9, 0, 1]\n"
+    start = "[start]\nposition = [-9, 0, 1]\n"
     box = '[[boxes]]\nname = "hall"\ncenter = [0, {y}, 1.5]\nsize = [2, 3, 3]\n'
-    path = tmp_path / "track.toml"
-    path.write_text(gate + box.format(y=0.0))
     with pytest.raises(ValueError, match=r"gates\[0\].center is .*the opening is inside 'hall'"):
-        load_track(path)
-    path.write_text(gate + box.format(y=1.2))
-    assert load_track(path).names[-1] == "hall"
+        load_track(write(tmp_path, GATE + start + box.format(y=0.0)))
+    assert load_track(write(tmp_path, GATE + start + box.format(y=1.2))).names[-1] == "hall"
 
 
 @pytest.mark.parametrize("kind", ["gates", "spheres", "meshes"])
 def test_more_gates_and_solids_than_can_be_read_in_time_are_refused(tmp_path, kind):
-    gate = "[[gates]]\ncenter = [0, 0, 1.5]\nwidth = 1.0\nheight = 1.0\n"
-    path = tmp_path / "track.toml"
-    path.write_text(gate + f"[[{kind}]]\n" * 20_000)
-    with pytest.raises(ValueError, match=rf"{kind} is 2000[01], allowed is up to 1000 of them"):
-        load_track(path)
+    with pytest.raises(ValueError, match=rf"{kind} is 100[12], allowed is up to 1000 of them"):
+        load_track(write(tmp_path, GATE + f"[[{kind}]]\n" * 1001))

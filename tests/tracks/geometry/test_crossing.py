@@ -33,13 +33,8 @@ def to_world(center_w, rot_w, point_g):
 @given(seeds)
 def test_a_crossing_is_what_it_looks_like_in_the_gates_frame(seed):
     center_w, rot_w, opening, before, after = draw(seed)
-    passed, missed = crossing(
-        center_w,
-        rot_w,
-        opening,
-        to_world(center_w, rot_w, before),
-        to_world(center_w, rot_w, after),
-    )
+    ends = (to_world(center_w, rot_w, point) for point in (before, after))
+    passed, missed = crossing(center_w, rot_w, opening, *ends)
     forward = (before[:, 0] < 0) & (after[:, 0] > 0)
     share = before[:, :1] / (before[:, :1] - after[:, :1])
     hit = (before + share * (after - before))[:, 1:]
@@ -87,9 +82,3 @@ def test_any_leading_shape_and_both_libraries():
 def test_the_radius_rule_is_a_ball_of_35_cm(distance, near):
     direction = np.array([2.0, -1.0, 2.0]) / 3
     assert is_near(np.ones(3), np.ones(3) + distance * direction) == near
-
-
-def test_a_regular_polygon_stands_on_its_first_side():
-    corner = regular_polygon(5, 0.5)
-    np.testing.assert_allclose(corner[:2, 1], -0.5, atol=1e-12)
-    assert corner[1, 0] == pytest.approx(-corner[0, 0]) and corner[1, 0] > 0

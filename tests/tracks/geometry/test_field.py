@@ -1,7 +1,6 @@
 """The field against a numerical line integral, and what Maxwell says of it."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,7 +13,7 @@ UPRIGHT = (np.zeros(3), np.eye(3))
 SQUARE = rectangle(1.0, 1.0)
 
 
-def by_line_integral(center_w, rot_w, opening, point_w, current=2e-5, pieces=4000):
+def by_line_integral(center_w, rot_w, opening, point_w, current=2e-5, pieces=2000):
     """Biot and Savart, C * integral of dl x r / |r|^3 along the rim, by the midpoint rule."""
     corner = center_w + np.column_stack([np.zeros(len(opening)), opening]) @ rot_w.T
     share = ((np.arange(pieces) + 0.5) / pieces)[:, None]
@@ -80,26 +79,19 @@ def test_far_away_it_is_a_dipole():
     assert np.allclose(near, dipole, rtol=0.02, atol=1e-12)
 
 
-def test_padding_corners_add_nothing_and_the_wire_is_safe():
+def test_padding_corners_add_nothing_and_the_wire_is_safe_in_both_libraries():
     padded = np.concatenate([SQUARE, SQUARE[-1:], SQUARE[-1:]])
-    point = np.random.default_rng(1).uniform(-2, 2, (50, 3))
+    point = np.random.default_rng(1).uniform(-2, 2, (6, 3))
     expected = magnetic_field(*UPRIGHT, SQUARE, point)
     assert np.allclose(magnetic_field(*UPRIGHT, padded, point), expected, rtol=1e-9, atol=0)
-    on_wire = np.array([[0, 0.5, 0], [0, 0.5, 0.5], [0, 0.1, -0.5], [0, 0.5, 3.0]])
-    for library in (np, jnp):
-        args = [library.asarray(a) for a in (*UPRIGHT, padded, on_wire)]
-        assert library.isfinite(magnetic_field(*args)).all()
-
-
-def test_both_libraries_and_any_leading_shape():
-    rng = np.random.default_rng(2)
-    point = rng.uniform(-3, 3, (6, 3))
-    field = magnetic_field(*UPRIGHT, SQUARE, point)
-    center, rot, corners = (np.broadcast_to(a, (2, 3, *a.shape)) for a in (*UPRIGHT, SQUARE))
+    center, rot, corners = (np.broadcast_to(a, (2, 3, *a.shape)) for a in (*UPRIGHT, padded))
     shaped = magnetic_field(center, rot, corners, point.reshape(2, 3, 3))
-    assert np.allclose(shaped.reshape(6, 3), field)
-    batched = jax.vmap(lambda p: magnetic_field(jnp.zeros(3), jnp.eye(3), jnp.asarray(SQUARE), p))
-    assert np.allclose(batched(jnp.asarray(point)), field, rtol=2e-3, atol=1e-8)
+    assert np.allclose(shaped.reshape(6, 3), expected)
+    on_wire = np.array([[0, 0.5, 0], [0, 0.5, 0.5], [0, 0.1, -0.5], [0, 0.5, 3.0]])
+    points = np.concatenate([point, on_wire])
+    assert np.isfinite(magnetic_field(*UPRIGHT, padded, points)).all()
+    by_jax = np.asarray(jax.jit(magnetic_field)(*UPRIGHT, padded, points))
+    assert np.allclose(by_jax[:6], expected, rtol=2e-3, atol=1e-8) and np.isfinite(by_jax).all()
 
 
 def test_attraction_fades_with_alignment_and_keeps_the_fields_direction():

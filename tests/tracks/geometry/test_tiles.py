@@ -40,8 +40,7 @@ def assert_same(found, expected):
     assert np.ptp(expected) > 3
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("level", [0, 9])
+@pytest.mark.parametrize(("family", "level"), [("zigzag", 0), *((name, 9) for name in FAMILIES)])
 def test_a_track_looks_as_in_mujoco(family, level):
     track = make_track(family, level, 3)
     model, data = model_of(track)
@@ -59,7 +58,7 @@ def test_a_track_looks_as_in_mujoco(family, level):
 def test_any_camera_looks_as_in_mujoco(camera):
     track = make_track("circular", 9, 4)
     model, data = model_of(track)
-    pos_w, rot_w = free_poses(model, data, track, np.random.default_rng(0), 4 * POSES)
+    pos_w, rot_w = free_poses(model, data, track, np.random.default_rng(0), 2 * POSES)
     expected, _ = seen_by_mujoco(camera, model, data, pos_w, rot_w)
     assert_same(seen(camera, track, pos_w, rot_w), expected)
 
@@ -116,7 +115,7 @@ def test_an_image_is_its_cameras_alone(monkeypatch):
         np.testing.assert_array_equal(alone, together[part])
 
 
-def test_inside_a_solid_the_depth_is_zero_and_below_the_ground_it_is_not_seen():
+def test_special_places_inside_a_solid_above_and_below_the_ground_and_none_at_all():
     track = crowd("spheres", np.random.default_rng(0), 1)
     center_w = track.scene.spheres.center_w
     level = np.eye(3)[None]
@@ -124,10 +123,5 @@ def test_inside_a_solid_the_depth_is_zero_and_below_the_ground_it_is_not_seen():
     assert (seen(FINE, track, np.array([[50.0, 0.0, -1.0]]), level) == FINE.range_m).all()
     ground = seen(FINE, track, np.array([[50.0, 0.0, 1.0]]), level)
     assert (ground[0, -1] < 4.0).all() and (ground[0, 0] == FINE.range_m).all()
-
-
-def test_no_camera_makes_no_image():
-    nothing = take(
-        (batched(make_track("zigzag", 0, 0), 1), np.zeros((1, 3)), np.eye(3)[None]), slice(0)
-    )
+    nothing = take((batched(track, 1), np.zeros((1, 3)), level), slice(0))
     assert depth_images(make_tiles(FINE), *nothing).shape == (0, 24, 32)

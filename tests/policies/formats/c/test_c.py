@@ -3,6 +3,8 @@
 import errno
 import shutil
 import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +15,43 @@ from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import STRICT, find_compiler
 from policies.formats.c.forward import Observed
 from policies.formats.c.project import c_project, native_actions, random_observations
+from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import NoAnswer, PolicyError
+from tests.support.policy_files import SPEC, action_of, lively
+from tracks.geometry.camera import Camera
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC is")
+CAMERA = Camera(width=36, height=20)
+ODD = replace(SPEC, camera=CAMERA, hidden_size=50, channels=(6, 96, 32), gate_axis=True)
+"""Sizes that fill no block and no group of four pixels."""
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path_factory):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+def written(project, folder):
+    for file, text in project.files.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def exports(tmp_path_factory, checkpoint):
+    """Folder, project and checkpoint by name: float32, and both types of odd sizes."""
+    spec = replace(ODD, second_axis=True)
+    odd = save_policy(tmp_path_factory.mktemp("odd") / "odd", lively(spec, 4), spec, seed=1)
+    made = {}
+    for name, folder in (("float32", checkpoint), ("odd", odd), ("odd8", odd)):
+        stored = load_policy_checkpoint(folder)
+        dtype = "int8" if name == "odd8" else "float32"
+        observed = random_observations(stored.spec, 40, seed=5)
+        project = c_project(stored, folder.name, dtype, observed)
+        place = written(project, tmp_path_factory.mktemp(name))
+        made[name] = SimpleNamespace(folder=place, checkpoint=stored, project=project)
+    return made
 
 
 def answers(policy, observed):
@@ -35,11 +72,13 @@ def checked(folder, *flags, name="check"):
     return subprocess.run([program], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("name", ["float32", "int8", "odd", "odd8"])
-def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name):
-    flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    plain = ("-DPOLICY_PLAIN",) if name == "odd" else ("-march=native",)
-    done = checked(exports[name].folder, *flags, *plain)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("odd", "-DPOLICY_PLAIN"), ("odd", "-march=native"), ("odd8", "-march=native")],
+)
+def test_it_compiles_strictly_and_runs_under_the_sanitizers(exports, name, kind):
+    flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", kind)
+    done = checked(exports[name].folder, *flags)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "12 steps, 0 numbers wrong" in done.stdout
 
@@ -82,9 +121,8 @@ def test_parity_with_jax_over_a_thousand_steps_with_memory(exports, name, steps)
     np.testing.assert_allclose(answers(policy, observed), wanted, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["int8", "odd8"])
-def test_int8_answers_as_worked_out_and_near_the_policy(exports, name):
-    export = exports[name]
+def test_int8_answers_as_worked_out_and_near_the_policy(exports):
+    export = exports["odd8"]
     params, spec = export.checkpoint.params, export.checkpoint.spec
     observed = random_observations(spec, 60, seed=5)
     found = answers(load_c(export.folder, trust=True), observed)
@@ -131,12 +169,9 @@ def test_what_is_not_finite_is_answered_with_nan_and_forgotten(exports):
             assert np.isnan(action).all() and (after == before).all()
 
 
-def test_code_is_not_run_without_trust(exports):
+def test_what_is_not_trusted_or_compiled_is_said_in_plain_words(exports, tmp_path, monkeypatch):
     with pytest.raises(PolicyError, match="pass --trust"):
         load_policy(exports["odd"].folder / "policy.c")
-
-
-def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monkeypatch):
     folder = shutil.copytree(exports["odd"].folder, tmp_path / "copy")
     (folder / "policy.c").write_text('#include "policy.h"\nvoid policy_reset(policy_state *s) {')
     with pytest.raises(PolicyError, match="refuses it"):
@@ -152,12 +187,11 @@ def test_what_cannot_be_compiled_is_said_in_plain_words(exports, tmp_path, monke
     with pytest.raises(OSError) as met:
         load_c(exports["odd"].folder, trust=True)
     assert met.value.errno == errno.ENOSPC and met.value.filename == "/t/x.s"
-    monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(PolicyError, match="no C compiler"):
-        load_c(exports["odd"].folder, trust=True)
-    monkeypatch.setenv("CC", "gcc '-O2")
-    with pytest.raises(PolicyError, match="not a command line .No closing quotation"):
-        load_c(exports["odd"].folder, trust=True)
+    wrong = {"no-such-compiler": "no C compiler", "gcc '-O2": "not a command line .No closing quot"}
+    for command, said in wrong.items():
+        monkeypatch.setenv("CC", command)
+        with pytest.raises(PolicyError, match=said):
+            load_c(exports["odd"].folder, trust=True)
 
 
 def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
@@ -174,9 +208,7 @@ def test_a_folder_of_links_flies_with_its_own_header(exports, tmp_path):
 def test_a_name_with_signs_that_c_reads_otherwise_comes_back(exports, tmp_path):
     """Of two ? and a third sign C99 makes another sign, a backslash even."""
     name = r'run ??) "one" ??/ \ü'
-    project = c_project(exports["odd"].checkpoint, name)
-    for file, text in project.files.items():
-        (tmp_path / file).write_text(text, encoding="utf-8")
+    written(c_project(exports["odd"].checkpoint, name), tmp_path)
     assert checked(tmp_path).returncode == 0
     assert load_c(tmp_path, trust=True).name == f"{name}.c"
 
@@ -221,9 +253,7 @@ def test_any_c_with_this_door_flies_but_none_with_a_memory_of_its_own(tmp_path):
 def test_c_without_its_functions_is_refused_with_what_it_lacks(tmp_path):
     (tmp_path / "policy.h").write_text(DOOR.replace("{size}", "12"))
     (tmp_path / "policy.c").write_text('#include "policy.h"\n')
-    with pytest.raises(
-        PolicyError, match="compiled C .* cannot load it .*must define policy_reset"
-    ):
+    with pytest.raises(PolicyError, match="C .* cannot load it .*must define policy_reset"):
         load_c(tmp_path, trust=True)
 
 
@@ -235,28 +265,22 @@ def test_c_that_hangs_or_crashes_in_flight_takes_nothing_with_it(fault, how, tmp
     """The next trial's question goes to a fresh process."""
     monkeypatch.setattr(process, "ANSWER_S", 1.0)
     policy = foreign(tmp_path, f"state->seen;\n    if (observation[1] > 1e6f) {{ {fault} }}")
-    hidden, image, fresh = policy.start(2), np.zeros((2, 24, 32), np.float32), np.ones(2, bool)
-    calm = np.tile(np.arange(12, dtype=np.float32), (2, 1))
-    before, _ = policy.act(hidden, calm, image, fresh)
+    calm = np.tile(np.arange(12.0), (2, 1))
+    before = action_of(policy, calm)
     with pytest.raises(NoAnswer, match=f"compiled C does not come to an end with it .*{how}"):
-        policy.act(hidden, calm * 1e7, image, fresh)
-    assert policy.act(hidden, calm, image, fresh)[0].tobytes() == before.tobytes()
+        action_of(policy, calm * 1e7)
+    assert action_of(policy, calm).tobytes() == before.tobytes()
 
 
 def test_it_includes_only_math_and_its_header_says_sizes_and_weights(exports):
-    export = exports["int8"]
-    text = (export.folder / "policy.c").read_text()
-    assert [line for line in text.splitlines() if line.startswith("#include")] == [
-        "#include <math.h>",
-        '#include "policy.h"',
-    ]
+    export = exports["float32"]
+    lines = (export.folder / "policy.c").read_text().splitlines()
+    included = [line for line in lines if line.startswith("#include")]
+    assert included == ["#include <math.h>", '#include "policy.h"']
     header = (export.folder / "policy.h").read_text()
     for said in ("POLICY_STATE_SIZE 12", "POLICY_IMAGE_HEIGHT 24", "POLICY_RATE_HZ 33.0f"):
         assert f"#define {said}" in header
     assert export.checkpoint.config["weights"]["sha256"] in header
-
-
-def test_sizes_in_the_header_are_those_of_the_struct(exports):
     for name, export in exports.items():
         policy = load_c(export.folder, trust=True)
         assert policy.state_bytes == source.memory_bytes(policy.spec, name.endswith("8"))
@@ -273,7 +297,7 @@ def test_tanh_and_literals_are_exact_enough():
 
 
 def test_a_type_is_known_and_int8_needs_flights(exports):
-    checkpoint = exports["int8"].checkpoint
+    checkpoint = exports["float32"].checkpoint
     with pytest.raises(ValueError, match="unknown type 'int9'. Did you mean 'int8'"):
         c_project(checkpoint, "tiny", "int9")
     with pytest.raises(PolicyError, match="needs observations of flights"):

@@ -15,7 +15,7 @@ from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
 from suite.judging.deploy import exporting, latency, parity
-from tests.policies.conftest import SPEC, lively
+from tests.support.policy_files import SPEC, lively
 from tests.support.pilots import Steady
 from tests.support.small_policy import small_checkpoint
 

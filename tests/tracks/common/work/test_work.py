@@ -5,9 +5,12 @@ import errno
 import os
 import subprocess
 import sys
+from types import MappingProxyType
 
 import pytest
 
+from eval.effects import find_effect
+from eval.logs.columns import FlightLogError
 from suite.cli import main
 from suite.common.errors import explain
 from tracks.common.work import MOST, core_shares, processes, read_workers, threads, worker_count
@@ -45,7 +48,7 @@ def test_workers_are_a_number_or_an_address(text, workers):
 
 @pytest.mark.parametrize(
     "text",
-    ["0", "-1", "two", "", "1.5", str(MOST + 1), "9" * 5000, "tcp://head", "ftp://a:1", "::"],
+    ["0", "-1", "two", "", "1.5", str(MOST + 1), "9" * 5000, "tcp://head", "ucx://head:8786", "::"],
 )
 def test_others_are_refused_with_what_is_allowed(text):
     with pytest.raises(ValueError, match=r"^--workers is '.{0,80}'; allowed is 1 to 256.*tcp://"):
@@ -63,14 +66,14 @@ def test_the_software_is_told_apart_by_name():
     assert differences({**ours, "jax": "0.1"}, ours) == f"jax 0.1 there, {ours['jax']} here"
 
 
-class Stubborn(Exception):
-    def __reduce__(self):
-        raise TypeError("cannot be pickled")
+class Stubborn(ValueError):
+    """One that cannot be made of what it says, so that it cannot travel."""
+
+    def __init__(self, name, value):
+        super().__init__(f"{name} is {value}")
 
 
 def test_an_error_travels_with_where_it_came_up():
-    from eval.effects import find_effect
-
     with pytest.raises(ValueError) as caught:
         find_effect("linear_dragg")
     there = unpack(pack(failure(caught.value)))
@@ -79,25 +82,29 @@ def test_an_error_travels_with_where_it_came_up():
     )
     found = remote_error(elsewhere)
     assert explain(found) == (2, str(found)) and "linear_drag" in str(found)
-    assert str(remote_error(failure(Stubborn("so")))) == "Stubborn: so"
+    log = unpack(pack(failure(FlightLogError("a.csv", "time", 3, "goes back"))))
+    assert isinstance(log.error, FlightLogError) and str(log.error).startswith("a.csv: column time")
+    other = remote_error(failure(Stubborn("x", 1)))
+    assert isinstance(other, ValueError) and str(other) == "Stubborn: x is 1"
+
+
+def test_a_read_only_table_travels_and_a_function_without_a_name_says_what_to_do():
+    assert unpack(pack(MappingProxyType({1: 2}))) == MappingProxyType({1: 2})
+    with pytest.raises(ValueError, match=r"functools\.partial"):
+        pack(lambda piece: [piece])
 
 
 @pytest.mark.parametrize(("cores", "wanted"), [(1, "2"), (2, "2"), (16, "16")])
-def test_a_thread_a_core_and_at_least_two(cores, wanted, monkeypatch):
+def test_a_thread_a_core_at_least_two_and_no_more_than_a_share_needs(cores, wanted, monkeypatch):
     monkeypatch.setattr(threads, "usable_cores", lambda: cores)
-    own, asked = {}, {"NPROC": "1"}
-    for environment in (own, asked):
-        set_threads(environment)
+    own, asked, many = {}, {"NPROC": "1"}, {"NPROC": "99"}
+    set_threads(own)
+    set_threads(asked)
     assert own == {"NPROC": wanted} and asked == {"NPROC": "1"}
     assert threads.threads(own) == int(wanted) and threads.threads({}) == cores
-
-
-def test_a_share_of_the_cores_takes_no_more_threads_than_it_needs(monkeypatch):
-    monkeypatch.setattr(threads, "usable_cores", lambda: 4)
-    for had, wanted in (("16", "4"), ("2", "2"), ("1", "1")):
-        environment = {"NPROC": had}
+    for environment, share in ((asked, "1"), (many, wanted)):
         share_threads(environment)
-        assert environment == {"NPROC": wanted}
+        assert environment == {"NPROC": share}
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "two", "1e3", "4097", "9" * 5000, "٣"])
@@ -135,12 +142,9 @@ def test_the_encoders_gradient_has_the_same_bits_on_any_number_of_cores():
     for number, pinned in ((None, True), (None, False), ("8", False), ("64", False)):
         environment = {**os.environ, **({} if number is None else {"NPROC": number})}
         done = subprocess.run(
-            [sys.executable, "-c", GRADIENT],
-            env=environment,
-            capture_output=True,
-            check=True,
+            [sys.executable, "-c", GRADIENT], env=environment, capture_output=True, check=True,
             preexec_fn=(lambda: os.sched_setaffinity(0, [one])) if pinned else None,
-        )
+        )  # fmt: skip
         found.add(done.stdout)
     assert len(found) == 1
 
@@ -155,13 +159,10 @@ def test_processes_that_share_no_lock_are_refused_by_its_place(monkeypatch):
     assert explain(met.value) == (2, "read-only file system: /dev/shm")
 
 
-def test_numpys_setting_of_a_user_stays():
+def test_a_command_gives_numpy_one_thread_and_leaves_a_users_setting(monkeypatch):
     own = {"OMP_NUM_THREADS": "3"}
     one_thread_a_product(own)
     assert own == {"OMP_NUM_THREADS": "3"}
-
-
-def test_a_command_gives_numpy_one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS")
