@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from policies import shipped
+from policies.formats import torch_file
 from policies.native import load_native, native_policy
 from policies.networks import network
 from policies.policy import load_policy
 from policies.spec import PolicyError
-from tests.support.policy_files import SPEC
+from tests.support.policy_files import SPEC, InProcess
 
 
 @pytest.fixture
@@ -62,7 +63,8 @@ def test_a_file_cut_anywhere_is_refused_by_name(exported, tmp_path_factory, file
     path = tmp_path_factory.mktemp("cut") / file
     data = (exported / file).read_bytes()
     path.write_bytes(data[: int(keep * len(data))])
-    with pytest.raises(PolicyError) as caught:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(PolicyError) as caught:
+        patch.setattr(torch_file, "ModelProcess", InProcess)
         load_policy(path, trust=True)
     assert str(path) in str(caught.value)
 

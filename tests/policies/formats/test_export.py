@@ -30,7 +30,7 @@ def rollout(policy, n, steps):
     return np.stack(actions)
 
 
-def test_the_three_are_equal_over_a_rollout(checkpoint, exported):
+def test_the_three_are_equal_over_a_rollout(checkpoint, exported, in_process):
     ours = rollout(load_policy(checkpoint), 70, 12)
     assert np.abs(ours).std() > 1.0
     for file in ("tiny.pt2", "tiny.onnx"):

@@ -15,8 +15,8 @@ from policies.policy import load_policy
 from policies.spec import PolicySpec
 from suite import cli
 from suite.judging.deploy import exporting, latency, parity
-from tests.support.policy_files import SPEC, lively
 from tests.support.pilots import Steady
+from tests.support.policy_files import SPEC, lively
 from tests.support.small_policy import small_checkpoint
 
 needs_cc = pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
