@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 import trimesh
 from hypothesis import HealthCheck, given, seed, settings
@@ -22,7 +21,7 @@ from eval.importers import import_log
 from eval.importers.formats.table import read_map
 from eval.importers.options import ImportOptions
 from eval.judging.results import Journal, read_trials, write_trials
-from eval.logs.flight_log import read_flight
+from eval.logs.flight_log import read_flight, write_flight
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.sensors.sensors_file import PRESETS, load_sensors
 from policies import shipped
@@ -37,6 +36,7 @@ from suite.train.recipes import named_recipe, with_quadrotor
 from tests.support import foreign_logs, known_flight, raw_logs
 from tests.support.judged_cells import ROWS
 from tests.support.mutations import changes, mutated_bytes, mutated_json, mutated_toml
+from tests.support.policy_files import onnx_model
 from tracks.common.files import plain
 from tracks.formats.custom import load_track
 from tracks.formats.mesh_reader import load_convex_parts
@@ -88,44 +88,28 @@ def answered(use, *given):
 
 
 def a_flight(folder, ending):
-    from eval.logs.flight_log import write_flight
-
     log = read_flight(ROOT / "suite" / "diagnose" / "example" / "flight_1.parquet")
-    short = slice(0, 150)
-    cut = replace(
-        log, **{k: v[short] for k, v in vars(log).items() if hasattr(v, "shape") and v.ndim}
-    )
-    return write_flight(folder / f"flight{ending}", cut).read_bytes()
-
-
-def an_onnx():
-    node = onnx.helper.make_node("Identity", ["state"], ["action"])
-    info = onnx.helper.make_tensor_value_info
-    graph = onnx.helper.make_graph(
-        [node], "g", [info("state", 1, ("n", 12))], [info("action", 1, ("n", 12))]
-    )
-    return onnx.helper.make_model(graph).SerializeToString()
+    parts = {k: v[:150] for k, v in vars(log).items() if hasattr(v, "shape") and v.ndim}
+    return write_flight(folder / f"flight{ending}", replace(log, **parts)).read_bytes()
 
 
 def a_foreign_file(kind, folder):
     """Return the bytes of a short flight, a table or a mesh as other programs write it."""
     path, short = folder / "whole", (0.0, 1.2)
-    if kind == "ulg":
-        return foreign_logs.write_ulog(path, short, rate=100.0).read_bytes()
-    if kind == "mcap":
-        return foreign_logs.write_mcap(path, short).read_bytes()
-    if kind == "blackbox":
-        return foreign_logs.write_blackbox(path, short, rate=200.0).read_bytes()
-    if kind in ("bbl", "bin"):
-        write = {"bbl": raw_logs.write_raw, "bin": raw_logs.write_bin}[kind]
-        return write(path, known_flight.fly(np.arange(0.0, 1.2, 0.01))).read_bytes()
-    if kind == "usd":
-        return foreign_logs.write_usd(path, short).read_bytes()
-    if kind == "trials.parquet":
-        write_trials(path, ROWS, {})
-        return path.read_bytes()
-    data = trimesh.creation.icosphere(1).export(file_type=kind)
-    return data.encode() if isinstance(data, str) else data
+    writers = {
+        "ulg": lambda: foreign_logs.write_ulog(path, short, rate=100.0),
+        "mcap": lambda: foreign_logs.write_mcap(path, short),
+        "blackbox": lambda: foreign_logs.write_blackbox(path, short, rate=200.0),
+        "usd": lambda: foreign_logs.write_usd(path, short),
+        "bbl": lambda: raw_logs.write_raw(path, known_flight.fly(np.arange(*short, 0.01))),
+        "bin": lambda: raw_logs.write_bin(path, known_flight.fly(np.arange(*short, 0.01))),
+        "trials.parquet": lambda: write_trials(path, ROWS, {}),
+    }
+    if kind in writers:
+        writers[kind]()
+    else:
+        trimesh.creation.icosphere(1).export(path, file_type=kind)
+    return path.read_bytes()
 
 
 def foreign_reader(kind):
@@ -172,7 +156,7 @@ def drawn_and_used(kind, folder):
         config = json.loads((source / "config.json").read_text())
         return mutated_json(config), filed(lambda _: load_policy_checkpoint(folder), "config.json")
     if kind == "policy.onnx":
-        return mutated_bytes(an_onnx()), filed(read_checked, "odd.onnx")
+        return mutated_bytes(onnx_model().SerializeToString()), filed(read_checked, "odd.onnx")
     if kind in ("flight.parquet", "flight.csv"):
         ending = Path(kind).suffix
         return mutated_bytes(a_flight(folder, ending)), filed(read_flight, f"odd{ending}")

@@ -18,10 +18,12 @@ from eval.effects import EFFECTS
 from eval.logs.flight_log import read_flights
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
+from policies.formats import torch_file
 from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
 from suite.train.overrides import override
+from tests.support.policy_files import InProcess
 from tests.support.short import cut_short
 
 RECIPE, DIAGNOSE = train_command.named_recipe, diagnose_run.diagnose_files
@@ -55,7 +57,7 @@ def source(name):
 
 
 def test_every_example_is_run_here_and_shown_to_newcomers():
-    # One needs a package of its own, one is longer: test_sb3.py, test_ppo.py.
+    # One needs a package of its own, one is longer: test_trainers.py.
     elsewhere = ["sb3_race", "cleanrl_ppo"]
     names = sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
     assert sorted([*EXAMPLES, *elsewhere]) == names
@@ -87,6 +89,8 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
         said = IN_SHORT.get(name, said).replace("[1-8] gates", r"\d gates")
     program = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [program, *args])
+    if name == "bring_your_own_policy":
+        monkeypatch.setattr(torch_file, "ModelProcess", InProcess)
     if name == "diagnose_a_log":
         monkeypatch.setattr(diagnose_run, "diagnose_files", diagnosed)
     runpy.run_path(program, run_name="__main__")

@@ -271,7 +271,5 @@ def test_a_family_that_returns_no_layout_is_refused_by_name(monkeypatch):
     monkeypatch.setitem(FAMILIES._entries, "hole", lambda d, rng: None)
     with pytest.raises(ValueError, match="'hole' returns NoneType, must return a Layout"):
         make_track("hole", 0, 0)
-    with pytest.raises(
-        ValueError, match="Did you mean .zigzag.*comes with its package"
-    ):
+    with pytest.raises(ValueError, match="Did you mean .zigzag.*comes with its package"):
         make_track("zigzak", 0, 0)
