@@ -172,7 +172,7 @@ PLACES = {
 
 WRITTEN = [(command, place) for command in WRITERS for place in PLACES]
 WRITTEN = [each for each in WRITTEN if each[0] == "eval" or "file" in each[1]]
-"""All places for one command, and for the others those of another kind each."""
+"""All places for one command, and for each other command those that people meet most."""
 
 
 @pytest.mark.parametrize(("command", "place"), WRITTEN)
