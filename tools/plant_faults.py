@@ -55,7 +55,7 @@ FAULTS = (
     ),
     Fault(
         "tracks", "half_u * (1 - (2 * np.arange(camera.width) + 1) /",
-        "half_u * (1 - (2 * np.arange(camera.width)) /", "test_depth",
+        "half_u * (1 - (2 * np.arange(camera.width)) /", "test_geometry",
     ),
     Fault(
         "tracks", "along = jnp.clip((away * rods.axis_w).sum(-1), -rods",
