@@ -9,8 +9,14 @@ FIELDS = ("pos_w", "quat_wxyz", "vel_w", "rate_b", "thrust_cmd", "rate_cmd_b", "
 
 def rows(log, chosen):
     """Return `log` with the rows at `chosen` (indices or bool) only."""
-    arrays = {name: getattr(log, name) for name in (*FIELDS, "time_s", "acc_b", "voltage")}
-    return replace(log, **{k: None if v is None else v[chosen] for k, v in arrays.items()})
+    names = (*FIELDS, "time_s", "acc_b", "voltage")
+    return changed(log, **dict.fromkeys(names, lambda values: values[chosen]))
+
+
+def changed(log, **functions):
+    """Return `log` with a function of the values in some fields, where it has them."""
+    have = {name: getattr(log, name) for name in functions}
+    return replace(log, **{k: functions[k](v) for k, v in have.items() if v is not None})
 
 
 def dropped(log, rng):
@@ -20,16 +26,14 @@ def dropped(log, rng):
 
 def holed(log, rng):
     """Stretches without a pose, a rate or a command."""
-    changed = {}
-    for name in FIELDS:
-        values = getattr(log, name)
-        if values is None:
-            continue
+
+    def with_holes(values):
         values = values.copy()
         for first in rng.integers(0, len(values), 3):
             values[first : first + int(rng.integers(1, 60))] = np.nan
-        changed[name] = values
-    return replace(log, **changed)
+        return values
+
+    return changed(log, **dict.fromkeys(FIELDS, with_holes))
 
 
 def jittered(log, rng):
@@ -47,46 +51,30 @@ def doubled(log, rng):
 
 def still(log, rng):
     """A hover without noise: nothing changes at all."""
-    count = len(log.time_s)
-    return replace(
-        log,
-        pos_w=np.tile([0.0, 0.0, 1.0], (count, 1)),
-        quat_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        vel_w=np.zeros((count, 3)),
-        rate_b=np.zeros((count, 3)),
-        thrust_cmd=None if log.thrust_cmd is None else np.full(count, 9.81),
-        rate_cmd_b=None if log.rate_cmd_b is None else np.zeros((count, 3)),
-    )
+    rest = {"pos_w": [0.0, 0.0, 1.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0], "thrust_cmd": 9.81}
+    rest |= dict.fromkeys(("vel_w", "rate_b", "rate_cmd_b"), 0.0)
+    return changed(log, **{k: lambda v, at=at: np.zeros(v.shape) + at for k, at in rest.items()})
 
 
 def grounded(log, rng):
     """The vehicle stands on the ground with its rotors off."""
-    quiet = still(log, rng)
-    count = len(log.time_s)
-    return replace(
-        quiet,
-        pos_w=np.tile([0.0, 0.0, 0.02], (count, 1)) + 1e-3 * rng.standard_normal((count, 3)),
-        thrust_cmd=None if log.thrust_cmd is None else np.zeros(count),
-        rotor_speed=None if log.rotor_speed is None else np.zeros((count, 4)),
-    )
+    quiet = silent(still(log, rng), rng)
+    noise = 1e-3 * rng.standard_normal(log.pos_w.shape)
+    return changed(quiet, pos_w=lambda v: v * [0.0, 0.0, 0.02] + noise, rotor_speed=np.zeros_like)
 
 
 def silent(log, rng):
     """All commands are zero while it flies."""
-    return replace(
-        log,
-        thrust_cmd=None if log.thrust_cmd is None else 0.0 * log.thrust_cmd,
-        rate_cmd_b=None if log.rate_cmd_b is None else 0.0 * log.rate_cmd_b,
-    )
+    return changed(log, thrust_cmd=np.zeros_like, rate_cmd_b=np.zeros_like)
 
 
 def wild(log, rng):
     """Commands, rates and poses of a broken sensor."""
-    return replace(
+    return changed(
         log,
-        pos_w=log.pos_w + 1e4 * rng.standard_normal(log.pos_w.shape),
-        rate_b=100.0 * rng.standard_normal(log.rate_b.shape),
-        thrust_cmd=None if log.thrust_cmd is None else 1e6 * np.abs(log.thrust_cmd),
+        pos_w=lambda v: v + 1e4 * rng.standard_normal(v.shape),
+        rate_b=lambda v: 100.0 * rng.standard_normal(v.shape),
+        thrust_cmd=lambda v: 1e6 * np.abs(v),
     )
 
 

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from eval.logs.flight import Flight
-from eval.worlds.trial import TrialResult
+from tests.support.judged_cells import result
 from tracks.geometry.gates import frame_boxes, square_gates
 from tracks.geometry.scene import Boxes, Rods, Scene, Spheres
 from tracks.track import Track
@@ -89,32 +89,17 @@ def smooth_flight(track, speed=4.0, duration_s=None, depth=True):
     )
 
 
-def result_of(track, flight, ended_by="finished"):
+def result_of(track, flight, ended_by):
     """The row of trials.parquet that such a flight has."""
-    speed = np.linalg.norm(flight.vel_w, axis=1)
-    return TrialResult(
-        track=track.family,
-        difficulty=track.level,
-        seed=track.seed,
-        policy="spline",
-        vehicle="reference",
-        world="none",
-        success=ended_by == "finished",
-        gates_passed=int(flight.gate[-1]),
-        ended_by=ended_by,
-        collided_with="pillar 0" if ended_by == "collision" else None,
-        pos_x=float(flight.pos_w[-1, 0]),
-        pos_y=float(flight.pos_w[-1, 1]),
-        pos_z=float(flight.pos_w[-1, 2]),
-        time_s=float(flight.time_s[-1]),
-        v_max=float(speed.max()),
-        v_mean=float(speed.mean()),
-        gates_8s=int(flight.gate[-1]),
-        gates_035=int(flight.gate[-1]),
-        bad_actions=0,
-        limited_actions=0,
-        late_actions=0,
-    )
+    speed, gates = np.linalg.norm(flight.vel_w, axis=1), int(flight.gate[-1])
+    won, hit = ended_by == "finished", ended_by == "collision"
+    row = result(track.seed, won, "spline", track.level)
+    x, y, z = flight.pos_w[-1].tolist()
+    return row._replace(
+        track=track.family, world="none", ended_by=ended_by, gates_passed=gates, gates_8s=gates,
+        gates_035=gates, collided_with="pillar 0" if hit else None, pos_x=x, pos_y=y, pos_z=z,
+        time_s=float(flight.time_s[-1]), v_max=float(speed.max()), v_mean=float(speed.mean()),
+    )  # fmt: skip
 
 
 @cache

@@ -42,16 +42,11 @@ def flight(hz=200.0, end=8.0, noise=0.0, seed=0):
 def write(path, parts, keep=None):
     """Write `parts` as CSV; cells that `keep` (signal -> mask of rows) leaves out stay empty."""
     columns = {"time": [repr(float(t)) for t in parts["time"]]}
-    for name, names in NAMES.items():
-        if name not in parts:
-            continue
-        mask = np.ones(len(parts["time"]), bool) if keep is None else keep.get(name)
-        mask = np.ones(len(parts["time"]), bool) if mask is None else mask
-        for k, column in enumerate(names):
-            values = parts[name][:, k]
-            columns[column] = [
-                repr(float(v)) if m else "" for v, m in zip(values, mask, strict=True)
-            ]
+    for name in [name for name in NAMES if name in parts]:
+        mask = (keep or {}).get(name, np.ones(len(parts["time"]), bool))
+        for column, values in zip(NAMES[name], parts[name].T, strict=True):
+            rows = zip(values, mask, strict=True)
+            columns[column] = [repr(float(v)) if kept else "" for v, kept in rows]
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(columns)

@@ -29,17 +29,14 @@ def mutated_bytes(valid: bytes) -> st.SearchStrategy[bytes]:
     def apply(changes: list[tuple[str, int, int, bytes]]) -> bytes:
         data = valid
         for kind, at, count, new in changes:
-            match kind:
-                case "w":
-                    data = data[:at] + new + data[at + len(new) :]
-                case "x":
-                    data = data[:at] + data[at + count :]
-                case "d":
-                    data = data[:at] + data[at : at + count] * 3 + data[at + count :]
-                case "t":
-                    data = data[:at]
-                case _:
-                    data = data[:at] + new * 200 + data[at:]
+            before, cut, after = data[:at], data[at : at + count], data[at + count :]
+            data = {
+                "w": before + new + data[at + len(new) :],
+                "x": before + after,
+                "d": before + cut * 3 + after,
+                "t": before,
+                "z": before + new * 200 + data[at:],
+            }[kind]
         return data
 
     return st.lists(change, min_size=1, max_size=4).map(apply)
