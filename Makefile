@@ -51,6 +51,8 @@ style: $(STAMP)
 types: $(STAMP)
 	$(PY) -m pyright --pythonpath $(PY) --warnings --level warning
 
+# Tests start dozens of programs, each of which would compile the modules anew.
+tests: export PYTHONDONTWRITEBYTECODE =
 tests: $(STAMP)
 	$(PY) -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder
 

@@ -10,6 +10,7 @@ from tracks.families import FAMILIES, MAX_COUNTS, make_track
 from tracks.formats.custom import load_track
 from tracks.formats.meshes import named_meshes, solid_meshes
 from tracks.formats.mujoco_scene import GROUND, PARKED, add_scene, solid_name
+from tracks.geometry.clearance import distances
 from tracks.geometry.scene import PARKED_Z, Counts
 
 
@@ -112,38 +113,22 @@ def test_what_does_not_fit_is_refused_and_what_has_no_names_gets_them_by_kind():
     assert names[0] == "boxes 0" and "spheres 0" in names and len(set(names)) == len(names)
 
 
-def test_meshes_have_the_solids_names_places_and_volumes():
+def test_a_mesh_has_its_solids_name_lies_on_it_and_fills_it():
     track = make_track("ellipse", 9, 5)
-    scene = track.scene
     meshes = solid_meshes(track)
     assert [name for name, _ in meshes] == list(track.names)
-    assert all(mesh.is_watertight and mesh.volume > 0 for _, mesh in meshes)
-    solids = (scene.boxes, scene.cylinders, scene.capsules, scene.spheres)
-    center_w = np.concatenate([kind.center_w for kind in solids])
-    assert np.allclose([mesh.center_mass for _, mesh in meshes], center_w, atol=1e-3)
-    tubes, capsules = (
-        2 * np.pi * rods.radius**2 * rods.half_length for rods in (scene.cylinders, scene.capsules)
-    )
-    balls, ends = (4 / 3 * np.pi * r**3 for r in (scene.spheres.radius, scene.capsules.radius))
-    volume = np.concatenate([8 * scene.boxes.half_size.prod(-1), tubes, capsules + ends, balls])
-    share = np.array([mesh.volume for _, mesh in meshes]) / volume
-    assert np.all((share > 0.95) & (share < 1 + 1e-9))
-
-
-def test_long_axes_point_where_the_rods_do():
-    track = make_track("zigzag", 9, 4)
-    scene = track.scene
-    meshes = solid_meshes(track)[len(scene.boxes.center_w) :]
-    long, rounded = scene.cylinders, scene.capsules
-    axes, centers = (
-        np.concatenate([getattr(rods, name) for rods in (long, rounded)])
-        for name in ("axis_w", "center_w")
-    )
-    halves = np.concatenate([long.half_length, rounded.half_length + rounded.radius])
-    for (_, mesh), axis, center, half in zip(meshes, axes, centers, halves, strict=False):
-        along = (mesh.vertices - center) @ axis
-        assert along.max() == pytest.approx(half, abs=1e-6)
-        assert along.min() == pytest.approx(-half, abs=1e-6)
+    corners = np.concatenate([mesh.vertices for _, mesh in meshes])
+    solid = np.repeat(np.arange(len(meshes)), [len(mesh.vertices) for _, mesh in meshes])
+    scene = jax.tree.map(np.float32, track.scene)
+    gap = np.asarray(distances(scene, jax.numpy.asarray(corners))[0])
+    assert np.abs(gap[np.arange(len(corners)), solid]).max() < 1e-4
+    centers = [kind.center_w for kind in track.scene[1:5]]
+    for (name, mesh), center_w in zip(meshes, np.concatenate(centers), strict=True):
+        assert mesh.is_watertight and mesh.volume > 0, name
+        assert np.allclose(mesh.center_mass, center_w, atol=1e-3), name
+        # Its corners lie to all sides of the middle, so that it is the whole solid.
+        ahead = (mesh.vertices - center_w) @ np.concatenate([np.eye(3), -np.eye(3)]).T
+        assert (ahead.max(axis=0) > 0).all(), name
 
 
 def test_a_gates_bars_are_one_mesh_and_parked_bars_none(root):

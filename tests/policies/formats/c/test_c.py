@@ -286,13 +286,8 @@ def test_it_includes_only_math_and_its_header_says_sizes_and_weights(exports):
         assert policy.state_bytes == source.memory_bytes(policy.spec, name.endswith("8"))
 
 
-def test_tanh_and_literals_are_exact_enough():
-    p, q = (np.array(c, np.float32) for c in source.tanh_polynomials())
-    x = np.linspace(-8, 8, 10_001, dtype=np.float32)
-    value = x * np.polyval(p[::-1], x * x) / np.polyval(q[::-1], x * x)
-    assert np.abs(value - np.tanh(x.astype(float))).max() < 4e-7
-    rng = np.random.default_rng(0)
-    for value in rng.normal(size=1000).astype(np.float32) * np.float32(1e-3):
+def test_literals_are_exact():
+    for value in np.random.default_rng(0).normal(size=1000).astype(np.float32) * np.float32(1e-3):
         assert np.float32(arrays.float_text(float(value))[:-1]) == value
 
 
