@@ -136,10 +136,3 @@ def test_a_gradient_is_the_limit_of_differences(case):
         wanted = np.moveaxis(ahead - behind, 0, -1) / (2 * STEP)
     assert np.abs(wanted).max() > 1e-3, "the case says nothing"
     np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
-
-
-def test_values_at_the_limit_are_as_they_were():
-    for force, error in (((0.0, 0.0, G), (0.0, 0.0)), ((0.0, 0.0, -G), (100.0, 0.0))):
-        loop = Loop(rate_max=np.full(3, 100.0), attitude_gain=np.array([100.0, 100.0, 4.0]))
-        rate = attitude_command(loop, np.array(force), LEVEL, X).rate_b
-        assert tuple(rate[:2]) == pytest.approx(error) and not np.signbit(rate[:2]).any()

@@ -55,16 +55,9 @@ def fly(vehicle, seed, *args, **options):
 
 
 def fly_all(
-    vehicles,
-    seeds,
-    duration_s=10.0,
-    speed=5.0,
-    noise=1.0,
-    motors=False,
-    acc=False,
-    extras=None,
+    vehicles, seeds, duration_s=10.0, speed=5.0, noise=1.0, motors=False, acc=False, extras=None,
     headings=None,
-):
+):  # fmt: skip
     """Return the logs of flights side by side, one a seed.
 
     There is a vehicle a flight, which differ in the values of their effects alone. `extras` are

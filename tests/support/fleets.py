@@ -98,19 +98,11 @@ def drawn(rng: np.random.Generator, duration_s: float = 8.0) -> Fleet:
         motors=motors,
         effects=MappingProxyType(effects),
     )
-    speeds = rng.uniform(2.5, 5.0, 4)
+    speeds = rng.uniform(2.5, 5.0, 4) * [1.0, 1.0, 0.8, 0.2]
+    kinds = {"figure_eight": "sweep", "circle": "wobble", "climb": "wobble", "chirp": "wobble"}
     ways = tuple(
-        replace(way, speed=float(speed), direction=float(rng.uniform(0.0, 2.0 * np.pi)))
-        for way, speed in zip(
-            (
-                Trajectory("figure_eight", duration_s, turn="sweep"),
-                Trajectory("circle", duration_s, turn="wobble"),
-                Trajectory("climb", duration_s, turn="wobble"),
-                Trajectory("chirp", duration_s, turn="wobble"),
-            ),
-            (*speeds[:2], 0.8 * speeds[2], 0.2 * speeds[3]),
-            strict=True,
-        )
+        Trajectory(kind, duration_s, speed, turn=turn, direction=float(rng.uniform(0.0, 2 * np.pi)))
+        for (kind, turn), speed in zip(kinds.items(), speeds.tolist(), strict=True)
     )
     scale = float(factor(0.15, 1)[0])
     flapping = EFFECTS[FLAPPING].values(float(rng.uniform(1e-7, 6e-7)))
@@ -125,22 +117,12 @@ def recordings_of(fleet: Fleet, rate_hz: float = SENSORS.rate_hz) -> list[Record
 
 
 def logs_of(
-    fleet: Fleet,
-    recordings: Sequence[Recording],
-    drive: str,
-    rng: np.random.Generator,
-    slow: Slow | None = None,
-    sensors: Sensors = SENSORS,
-) -> list[FlightLog]:
+    fleet: Fleet, recordings: Sequence[Recording], drive: str, rng: np.random.Generator,
+    slow: Slow | None = None, sensors: Sensors = SENSORS,
+) -> list[FlightLog]:  # fmt: skip
     """Return logs with what `drive` (one of `drive.DRIVES`) needs, and no other drive's.
 
-    Args:
-        fleet: that was flown.
-        recordings: of its flights.
-        drive: rotors, pwm, torques, rates or thrust.
-        rng: of the noise.
-        slow: slow errors besides the white noise.
-        sensors: what is logged, and its white noise.
+    Slow errors come besides the white noise of `sensors`.
     """
     found = []
     for index, recording in enumerate(recordings):

@@ -9,9 +9,9 @@ import numpy as np
 from eval.effects import EFFECTS
 from eval.flights.simulate import Sensors
 from eval.flights.trajectory import Trajectory
-from eval.quadrotor.vehicle_file import load_vehicle
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.identify.identify import identify
+from tests.support import fleets
 from tests.support.fleets import Fleet, logs_of, recordings_of
 
 DRAG, DELAY = (0.3, 0.4, 0.2), 0.012
@@ -30,7 +30,7 @@ HOVER = (Trajectory("hover", 8.0), Trajectory("vertical", 8.0, 0.5))
 
 def vehicle():
     """Return the nominal quadrotor, with a table `[motors]`."""
-    return replace(load_vehicle("reference"), motors=MOTORS, effects=MappingProxyType({}))
+    return replace(fleets.start(), motors=MOTORS)
 
 
 def truth():
@@ -44,14 +44,14 @@ def truth():
 
 def start():
     """Return a start of `suite identify`: right mass and arms, and wrong numbers otherwise."""
-    nominal = vehicle()
+    nominal = fleets.start()
     x, y, z = nominal.inertia
     return replace(
         nominal,
         inertia=(1.2 * x, y / 1.2, z),
         rotors=replace(nominal.rotors, time_constant=0.02),
         controller=replace(nominal.controller, rate_gain=(15.0, 25.0, 6.0)),
-        motors=MotorMap(thrust=(1.6, 3.0), voltage=15.0, voltage_exponent=1.0),
+        motors=replace(nominal.motors, voltage=15.0),
     )
 
 

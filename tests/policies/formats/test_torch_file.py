@@ -76,36 +76,6 @@ def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, in_proce
         load_policy(path, trust=True)
 
 
-class Everything(torch.nn.Module):
-    """Layers that people's policies are made of."""
-
-    def __init__(self):
-        super().__init__()
-        nn = torch.nn
-        conv = nn.Conv2d(1, 4, 3, stride=2, padding=1), nn.BatchNorm2d(4), nn.ELU()
-        self.encoder = nn.Sequential(*conv, nn.AdaptiveAvgPool2d(2), nn.Flatten())
-        dense = nn.Linear(28, 16), nn.LayerNorm(16), nn.SiLU(), nn.Dropout(0.1)
-        self.mlp, self.gru, self.head = nn.Sequential(*dense), nn.GRU(16, 8), nn.Linear(8, 6)
-
-    def forward(self, state, image, hidden):
-        features = self.mlp(torch.cat([state, self.encoder(image[:, None])], -1))
-        out, hidden = self.gru(features[None], hidden[None].contiguous())
-        mean, spread = self.head(out[0]).chunk(2, -1)
-        return torch.tanh(mean) * 20.0 * torch.exp(spread).clamp(max=1.0), hidden[0]
-
-
-@pytest.mark.filterwarnings("ignore:The tensor attributes:UserWarning")
-def test_common_layers_pass_and_answer_as_torch_does(tmp_path, in_process):
-    module = Everything().eval()
-    inputs = (torch.randn(2, 12), torch.randn(2, 24, 32), torch.randn(2, 8))
-    policy = load_policy(program(tmp_path, module, *inputs), trust=True)
-    state, image, hidden = (x.numpy() for x in inputs)
-    found = policy.act(hidden, state, image, np.zeros(2, bool))
-    with torch.no_grad():
-        for mine, theirs in zip(found, module(*inputs), strict=True):
-            np.testing.assert_allclose(mine, theirs, atol=1e-5)
-
-
 class Reactive(torch.nn.Module):
     """A policy without memory."""
 

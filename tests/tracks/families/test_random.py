@@ -138,10 +138,3 @@ def test_heights_lie_further_apart_where_they_are_to():
     free = (usual[:, 2] > 0.9) & (wide[:, 2] > 0.9) & (wide[:, 2] < 2.2)
     assert free.sum() > 3
     np.testing.assert_allclose(np.diff(wide[free, 2]), 2 * np.diff(usual[free, 2]))
-
-
-def test_without_hairpins_a_seed_keeps_its_tracks():
-    one, other = (random_track(0.6, np.random.default_rng(3), mix) for mix in (Mix(), Mix(0.55)))
-    np.testing.assert_array_equal(one.scene.gates.center_w, other.scene.gates.center_w)
-    drawn = random_track(0.6, np.random.default_rng(3), Mix(hairpin_share=1e-9))
-    assert not np.array_equal(one.scene.gates.center_w, drawn.scene.gates.center_w)

@@ -17,7 +17,7 @@ from suite.delta.fit import FitConfig
 from suite.experiments import EXPERIMENTS
 from suite.train.config import QuadrotorConfig, TrainConfig
 from suite.train.ppo.config import PpoConfig
-from tracks.input.ranges import Range, check_ranges, is_finite, ranged, shown
+from tracks.input.ranges import Range, check_ranges, is_finite, shown
 from tracks.input.reading import InputError, parse_json, read_bytes, read_json, read_toml
 
 
@@ -51,9 +51,6 @@ def test_what_is_outside_of_its_range_is_refused_by_name(config, words):
     check_ranges(Outer())
     with pytest.raises(ValueError, match=words):
         check_ranges(config)
-
-
-def test_an_option_is_called_as_it_is_written():
     with pytest.raises(ValueError, match="^--late-s is -1.0"):
         check_ranges(Outer(late_s=-1.0), options=True)
 
@@ -92,12 +89,6 @@ def test_every_number_of_every_configuration_has_its_range():
             hints = get_type_hints(cls, include_extras=True)
             without = [name for name in _numbers(cls) if "Range(" not in repr(hints[name])]
             assert not without, cls
-
-
-def test_the_defaults_are_within():
-    for config in (TrainConfig(), PpoConfig(), FitConfig()):
-        check_ranges(config)
-        assert list(ranged(config))
 
 
 def test_a_plain_file_is_read(tmp_path):

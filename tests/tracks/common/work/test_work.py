@@ -13,7 +13,7 @@ from eval.effects import find_effect
 from eval.logs.columns import FlightLogError
 from suite.cli import main
 from suite.common.errors import explain
-from tracks.common.work import MOST, core_shares, processes, read_workers, threads, worker_count
+from tracks.common.work import MOST, processes, read_workers, threads
 from tracks.common.work.pickling import (
     PACKAGES,
     differences,
@@ -23,12 +23,7 @@ from tracks.common.work.pickling import (
     software,
     unpack,
 )
-from tracks.common.work.threads import (
-    one_thread_a_product,
-    set_threads,
-    share_threads,
-    usable_cores,
-)
+from tracks.common.work.threads import one_thread_a_product, set_threads, share_threads
 
 
 @pytest.mark.parametrize(
@@ -53,11 +48,6 @@ def test_workers_are_a_number_or_an_address(text, workers):
 def test_others_are_refused_with_what_is_allowed(text):
     with pytest.raises(ValueError, match=r"^--workers is '.{0,80}'; allowed is 1 to 256.*tcp://"):
         read_workers(text)
-
-
-def test_a_number_is_its_own_crew_and_shares_no_core():
-    assert worker_count(3) == 3
-    assert len(core_shares(1)[0]) == usable_cores()
 
 
 def test_the_software_is_told_apart_by_name():
