@@ -1,4 +1,4 @@
-"""One diagnosis of a hidden drag, for the tests of what is said of it; code here is optimised."""
+"""Diagnoses that many tests share; code that is compiled here is optimised."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 UNOPTIMISED = os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] != "0"
-"""As tests/conftest.py, or who calls, says."""
+"""The setting of tests/conftest.py, or of the caller."""
 
 
 def pytest_runtest_setup():
@@ -35,10 +35,7 @@ LAGGED = with_lag(PLAIN, 0.03)
 
 @pytest.fixture(scope="session")
 def diagnosed(tmp_path_factory):
-    """Diagnose by the command line three flights with a drag that the vehicle file lacks.
-
-    Return its folder with the files that it wrote, and the diagnosis itself.
-    """
+    """Diagnose three flights with a hidden drag by the command; return its folder and result."""
     folder = tmp_path_factory.mktemp("diagnosis")
     truth = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
     logs = fly_all([truth] * 3, range(3), duration_s=6.0, motors=True)
@@ -48,22 +45,17 @@ def diagnosed(tmp_path_factory):
     save_vehicle(LAGGED, folder / "v.toml")
     out = folder / "out"
     line = [*paths, str(bad), "--vehicle", str(folder / "v.toml"), "--out", str(out), "--plan"]
-    said, made = io.StringIO(), {}
+    said, made = io.StringIO(), []
+
+    def kept(*args, **options):
+        made.append(diagnose(*args, **options))
+        return made[0]
+
     with contextlib.redirect_stdout(said), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "diagnose", kept("diagnose", run.diagnose, made))
+        patch.setattr(run, "diagnose", kept)
         assert main(["diagnose", *line, "--drive", "commands", "--seed", "3", "--json"]) == 0
     (folder / "said.json").write_text(said.getvalue(), encoding="utf-8")
-    return out, made["diagnose"]
-
-
-def kept(name, function, made):
-    """Return `function`, whose result is kept in `made` as well."""
-
-    def call(*args, **options):
-        made[name] = function(*args, **options)
-        return made[name]
-
-    return call
+    return out, made[0]
 
 
 @pytest.fixture(scope="session")

@@ -16,11 +16,10 @@ from eval.effects import EFFECTS, nameable_effects
 from eval.flights.simulate import SENSORS, log_of
 from eval.flights.simulate import fly as fly_ways
 from eval.flights.trajectory import ordinary_flights
-from eval.logs.flight_log import write_flight
 from eval.quadrotor.loops import KINDS
-from suite.cli import main
 from suite.common.report import html
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.report.diagnosis_json import diagnosis_json
 from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
@@ -31,23 +30,10 @@ from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
 
 LAGGED = with_lag(PLAIN, 0.03)
-CASES = {
-    "linear_drag": ("coefficient", (0.1, 0.1, 0.05)),
-    "com_offset": ("offset", (0.001, -0.0005, 0.0)),
-    "gyro_bias": ("bias", (0.02, 0.0, -0.01)),
-    "weak_motor": ("scale", (1.0, 0.96, 1.0, 1.0)),
-}
 
 
 def flights(vehicle, seed=0, count=3, duration_s=7.0, **options):
     return fly_all([vehicle] * count, range(seed, seed + count), duration_s, **options)
-
-
-def within(entry, truth):
-    value = np.atleast_1d(np.array(entry["ci95"], dtype=float))
-    low, high = value.reshape(-1, 2).T
-    middle, half = (low + high) / 2, (high - low) / 2
-    return np.all(np.abs(np.atleast_1d(truth) - middle) < 2 * half + 1e-12)
 
 
 def test_flights_of_the_vehicle_itself_have_no_gap():
@@ -56,30 +42,9 @@ def test_flights_of_the_vehicle_itself_have_no_gap():
     assert 0.8 < found["gap"]["before"] < 1.2
 
 
-REMEMBERED = with_lag(REMEMBERING, 0.03)
-
-
-@pytest.mark.slow
-def test_behind_a_loop_that_remembers_measured_rotors_drive():
-    """What its integrators hold where a stretch begins is in no log."""
-    truth = (0.2, 0.2, 0.1)
-    dragged = with_effects(REMEMBERED, linear_drag=(truth,))
-    logs = flights(dragged, duration_s=5.0, motors=True)
-    found = diagnosis_json(diagnose(logs, REMEMBERED, limits=Thresholds(most_names=1)))
-    assert found["gap"]["before"] > 5.0 and found["gap"]["after"] < 1.3
-    (drag,) = [effect for effect in found["effects"] if effect["name"] == "linear_drag"]
-    np.testing.assert_allclose(drag["parameters"]["coefficient"]["value"], truth, atol=0.03)
-
-
-@pytest.mark.slow
-def test_behind_a_loop_that_remembers_there_is_no_gap_where_nothing_is_hidden():
-    found = diagnosis_json(diagnose(flights(REMEMBERED, motors=True), REMEMBERED, by="rollouts"))
-    assert 0.8 < found["gap"]["before"] < 1.3
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind, capsys):
+def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind):
     """And what is hidden is; docs/results.md has what it says."""
     controller = replace(REMEMBERING.controller, kind=kind, settings=KINDS[kind].Settings())
     nominal = with_lag(replace(REMEMBERING, controller=controller), 0.03)
@@ -87,8 +52,6 @@ def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind
     def names(seed, **effects):
         true = with_effects(nominal, **effects)
         found = diagnosis_json(diagnose(flights(true, seed=seed, motors=True), nominal))
-        with capsys.disabled():
-            print(kind, seed, effects, found["verdict"], found["effects"])
         return {effect["name"]: effect["parameters"] for effect in found["effects"]}
 
     assert sum(bool(names(seed)) for seed in range(100, 160, 10)) <= 1
@@ -100,29 +63,13 @@ def test_behind_firmware_rate_loops_little_is_named_where_nothing_is_hidden(kind
 
 
 def test_a_drag_is_named_with_its_value(drag):
-    named_with_value(diagnosis_json(drag), "linear_drag", "coefficient", (0.15, 0.15, 0.05))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_an_effect_is_named_with_its_value(name):
-    parameter, truth = CASES[name]
-    logs = flights(with_effects(LAGGED, **{name: (truth,)}))
-    named_with_value(diagnosis_json(diagnose(logs, LAGGED, by="rollouts")), name, parameter, truth)
-
-
-def named_with_value(found, name, parameter, truth):
-    assert found["verdict"] == "named"
+    found = diagnosis_json(drag)
+    assert found["verdict"] == "named" and found["gap"]["after"] < 1.15
     (effect,) = found["effects"]
-    assert name in (effect["name"], *effect["alternatives"])
-    assert found["gap"]["after"] < 1.15
-    if effect["name"] == name:
-        seen = truth[1] if name == "weak_motor" else truth
-        entry = effect["parameters"][parameter]
-        if name == "com_offset":
-            assert entry["value"][2] is None
-            seen, entry = truth[:2], {"ci95": entry["ci95"][:2]}
-        assert within(entry, seen)
+    assert "linear_drag" in (effect["name"], *effect["alternatives"])
+    if effect["name"] == "linear_drag":
+        low, high = np.array(effect["parameters"]["coefficient"]["ci95"], dtype=float).T
+        assert np.all(np.abs([0.15, 0.15, 0.05] - (low + high) / 2) < high - low)
     if found["control"] is not None:
         assert found["control"]["after"] > found["gap"]["after"]
 
@@ -142,34 +89,6 @@ def test_a_force_outside_the_catalogue_is_not_called_by_a_name_alone():
     # What is left is what nothing that was withdrawn has taken away.
     assert found["unexplained"]["share"] == 1.0 and found["unexplained"]["where"]
     assert found["gap"]["after"] == found["gap"]["before"]
-
-
-SIDE = {"linear_drag": ((0.25, 0.45, 0.1),), "constant_wind": ((0.4, -0.5, 0.0),)}
-"""A drag that differs along x and y, and a wind for it to pass on."""
-
-
-def blown(*headings):
-    """Return what is named of flights that hardly move, with what could stand in its place."""
-    truth = with_effects(LAGGED, **SIDE)
-    each = range(50, 50 + len(headings))
-    logs = fly_all([truth] * len(each), each, 6.0, speed=0.2, noise=2.0, headings=headings)
-    found = diagnosis_json(diagnose(logs, LAGGED, by="rollouts"))
-    return {effect["name"]: set(effect["alternatives"]) for effect in found["effects"]}
-
-
-@pytest.mark.slow
-def test_a_wind_at_one_heading_is_one_of_a_set():
-    found = blown(0.3, 0.3, 0.3)
-    together = set(found).union(*found.values())
-    assert {"frame_tilt", "thrust_tilt"} <= together
-    assert {"constant_wind", "constant_wind + linear_drag"} & together
-
-
-@pytest.mark.slow
-def test_a_wind_on_two_headings_is_named_with_the_drag_that_passes_it_on():
-    found = blown(0.3, 0.3 + np.pi / 2, 0.3 + np.pi / 2)
-    assert set(found) == {"constant_wind", "linear_drag"}
-    assert found["constant_wind"] == set()
 
 
 @pytest.mark.slow
@@ -197,22 +116,6 @@ def test_a_load_on_a_line_is_said_to_swing():
     assert "oscillates with a period of 1." in found["unexplained"]["where"]
 
 
-def test_unusable_input_ends_with_2(tmp_path, capsys):
-    assert main(["diagnose", str(tmp_path / "none.csv"), "--vehicle", "reference"]) == 2
-    log = fly(LAGGED, 0, duration_s=1.2)
-    path = write_flight(tmp_path / "short.parquet", log)
-    assert main(["diagnose", str(path), "--vehicle", "reference"]) == 2
-    assert "1.3 s" in capsys.readouterr().err
-
-
-def test_what_drives_the_model_must_be_in_every_log():
-    with pytest.raises(ValueError, match="motors"):
-        diagnose([fly(LAGGED, 0, duration_s=2.0)], LAGGED, by="rollouts", drive="motors")
-    log = replace(fly(LAGGED, 0, duration_s=2.0), thrust_cmd=None, rate_cmd_b=None)
-    with pytest.raises(ValueError, match="diagnose each kind alone"):
-        diagnose([log, fly(LAGGED, 1, duration_s=2.0)], LAGGED, by="rollouts")
-
-
 def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch):
     monkeypatch.setattr(
         "suite.diagnose.sources.rollouts.flown_by_other_controller", lambda *_: True
@@ -221,14 +124,6 @@ def test_where_another_controller_flew_every_log_needs_rotor_speeds(monkeypatch)
     without = next(log.name for log in logs if log.rotor_speed is None)
     with pytest.raises(ValueError, match=f"{without} has none as an input: diagnose the other"):
         diagnose(logs, LAGGED)
-
-
-@pytest.mark.slow
-def test_thresholds_are_those_that_are_given():
-    logs = flights(with_effects(LAGGED, linear_drag=((0.1, 0.1, 0.05),)), duration_s=4.0)
-    strict = diagnose(logs, LAGGED, by="rollouts", limits=Thresholds(most_names=0))
-    assert not strict.main.names and strict.verdict.label == "unknown"
-    assert strict.limits.most_names == 0
 
 
 TRUTH = with_effects(LAGGED, linear_drag=((0.15, 0.15, 0.05),))
@@ -256,44 +151,29 @@ def outcome(logs, drive="commands"):
     return found
 
 
-@pytest.mark.parametrize(
-    "breakages",
-    [
-        pytest.param(
-            BREAKAGES[first : first + 3],
-            id="-".join(breakage.__name__ for breakage in BREAKAGES[first : first + 3]),
-            # One of the groups is flown in every run of the tests.
-            marks=pytest.mark.slow if first + 3 < len(BREAKAGES) else (),
-        )
-        for first in range(0, len(BREAKAGES), 3)
-    ],
-)
-def test_broken_flights_among_sound_ones(sound, breakages):
+def test_broken_flights_among_sound_ones(sound):
     rng = np.random.default_rng(0)
-    broken = [breakage(log, rng) for breakage, log in zip(breakages, sound, strict=False)]
+    broken = [breakage(log, rng) for breakage, log in zip(BREAKAGES[-3:], sound, strict=False)]
     found = outcome([*broken, *sound[1:]])
     assert isinstance(found, dict), found
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("breakage", BREAKAGES, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("drive", ["commands", "motors", "auto"])
-def test_every_flight_broken_alike(sound, breakage, drive):
-    rng = np.random.default_rng(1)
-    outcome([breakage(log, rng) for log in sound], drive)
-
-
-@pytest.mark.slow
-@settings(max_examples=40)
-@given(st.lists(st.sampled_from(BREAKAGES), min_size=1, max_size=4), st.integers(0, 2**16))
-def test_flights_broken_in_several_ways(sound, breakages, seed):
+@settings(max_examples=80)
+@given(
+    st.lists(st.sampled_from(BREAKAGES), min_size=1, max_size=4),
+    st.sampled_from(["commands", "motors", "auto"]),
+    st.booleans(),
+    st.integers(0, 2**16),
+)
+def test_flights_broken_in_several_ways(sound, breakages, drive, alike, seed):
     rng = np.random.default_rng(seed)
     logs = list(sound)
     for breakage in breakages:
-        k = int(rng.integers(len(logs)))
-        if len(logs[k].time_s) > 30:
-            logs[k] = breakage(logs[k], rng)
-    outcome(logs)
+        for k in range(len(logs)) if alike else [int(rng.integers(len(logs)))]:
+            if len(logs[k].time_s) > 30:
+                logs[k] = breakage(logs[k], rng)
+    outcome(logs, drive)
 
 
 DRAG = {"linear_drag": ((0.3, 0.25, 0.15),), "quadratic_drag": ((0.012, 0.016, 0.03),)}
@@ -347,8 +227,10 @@ def logged(truth, ways, seed):
     return [log_of(flight, truth, sensors, rng, f"flight_{k}") for k, flight in enumerate(flights)]
 
 
-def test_no_effect_is_forgotten():
+def test_every_effect_is_a_candidate_and_tested():
     assert set(HIDDEN) == set(nameable_effects())
+    among = candidates(make_space(GIVEN), True, ("acc_b", "command"))
+    assert {candidate.name for candidate in among} >= set(HIDDEN)
 
 
 @pytest.mark.slow
@@ -374,3 +256,42 @@ def test_an_effect_is_named_alone(name, ways):
     scale = np.abs(true - neutral).max()
     seen = np.isfinite(value)
     assert np.abs(value - true)[seen].max() < (0.5 if name == "gusts" else 0.15) * scale
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", [PLAIN, LAGGED], ids=["at once", "lagged"])
+def test_without_noise_the_models_own_error_is_no_finding(vehicle):
+    logs = flights(vehicle, duration_s=5.0, noise=0.0, motors=True)
+    found = diagnosis_json(diagnose(logs, vehicle, drive="commands"))
+    assert (found["verdict"], found["effects"]) == ("no_gap", [])
+    assert all(not one["relevant"] for one in found["negligible"])
+
+
+@pytest.mark.slow
+def test_a_gyro_of_half_the_rate_and_no_commands_end_in_a_verdict():
+    logs = []
+    for log in flights(LAGGED, duration_s=5.0, motors=True):
+        rate_b = np.array(log.rate_b)
+        rate_b[1::2] = np.nan
+        logs.append(replace(log, rate_b=rate_b, thrust_cmd=None, rate_cmd_b=None))
+    found = diagnosis_json(diagnose(logs, LAGGED))
+    assert (found["verdict"], found["effects"]) == ("no_gap", [])
+
+
+@pytest.mark.slow
+def test_what_rotor_speeds_do_between_rows_is_no_finding():
+    """At 100 rows a second it looks like 0.5 % less inertia, and 2 % with every second row."""
+    logs = flights(LAGGED, duration_s=6.0, noise=0.0, motors=True)
+    found = diagnosis_json(diagnose(logs, LAGGED, drive="motors"))
+    assert (found["verdict"], found["effects"]) == ("no_gap", [])
+    assert [one["name"] for one in found["negligible"]] == ["inertia_scale"]
+
+
+@pytest.mark.slow
+def test_what_a_rate_loop_does_between_rows_is_no_inertia_next_to_a_drag():
+    """Without a lag rows of 100 Hz look like 8 % less inertia, on three stretches."""
+    true = with_effects(PLAIN, linear_drag=((0.3, 0.3, 0.1),))
+    log = fly(true, 0, duration_s=6.0, noise=0.1, motors=True)
+    found = diagnose([replace(log, thrust_cmd=None, rate_cmd_b=None)], PLAIN)
+    assert [name.candidate.name for _, name in found.named] == ["linear_drag"]
+    assert any("no larger than the model's own error" in line for line in found.warnings)

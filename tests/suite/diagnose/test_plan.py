@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from eval.effects import EFFECTS
-from eval.flights.follow import PilotGains, steer
 from eval.flights.simulate import SENSORS, fly, log_of
-from eval.flights.trajectory import Reference, Trajectory
+from eval.flights.trajectory import Trajectory
 from eval.logs.flight_log import read_flight
-from eval.quadrotor.plant import Motion
 from suite.diagnose.diagnose import diagnose
 from suite.diagnose.plan import (
     COLUMNS,
@@ -51,18 +49,15 @@ def test_a_plan_comes_back_from_its_file(tmp_path):
     )
 
 
-def test_the_plan_is_for_the_sets_and_only_for_them():
+def test_the_plan_is_for_the_sets_and_only_for_them(tmp_path):
     ways, words = trajectories_for(SET)
     entry = next(e for e in SEPARATIONS if set(e.pair) == {"rotor_drag", "linear_drag"})
     assert {way.kind for way in ways} == {way.kind for way in entry.separating}
     assert len(ways) == 2 * len(entry.separating) and entry.words in words[0]
     alone = {"effects": [{"name": "rotor_drag", "alternatives": []}]}
     assert trajectories_for(alone) == ([], [])
-
-
-def test_nothing_is_written_where_nothing_is_left_to_tell(tmp_path):
-    plan = write_plan_of({"effects": []}, tmp_path / "plan")
-    assert plan["flights"] == [] and not (tmp_path / "plan").exists()
+    assert write_plan_of(alone, tmp_path / "plan")["flights"] == []
+    assert not (tmp_path / "plan").exists()
 
 
 def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):
@@ -82,12 +77,6 @@ def test_an_earlier_plan_goes_and_what_is_not_of_it_stays(tmp_path):
     assert own.exists() and outside.exists()
     (folder / "plan.json").write_text("[]")
     assert write_plan_of(SET, folder)["flights"]
-
-
-def test_advice_is_that_of_the_plans():
-    assert advice("linear_drag", "rotor_drag").startswith("linear_drag from rotor_drag: ")
-    assert OTHERWISE not in advice("linear_drag", "rotor_drag")
-    assert OTHERWISE in advice("inflow", "gyro_bias")
 
 
 def test_a_plan_is_flown_with_the_noise_of_the_logs(tmp_path):
@@ -131,18 +120,6 @@ def test_flying_the_plan_turns_the_set_into_a_name(tmp_path):
     assert low < 3e-5 < high
 
 
-def test_the_pilot_pushes_towards_where_it_should_be_and_never_turns_over():
-    level = np.eye(3)[None]
-    still = Motion(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)))
-    wanted = Reference(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
-    hover = steer(LAGGED, PilotGains(), wanted, still, np.zeros((1, 3)))
-    assert hover.thrust[0] == pytest.approx(9.81) and np.abs(hover.rate_b).max() < 1e-9
-    ahead = wanted._replace(pos_w=np.array([[1.0, 0.0, 0.0]]))
-    assert steer(LAGGED, PilotGains(), ahead, still, np.zeros((1, 3))).rate_b[0, 1] > 0.1
-    fall = wanted._replace(acc_w=np.array([[0.0, 0.0, -30.0]]))
-    assert steer(LAGGED, PilotGains(), fall, still, np.zeros((1, 3))).thrust[0] > 0.0
-
-
 def test_plans_name_catalogue_effects_and_end_in_flights():
     for entry in SEPARATIONS:
         assert set(entry.pair) <= set(EFFECTS) and entry.pair[0] != entry.pair[1]
@@ -151,3 +128,6 @@ def test_plans_name_catalogue_effects_and_end_in_flights():
     (wind,) = separations_of(["frame_tilt", "constant_wind + linear_drag"])
     assert wind.pair == ("constant_wind", "frame_tilt") and "two headings" in wind.words
     assert plan_for(["gusts", "inflow"]), "an unknown pair gets the flights that excite most"
+    assert advice("linear_drag", "rotor_drag").startswith("linear_drag from rotor_drag: ")
+    assert OTHERWISE not in advice("linear_drag", "rotor_drag")
+    assert OTHERWISE in advice("inflow", "gyro_bias")

@@ -1,4 +1,4 @@
-"""The colour of noise: found where it is, not where a model is off, and taken out by its filter."""
+"""The colour of noise: found where it is, not in a model's error, and removed by its filter."""
 
 import numpy as np
 import pytest
@@ -19,18 +19,18 @@ GROUP = "attitude"
 
 @pytest.fixture(scope="module")
 def windows():
-    found, _ = cut(fly_all([PLAIN] * 3, range(3), duration_s=8.0), PLAIN, False)
+    found, _ = cut(fly_all([PLAIN] * 3, range(3), duration_s=6.0), PLAIN, False)
     assert found is not None
     return found
 
 
 def measured(residual, windows):
-    """The noise where nothing hangs on the start."""
+    """Return the noise of residuals that do not depend on the start."""
     return measured_noise(residual, np.zeros((*residual.shape, 12)), windows)
 
 
 def noise_like(windows, share, lasts_s, rng, group=GROUP):
-    """White noise of 1 in every channel, that of `group` with a Gauss-Markov part."""
+    """Return white noise of 1 in every channel, that of `group` with a Gauss-Markov part."""
     values = rng.standard_normal(windows.valid.shape)
     shape = values[..., SLICES[group]].shape
     slow = np.zeros(shape)
@@ -46,9 +46,8 @@ def noise_like(windows, share, lasts_s, rng, group=GROUP):
 
 @pytest.mark.parametrize(
     ("group", "share", "lasts_s"),
-    [("velocity", 0.85, 0.02), ("attitude", 0.7, 0.06), ("position", 0.9, 0.1),
-     ("position", 0.3, 0.05)],
-)  # fmt: skip
+    [("velocity", 0.85, 0.02), ("attitude", 0.7, 0.06), ("position", 0.3, 0.05)],
+)
 def test_a_colour_is_found_where_it_is(windows, group, share, lasts_s):
     values = noise_like(windows, share, lasts_s, np.random.default_rng(0), group)
     noise = measured(values, windows)
@@ -62,7 +61,7 @@ def test_a_colour_is_found_where_it_is(windows, group, share, lasts_s):
     np.testing.assert_allclose(noise.sigma[SLICES["rates"]], 1.0, rtol=0.1)
 
 
-def test_one_estimators_groups_speak_for_each_other(windows):
+def test_groups_of_one_estimator_have_one_correlation_time(windows):
     rng = np.random.default_rng(3)
     weak = noise_like(windows, 0.02, 0.05, rng, "velocity")
     pose = SLICES["position"]
@@ -73,7 +72,7 @@ def test_one_estimators_groups_speak_for_each_other(windows):
     assert coloured["velocity"][0] < 0.1
 
 
-def test_white_noise_and_a_slow_error_of_the_model_have_none(windows):
+def test_white_noise_and_a_slow_error_of_the_model_have_no_colour(windows):
     residual = noise_like(windows, 0.0, 1.0, np.random.default_rng(1))
     assert measured(residual, windows).coloured == {}
     bent = residual + 5.0 * (windows.row_s**2)[..., None] * windows.valid
@@ -90,7 +89,7 @@ def test_the_filter_makes_rows_independent(windows):
     assert abs((white**2).mean() - 1.0) < 0.05
 
 
-def test_all_that_is_left_counts_as_noise_where_the_model_is_off(windows):
+def test_where_the_model_lacks_something_the_whole_residual_counts_as_noise(windows):
     rng = np.random.default_rng(5)
     residual = noise_like(windows, 0.0, 1.0, rng)
     swing = np.sin(6.0 * windows.row_s[..., None] + rng.uniform(0.0, 6.0, (len(residual), 1, 3)))

@@ -13,14 +13,13 @@ from suite.diagnose.data.sampling import (
     without_slow_rotors,
 )
 from suite.diagnose.data.windows import SLICES, cut
-from suite.diagnose.estimate.gauss_newton import solve
 from suite.diagnose.thresholds import Thresholds
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 
 
 def on_rows(values, chosen):
-    """`values` on every row that is `chosen`, and nothing on the others."""
+    """Return `values` on every row that is `chosen`, and NaN on the others."""
     values = np.array(values)
     values[~chosen] = np.nan
     return values
@@ -36,11 +35,8 @@ def row(log):
     return np.arange(len(log.time_s))
 
 
-def test_a_log_whose_signals_share_their_rows_is_left_as_it_is(log):
-    assert on_every_row(log) is log
-
-
 def test_a_slower_signal_is_joined_by_lines_a_command_is_held_and_a_hole_stays(log, row):
+    assert on_every_row(log) is log
     hole = (log.time_s > 1.0) & (log.time_s < 1.3)
     sparse = replace(
         log,
@@ -61,15 +57,16 @@ def test_a_slower_signal_is_joined_by_lines_a_command_is_held_and_a_hole_stays(l
 
 def test_rotor_speeds_at_three_hertz_are_left_out_with_the_bound(log, row):
     slow = replace(log, rotor_speed=on_rows(log.rotor_speed, row % 30 == 0))
-    kept, notes = without_slow_rotors([log, slow])
+    kept, (note,) = without_slow_rotors([log, slow])
     assert kept[0] is log and kept[1].rotor_speed is None
-    (note,) = notes
     assert "3.3 Hz" in note and "at least 10 Hz" in note
 
 
-@pytest.mark.parametrize("every", [2, 10])
-def test_windows_take_each_signal_by_its_own_rows(log, row, every):
-    sparse = replace(log, rate_b=on_rows(log.rate_b, row % every == 1))
+@pytest.mark.parametrize(
+    ("every", "accuracy"), [(2, 0.4), pytest.param(25, 0.5, id="too few rows for a polynomial")]
+)
+def test_windows_take_each_signal_by_its_own_rows(log, row, every, accuracy):
+    sparse = replace(log, rate_b=on_rows(log.rate_b, row % every == 0))
     windows, warnings = cut([sparse], PLAIN, True)
     assert windows is not None and not warnings
     seen = windows.valid.sum(axis=1)
@@ -79,16 +76,7 @@ def test_windows_take_each_signal_by_its_own_rows(log, row, every):
     assert windows.rotor_valid.sum(axis=1).min() > 90
     assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
     residual = 0.01 * np.random.default_rng(0).standard_normal(windows.valid.shape)
-    sigma = noise_of(residual, windows)
-    assert np.isfinite(sigma[SLICES["rates"]]).all()
-    np.testing.assert_allclose(sigma[SLICES["rates"]], 0.01, rtol=0.4)
-
-
-def test_a_signal_with_too_few_rows_is_given_a_bound_that_no_noise_exceeds(log, row):
-    windows, _ = cut([replace(log, rate_b=on_rows(log.rate_b, row % 25 == 0))], PLAIN, True)
-    assert windows is not None
-    residual = 0.01 * np.random.default_rng(0).standard_normal(windows.valid.shape)
-    np.testing.assert_allclose(noise_of(residual, windows)[SLICES["rates"]], 0.01, rtol=0.5)
+    np.testing.assert_allclose(noise_of(residual, windows)[SLICES["rates"]], 0.01, rtol=accuracy)
 
 
 def test_rows_are_thinned_so_that_no_signal_is_lost():
@@ -98,21 +86,14 @@ def test_rows_are_thinned_so_that_no_signal_is_lost():
     kept = thinned(seen, time_s, 101)
     assert len(kept) <= 101 and (np.diff(kept) > 0).all()
     assert seen[kept].sum(axis=0).min() >= 18
-    np.testing.assert_array_equal(thinned(np.ones((250, 2), bool), time_s[:250], 101),
-                                  np.arange(0, 250, 3))  # fmt: skip
-
-
-def test_equations_that_are_not_finite_are_refused():
-    room, one = np.ones(2), np.eye(2)
-    for hessian, gradient in ((one * np.nan, room), (one, room * np.inf)):
-        with pytest.raises(ValueError, match="not finite"):
-            solve(hessian, gradient, -room, room, room)
+    every_third = thinned(np.ones((250, 2), bool), time_s[:250], 101)
+    np.testing.assert_array_equal(every_third, np.arange(0, 250, 3))
 
 
 def test_of_too_many_rows_every_so_many_th_of_each_signal_stays(log, row):
     sparse = replace(log, rate_b=on_rows(log.rate_b, row % 3 == 1))
-    (same,), nothing = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
-    assert same is sparse and nothing == []
+    (same,), notes = with_fewer_rows([sparse], Thresholds(most_rows=len(row)))
+    assert same is sparse and notes == []
     (few,), (note,) = with_fewer_rows([sparse], Thresholds(most_rows=len(row) // 2))
     assert "every 3. row" in note
     position = np.isfinite(few.pos_w).all(axis=1)
@@ -120,9 +101,3 @@ def test_of_too_many_rows_every_so_many_th_of_each_signal_stays(log, row):
     turning = np.isfinite(few.rate_b).all(axis=1)
     np.testing.assert_array_equal(few.rate_b[turning], log.rate_b[row % 3 == 1][::3])
     assert len(few.rotor_speed) == len(few.time_s) < len(row)
-
-
-def test_rollouts_under_measured_rotor_speeds_are_fewer(log):
-    limits = Thresholds(most_rotor_windows=1)
-    count = [len(cut([log], PLAIN, by, limits=limits)[0].flight) for by in (True, False)]
-    assert count[0] == 1 < count[1]

@@ -1,47 +1,51 @@
-"""Steps between rows: where they end, when the loop looks, and what a lost row is worth."""
+"""Steps between rows: where they end, when the loop samples, and what lies between rows."""
 
 import numpy as np
 import pytest
 
-from suite.diagnose.data.steps import padded_grid, step_grid, with_lost_rows
-
-
-def test_steps_on_a_grid_are_the_loops_periods():
-    grid = step_grid(np.arange(11) * 0.01, 0.002)
-    np.testing.assert_allclose(grid.edge_s, np.arange(51) * 0.002, atol=1e-12)
-    np.testing.assert_allclose(grid.sample_s, 0.002)
-    np.testing.assert_allclose(grid.lead_s, 0.0, atol=1e-12)
+from suite.diagnose.data.sampling import hold, interpolate
+from suite.diagnose.data.steps import (
+    padded_grid,
+    rows_show_torque,
+    step_grid,
+    torque_between_rows,
+    with_lost_rows,
+)
+from tests.support.vehicles import PLAIN, with_lag
 
 
 def test_a_row_off_the_grid_ends_a_step():
     rows = np.array([0.0, 0.0093, 0.0211, 0.03])
     grid = step_grid(rows, 0.002)
-    for row in rows:
-        assert np.abs(grid.edge_s - row).min() < 1e-12
+    assert np.abs(grid.edge_s[:, None] - rows).min(axis=0).max() < 1e-12
     assert 0.0015 < np.diff(grid.edge_s).min() and np.diff(grid.edge_s).max() < 0.0025
 
 
-def test_a_slow_loop_looks_at_its_own_times_and_steps_between():
+def test_a_slow_loop_samples_at_its_own_times_and_steps_between():
     grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.005)
-    looks = grid.edge_s[:-1][grid.sample_s > 0]
-    np.testing.assert_allclose(looks, [0.0, 0.005, 0.01, 0.015])
+    samples_s = grid.edge_s[:-1][grid.sample_s > 0]
+    np.testing.assert_allclose(samples_s, [0.0, 0.005, 0.01, 0.015])
     assert np.diff(grid.edge_s).max() < 0.003
     np.testing.assert_allclose(grid.lead_s, 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("period", "lead"), [(0.001, 0.0005), (0.0005, 0.00075)])
-def test_looks_of_a_fast_loop_are_taken_together(period, lead):
-    """Rates held for a period are old by half of one on average, ours by half a step of 2 ms."""
-    grid = step_grid(np.arange(5) * 0.01, period)
-    assert len(grid.sample_s) == 20
-    np.testing.assert_allclose(grid.lead_s, lead, atol=1e-12)
-
-
-def test_rows_nearer_than_a_step_share_one_and_start_the_loop_anew():
-    grid = step_grid(np.arange(101) * 0.001, 0.005)
-    assert len(grid.sample_s) == 50
-    # The loop looks at every row, so that what it knows is old by half a row.
-    np.testing.assert_allclose(grid.lead_s, 0.0005, atol=1e-9)
+@pytest.mark.parametrize(
+    ("row_s", "period_s", "steps", "lead_s"),
+    [
+        (0.01, 0.002, 20, 0.0),
+        # Rates held for a period are old by half of it on average, ours by half a step of 2 ms.
+        (0.01, 0.001, 20, 0.0005),
+        (0.01, 0.0005, 20, 0.00075),
+        # Rows nearer than a step share one. The loop samples at every row, so its rates are old by
+        # half a row.
+        (0.001, 0.005, 20, 0.0005),
+    ],
+)
+def test_samples_of_a_fast_loop_are_taken_together(row_s, period_s, steps, lead_s):
+    grid = step_grid(row_s * np.arange(round(0.04 / row_s) + 1), period_s)
+    np.testing.assert_allclose(grid.edge_s, np.linspace(0.0, 0.04, steps + 1), atol=1e-12)
+    np.testing.assert_allclose(grid.sample_s, 0.002)
+    np.testing.assert_allclose(grid.lead_s, lead_s, atol=1e-9)
 
 
 def test_a_lost_row_is_put_in_on_a_line_and_jitter_is_none():
@@ -58,7 +62,7 @@ def test_a_lost_row_is_put_in_on_a_line_and_jitter_is_none():
     np.testing.assert_array_equal(filled[-1], command[-1])
 
 
-def test_padding_moves_nothing():
+def test_padding_adds_steps_of_no_length():
     grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.002)
     for at_front in (False, True):
         longer = padded_grid(grid, 16, at_front)
@@ -66,3 +70,22 @@ def test_padding_moves_nothing():
         assert (np.diff(longer.edge_s) == 0.0).sum() == 6
         assert longer.edge_s[0] == 0.0 and longer.edge_s[-1] == 0.02
         assert (longer.sample_s > 0.0).sum() == 10
+
+
+def test_measurements_are_joined_across_holes_and_commands_held():
+    time_s = np.array([0.0, 0.1, 0.2, 0.3])
+    series = np.array([[0.0, np.nan], [np.nan, np.nan], [2.0, np.nan], [3.0, np.nan]])
+    found = interpolate(np.array([0.1, 0.25]), time_s, series)
+    np.testing.assert_allclose(found, [[1.0, 0.0], [2.5, 0.0]])
+    held = hold(np.array([-1.0, 0.15, 0.2, 9.0]), time_s, series[:, :1])
+    np.testing.assert_allclose(held[:, 0], [0.0, 0.0, 2.0, 3.0])
+    assert np.isnan(hold(time_s, time_s, series)).all()
+
+
+@pytest.mark.parametrize(("lag", "share"), [(0.0, 0.1), (0.01, 0.0143), (0.03, 0.0056)])
+def test_a_rate_loop_between_rows_turns_less_than_the_rows_show(lag, share):
+    """By hand: gain 20/s, rows of 10 ms; without a lag half of the fall, else a twelfth over it."""
+    vehicle = with_lag(PLAIN, lag)
+    np.testing.assert_allclose(torque_between_rows(vehicle, 0.01)[0], share, rtol=0.01)
+    assert not torque_between_rows(vehicle, 0.002).any()  # as often as the loop samples
+    assert rows_show_torque(vehicle, 0.01) == (lag >= 0.01)

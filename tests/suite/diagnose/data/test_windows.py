@@ -1,25 +1,31 @@
-"""Logs cut into windows: what is held, what is seen, and what a hole does."""
+"""Logs cut into windows: what they hold, what a hole does, their noise, and which are held out."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from suite.diagnose.data.windows import (
-    BURN_IN_S,
-    LENGTH_S,
-    SLICES,
-    STEPS,
-    cut,
-    take,
-)
+from suite.diagnose.data.flights import choose_held_out
+from suite.diagnose.data.noise import noise_of, rotor_noise
+from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import Thresholds
-from tests.support.diagnosis_flights import fly
+from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 
 
-def test_windows_hold_the_rows_and_commands_of_their_time():
-    log = fly(PLAIN, 0, duration_s=4.0)
+@pytest.fixture(scope="module")
+def log():
+    return fly(PLAIN, 0, duration_s=4.0, motors=True)
+
+
+def of_rows(log, rows, **changed):
+    """Return `log` with these rows only."""
+    arrays = {name: value[rows] for name, value in vars(log).items()
+              if isinstance(value, np.ndarray) and len(value) == len(log.time_s)}  # fmt: skip
+    return replace(log, **{**arrays, **changed})
+
+
+def test_windows_hold_the_rows_and_commands_of_their_time(log):
     windows, warnings = cut([log], PLAIN, False)
     assert windows is not None and not warnings
     assert len(windows.flight) == 3 and np.diff(windows.start_s).min() >= LENGTH_S - 1e-9
@@ -31,7 +37,6 @@ def test_windows_hold_the_rows_and_commands_of_their_time():
     row = int(np.searchsorted(log.time_s, windows.start_s[1] - 1e-9))
     np.testing.assert_array_equal(windows.pos_w[1], log.pos_w[row])
     np.testing.assert_array_equal(windows.row_pos_w[1][7], log.pos_w[row + 7])
-    assert log.thrust_cmd is not None
     now = int(np.searchsorted(windows.command_s[1], -1e-9))
     assert windows.command[1, now, 0] == log.thrust_cmd[row]
     held = np.diff(windows.command_s[1, now : now + 2]) * windows.command[1, now]
@@ -40,15 +45,12 @@ def test_windows_hold_the_rows_and_commands_of_their_time():
     np.testing.assert_array_equal(chosen.pos_w, windows.pos_w[1:])
 
 
-def test_few_shapes_hold_rows_of_every_rate():
-    log = fly(PLAIN, 0, duration_s=2.0)
+def test_few_shapes_hold_rows_of_every_rate(log):
     shapes = {}
     for rate_hz in (50.0, 97.0, 140.0, 250.0, 310.0, 400.0, 990.0):
-        rows = np.arange(0.0, 1.9, 1.0 / rate_hz)
-        near = np.clip(np.searchsorted(log.time_s, rows), 0, len(log.time_s) - 1)
-        arrays = {name: value[near] for name, value in vars(log).items()
-                  if isinstance(value, np.ndarray) and len(value) == len(log.time_s)}  # fmt: skip
-        windows, _ = cut([replace(log, **{**arrays, "time_s": rows})], PLAIN, False)
+        rows_s = np.arange(0.0, 1.9, 1.0 / rate_hz)
+        near = np.clip(np.searchsorted(log.time_s, rows_s), 0, len(log.time_s) - 1)
+        windows, _ = cut([of_rows(log, near, time_s=rows_s)], PLAIN, False)
         assert windows is not None
         shape = (windows.edge_s.shape[1], windows.command_s.shape[1])
         shapes.setdefault(shape, []).append(rate_hz)
@@ -60,10 +62,9 @@ def test_few_shapes_hold_rows_of_every_rate():
     }
 
 
-def test_what_is_an_input_or_derived_is_no_measurement():
-    log = replace(fly(PLAIN, 0, duration_s=2.0, motors=True), velocity_derived=True)
+def test_what_is_an_input_or_derived_is_no_measurement(log):
     for rotor_input in (False, True):
-        windows, _ = cut([log], PLAIN, rotor_input)
+        windows, _ = cut([replace(log, velocity_derived=True)], PLAIN, rotor_input)
         assert windows is not None
         seen = windows.valid.any(axis=(0, 1))
         assert seen[SLICES["rotor speed"]].all() != rotor_input
@@ -71,23 +72,17 @@ def test_what_is_an_input_or_derived_is_no_measurement():
         assert not seen[SLICES["velocity"]].any() and seen[SLICES["position"]].all()
 
 
-def test_a_hole_is_stepped_over_and_a_log_of_holes_is_named():
-    log = fly(PLAIN, 0, duration_s=4.0)
-    kept = (log.time_s < 0.8) | (log.time_s > 1.15)
-    arrays = {name: value[kept] for name, value in vars(log).items()
-              if isinstance(value, np.ndarray) and len(value) == len(kept)}  # fmt: skip
-    holed = replace(log, **arrays)
+def test_no_window_lies_over_a_hole_and_a_log_of_holes_is_named(log):
+    holed = of_rows(log, (log.time_s < 0.8) | (log.time_s > 1.15))
     windows, _ = cut([holed], PLAIN, False)
-    assert windows is not None and windows.start_s.min() > 1.1
+    assert windows is not None
     assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"
     none, warnings = cut([holed], PLAIN, False, limits=Thresholds(longest_hole_s=1e-3))
     assert none is None and warnings == [f"{log.name}: no stretch of 1.3 s without a hole"]
 
 
 @pytest.mark.parametrize("rotor_input", [False, True])
-def test_what_drives_must_be_known_all_the_way(rotor_input):
-    """A row is there, but not what drives: between two that say it, it would be made up."""
-    log = fly(PLAIN, 0, duration_s=4.0, motors=True)
+def test_no_window_lies_over_a_hole_of_its_input(log, rotor_input):
     name = "rotor_speed" if rotor_input else "rate_cmd_b"
     lost = np.array(getattr(log, name))
     lost[(log.time_s > 0.8) & (log.time_s < 1.15)] = np.nan
@@ -97,12 +92,43 @@ def test_what_drives_must_be_known_all_the_way(rotor_input):
     assert other is not None and other.start_s.min() < 0.5
 
 
-def test_of_many_stretches_as_many_as_allowed_are_spread_over_the_flights():
-    logs = [fly(PLAIN, seed, duration_s=8.0) for seed in (0, 1)]
+def test_of_many_windows_as_many_as_allowed_are_spread_over_the_flights(log):
+    logs = [log, replace(log, name="other")]
     every, _ = cut(logs, PLAIN, False)
-    some, (said,) = cut(logs, PLAIN, False, limits=Thresholds(most_windows=4))
-    assert said == f"4 stretches of 1 s, evenly spread, are used of {len(every.flight)}"
+    some, (warning,) = cut(logs, PLAIN, False, limits=Thresholds(most_windows=4))
+    assert warning == f"4 stretches of 1 s, evenly spread, are used of {len(every.flight)}"
     assert some.flight.tolist() == [0, 0, 1, 1]
     assert some.start_s[0] == every.start_s[0] and some.start_s[-1] == every.start_s[-1]
     second, _ = cut(logs, PLAIN, False, only=[1])
     assert set(second.flight.tolist()) == {1}
+    one, _ = cut([log], PLAIN, True, limits=Thresholds(most_rotor_windows=1))
+    assert len(one.flight) == 1, "windows under measured rotor speeds have a limit of their own"
+
+
+def test_noise_is_estimated_under_a_models_error(log):
+    windows, _ = cut([log], PLAIN, True)
+    assert windows is not None
+    rng = np.random.default_rng(0)
+    time_s = np.asarray(windows.row_s)[..., None]
+    residual = 0.3 * time_s**2 + 0.002 * rng.standard_normal(windows.valid.shape)
+    sigma = noise_of(residual, windows)
+    np.testing.assert_allclose(sigma[:12], 0.002, rtol=0.15)
+    assert np.isnan(sigma[12:]).all(), "of no measurement"
+    # Motors without a lag move between rows, which counts as noise.
+    assert rotor_noise(windows) == pytest.approx(NOISE["motor"], rel=0.5)
+
+
+def test_a_flight_that_alone_identifies_something_is_fitted(log):
+    logs = [replace(log, name=f"flight_{k}") for k in range(3)]
+    windows, _ = cut(logs, PLAIN, False)
+    information = np.ones((len(windows.flight), 2))
+    information[windows.flight != 2, 1] = 1e-3
+    fitted, names = choose_held_out(logs, windows.flight, windows.start_s, information)
+    assert names == ["flight_1"] and set(windows.flight[fitted]) == {0, 2}
+
+
+def test_of_a_single_flight_the_end_is_held_out(log):
+    windows, _ = cut([log], PLAIN, False)
+    information = np.ones((len(windows.flight), 1))
+    fitted, names = choose_held_out([log], windows.flight, windows.start_s, information)
+    assert names == ["flight_0 from 2.8 s"] and fitted.any() and not fitted[-1]

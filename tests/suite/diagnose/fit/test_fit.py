@@ -1,9 +1,8 @@
-"""The model that is fitted: its slopes, its whitening, its numbers, and the search on top."""
+"""The model of rollouts that is fitted: its slopes, its whitening, and how long it is trusted."""
 
 import numpy as np
 import pytest
 
-from eval.effects import nameable_effects
 from suite.diagnose.data.colour import Noise
 from suite.diagnose.data.whitening import (
     make_whitening,
@@ -14,59 +13,21 @@ from suite.diagnose.data.whitening import (
     whitened_residual,
 )
 from suite.diagnose.data.windows import KNOTS, STATE, trusted
-from suite.diagnose.estimate.parameters import candidates, effects_at, indices_of, make_space
-from suite.diagnose.evidence.rollouts import (
-    BATCH,
-    DIRECTIONS,
-    batches,
-    block_of,
-    rollout_evidence,
-    start_estimate,
-)
-from suite.diagnose.search.evaluation import NamedEffect
-from suite.diagnose.search.search import search
-from tests.support.vehicles import PLAIN, with_effects, with_lag
-
-LAGGED = with_lag(PLAIN, 0.03)
-SPACE = make_space(LAGGED)
-NEEDED = ("acc_b", "command")
+from suite.diagnose.evidence.rollouts import block_of, start_estimate
 
 
 @pytest.fixture(scope="module")
 def linearised(flown):
-    """Return a model, windows with a drag that it lacks, and their slopes along everything.
-
-    They are those of the shared diagnosis, for which the model's programs are compiled already.
-    """
+    """Return the model of the shared diagnosis, its windows, and their slopes along everything."""
     model, windows = flown.model, flown.cut(1.0)
     begin = start_estimate(model, windows)
     return model, windows, model.linearise(begin.theta, begin.free, windows, None)
 
 
-def test_a_vector_of_numbers_is_the_vehicles_effects_and_back():
-    theta = SPACE.array("start")
-    place = {(e.effect, e.parameter, e.component): i for i, e in enumerate(SPACE.entries)}
-    theta[place["linear_drag", "coefficient", 1]] = 0.4
-    drag = effects_at(SPACE.layout, SPACE.base, theta)["linear_drag"].coefficient
-    np.testing.assert_allclose(drag, [0.0, 0.4, 0.0])
-    assert len({candidate.label for candidate in candidates(SPACE, True, NEEDED)}) >= len(
-        nameable_effects()
-    )
-    wind = next(c for c in candidates(SPACE, True, NEEDED) if c.name == "constant_wind")
-    assert indices_of([wind, wind]) == sorted(wind.indices)
-
-
-def test_a_vehicle_that_no_stretch_can_begin_with_is_refused():
-    assert not any(entry.effect == "slung_load" for entry in SPACE.entries)
-    with pytest.raises(ValueError, match=r"effects\.slung_load has a motion of its own.*remove it"):
-        make_space(with_effects(slung_load=(0.05, 0.5)))
-
-
 def test_slopes_are_those_of_small_changes(linearised):
     model, windows, linear = linearised
     begin = start_estimate(model, windows)
-    name = ("linear_drag", "coefficient", 0)
-    index = SPACE.layout.index(name)
+    index = model.space.layout.index(("linear_drag", "coefficient", 0))
     step = np.zeros(model.size)
     step[index] = 1e-4
     ends = [model.residual(begin.theta + s * step, begin.free, windows) for s in (-1, 1)]
@@ -86,14 +47,6 @@ def test_a_disturbance_pushes_the_windows(linearised):
     at = np.abs(np.asarray(windows.row_s) - 0.5).argmin(axis=1)
     # 1 m/s^2 along body z for half a second, less what tilt takes of it.
     np.testing.assert_allclose(up[np.arange(len(at)), at], 0.125, rtol=0.5)
-
-
-def test_batches_are_of_one_size_and_whole(linearised):
-    model, windows, _ = linearised
-    offset = start_estimate(model, windows).free
-    parts = list(batches(offset, windows))
-    assert all(len(x) == len(w.flight) == BATCH for x, w, _ in parts)
-    assert sum(count for *_, count in parts) == len(windows.flight) and DIRECTIONS <= model.size
 
 
 def test_what_the_start_explains_is_projected_out(linearised):
@@ -125,9 +78,8 @@ def test_columns_that_depend_on_each_other_are_made_orthonormal_too():
     for tall in (matrix, matrix[..., [0, 1, 2, 2]] + 1e-9 * matrix):
         base, upper = orthonormal(tall, 1e-5)
         np.testing.assert_allclose(base @ upper, tall, atol=1e-9)
-        np.testing.assert_allclose(
-            np.swapaxes(base, 1, 2) @ base, np.broadcast_to(np.eye(4), (3, 4, 4)), atol=1e-6
-        )
+        unit = np.broadcast_to(np.eye(4), (3, 4, 4))
+        np.testing.assert_allclose(np.swapaxes(base, 1, 2) @ base, unit, atol=1e-6)
 
 
 def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
@@ -137,23 +89,3 @@ def test_windows_are_trusted_until_the_model_leaves_the_flight(linearised):
     view = trusted(windows, residual)
     last = [np.asarray(windows.row_s)[w][view.valid[w].any(axis=1)].max() for w in (0, 1)]
     assert last == pytest.approx([0.25, 1.0], abs=0.011)
-
-
-@pytest.mark.slow
-def test_a_search_names_the_drag_and_leaves_its_result_alone(linearised):
-    model, windows, linear = linearised
-    among = [
-        c for c in candidates(SPACE, False, NEEDED[1:]) if c.name in ("linear_drag", "gyro_bias")
-    ]
-    said = []
-    known = rollout_evidence(model, windows, linear)
-    begin = start_estimate(model, windows)
-    found = search(known[0], begin, among, said.append, known=known)
-    assert [candidate.name for candidate in found.candidates] == ["linear_drag"]
-    one = found.named[0]
-    assert one.p_value <= 1e-3 and one.gain > 0.0 and found.explained > 100.0 and said
-    assert found.indices == sorted(one.candidate.indices)
-    np.testing.assert_allclose(found.estimate.theta[found.indices], [0.15, 0.15, 0.05], atol=0.03)
-    with pytest.raises(AttributeError):
-        one.gain = 0.0  # type: ignore[misc]
-    assert NamedEffect(one.candidate, 1.0, 0.0).rivals == ()

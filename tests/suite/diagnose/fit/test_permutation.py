@@ -1,9 +1,6 @@
 """The null of the search on sums whose truth is known: p-values are what they say."""
 
-from functools import cache
-
 import numpy as np
-import pytest
 from scipy.stats import kstest
 
 from suite.diagnose.estimate.block import NormalEquations
@@ -22,14 +19,10 @@ DRAWS = 50
 
 
 def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
-    """Sums of windows of noise, plus `size` of what `truth` does in each of them.
+    """Return normal equations of noise, plus `size` of what `truth` does in each window.
 
-    Args:
-        rng: of the noise and of the slopes.
-        colour: correlation of one row's noise with the next within a window.
-        truth: name of the effect that is there.
-        size: of it, in units of the noise.
-        alike: share of the slope of `truth` in those of all other effects.
+    One row's noise has the correlation `colour` with the next one; other effects have the share
+    `alike` of the slope of `truth`.
     """
     count = len(SPACE.entries)
     slope = rng.standard_normal((WINDOWS, ROWS, count))
@@ -46,26 +39,22 @@ def equations(rng, colour=0.0, truth=None, size=0.0, alike=0.0):
     return NormalEquations(turned @ slope, cross, (noise**2).sum(axis=1))
 
 
-@cache
-def best_of(draws, **options):
+def best_of(draws, named=(), among=AMONG, **options):
+    """Return the best score of each of `draws` made data sets."""
     found = []
     for k in range(draws):
         made = equations(np.random.default_rng([7, k]), **options)
-        found.append(score_candidates(made, MIDDLE, SPACE, [], AMONG, FOLD, seed=k)[0])
+        found.append(score_candidates(made, MIDDLE, SPACE, named, among, FOLD, seed=k)[0])
     return found
 
 
-@pytest.mark.parametrize("colour", [pytest.param(0.0, marks=pytest.mark.slow), 0.9])
-def test_p_values_of_noise_are_uniform_also_where_it_is_coloured(colour):
-    p_values = [found.p_value for found in best_of(DRAWS, colour=colour)]
+def test_p_values_of_coloured_noise_are_uniform():
+    found = best_of(DRAWS, colour=0.9)
+    p_values = np.array([one.p_value for one in found])
     assert kstest(p_values, "uniform").pvalue > 0.005
     # Of 50 nulls 0.5 are expected at or below 1 %; 4 or more come with a chance of 0.2 %.
-    assert np.sum(np.array(p_values) <= 0.01) < 4
-
-
-def test_chance_is_the_gain_that_one_null_in_a_hundred_exceeds():
-    above = [found.gain > found.chance for found in best_of(DRAWS, colour=0.9)]
-    assert np.sum(above) < 4
+    assert np.sum(p_values <= 0.01) < 4
+    assert sum(one.gain > one.chance for one in found) < 4, "one null in a hundred exceeds it"
 
 
 def test_the_true_effect_wins_over_one_that_looks_like_it():
@@ -77,17 +66,12 @@ def test_the_true_effect_wins_over_one_that_looks_like_it():
     assert min(one.p_value for one in found) >= least * (1.0 - 1e-9)
 
 
-def test_a_wrong_effect_adds_nothing_beside_the_true_one():
+def test_a_wrong_effect_adds_nothing_to_the_true_one():
     true = next(c for c in AMONG if c.name == "rotor_drag")
-    others = [c for c in AMONG if c != true]
-    p_values = []
-    for k in range(20):
-        rng = np.random.default_rng([9, k])
-        made = equations(rng, truth="rotor_drag", size=0.6, alike=1.0)
-        scores = score_candidates(made, MIDDLE, SPACE, list(true.indices), others, FOLD, seed=k)
-        p_values.append(scores[0].p_value)
+    others, named = [c for c in AMONG if c != true], list(true.indices)
+    found = best_of(20, named, others, truth="rotor_drag", size=0.6, alike=1.0)
     # The null shuffles the named effect's own part as well, which makes it the more careful.
-    assert np.sum(np.array(p_values) <= 0.01) < 3
+    assert sum(one.p_value <= 0.01 for one in found) < 3
 
 
 def test_other_seeds_draw_another_null_and_one_seed_the_same():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from eval.judging.statistics import wilson
-from eval.vehicles.vehicle_check import check_vehicle
 from suite.diagnose.identify.identify import identify
 from suite.diagnose.identify.numbers import numbers_json
 from tests.support import identified as known
@@ -29,13 +28,14 @@ TRUE = {
 
 
 def pulls(found):
-    """How many half-widths every identified number is off, by key and component."""
+    """Return by how many half-widths each identified number is off, by key and component."""
     off = {}
     for entry in found.numbers:
         true = TRUE[entry.key]
         if entry.key == "motors.thrust":
-            # At the start's nominal voltage.
-            per = (15.0 / known.MOTORS.voltage) ** known.MOTORS.voltage_exponent
+            # At the nominal voltage of the file.
+            per = found.vehicle.motors.voltage / known.MOTORS.voltage
+            per **= known.MOTORS.voltage_exponent
             true = (true[0] * per, true[1] * per**2)
         for k, (value, span) in enumerate(zip(entry.value, entry.ci95, strict=True)):
             if span is not None:
@@ -46,7 +46,7 @@ def pulls(found):
 @pytest.mark.parametrize(
     ("drive", "least"), [("rates", 9), ("pwm", 7), ("rotors", 7), ("torques", 6)]
 )
-def test_what_flights_tell_is_near_the_truth(drive, least):
+def test_identified_numbers_are_near_the_truth(drive, least):
     found = known.found(drive)
     off = pulls(found)
     assert found.drive == drive
@@ -54,42 +54,19 @@ def test_what_flights_tell_is_near_the_truth(drive, least):
     assert np.max(np.abs(list(off.values()))) < 2.5
 
 
-@pytest.mark.parametrize("noise", [pytest.param(2.0, marks=pytest.mark.slow), 4.0])
-def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn(noise):
-    """Without a chirp they say little of the inertia: less than its own noise, and then nothing."""
+def test_noise_of_the_rotor_speeds_makes_no_body_heavier_to_turn():
+    """Without a chirp the flights hardly identify the inertia, or not at all."""
     fleet = Fleet(known.truth(), known.WAYS[:3])
-    sensors, rng = replace(known.SENSORS, rotor=noise), np.random.default_rng(0)
+    sensors, rng = replace(known.SENSORS, rotor=4.0), np.random.default_rng(0)
     logs = logs_of(fleet, known.recordings(known.WAYS[:3]), "rotors", rng, sensors=sensors)
     (entry,) = [n for n in identify(logs, known.start()).numbers if n.key == "inertia"]
     for value, true, span in zip(entry.value, TRUE["inertia"], entry.ci95, strict=True):
         assert span is None or abs(np.log(value / true)) < 0.2
 
 
-@pytest.fixture(scope="module")
-def coverage(root):
-    """`tools/coverage.py`."""
-    return program(root / "tools" / "coverage.py")
-
-
-@pytest.fixture(scope="module")
-def fleet(coverage):
-    """A vehicle of drawn numbers, and its flights."""
-    return coverage.fly_fleet(0, 1)
-
-
 @pytest.mark.slow
-def test_drawn_numbers_come_back_within_their_intervals(coverage, fleet):
-    off = []
-    for case in coverage.CASES:
-        found = coverage.pulls(*fleet, case, np.random.default_rng(0))
-        assert len(found) >= 3, case
-        off += [pull for pull, _ in found.values()]
-    assert np.sqrt(np.mean(np.square(off))) < 0.75
-    assert np.max(np.abs(off)) < 2.5
-
-
-@pytest.mark.slow
-def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(coverage):
+def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(root):
+    coverage = program(root / "tools" / "coverage.py")
     found = coverage.measure(40, 0, list(coverage.CASES), "")
     assert len(found) > 40
     for (case, key), rows in found.items():
@@ -99,59 +76,60 @@ def test_intervals_of_every_number_hold_the_truth_as_often_as_they_say(coverage)
 
 
 TURNING = ("inertia", "lag")
-"""Left alone where a test is of forces: what turns the body takes most of the time."""
+"""Parts that tests of forces leave: their fits take most of the time."""
 
 
-def test_a_hover_tells_thrust_and_says_what_it_cannot():
-    found = identify(known.logs("pwm", 0, known.HOVER), known.start(), leave=TURNING)
-    estimated = numbers_json(found.numbers)
-    assert "motors.thrust" in estimated
-    words = " ".join(found.not_identified)
-    assert "drag along body x: too slow" in words
-    assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
-
-
-def test_what_is_left_alone_stays():
+def test_parts_that_are_left_stay():
     begun = known.start()
-    found = identify(known.logs("rates", 0), begun, leave=("drag", "loop"))
+    found = identify(known.logs("rates", 0, known.HOVER), begun, leave=("drag", "loop"))
     assert "linear_drag" not in found.vehicle.effects
     assert found.vehicle.controller == begun.controller
 
 
 def without(logs, *fields):
-    """The logs without these, as a partial log has them."""
+    """Return the logs without these columns, as partial logs have them."""
     return [
         replace(log, **{name: np.full_like(getattr(log, name), np.nan) for name in fields})
         for log in logs
     ]
 
 
-def test_without_an_attitude_the_thrust_is_told_and_the_drag_is_said_to_need_one():
-    logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz")
-    found = identify(logs, known.start(), leave=TURNING)
+@pytest.mark.parametrize(
+    ("missing", "lines"),
+    [
+        ((), ("drag along body x: too slow",)),
+        (
+            ("quat_wxyz", "rate_b"),
+            (
+                "drag along body x and y: without",
+                "inertia and torque_coefficient: no body rates",
+                "time_constant and command_delay: no body rates",
+            ),
+        ),
+    ],
+)
+def test_a_hover_identifies_thrust_and_reports_what_it_does_not(missing, lines):
+    logs = without(known.logs("pwm", 0, known.HOVER), *missing)
+    found = identify(logs, known.start(), leave=() if missing else TURNING)
     off = pulls(found)
     assert {key for key, _ in off} >= {"motors.thrust"}
     assert np.max(np.abs(list(off.values()))) < 2.0
-    assert any(line.startswith("drag along body x and y: without") for line in found.not_identified)
+    for line in lines:
+        assert any(text.startswith(line) for text in found.not_identified)
     assert found.vehicle.effects["linear_drag"].coefficient[:2] == (0.0, 0.0)
-
-
-def test_without_attitude_and_rates_what_turns_is_listed_as_not_identified():
-    logs = without(known.logs("pwm", 0, known.HOVER), "quat_wxyz", "rate_b")
-    found = identify(logs, known.start())
-    assert "motors.thrust" in numbers_json(found.numbers)
-    words = " ".join(found.not_identified)
-    assert "inertia and torque_coefficient: no body rates" in words
-    assert "time_constant and command_delay: no body rates" in words
     assert found.vehicle.inertia == known.start().inertia
 
 
-def test_without_rates_the_attitude_tells_the_inertia(coverage, fleet):
-    off = coverage.pulls(*fleet, "pwm without rates", np.random.default_rng(0))
-    assert "inertia[0]" in off and "inertia[1]" in off
+def test_without_rates_the_attitude_identifies_the_inertia():
+    fleet, rng = Fleet(known.truth(), known.WAYS), np.random.default_rng(0)
+    sensors = replace(known.SENSORS, attitude=0.002)
+    logs = logs_of(fleet, known.recordings(), "pwm", rng, sensors=sensors)
+    off = pulls(identify(without(logs, "rate_b"), known.start(), leave=("loop",)))
+    assert {("inertia", 0), ("inertia", 1)} <= set(off)
+    assert np.max(np.abs(list(off.values()))) < 2.5
 
 
-def test_without_positions_the_rates_tell_what_turns():
+def test_without_positions_the_rates_identify_what_turns():
     found = identify(without(known.logs("pwm", 0), "pos_w", "vel_w"), known.start())
     assert "rotors.torque_coefficient" in numbers_json(found.numbers)
     assert any(
@@ -159,14 +137,8 @@ def test_without_positions_the_rates_tell_what_turns():
     )
 
 
-def test_flights_that_hold_nothing_are_refused_with_what_they_lack():
-    logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
-    with pytest.raises(ValueError, match="flight_0, .*: no stretch of a second with positions"):
-        identify(logs, known.start())
-
-
 def cut(logs, name, rows=5):
-    """The logs with this column for so many rows only."""
+    """Return the logs with this column for so many rows only."""
     found = []
     for log in logs:
         values = np.array(getattr(log, name), dtype=float)
@@ -179,38 +151,20 @@ def without_voltage(logs):
     return [replace(log, voltage=None) for log in logs]
 
 
-@pytest.mark.parametrize("first", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_file_from_flights_with_or_without_a_voltage_starts_flights_with_or_without(first):
-    with_it = known.logs("pwm", 0)
-    bare = replace(known.start(), motors=None)
-    begun = identify(with_it if first else without_voltage(with_it), bare)
+def test_a_file_without_motors_gets_them_and_keeps_its_voltage_for_flights_without_one():
+    logs, bare = known.logs("pwm", 0), replace(known.start(), motors=None)
+    begun = identify(logs, bare, leave=TURNING)
     motors = begun.vehicle.motors
-    assert motors is not None and (motors.voltage_exponent > 0.0) == first
-    later = identify(with_it, begun.vehicle)
-    assert {key for key, _ in motor_pulls(later)} == {"thrust", "voltage_exponent"}
-    assert np.max(np.abs(list(motor_pulls(later).values()))) < 2.5
-    again = identify(without_voltage(with_it), begun.vehicle)
+    assert motors is not None and motors.voltage_exponent > 0.0
+    off = pulls(identify(logs, begun.vehicle, leave=TURNING))
+    assert {key for key, _ in off} >= {"motors.thrust", "motors.voltage_exponent"}
+    assert np.max(np.abs(list(off.values()))) < 2.5
+    again = identify(without_voltage(logs), begun.vehicle, leave=TURNING)
     assert "motors.thrust" in numbers_json(again.numbers)
     after = again.vehicle.motors
     assert after is not None and after == replace(motors, thrust=after.thrust)
     (line,) = [text for text in again.not_identified if text.startswith("voltage_exponent")]
-    assert ("assumed to be that at 16.4" in line) == first
-
-
-def motor_pulls(found):
-    """How many half-widths the motors are off at the nominal voltage that they have now."""
-    motors, off = found.vehicle.motors, {}
-    per = (motors.voltage / known.MOTORS.voltage) ** known.MOTORS.voltage_exponent
-    first, second = known.MOTORS.thrust
-    true = {
-        "thrust": (first * per, second * per**2),
-        "voltage_exponent": (known.MOTORS.voltage_exponent,),
-    }
-    for entry in found.numbers:
-        table, _, key = entry.key.partition(".")
-        for k, span in enumerate(entry.ci95 if table == "motors" else ()):
-            off[key, k] = (entry.value[k] - true[key][k]) / (0.5 * (span[1] - span[0]))
-    return off
+    assert "assumed to be that at 16.4" in line
 
 
 def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
@@ -218,8 +172,8 @@ def test_what_lag_and_delay_make_together_does_not_pass_for_a_delay():
     assert "effects.command_delay.delay" not in numbers_json(found.numbers)
     # Their sum is identified, and the file has it, however its lag shares it.
     rest = found.vehicle.effects["command_delay"].delay
-    stacked_residuals = known.vehicle().rotors.time_constant + known.DELAY
-    assert found.vehicle.rotors.time_constant + rest == pytest.approx(stacked_residuals, abs=0.004)
+    total_s = known.vehicle().rotors.time_constant + known.DELAY
+    assert found.vehicle.rotors.time_constant + rest == pytest.approx(total_s, abs=0.004)
     assert any(line.startswith("command_delay: only its sum with") for line in found.not_identified)
 
 
@@ -236,16 +190,21 @@ def test_commands_that_stop_early_do_not_identify_what_needs_them(drive, column,
     assert any(text.startswith(line) and "with both" in text for text in found.not_identified)
 
 
-def test_a_flight_whose_commands_stop_early_takes_nothing_from_the_others():
+def test_a_flight_without_commands_or_voltage_takes_nothing_from_the_others():
     logs = known.logs("pwm", 0)
-    found = numbers_json(identify([*logs[:3], *cut(logs[3:], "pwm")], known.start()).numbers)
-    alone = numbers_json(known.found("pwm", 3).numbers)
-    assert set(found) == set(alone)
-    for key, entry in found.items():
-        np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
+    alone = numbers_json(identify(logs[:3], known.start(), leave=TURNING).numbers)
+    assert set(alone) >= {"motors.thrust", "motors.voltage_exponent"}
+    short = identify([*logs[:3], *cut(logs[3:], "pwm")], known.start(), leave=TURNING)
+    no_voltage = identify([*logs[:3], *without_voltage(logs[3:])], known.start(), leave=TURNING)
+    assert no_voltage.notes[0].startswith("no voltage in flight_3: ")
+    for found in (short, no_voltage):
+        entries = numbers_json(found.numbers)
+        assert set(entries) == set(alone)
+        for key, entry in entries.items():
+            np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
 
 
-def test_rotors_that_are_logged_in_turn_tell_all_but_their_lag():
+def test_rotors_that_are_logged_in_turn_identify_all_but_their_lag():
     logs = []
     for log in known.logs("rotors", 0):
         turn = np.arange(len(log.time_s))[:, None] % 4 == np.arange(4)
@@ -260,13 +219,10 @@ def test_rotors_that_are_logged_in_turn_tell_all_but_their_lag():
     assert sum("no row has all columns of rotor_speed" in note for note in found.notes) == 4
 
 
-@pytest.mark.parametrize(
-    "drive", [*(pytest.param(d, marks=pytest.mark.slow) for d in ("rates", "torques")), "thrust"]
-)
-def test_a_scale_of_the_thrust_that_is_left_alone_counts(drive):
+def test_a_scale_of_the_thrust_that_is_left_alone_counts():
     fleet = Fleet(known.truth(), known.WAYS, scale=0.8)
     rng = np.random.default_rng(0)
-    logs = logs_of(fleet, known.recordings(), drive, rng, sensors=known.SENSORS)
+    logs = logs_of(fleet, known.recordings(), "thrust", rng, sensors=known.SENSORS)
     begun = with_effects(known.start(), thrust_scale=(0.8,))
     found = identify(logs, begun, leave=("motors",))
     assert found.vehicle.effects["thrust_scale"].scale == 0.8
@@ -276,32 +232,9 @@ def test_a_scale_of_the_thrust_that_is_left_alone_counts(drive):
         assert value == pytest.approx(true, abs=0.03)
 
 
-def test_a_speed_that_is_too_low_to_hover_is_that_of_the_flights():
-    begun = known.start()
-    rotors = replace(begun.rotors, thrust_coefficient=3.2e-6, speed_max=1000.0)
-    found = identify(known.logs("rotors", 0), replace(begun, rotors=rotors))
-    check_vehicle(found.vehicle)
-    assert 1100.0 < found.vehicle.rotors.speed_max < known.vehicle().rotors.speed_max
-    assert any(note.startswith("rotors.speed_max = ") for note in found.notes)
-
-
-def test_flights_without_a_voltage_leave_the_motors_to_those_that_have_one():
-    logs = known.logs("pwm", 0)
-    found = identify([*logs[:3], *without_voltage(logs[3:])], known.start())
-    off = pulls(found)
-    assert {key for key, _ in off} >= {"motors.thrust", "motors.voltage_exponent"}
-    assert np.max(np.abs(list(off.values()))) < 2.5
-    (note,) = found.notes
-    assert note.startswith("no voltage in flight_3: ")
-    alone = numbers_json(known.found("pwm", 3).numbers)
-    for key, entry in numbers_json(found.numbers).items():
-        np.testing.assert_allclose(entry["value"], alone[key]["value"], rtol=1e-3)
-
-
-def test_what_cannot_be_compared_is_refused_with_parts_left_alone_as_well():
+def test_flights_that_identify_nothing_are_refused_with_what_they_lack():
     logs = without(known.logs("pwm", 0), "pos_w", "vel_w", "quat_wxyz", "rate_b")
+    with pytest.raises(ValueError, match="flight_0, .*: no stretch of a second with positions"):
+        identify(logs, known.start())
     with pytest.raises(ValueError, match="without drag nothing is identifiable: thrust and"):
         identify(logs, known.start(), leave=("drag",))
-    others = ("drag", "motors", "inertia", "lag")
-    with pytest.raises(ValueError, match="without drag, .*: rate_gain: these logs have no comm"):
-        identify(known.logs("pwm", 0), known.start(), leave=others)

@@ -1,4 +1,6 @@
-"""A diagnosis as JSON, report and recording: what is said is what was found."""
+"""A diagnosis as JSON, tables and charts: what they show is what was found."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,12 +8,7 @@ import pytest
 from suite.common.report import html
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.report import charts
-from suite.diagnose.report.charts import (
-    black_box_chart,
-    gains_chart,
-    series_chart,
-    write_rollouts,
-)
+from suite.diagnose.report.charts import black_box_chart, gains_chart, series_chart
 from suite.diagnose.report.diagnosis_json import (
     actuators_json,
     black_box_json,
@@ -26,14 +23,7 @@ from suite.diagnose.report.sections import (
     noise_section,
     residual_section,
 )
-from suite.diagnose.report.summary import (
-    NOT_IDENTIFIABLE,
-    cells,
-    components,
-    grid,
-    in_digits,
-    short_name,
-)
+from suite.diagnose.report.summary import NOT_IDENTIFIABLE, answer, components, in_digits
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
 from tests.support.diagnosis_flights import fly
@@ -41,14 +31,18 @@ from tests.support.vehicles import PLAIN
 from tracks.common.files import plain
 from tracks.common.grid import Grid
 
-PNG = b"\x89PNG"
-
 
 @pytest.fixture(scope="module")
 def found(drag, flown):
     mismatches = actuator_mismatches(flown.logs, flown.vehicle)
+    gaps = (drag.main.before, drag.main.after, drag.main.before)
+    side = BlackBoxComparison("flights left out", 9, 5, *gaps)
     return plain(
-        {**diagnosis_json(drag), "actuators": actuators_json(mismatches), "black_box": None}
+        {
+            **diagnosis_json(drag),
+            "actuators": actuators_json(mismatches),
+            "black_box": black_box_json(BlackBoxComparisons(side, None, 4.0, 1.0), 0),
+        }
     )
 
 
@@ -56,32 +50,34 @@ def texts(table):
     return [[cell.text for cell in row] for row in table.rows]
 
 
-def compared(drag):
-    gaps = (drag.main.before, drag.main.after, drag.main.before)
-    side = BlackBoxComparison("flights left out", 9, 5, *gaps)
-    return black_box_json(BlackBoxComparisons(side, None, 4.0, 1.0), 0)
-
-
-def test_rows_are_cells_without_a_tone():
-    assert [cell.text for cell in cells("a", "b")] == ["a", "b"] and not cells("a")[0].tone
-    assert texts(grid("t", ["x"], [("1",), ("2",)], "n")) == [["1"], ["2"]]
-    assert short_name("a\\b/c.parquet") == "c.parquet"
-
-
-def test_the_json_says_what_was_found(drag, found):
+def test_the_json_has_what_was_found(drag, found):
     assert found["verdict"] == drag.label and found["driven_by"] == "commands"
     (effect,) = found["effects"]
     assert effect["name"] == "linear_drag" and effect["gap_removed"] > 0.9
     value = np.array(effect["parameters"]["coefficient"]["value"])
     np.testing.assert_allclose(value, drag.main.theta[drag.main.search.indices])
     assert found["gap"]["channels"]["1 s"]["velocity"]["noise_floor"] > 0.0
-    assert found["actuators"][0]["followed"] > 0.9
-
-
-def test_a_comparison_with_a_black_box_is_in_the_json(drag):
-    box = compared(drag)
+    box = found["black_box"]
     assert box["outside"] is None and box["held_out"]["stretches"] == {"fitted": 9, "judged": 5}
     assert box["held_out"]["named"]["gap"] == drag.main.after.rms
+
+
+def test_each_view_names_its_own_effect_and_the_page_has_its_headline_first(by_views):
+    found = plain(diagnosis_json(by_views))
+    effects = {effect["name"]: effect for effect in found["effects"]}
+    drag = effects.pop("linear_drag")
+    assert drag["view"] == "force" and 0.0 < drag["gap_removed"] <= 1.0
+    span = drag["parameters"]["coefficient"]["ci95"][0]
+    assert span[0] < 0.4 < span[1]
+    assert effects and all(effect["view"] == "torque" for effect in effects.values())
+    assert set(found["gap"]["channels"]["force"]) == {"x", "y", "z"}
+    main = found["gap"]["channels"][by_views.main.source.name]
+    whole = sum(axis["before"] ** 2 for axis in main.values()) ** 0.5
+    assert found["gap"]["before"] == pytest.approx(whole, rel=1e-9)
+    assert found["headline"].startswith(answer(found)) and "linear_drag" in answer(found)
+    text = html(page(by_views, found, "mass = 1", {"vehicle.toml"}))
+    assert text.index(found["headline"][:40]) < text.index("data:image/png") < text.index("<table")
+    assert "What was written" in text and "mass = 1" in text and "black box" in text
 
 
 def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supports():
@@ -98,36 +94,37 @@ def test_components_are_named_by_axis_and_shown_in_digits_that_the_interval_supp
     assert in_digits(1234.56, (1234.56, 1200.0, 1270.0)) == "1235"
 
 
-def test_a_weak_motor_says_which_and_how_surely():
+def test_a_weak_motor_has_its_number_and_the_motors_that_it_may_be():
     space = make_space(PLAIN)
     at = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
     theta, width = space.array("start"), dict.fromkeys(at, 0.01)
-    told = parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
-    assert (told["index"]["value"], told["index"]["ci95"]) == (2, [2, 3])
-    sure = parameters_json(space, "weak_motor", [at[1]], theta, width)
-    assert sure["index"]["ci95"] == [2, 2]
+    unsure = parameters_json(space, "weak_motor", [at[1]], theta, width, undecided=[at[2]])
+    assert (unsure["index"]["value"], unsure["index"]["ci95"]) == (2, [2, 3])
     several = parameters_json(space, "weak_motor", [at[1], at[3]], theta, width)
     assert several["index"] == {"value": [2, 4], "unit": "1", "ci95": [[2, 2], [4, 4]]}
     labels = [one.label for one in components({"name": "weak_motor", "parameters": several})]
     assert labels == ["scale 2 [1]", "scale 4 [1]"]
 
 
-def test_sections_show_the_numbers(drag, flown, found):
-    logs = logs_section(flown.logs)
-    assert isinstance(logs.parts[0], Grid) and len(logs.parts[0].rows) == 3
+def test_sections_show_the_numbers(drag, found):
     noise = noise_section(drag).parts[1]
-    assert isinstance(noise, Grid) and [row[0] for row in texts(noise)][0] == "position [m]"
+    assert isinstance(noise, Grid) and texts(noise)[0][0] == "position [m]"
     assert len(actuators_section(found)) == 1
     assert actuators_section({**found, "actuators": []}) == []
     rest = {**found, "unexplained": {"where": "a shape", "share": 0.25}}
     assert residual_section(rest).parts[0] == "25 % of the gap remains: a shape."
-    held = evidence_section(drag, {**found, "black_box": compared(drag)}).parts
+    held = evidence_section(drag, found).parts
     assert "too few stretches" in str(held[-1])
     tables = [part for part in held if isinstance(part, Grid)]
     assert texts(tables[0])[-1][0] == "with the named effects" and len(tables) == 2
+    # A channel that no log measured is not in the table.
+    none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
+    every = found["gap"]["channels"].items()
+    table = channels_grid({horizon: {**groups, "velocity": none} for horizon, groups in every})
+    assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
 
 
-def test_the_facts_of_a_log():
+def test_a_log_is_shown_with_duration_rate_holes_and_signals():
     log = fly(PLAIN, 0, duration_s=3.0, motors=True)
     log.pos_w[30:60] = np.nan
     (row,) = texts(logs_section([log]).parts[0])
@@ -135,38 +132,15 @@ def test_the_facts_of_a_log():
     assert row[7] == "commands, velocity, rotor speeds"
 
 
-def test_what_no_log_measured_is_not_in_the_table(found):
-    none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
-    every = found["gap"]["channels"].items()
-    table = channels_grid({horizon: {**groups, "velocity": none} for horizon, groups in every})
-    assert not any("velocity" in row[1] for row in texts(table)) and len(table.rows) > 3
-
-
-def test_charts_are_pictures(drag, monkeypatch):
+def test_charts_show_the_scores_the_black_box_and_measured_next_to_simulated(
+    drag, found, monkeypatch
+):
     main = drag.main
     scores = main.search.first
     assert gains_chart(scores, None, set()) != gains_chart(scores, 5.0, {"linear_drag"})
-    assert black_box_chart([compared(drag)["held_out"]]).startswith(PNG)
+    assert black_box_chart([found["black_box"]["held_out"]]).startswith(b"\x89PNG")
     series = main.source.series(main.search)
-    assert series_chart(series).startswith(PNG)
-    drawn = lambda figure: figure.axes[0]  # noqa: E731
-    monkeypatch.setattr(charts, "png", drawn)
-    axes = series_chart(series)
+    monkeypatch.setattr(charts, "png", lambda figure: figure.axes[0])
+    axes: Any = series_chart(series)
     labels = [line.get_label() for line in axes.lines if not line.get_label().startswith("_")]
     assert labels == ["measured", *series.simulated] and len(series.simulated) == 2
-
-
-def test_the_page_stands_alone(drag, found):
-    text = html(page(drag, found, "name = 'x'", {"vehicle.toml"}))
-    assert (
-        text.count("<h2>") == 4
-        and text.count('class="section"') >= 6
-        and "linear_drag" in text
-        and "vehicle.toml" in text
-    )
-    assert "recording.rrd" not in text
-
-
-def test_the_recording_is_written(drag, flown, tmp_path):
-    path = write_rollouts(tmp_path / "x.rrd", flown, drag.main.theta)
-    assert path.stat().st_size > 10_000

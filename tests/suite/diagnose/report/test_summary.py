@@ -34,9 +34,8 @@ def test_an_answer_has_the_effect_its_values_and_its_size():
         "one second (RMS). This explains the gap between simulation and flights."
     )
     by_force = {**DRAG, "size": {**DRAG["size"], "drift": None}}
-    assert "causes 0.8 m/s² and 0 rad/s² (RMS). This explains a part" in answer(
-        found("partly", [by_force])
-    )
+    partly = answer(found("partly", [by_force]))
+    assert "causes 0.8 m/s² and 0 rad/s² (RMS). This explains a part" in partly
     assert "has changed since the reference" in answer(found("named", [DRAG], reference=["a"]))
 
 

@@ -19,7 +19,7 @@ from tests.support.vehicles import PLAIN
 
 
 def spoilt(found_drag, steps):
-    """What was found, and a torque that is not there next to the drag that is."""
+    """Return what was found, and a torque of so many steps that is not there."""
     found, space = found_drag.search, found_drag.source.space
     other = next(s.candidate for s in found.first if s.candidate.name == "torque_trim")
     theta, at = found.estimate.theta.copy(), list(other.indices)
@@ -29,14 +29,17 @@ def spoilt(found_drag, steps):
     return replace(found, named=named, last=last, judged=last)
 
 
-def judged(found_drag, found):
-    after = found_drag.source.gap(found, found.estimate.theta)
-    return after, confirmed(found_drag.source, found, (found_drag.before, after))
+def test_a_name_that_held_out_flights_contradict_is_withdrawn_and_one_that_they_cannot_show_stays(
+    found_drag,
+):
+    def judged(found):
+        after = found_drag.source.gap(found, found.estimate.theta)
+        return after, confirmed(found_drag.source, found, (found_drag.before, after))
 
-
-def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(found_drag):
+    _, (kept, _, _, gone) = judged(spoilt(found_drag, 1e-4))
+    assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
     found = spoilt(found_drag, 0.2)
-    after, (kept, gap, without, gone) = judged(found_drag, found)
+    after, (kept, gap, without, gone) = judged(found)
     assert gone == ["torque_trim"] and gap.rms < after.rms
     labels = [one.label for one in found_drag.search.candidates]
     assert [one.label for one in kept.candidates] == labels and set(without) == set(labels)
@@ -44,36 +47,26 @@ def test_a_name_that_held_out_flights_do_not_want_is_withdrawn(found_drag):
     np.testing.assert_allclose(kept.estimate.theta[kept.indices], theta[kept.indices], rtol=0.05)
 
 
-def test_where_the_model_lacks_something_a_name_must_take_away_a_share_of_the_rest(found_drag):
+def test_where_the_model_lacks_something_a_name_must_explain_a_share_of_the_rest(found_drag):
     found, before, after = found_drag.search, found_drag.before, found_drag.after
     # As if the rest were so large that the gap without the drag is a fifth larger only.
     raised = found_drag.without["linear_drag"].energy.sum() / 1.2 / after.energy.sum()
     after = after._replace(score=raised * after.score, energy=raised * after.energy)
     misfit = replace(of_rollouts(found.judged), misfit_is_noise=True)
     off = replace(found, judged=found.judged._replace(evidence=misfit))
-    gone = {
-        one.judged.evidence.misfit_is_noise: confirmed(found_drag.source, one, (before, after))[3]
-        for one in (found, off)
-    }
-    assert gone == {False: [], True: ["linear_drag"]}
-
-
-def test_one_that_they_could_not_show_stays(found_drag):
-    _, (kept, _, _, gone) = judged(found_drag, spoilt(found_drag, 1e-4))
-    assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
+    withdrawn = [confirmed(found_drag.source, one, (before, after))[3] for one in (found, off)]
+    assert withdrawn == [[], ["linear_drag"]]
 
 
 def test_what_was_withdrawn_has_explained_nothing(found_drag):
-    """A gap that a withdrawn name had closed is there again: `unknown`, not `no_gap`."""
-
-    def errors(found):
-        return of_rollouts(found.last).slow_errors(found.last.block)
-
+    """The verdict is then `unknown`, not `no_gap`."""
     bare = found_drag.search.refitted(())
     assert bare.named == () and bare.explained == 0.0
-    slow, expected = errors(found_drag.search)
-    assert slow.sum() / expected.sum() < 1.5
-    assert structure_where(errors(bare), ResidualStructure([], {}), True) is not None
+    with_drag, without = (
+        of_rollouts(found.last).slow_errors(found.last.block) for found in (found_drag.search, bare)
+    )
+    assert with_drag[0].sum() / with_drag[1].sum() < 1.5
+    assert structure_where(without, ResidualStructure([], {}), True) is not None
 
 
 def test_a_fault_that_the_accelerometer_alone_shows_counts_on_held_out_flights():

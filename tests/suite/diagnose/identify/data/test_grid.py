@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.identify.grid import (
-    ROTOR_NOISE,
-    STEP_S,
-    FlightGrid,
-    grid_of,
-)
+from suite.diagnose.identify.grid import ROTOR_NOISE, STEP_S, FlightGrid, grid_of
 
 
 def grid(values):
@@ -32,66 +27,28 @@ def test_bumps_are_exact_on_lines_and_parabolas():
     np.testing.assert_allclose(path.mean @ time_s, 1.0, rtol=1e-3)
 
 
-def test_no_bump_lies_over_a_hole():
-    values = np.ones(500)
-    values[250] = np.nan
-    for middle_s in grid(values).form(0.2, ("x",)).middle_s:
-        assert abs(middle_s - 1.0) > 0.095
-
-
-def test_commands_hold_until_the_next_row_and_measurements_are_joined():
-    time_s = np.arange(0.0, 2.0, 0.02)
-    step = (time_s >= 1.0).astype(float)
-    still, up = np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (100, 1))
-    log = FlightLog(
-        "made",
-        time_s,
-        still,
-        up,
-        still,
-        step[:, None] * [1.0, 0.0, 0.0],
-        pwm=np.repeat(step[:, None], 4, axis=1),
-    )
-    flight = grid_of(log)
-    at = round(0.996 / STEP_S)
-    assert flight.signals["pwm"][at, 0] == 0.0
-    np.testing.assert_allclose(flight.signals["rate_b"][at, 0], 0.8)
-    assert not flight.has("voltage")
-
-
-def test_a_command_counts_from_its_stamp_wherever_that_is_on_the_grid():
-    rng = np.random.default_rng(0)
-    time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.012, 400))])
-    still, up = np.zeros((401, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (401, 1))
-    asked = rng.standard_normal((401, 4))
-    log = FlightLog("made", time_s, still, up, still, still, pwm=asked)
-    held = grid_of(log).signals["pwm"]
-    for k in (0, 17, 100, 250):
-        fine = STEP_S * (k + (np.arange(4000) + 0.5) / 4000)
-        mean = asked[np.searchsorted(time_s, fine, side="right") - 1].mean(axis=0)
-        np.testing.assert_allclose(held[k], mean, atol=2e-3)
-
-
-def test_rates_that_are_not_logged_come_of_the_attitude():
-    time_s = np.arange(0.0, 2.0, 0.01)
-    half = 0.5 * 0.8 * time_s
-    quat = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=1)
-    still, none = np.zeros((200, 3)), np.full((200, 3), np.nan)
-    log = FlightLog("made", time_s, still, quat, still, none, pwm=np.zeros((200, 4)))
-    rate_b = grid_of(log).signals["rate_b"]
-    known = np.asarray(np.isfinite(rate_b).all(axis=1))
-    assert known[10:-10].all()
-    np.testing.assert_allclose(rate_b[known], np.tile([0.8, 0.0, 0.0], (known.sum(), 1)), atol=1e-9)
-
-
 COUNT = 400
 SECONDS = 0.01 * np.arange(COUNT)
 
 
 def logged(**signals):
     still, up = np.zeros((COUNT, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
-    whole = {"pos_w": still, "quat_wxyz": up, "vel_w": still, "rate_b": still}
-    return FlightLog("made", SECONDS, **{**whole, **signals})
+    whole = {"time_s": SECONDS, "pos_w": still, "quat_wxyz": up, "vel_w": still, "rate_b": still}
+    return FlightLog("made", **{**whole, **signals})
+
+
+def test_a_command_counts_from_its_stamp_and_measurements_are_joined():
+    rng = np.random.default_rng(0)
+    time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.012, COUNT - 1))])
+    pwm, rate_b = rng.standard_normal((COUNT, 4)), rng.standard_normal((COUNT, 3))
+    flight = grid_of(logged(time_s=time_s, pwm=pwm, rate_b=rate_b))
+    assert not flight.has("voltage")
+    for k in (0, 17, 100, 250):
+        fine_s = STEP_S * (k + (np.arange(4000) + 0.5) / 4000)
+        mean = pwm[np.searchsorted(time_s, fine_s, side="right") - 1].mean(axis=0)
+        np.testing.assert_allclose(flight.signals["pwm"][k], mean, atol=2e-3)
+        joined = [np.interp(flight.time_s[k], time_s, column) for column in rate_b.T]
+        np.testing.assert_allclose(flight.signals["rate_b"][k], joined, atol=1e-9)
 
 
 def in_turn(values):
@@ -123,18 +80,14 @@ def test_motors_in_turn_are_as_noisy_as_they_are():
 
 
 @pytest.mark.parametrize(
-    "name", ["pos_w", "vel_w", "rate_b", "rotor_speed", "pwm", "rate_cmd_b", "thrust_cmd"]
-)
-def test_a_signal_of_one_row_is_none(name):
-    width = {"rotor_speed": (4,), "pwm": (4,), "thrust_cmd": ()}.get(name, (3,))
+    ("name", "width"),
+    [("pos_w", (3,)), ("vel_w", (3,)), ("rate_b", (3,)), ("rotor_speed", (4,)), ("pwm", (4,)),
+     ("rate_cmd_b", (3,)), ("thrust_cmd", ()), ("voltage", ()), ("quat_wxyz", (4,))],
+)  # fmt: skip
+def test_a_signal_of_one_row_is_none(name, width):
     values = np.full((COUNT, *width), np.nan)
-    values[0] = 1.0
-    # Rates that are not logged come of the attitude.
+    values[0] = 0.5
+    # Rates that are not logged are computed from the attitude.
     level = np.full((COUNT, 4), np.nan)
-    assert not grid_of(logged(**{"quat_wxyz": level, name: values})).has(name)
-
-
-def test_an_attitude_or_a_voltage_of_one_row_is_none():
-    quat, volts = np.full((COUNT, 4), np.nan), np.full(COUNT, np.nan)
-    quat[0], volts[0] = [1.0, 0.0, 0.0, 0.0], 15.0
-    assert not {"rot_w", "voltage"} & {*grid_of(logged(quat_wxyz=quat, voltage=volts)).signals}
+    flight = grid_of(logged(**{"quat_wxyz": level, name: values}))
+    assert not flight.has({"quat_wxyz": "rot_w"}.get(name, name))

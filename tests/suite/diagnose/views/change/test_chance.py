@@ -11,7 +11,7 @@ SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM
 
 
 def told(slope, groups, truth=0.0, beside=(), seed=0):
-    """Return p-values and gains of `groups` where what is left is noise and `truth` of column 0."""
+    """Return p-values and gains of `groups` for noise and `truth` times column 0."""
     rng = np.random.default_rng(seed)
     size = np.sqrt(rng.chisquare(FREEDOM, 3) / FREEDOM)
     left = (rng.standard_normal(slope.shape[:2]) / size + truth * slope[..., 0]).ravel()
@@ -31,11 +31,10 @@ def names_by_chance(slope, groups, **asked):
     return np.mean([min(told(slope, groups, seed=k, **asked)[0]) <= 0.1 for k in range(150)])
 
 
-@pytest.mark.parametrize("alike", [pytest.param(0.0, marks=pytest.mark.slow), 0.99])
-def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are(alike):
+def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are():
     rng = np.random.default_rng(5)
     common = rng.standard_normal((6, 3, 1))
-    slope = alike * common + (1.0 - alike) * rng.standard_normal((6, 3, 10))
+    slope = 0.99 * common + 0.01 * rng.standard_normal((6, 3, 10))
     assert names_by_chance(slope, [(k,) for k in range(10)]) == pytest.approx(0.1, abs=0.055)
     several = [(0,), (1, 2, 3), (4, 5), (6,)]
     assert names_by_chance(slope, several, beside=(9,)) == pytest.approx(0.1, abs=0.055)

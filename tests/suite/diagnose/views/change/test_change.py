@@ -1,4 +1,4 @@
-"""What has changed since reference flights, and how far flights of one vehicle are apart."""
+"""What has changed since reference flights, by trims or by how the vehicle moves."""
 
 from dataclasses import replace
 
@@ -8,10 +8,15 @@ import pytest
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.moments import ForceModel
+from suite.diagnose.evidence.moments import ForceModel, ViewData
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
 from suite.diagnose.search.chance import RotorSpread, rotor_spread
-from suite.diagnose.search.change import change_evidence
+from suite.diagnose.search.change import (
+    change_evidence,
+    fit_each_flight,
+    search_motion_change,
+    within_flights,
+)
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
@@ -25,40 +30,36 @@ def task_of(logs, view=FORCE):
     return ViewEvidence(view, ForceModel(VEHICLE, SPACE, False), smoothed)
 
 
-def changes(logs, references):
-    among, found = candidates(SPACE, False, ()), {}
-    before = [task_of(references, view) for view in (FORCE, TORQUE)]
-    after = [task_of(logs, view) for view in (FORCE, TORQUE)]
-    spread = rotor_spread([*before, *after])
-    for reference, task in zip(before, after, strict=True):
-        evidence, start = change_evidence(reference, task.flights, spread)
+def named(found):
+    return [name.candidate.label for name in found.named]
+
+
+@pytest.fixture(scope="module")
+def before():
+    """Return reference flights, by view, of a vehicle that the file describes wrongly."""
+    logs = flights(3, seed=5, speed=1.0, thrust_scale=(0.9,), linear_drag=(DRAG,))
+    return {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
+
+
+@pytest.mark.parametrize("share", [0.8, 1.0])
+def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(before, share):
+    motor = {"weak_motor": ((1.0, 1.0, share, 1.0),)} if share < 1.0 else {}
+    logs = flights(3, seed=6, speed=1.0, thrust_scale=(0.9,), linear_drag=(DRAG,), **motor)
+    after = {view.name: task_of(logs, view) for view in (FORCE, TORQUE)}
+    spread = rotor_spread([*before.values(), *after.values()])
+    found = {}
+    for name, task in after.items():
+        evidence, start = change_evidence(before[name], task.flights, spread)
         known = evidence.relinearise(start)
-        result = search(evidence, start, view_candidates(among, known[1]), known=known)
-        found[task.view.name] = [name.candidate.label for name in result.named]
-    return found
-
-
-def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong():
-    wrong = {"thrust_scale": (0.9,), "linear_drag": (DRAG,)}
-    references = flights(3, seed=5, speed=1.0, **wrong)
-    weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),), **wrong)
-    assert "weak_motor 3" in changes(weak, references)["torque"]
-    assert changes(flights(3, seed=7, speed=1.0, **wrong), references) == {
-        "force": [],
-        "torque": [],
-    }
-
-
-def test_only_what_comes_near_the_best_stands_in_its_place():
-    """Otherwise a more usual effect replaces the right one, and held-out flights refute it."""
-    weak = flights(3, seed=6, speed=1.0, weak_motor=((1.0, 1.0, 0.8, 1.0),))
-    before, after = (task_of(logs, TORQUE) for logs in (flights(3, seed=5, speed=1.0), weak))
-    evidence, start = change_evidence(before, after.flights, rotor_spread([before, after]))
-    block = evidence.linearise(start)
-    among = view_candidates(candidates(SPACE, False, ()), block)
-    found = evidence.scores(block, block.equations, start.theta, [], among, 0)
-    assert 0 < len(found) < len(among)
-    assert found[-1].gain >= THRESHOLDS.near_share * found[0].gain
+        among = view_candidates(candidates(SPACE, False, ()), known[1])
+        found[name] = named(search(evidence, start, among, known=known))
+        # Only what comes near the best may stand in its place: otherwise a more usual effect
+        # replaces the right one.
+        scores = evidence.scores(known[1], known[1].equations, start.theta, [], among, 0)
+        assert 0 < len(scores) < len(among)
+        assert scores[-1].gain >= THRESHOLDS.near_share * scores[0].gain
+    assert (found == {"force": [], "torque": []}) == (share == 1.0)
+    assert share == 1.0 or "weak_motor 3" in found["torque"]
 
 
 def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_others():
@@ -92,3 +93,32 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
     own, shared = 2.0 * 2.0, 2.0 * 8.0  # variances of the sums of squares
     both = (4.0 / 8.0) ** 2 * shared + own + 2.0 * (4.0 / 8.0) * own
     assert sizes["torque"].var(axis=0) == pytest.approx(np.full(3, both / 36.0), rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def dragged():
+    return task_of(flights(3, seed=5, linear_drag=(DRAG,)))
+
+
+def test_more_drag_is_named_with_its_whole_size(dragged):
+    more = (0.6, 0.5, 0.2)
+    after = task_of(flights(3, seed=6, speed=2.5, linear_drag=(more,)))
+    found = search_motion_change(dragged, after, candidates(SPACE, False, ()))
+    assert found is not None and named(found) == ["linear_drag"]
+    np.testing.assert_allclose(found.estimate.theta[found.indices], more, atol=0.06)
+    np.testing.assert_allclose(found.start.theta[found.indices], DRAG, atol=0.06)
+
+
+def test_other_speeds_of_the_same_vehicle_are_no_change(dragged):
+    after = task_of(flights(3, seed=7, speed=2.0, linear_drag=(DRAG,)))
+    assert search_motion_change(dragged, after, candidates(SPACE, False, ())) is None
+
+
+def test_the_fit_of_each_flight_ignores_its_trim():
+    rng = np.random.default_rng(0)
+    flight, slope = np.repeat([0, 1], 200), rng.standard_normal((400, 3, 2))
+    true, trim = np.array([[0.5, -1.0], [0.7, 0.0]]), np.array([3.0, -2.0])
+    residual = np.einsum("mak,mk->ma", slope, true[flight]) + trim[flight, None]
+    data = ViewData(flight, np.arange(400.0), residual, residual, slope, np.zeros((400, 3, 0)))
+    found = fit_each_flight(within_flights(data), [0, 1], np.ones(3))
+    np.testing.assert_allclose(found, true, atol=1e-9)

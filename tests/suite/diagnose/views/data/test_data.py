@@ -9,7 +9,7 @@ import pytest
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.data.flights import acting_rotors, completed, parted, ready
-from suite.diagnose.data.view import FORCE, TORQUE, rows_of, smoothed, weak_form
+from suite.diagnose.data.view import FORCE, TORQUE, rows_of, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
@@ -27,19 +27,16 @@ def hover_speed(vehicle=VEHICLE, share=1.0):
     return float(np.sqrt(push / vehicle.rotors.thrust_coefficient))
 
 
-def test_bumps_take_a_line_to_its_slope_whatever_the_stamps():
+def test_a_bump_has_the_mean_acceleration_of_what_the_velocity_changes_by():
     rng = np.random.default_rng(0)
     time_s = np.sort(rng.uniform(0.0, 3.0, 400))
     form = weak_form(time_s, np.ones(400, bool), 0.2, 0.1)
     assert len(form.middle_s) > 20
     assert np.allclose(form.change @ (2.5 * time_s - 1.0), 2.5)
     assert np.allclose(form.mean @ np.full(400, -3.0), -3.0)
-
-
-def test_a_bump_sees_the_mean_of_what_the_model_is_smoothed_by():
-    time_s = np.arange(0.0, 4.0, 0.01)
-    form = weak_form(time_s, np.ones(400, bool), 0.2, 0.1)
-    velocity, acceleration = np.sin(3.0 * time_s), 3.0 * np.cos(3.0 * time_s)
+    even_s = np.arange(0.0, 4.0, 0.01)
+    form = weak_form(even_s, np.ones(400, bool), 0.2, 0.1)
+    velocity, acceleration = np.sin(3.0 * even_s), 3.0 * np.cos(3.0 * even_s)
     assert np.abs(form.change @ velocity - form.mean @ acceleration).max() < 1e-3
 
 
@@ -53,7 +50,7 @@ def test_no_bump_reaches_across_a_hole_or_a_bad_row():
     assert np.abs(form.middle_s - 3.1).min() > 0.095
 
 
-def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_lag():
+def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_need_one():
     time_s = np.arange(0.0, 2.0, 0.01)
     pwm, volt = np.full((200, 4), 0.6), np.full(200, 3.5)
     vehicle = replace(VEHICLE, motors=MotorMap((0.0, 8.0), 3.7, 1.0))
@@ -61,13 +58,8 @@ def test_motor_commands_give_the_speeds_of_the_vehicles_map_and_lag():
     thrust = 8.0 * (0.6 * 3.5 / 3.7) ** 2
     assert rotors is not None and rotors.each
     assert np.allclose(rotors.speed**2 * vehicle.rotors.thrust_coefficient, thrust)
-    step = np.where(time_s[:, None] < 1.0, 0.3, 0.6) * np.ones(4)
-    still = replace(vehicle, motors=MotorMap((0.0, 8.0), 3.7, 0.0))
-    lagged = acting_rotors(level(time_s, np.zeros((200, 3)), pwm=step), still)
-    assert lagged is not None
-    speed = lagged.speed[:, 0]
-    after = speed[np.searchsorted(time_s, 1.0 + VEHICLE.rotors.time_constant)]
-    assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
+    with pytest.raises(ValueError, match=r"\[motors\]"):
+        ready([level(time_s, np.zeros((200, 3)), pwm=pwm)], VEHICLE)
 
 
 def test_delay_and_lag_of_the_vehicle_file_are_those_of_its_effects():
@@ -84,7 +76,7 @@ def test_delay_and_lag_of_the_vehicle_file_are_those_of_its_effects():
     assert after == pytest.approx(speed[0] + (1 - np.exp(-1)) * (speed[-1] - speed[0]), rel=0.02)
 
 
-def test_a_collective_thrust_says_nothing_of_each_rotor():
+def test_a_collective_thrust_gives_the_force_view_only():
     time_s = np.arange(0.0, 2.0, 0.01)
     log = level(time_s, np.zeros((200, 3)), thrust_cmd=np.full(200, 9.81),
                 rate_cmd_b=np.zeros((200, 3)))  # fmt: skip
@@ -93,14 +85,7 @@ def test_a_collective_thrust_says_nothing_of_each_rotor():
     assert [view.name for view in ready([log], VEHICLE).views] == ["force"]
 
 
-def test_motor_commands_without_a_map_are_refused_with_what_to_do():
-    time_s = np.arange(0.0, 2.0, 0.01)
-    log = level(time_s, np.zeros((200, 3)), pwm=np.full((200, 4), 0.5))
-    with pytest.raises(ValueError, match=r"\[motors\]"):
-        ready([log], VEHICLE)
-
-
-def test_what_stands_on_the_ground_is_no_flight():
+def test_rows_on_the_ground_are_not_used():
     time_s = np.arange(0.0, 10.0, 0.01)
     on = (time_s < 4.0) | (time_s > 6.0)
     speed = np.where(on, hover_speed(), 0.0)[:, None] * np.ones(4)
@@ -110,8 +95,8 @@ def test_what_stands_on_the_ground_is_no_flight():
     assert not rows.good[(time_s > 4.0 - margin + 0.02) & (time_s < 6.0 + margin - 0.02)].any()
 
 
-def test_a_path_says_how_a_quadrotor_leaned():
-    log = flights(1, trim=0.0)[0]
+def test_a_missing_attitude_follows_from_the_path():
+    (log,) = flights(1, trim=0.0, duration_s=6.0)
     lacks = replace(log, quat_wxyz=np.full_like(log.quat_wxyz, np.nan),
                     rate_b=np.full_like(log.rate_b, np.nan),
                     about={"partial": ["quat", "rate"]})  # fmt: skip
@@ -123,17 +108,20 @@ def test_a_path_says_how_a_quadrotor_leaned():
     assert ready([log], VEHICLE, others=[lacks]).views == views, "both sets are judged alike"
 
 
-def test_a_lone_flights_end_is_held_out():
-    both = ready(flights(1), VEHICLE)
-    fitted, held = parted(both, [])
-    last = fitted[FORCE.name][0].form.middle_s.max()
-    assert held[FORCE.name][0].form.middle_s.min() > last
-    assert last < THRESHOLDS.lone_fitted_share * 8.0
+@pytest.fixture(scope="module")
+def pair():
+    return flights(2)
+
+
+def rows_of_log(log, rows):
+    """Return `log` with these rows, and rotor speeds as its only input."""
+    names = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b", "rotor_speed")
+    kept = {name: getattr(log, name)[rows] for name in names}
+    return replace(log, **kept, thrust_cmd=None, rate_cmd_b=None, voltage=None)
 
 
 def on_the_ground(log, before_s, after_s):
-    """Return a log with time on the ground before and after what was flown, rotors at rest."""
-    assert log.rotor_speed is not None
+    """Return a log with so much time [s] on the ground before and after, rotors at rest."""
     step = float(np.median(np.diff(log.time_s)))
     first, last = round(before_s / step), round(after_s / step)
     count = len(log.time_s)
@@ -141,22 +129,22 @@ def on_the_ground(log, before_s, after_s):
     flown = (np.arange(len(rows)) >= first) & (np.arange(len(rows)) < first + count)
     still = np.where(flown[:, None], log.vel_w[rows], 0.0)
     speed = np.where(flown[:, None], log.rotor_speed[rows], 0.0)
-    return replace(log, time_s=step * np.arange(len(rows)), pos_w=log.pos_w[rows],
-                   quat_wxyz=log.quat_wxyz[rows], vel_w=still, rate_b=log.rate_b[rows],
-                   rotor_speed=speed, thrust_cmd=None, rate_cmd_b=None, voltage=None)  # fmt: skip
+    time_s = step * np.arange(len(rows))
+    return replace(rows_of_log(log, rows), time_s=time_s, vel_w=still, rotor_speed=speed)
 
 
-@pytest.mark.parametrize("ground_s", [(0.0, 6.0), (30.0, 0.0)])
-def test_of_a_lone_flight_that_stood_on_the_ground_a_part_of_what_flew_is_held_out(ground_s):
-    (log,) = flights(1)
-    fitted, held = parted(ready([on_the_ground(log, *ground_s)], VEHICLE), [])
+@pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
+def test_of_a_single_flight_the_end_of_what_flew_is_held_out(pair, ground_s):
+    fitted, held = parted(ready([on_the_ground(pair[0], *ground_s)], VEHICLE), [])
     for name in (FORCE.name, TORQUE.name):
-        first, last = (len(part[name][0].form.middle_s) for part in (fitted, held))
-        assert first / (first + last) == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
+        first, last = (part[name][0].form.middle_s for part in (fitted, held))
+        assert first.max() < last.min()
+        share = len(first) / (len(first) + len(last))
+        assert share == pytest.approx(THRESHOLDS.lone_fitted_share, abs=0.1)
 
 
-def test_a_log_without_a_stretch_is_left_out_and_ends_nothing_but_what_has_no_other():
-    good, other = flights(2)
+def test_a_log_without_a_stretch_is_left_out_and_an_error_only_where_it_is_the_only_one(pair):
+    good, other = pair
     bad = replace(other, name="all holes", rotor_speed=np.full_like(other.rotor_speed, np.nan))
     found = ready([bad, good], VEHICLE)
     assert found.names == (good.name,) and found.kept == (1,)
@@ -166,22 +154,13 @@ def test_a_log_without_a_stretch_is_left_out_and_ends_nothing_but_what_has_no_ot
         ready([bad], VEHICLE)
 
 
-def test_logs_too_slow_for_the_torque_are_looked_at_by_their_force():
-    rows = slice(None, None, 4)
-    slow = [
-        replace(log, time_s=log.time_s[rows], pos_w=log.pos_w[rows],
-                quat_wxyz=log.quat_wxyz[rows], vel_w=log.vel_w[rows], rate_b=log.rate_b[rows],
-                rotor_speed=np.asarray(log.rotor_speed)[rows], thrust_cmd=None, rate_cmd_b=None,
-                voltage=None)
-        for log in flights(2)
-    ]  # fmt: skip
-    assert np.diff(slow[0].time_s)[0] == pytest.approx(0.04)
-    found = ready(slow, VEHICLE)
+def test_logs_too_slow_for_the_torque_are_diagnosed_by_their_force(pair):
+    found = ready([rows_of_log(log, np.arange(0, len(log.time_s), 4)) for log in pair], VEHICLE)
     assert found.views == (FORCE,) and set(found.smoothed) == {FORCE.name}
     assert found.notes[0].startswith("torque: not examined, as") and "log faster" in found.notes[0]
 
 
-def test_the_row_nearest_to_a_bump_takes_no_memory_by_the_square_of_a_flight():
+def test_a_long_flight_takes_no_memory_by_the_square_of_its_rows():
     time_s = np.sort(np.random.default_rng(1).uniform(0.0, 300.0, 60_000))
     tracemalloc.start()
     form = weak_form(time_s, np.ones(len(time_s), bool), 0.2, 0.1)
@@ -191,13 +170,6 @@ def test_the_row_nearest_to_a_bump_takes_no_memory_by_the_square_of_a_flight():
     some = slice(None, None, 200)
     apart = np.abs(time_s[:, None] - form.middle_s[some])
     np.testing.assert_array_equal(form.middle_row[some], apart.argmin(axis=0))
-
-
-def test_the_measured_side_of_a_view_is_a_mean_acceleration():
-    time_s = np.arange(0.0, 2.0, 0.01)
-    vel_w = np.stack([1.5 * time_s, 0.0 * time_s, -0.5 * time_s], axis=1)
-    rows = rows_of(level(time_s, vel_w), VEHICLE, np.full((200, 4), hover_speed()))
-    assert np.allclose(smoothed(FORCE, rows).measured, [1.5, 0.0, -0.5])
 
 
 def test_a_model_is_believed_as_far_as_its_rotors_are_measured():

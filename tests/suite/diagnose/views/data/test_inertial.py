@@ -7,8 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from eval.logs.flight_log import FlightLog
-from eval.quadrotor.plant import Command, Motion, make_plant
-from eval.quadrotor.stepper import Inputs, hover_state, step
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.data.flights import completed, ready
 from suite.diagnose.data.inertial import by_inertia
@@ -16,15 +14,14 @@ from suite.diagnose.data.view import SPECIFIC, TORQUE
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.moments import ForceModel, compare
 from suite.diagnose.identify.identify import identify
+from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE
-from tracks.geometry.rotation import rot_to_quat
 
 DRAG = 0.4
-LACKS = {"partial": ["pos", "quat"]}
 
 
 def flown(seed=0, end_s=10.0, bias=1.0, speed=1.0, gyro_walk=0.0, acc_noise=0.2):
-    """A flight from rest along smooth curves under the same drag along all axes; its velocity.
+    """Return a flight from rest under a drag, its velocity and attitude.
 
     `speed` scales the path; `gyro_walk` is the deviation of a gyro error held for 0.1 s [rad/s].
     """
@@ -49,22 +46,15 @@ def flown(seed=0, end_s=10.0, bias=1.0, speed=1.0, gyro_walk=0.0, acc_noise=0.2)
     each = np.sqrt(VEHICLE.mass * thrust / 4.0 / VEHICLE.rotors.thrust_coefficient)
     lost = np.full((len(time_s), 4), np.nan)
     log = FlightLog(
-        f"flight {seed}",
-        time_s,
-        lost[:, :3],
-        lost,
-        lost[:, :3],
-        rate_b,
+        f"flight {seed}", time_s, lost[:, :3], lost, lost[:, :3], rate_b, acc_b=acc_b,
         rotor_speed=each[:, None] + rng.normal(size=(len(time_s), 4)),
-        acc_b=acc_b,
-        about=LACKS,
-        velocity_derived=True,
-    )
+        about={"partial": ["pos", "quat"]}, velocity_derived=True,
+    )  # fmt: skip
     return log, vel_w, rot
 
 
 @pytest.mark.parametrize("end_s", [10.0, 40.0])
-def test_gyro_and_accelerometer_tell_the_velocity(end_s):
+def test_gyro_and_accelerometer_give_the_velocity(end_s):
     log, vel_w, rot = flown(end_s=end_s)
     (found,) = by_inertia([log])
     off = found.vel_w - vel_w
@@ -104,7 +94,7 @@ def test_thrust_and_drag_are_identified_without_a_pose():
 
 def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts():
     """As in logs whose gyro was sampled too rarely: the tilt drifts by 0.03 rad a second."""
-    slow = {"end_s": 30.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
+    slow = {"end_s": 20.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
     found = identify([flown(seed, **slow)[0] for seed in range(3)], VEHICLE)
     drag = next(n for n in found.numbers if n.key == "effects.linear_drag.coefficient")
     spans = [span for span in drag.ci95[:2] if span is not None]
@@ -112,7 +102,7 @@ def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts():
 
 
 def test_a_drag_of_a_hover_is_not_identified():
-    still = {"end_s": 20.0, "speed": 0.003, "gyro_walk": 0.1}
+    still = {"end_s": 10.0, "speed": 0.003, "gyro_walk": 0.1}
     found = identify([flown(seed, **still)[0] for seed in range(3)], VEHICLE)
     drag = [span for n in found.numbers if "linear_drag" in n.key for span in n.ci95[:2]]
     assert not any(drag), drag
@@ -131,23 +121,10 @@ def test_views_are_of_what_a_log_has():
 
 
 def test_a_rate_loop_faster_than_the_log_does_not_look_like_inertia():
-    vehicle, step_s = load_vehicle("reference"), 0.002
-    plant = make_plant(vehicle, step_s)
-    motion = Motion(np.array([0.0, 0.0, 50.0]), np.eye(3), *np.zeros((2, 3)))
-    state, rows, asked = hover_state(plant, ()), [], np.zeros(3)
-    for k in range(1500):
-        if k % 5 == 0:
-            asked = np.sin(k * step_s * np.array([9.0, 13.0, 5.0]))
-            rows.append((k * step_s, motion, state.rotor_speed))
-        inputs = Inputs(Command(np.asarray(9.81), asked))
-        state, motion, _ = step(plant, state, motion, inputs, k * step_s)
-    columns = [np.array(c) for c in zip(*((t, *m, s) for t, m, s in rows), strict=True)]
-    time_s, pos_w, rot_w, vel_w, rate_b, speed = columns
-    quat = np.asarray(rot_to_quat(rot_w))
-    log = FlightLog("fast", time_s, pos_w, quat, vel_w, rate_b, rotor_speed=speed)
-    flights = ready([log], vehicle).smoothed[TORQUE.name]
+    vehicle = load_vehicle("reference")
+    log = fly(vehicle, 0, duration_s=4.0, noise=0.0, motors=True)
     space = make_space(vehicle)
-    model = ForceModel(vehicle, space, voltage=False)
-    data = compare(TORQUE, model, space.array("start"), flights, [])
+    model, smoothed = ForceModel(vehicle, space, voltage=False), ready([log], vehicle).smoothed
+    data = compare(TORQUE, model, space.array("start"), smoothed[TORQUE.name], [])
     share = (data.value * data.residual).sum(axis=0) / (data.value**2).sum(axis=0)
     assert share == pytest.approx([0.0] * 3, abs=0.0015)

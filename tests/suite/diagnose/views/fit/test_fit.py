@@ -1,12 +1,15 @@
-"""The model on measured rows, weights of flights with trims, and the searches for names."""
+"""The model on measured rows, weights of flights with a trim each, and slow and fast changes."""
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from suite.diagnose.data.flights import ready
-from suite.diagnose.data.view import FORCE, TORQUE
+from suite.diagnose.data.view import FORCE
 from suite.diagnose.estimate.composites import composites
-from suite.diagnose.estimate.gauss_newton import chi2_by_group
 from suite.diagnose.estimate.parameters import (
     Candidate,
     at_bound,
@@ -19,39 +22,18 @@ from suite.diagnose.evidence.moments import (
     ForceModel,
     ViewData,
     Weights,
-    block_of,
-    centred,
     compare,
-    means_of,
-    stretch_numbers,
+    fast_share,
+    successive_changes,
     validation_groups,
     weights_of,
     whitened,
 )
-from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.search.search import search
+from suite.diagnose.evidence.views import fast_changes_agree
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
-from tests.support.vehicles import with_effects
 
 SPACE = make_space(VEHICLE)
-DRAG = (0.4, 0.3, 0.2)
-
-
-def task_of(logs, view=FORCE, vehicle=VEHICLE):
-    model = ForceModel(vehicle, make_space(vehicle), False)
-    return ViewEvidence(view, model, ready(logs, vehicle).smoothed[view.name])
-
-
-@pytest.fixture(scope="module")
-def dragged():
-    return flights(4, linear_drag=(DRAG,))
-
-
-def names_of(task):
-    known = task.estimate_noise(task.start)
-    among = view_candidates(candidates(SPACE, False, ()), known[1])
-    return search(known[0], task.start, among, known=known)
 
 
 def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
@@ -63,34 +45,25 @@ def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
     return ViewData(flight, middle, 0.0 * residual, residual, slope, none)
 
 
-def test_the_vehicle_itself_leaves_only_noise_and_a_drag_leaves_the_drag(dragged):
-    task = task_of(flights(1, trim=0.0))
-    data = compare(FORCE, task.model, SPACE.array("start"), task.flights)
-    assert np.abs(data.residual.mean(axis=0)).max() < 0.03
-    true = with_effects(VEHICLE, linear_drag=(DRAG,))
-    with_it, without = task_of(dragged, vehicle=true), task_of(dragged)
-    power = [
-        (compare(FORCE, t.model, t.model.space.array("start"), t.flights).residual ** 2).mean()
-        for t in (with_it, without)
-    ]
-    assert power[0] < 0.1 * power[1]
-
-
 def test_slopes_are_those_of_finite_differences():
-    task, theta = task_of(flights(1)), SPACE.array("start")
-    first = compare(FORCE, task.model, theta, task.flights)
+    model, theta = ForceModel(VEHICLE, SPACE, False), SPACE.array("start")
+    smoothed = ready(flights(1, duration_s=4.0), VEHICLE).smoothed[FORCE.name]
+    first = compare(FORCE, model, theta, smoothed)
     for index in (0, 10, 25):
         moved = theta.copy()
         moved[index] += 1e-5
-        change = compare(FORCE, task.model, moved, task.flights).value - first.value
+        change = compare(FORCE, model, moved, smoothed).value - first.value
         assert np.allclose(change / 1e-5, first.slope[..., index], atol=1e-4, rtol=1e-3)
 
 
-def test_trims_of_flights_are_told_from_scatter_within_them():
+def test_trims_of_flights_are_separated_from_scatter_within_them():
     weights = weights_of(made(np.random.default_rng(1), count=60))
     assert weights.scatter == pytest.approx([0.3, 0.3, 0.3], rel=0.05)
     assert weights.trim == pytest.approx([0.5, 0.0, 2.0], abs=0.35)
     assert np.isinf(weights_of(made(np.random.default_rng(1), count=2)).trim).all()
+    # A single flight is validated by thirds, others by flights.
+    assert validation_groups(np.array([2, 2, 5])).tolist() == [2, 2, 5]
+    assert validation_groups(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_weighed_moments_of_flights_with_trims_are_independent_units():
@@ -104,50 +77,6 @@ def test_weighed_moments_of_flights_with_trims_are_independent_units():
         within.append(residual.std(axis=0))
     assert np.std(means, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.2)
     assert np.mean(within, axis=0) == pytest.approx([1.0, 1.0, 1.0], rel=0.05)
-
-
-def test_blocks_stand_apart_and_a_flight_has_one_mean():
-    data = made(np.random.default_rng(3), count=2, moments=60)
-    stretch = stretch_numbers(data)
-    assert stretch.max() + 1 == 2 * 3  # 6 s in blocks of 2 s
-    weights = weights_of(data)
-    assert block_of(data, weights, stretch, [0]).slope.shape == (6, 60, 1)
-
-
-def test_flights_have_means_and_a_lone_one_has_thirds():
-    flight, values = np.array([2, 2, 5, 5, 5]), np.array([[1.0], [3.0], [0.0], [3.0], [6.0]])
-    assert means_of(values, flight).ravel().tolist() == [2.0, 3.0]
-    assert centred(values, flight).ravel().tolist() == [-1.0, 1.0, -3.0, 0.0, 3.0]
-    assert validation_groups(flight).tolist() == flight.tolist()
-    assert validation_groups(np.zeros(6)).tolist() == [0, 0, 1, 1, 2, 2]
-
-
-def test_a_drag_is_named_with_its_numbers_by_flights_that_agree(dragged):
-    found = names_of(task_of(dragged))
-    (name,) = found.named
-    assert name.candidate.name == "linear_drag" and (np.array(name.gains) > 0.0).all()
-    at = list(name.candidate.indices)
-    width = found.half_widths()
-    assert (np.abs(found.estimate.theta[at] - DRAG) < 2.0 * width + 0.02).all()
-    assert width[:2].max() < 0.1
-
-
-def test_trims_that_differ_from_flight_to_flight_are_no_effect():
-    logs = flights(4, seed=3)
-    for view in (FORCE, TORQUE):
-        assert names_of(task_of(logs, view)).named == ()
-
-
-def test_a_flight_is_judged_by_what_the_others_say(dragged):
-    task = task_of(dragged)
-    drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
-    evidence, block = task.estimate_noise(task.start)
-    equations, theta, part = block.equations, task.start.theta, evidence.groups(block)
-    without, with_it = (
-        chi2_by_group(equations.along_numbers(at), theta, SPACE, part) for at in ([], drag)
-    )
-    gains = without - with_it
-    assert gains.shape == (4,) and (gains > 0.0).all()
 
 
 def test_sizes_beyond_three_times_the_usual_are_implausible():
@@ -169,3 +98,58 @@ def test_sizes_beyond_three_times_the_usual_are_implausible():
     assert any("constant_wind velocity" in told for told in implausible(SPACE, start, whole))
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
     assert not at_bound(SPACE, theta, Candidate("linear_drag", tuple(drag), "linear_drag"))
+
+
+ROWS, STEP_S = 1200, 0.05
+
+
+def data_of(residual, slope):
+    """Return two flights of half a minute; `slope` (M, 3) is that along the only parameter."""
+    flight = np.repeat([0, 1], ROWS // 2)
+    middle_s = np.tile(STEP_S * np.arange(ROWS // 2), 2)
+    none = np.zeros((len(flight), 3, 0))
+    return ViewData(flight, middle_s, slope, residual, slope[..., None], none)
+
+
+def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, np.ndarray]:
+    """Return the fit of a thrust scale under motors that answer a slow force, or less thrust."""
+    rng = np.random.default_rng(seed)
+    slow = slow * gaussian_filter1d(rng.standard_normal((ROWS, 3)), 20.0, axis=0) * 8.0
+    fast, noise = rng.standard_normal((2, ROWS, 3))
+    motors = fast - slow if closed_loop else fast + slow
+    measured = motors + slow if closed_loop else 0.6 * motors
+    lacks = measured + 0.1 * noise - motors
+    away = float((lacks * motors).sum() / (motors**2).sum())
+    data = data_of(lacks - away * motors, motors)
+    return SimpleNamespace(along=(0,), data=data), np.array([away])
+
+
+@pytest.mark.parametrize("slow", [1.0, 3.0])
+def test_a_slow_force_that_motors_answer_is_no_weak_thrust(slow):
+    found, away = fitted(slow, closed_loop=True)
+    assert away[0] < -0.3, "it does look like less thrust"
+    share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
+    assert share + half_width < 0.3
+    assert not fast_changes_agree(found, [0], away, THRESHOLDS)
+
+
+def test_less_thrust_is_so_for_slow_and_fast_changes():
+    found, away = fitted(1.0, closed_loop=False)
+    assert away[0] == pytest.approx(-0.4, abs=0.02)
+    share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
+    assert share == pytest.approx(1.0, abs=3.0 * half_width) and half_width < 0.1
+    assert fast_changes_agree(found, [0], away, THRESHOLDS)
+
+
+def test_changes_reach_across_no_hole_and_no_two_flights():
+    data = data_of(np.cumsum(np.ones((ROWS, 3)), axis=0), np.ones((ROWS, 3)))
+    kept = np.ones(ROWS, bool)
+    kept[100:110] = False
+    found = successive_changes(ViewData(*(field[kept] for field in data)))
+    assert len(found.flight) == ROWS - 10 - 1 - 2
+    np.testing.assert_array_equal(found.residual, 1.0)
+    np.testing.assert_array_equal(found.slope, 0.0)
+    # Means of flights have no changes, which contradicts nothing.
+    fit, away = fitted(1.0, closed_loop=True)
+    means: Any = SimpleNamespace(along=(0,), data=ViewData(*(f[[0, -1]] for f in fit.data)))
+    assert fast_changes_agree(means, [0], away, THRESHOLDS)
