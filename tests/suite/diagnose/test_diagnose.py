@@ -268,17 +268,6 @@ def test_without_noise_the_models_own_error_is_no_finding(vehicle):
 
 
 @pytest.mark.slow
-def test_a_gyro_of_half_the_rate_and_no_commands_end_in_a_verdict():
-    logs = []
-    for log in flights(LAGGED, duration_s=5.0, motors=True):
-        rate_b = np.array(log.rate_b)
-        rate_b[1::2] = np.nan
-        logs.append(replace(log, rate_b=rate_b, thrust_cmd=None, rate_cmd_b=None))
-    found = diagnosis_json(diagnose(logs, LAGGED))
-    assert (found["verdict"], found["effects"]) == ("no_gap", [])
-
-
-@pytest.mark.slow
 def test_what_rotor_speeds_do_between_rows_is_no_finding():
     """At 100 rows a second it looks like 0.5 % less inertia, and 2 % with every second row."""
     logs = flights(LAGGED, duration_s=6.0, noise=0.0, motors=True)

@@ -77,10 +77,11 @@ def test_the_recording_has_what_was_measured_and_simulated(written):
     assert times is not None and (np.diff(times) > 0).all()
 
 
-def test_a_file_with_a_load_on_a_line_is_refused_in_one_line(tmp_path, capsys):
-    save_vehicle(with_effects(slung_load=(0.05, 0.5)), tmp_path / "loaded.toml")
-    line = [str(tmp_path), "--vehicle", str(tmp_path / "loaded.toml"), "--out", str(tmp_path / "o")]
-    assert main(["diagnose", *line]) == 2
+@pytest.mark.parametrize("command", ["diagnose", "identify"])
+def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command, tmp_path, capsys):
+    file, none, out = (str(tmp_path / name) for name in ("loaded.toml", "none.csv", "out.toml"))
+    save_vehicle(with_effects(slung_load=(0.05, 0.5)), file)
+    assert main([command, none, "--vehicle", file, "--out", out]) == 2
     said = capsys.readouterr().err.strip()
     assert "effects.slung_load" in said and "remove it" in said and "\n" not in said
 

@@ -5,20 +5,12 @@ import pytest
 
 from suite.diagnose.data.sampling import hold, interpolate
 from suite.diagnose.data.steps import (
-    padded_grid,
     rows_show_torque,
     step_grid,
     torque_between_rows,
     with_lost_rows,
 )
 from tests.support.vehicles import PLAIN, with_lag
-
-
-def test_a_row_off_the_grid_ends_a_step():
-    rows = np.array([0.0, 0.0093, 0.0211, 0.03])
-    grid = step_grid(rows, 0.002)
-    assert np.abs(grid.edge_s[:, None] - rows).min(axis=0).max() < 1e-12
-    assert 0.0015 < np.diff(grid.edge_s).min() and np.diff(grid.edge_s).max() < 0.0025
 
 
 def test_a_slow_loop_samples_at_its_own_times_and_steps_between():
@@ -60,16 +52,6 @@ def test_a_lost_row_is_put_in_on_a_line_and_jitter_is_none():
     np.testing.assert_allclose(filled_s[20], time_s[[19, 21]].mean())
     np.testing.assert_allclose(filled[:, 1], filled_s, atol=1e-12)
     np.testing.assert_array_equal(filled[-1], command[-1])
-
-
-def test_padding_adds_steps_of_no_length():
-    grid = step_grid(np.array([0.0, 0.01, 0.02]), 0.002)
-    for at_front in (False, True):
-        longer = padded_grid(grid, 16, at_front)
-        assert len(longer.sample_s) == 16 and len(longer.edge_s) == 17
-        assert (np.diff(longer.edge_s) == 0.0).sum() == 6
-        assert longer.edge_s[0] == 0.0 and longer.edge_s[-1] == 0.02
-        assert (longer.sample_s > 0.0).sum() == 10
 
 
 def test_measurements_are_joined_across_holes_and_commands_held():

@@ -9,6 +9,7 @@ from suite.diagnose.data.flights import choose_held_out
 from suite.diagnose.data.noise import noise_of, rotor_noise
 from suite.diagnose.data.windows import BURN_IN_S, LENGTH_S, SLICES, STEPS, cut, take
 from suite.diagnose.thresholds import Thresholds
+from tests.support.broken_logs import rows
 from tests.support.diagnosis_flights import NOISE, fly
 from tests.support.vehicles import PLAIN
 
@@ -16,13 +17,6 @@ from tests.support.vehicles import PLAIN
 @pytest.fixture(scope="module")
 def log():
     return fly(PLAIN, 0, duration_s=4.0, motors=True)
-
-
-def of_rows(log, rows, **changed):
-    """Return `log` with these rows only."""
-    arrays = {name: value[rows] for name, value in vars(log).items()
-              if isinstance(value, np.ndarray) and len(value) == len(log.time_s)}  # fmt: skip
-    return replace(log, **{**arrays, **changed})
 
 
 def test_windows_hold_the_rows_and_commands_of_their_time(log):
@@ -50,7 +44,7 @@ def test_few_shapes_hold_rows_of_every_rate(log):
     for rate_hz in (50.0, 97.0, 140.0, 250.0, 310.0, 400.0, 990.0):
         rows_s = np.arange(0.0, 1.9, 1.0 / rate_hz)
         near = np.clip(np.searchsorted(log.time_s, rows_s), 0, len(log.time_s) - 1)
-        windows, _ = cut([of_rows(log, near, time_s=rows_s)], PLAIN, False)
+        windows, _ = cut([replace(rows(log, near), time_s=rows_s)], PLAIN, False)
         assert windows is not None
         shape = (windows.edge_s.shape[1], windows.command_s.shape[1])
         shapes.setdefault(shape, []).append(rate_hz)
@@ -73,7 +67,7 @@ def test_what_is_an_input_or_derived_is_no_measurement(log):
 
 
 def test_no_window_lies_over_a_hole_and_a_log_of_holes_is_named(log):
-    holed = of_rows(log, (log.time_s < 0.8) | (log.time_s > 1.15))
+    holed = rows(log, (log.time_s < 0.8) | (log.time_s > 1.15))
     windows, _ = cut([holed], PLAIN, False)
     assert windows is not None
     assert windows.start_s.min() > 1.15 + BURN_IN_S, "the rotors follow commands before it"

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from eval.logs.flight_log import write_flight
-from eval.quadrotor.vehicle_file import save_vehicle
 from eval.vehicles.vehicle import MotorMap
 from suite.common.console import Console
 from suite.diagnose.identify import run
@@ -130,13 +129,6 @@ def test_parts_that_do_not_exist_and_nothing_but_parts_to_leave_are_refused(tmp_
     for leave, message in ((["wings"], f"allowed: {', '.join(PARTS)}"), (PARTS, "nothing remains")):
         with pytest.raises(ValueError, match=message):
             identify_files([tmp_path], "reference", tmp_path / "v.toml", leave, Console())
-
-
-def test_a_file_with_a_load_on_a_line_is_refused_before_the_flights_are_read(tmp_path):
-    file = tmp_path / "loaded.toml"
-    save_vehicle(with_effects(slung_load=(0.05, 0.5)), file)
-    with pytest.raises(ValueError, match="plain: effects.slung_load has a motion of its own"):
-        identify_files([tmp_path / "none"], str(file), tmp_path / "v.toml", [], Console())
 
 
 def test_numbers_that_no_file_may_hold_are_printed_with_the_refusal(tmp_path, monkeypatch):

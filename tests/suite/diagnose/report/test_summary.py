@@ -8,15 +8,10 @@ from suite.diagnose.report.summary import answer, next_steps
 DRAG = {
     "name": "linear_drag",
     "alternatives": ["rotor_drag"],
-    "parameters": {
-        "coefficient": {
-            "value": [0.31, 0.302, 0.01],
-            "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]],
-            "unit": "1/s",
-        }
-    },
+    "parameters": {"coefficient": {"value": [0.31, 0.302, 0.01], "unit": "1/s",
+                                   "ci95": [[0.3, 0.32], [0.29, 0.31], [-0.01, 0.03]]}},
     "size": {"force": 0.8, "torque": 0.0, "drift": 0.4},
-}
+}  # fmt: skip
 
 
 def found(verdict, effects=(), where=None, **more):

@@ -3,19 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from suite.diagnose.data.colour import Noise
-from suite.diagnose.data.windows import cut
-from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import confirmed
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.verdict.residual_structure import ResidualStructure
-from suite.diagnose.verdict.rollout_gap import measure
-from tests.support.diagnosis_flights import NOISE, fly
-from tests.support.vehicles import PLAIN
 
 
 def spoilt(found_drag, steps):
@@ -67,16 +59,3 @@ def test_what_was_withdrawn_has_explained_nothing(found_drag):
     )
     assert with_drag[0].sum() / with_drag[1].sum() < 1.5
     assert structure_where(without, ResidualStructure([], {}), True) is not None
-
-
-def test_a_fault_that_the_accelerometer_alone_shows_counts_on_held_out_flights():
-    windows, _ = cut([fly(PLAIN, 0, duration_s=4.0, acc=True)], PLAIN, False)
-    model = RolloutModel(PLAIN, make_space(PLAIN), False, False)
-    sizes = [NOISE[name] for name in ("pos", "att", "vel", "rate", "acc", "motor")]
-    noise = Noise(np.repeat(sizes, [3, 3, 3, 3, 3, 4]), {})
-    theta = model.space.array("start")
-    wrong = theta.copy()
-    wrong[[entry.effect == "accelerometer_bias" for entry in model.space.entries]] += 0.3
-    right, biased = (measure(model, one, windows, noise) for one in (theta, wrong))
-    assert biased.energy.sum() > right.energy.sum() + 100.0 * len(right.energy)
-    assert biased.rms == pytest.approx(right.rms, rel=0.05)

@@ -52,7 +52,7 @@ def test_a_command_counts_from_its_stamp_and_measurements_are_joined():
 
 
 def in_turn(values):
-    """Values of which every row has one column only."""
+    """Return values of which every row has one column only."""
     count, width = values.shape
     return np.where(np.arange(count)[:, None] % width == np.arange(width), values, np.nan)
 
@@ -68,11 +68,7 @@ def test_motors_that_are_logged_in_turn_are_each_taken_by_their_own_rows():
     np.testing.assert_allclose(known[good], wanted)
     np.testing.assert_allclose(flight.signals["pwm"][10:-10], 0.5)
     assert grid_of(logged(rotor_speed=ramp)).in_turn == ()
-
-
-def test_motors_in_turn_are_as_noisy_as_they_are():
-    rng = np.random.default_rng(0)
-    speed = in_turn(1000.0 + 8.0 * rng.standard_normal((COUNT, 4)))
+    speed = in_turn(1000.0 + 8.0 * np.random.default_rng(0).standard_normal((COUNT, 4)))
     noise = grid_of(logged(rotor_speed=speed)).signals[ROTOR_NOISE]
     assert np.isfinite(noise[10:-10]).all()
     # On the grid it is joined by lines, which leaves two thirds of the variance.

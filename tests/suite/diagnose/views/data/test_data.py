@@ -11,6 +11,7 @@ from eval.vehicles.vehicle import MotorMap
 from suite.diagnose.data.flights import acting_rotors, completed, parted, ready
 from suite.diagnose.data.view import FORCE, TORQUE, rows_of, weak_form
 from suite.diagnose.thresholds import THRESHOLDS
+from tests.support.broken_logs import rows
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import with_effects
 
@@ -89,10 +90,10 @@ def test_rows_on_the_ground_are_not_used():
     time_s = np.arange(0.0, 10.0, 0.01)
     on = (time_s < 4.0) | (time_s > 6.0)
     speed = np.where(on, hover_speed(), 0.0)[:, None] * np.ones(4)
-    rows = rows_of(level(time_s, np.zeros((1000, 3))), VEHICLE, speed)
+    good = np.asarray(rows_of(level(time_s, np.zeros((1000, 3))), VEHICLE, speed).good)
     margin = THRESHOLDS.ground_margin_s
-    assert rows.good[time_s < 4.0 - margin - 0.02].all()
-    assert not rows.good[(time_s > 4.0 - margin + 0.02) & (time_s < 6.0 + margin - 0.02)].any()
+    assert good[time_s < 4.0 - margin - 0.02].all()
+    assert not good[(time_s > 4.0 - margin + 0.02) & (time_s < 6.0 + margin - 0.02)].any()
 
 
 def test_a_missing_attitude_follows_from_the_path():
@@ -113,24 +114,16 @@ def pair():
     return flights(2)
 
 
-def rows_of_log(log, rows):
-    """Return `log` with these rows, and rotor speeds as its only input."""
-    names = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b", "rotor_speed")
-    kept = {name: getattr(log, name)[rows] for name in names}
-    return replace(log, **kept, thrust_cmd=None, rate_cmd_b=None, voltage=None)
-
-
 def on_the_ground(log, before_s, after_s):
     """Return a log with so much time [s] on the ground before and after, rotors at rest."""
     step = float(np.median(np.diff(log.time_s)))
-    first, last = round(before_s / step), round(after_s / step)
-    count = len(log.time_s)
-    rows = np.concatenate([np.zeros(first, int), np.arange(count), np.full(last, count - 1)])
-    flown = (np.arange(len(rows)) >= first) & (np.arange(len(rows)) < first + count)
-    still = np.where(flown[:, None], log.vel_w[rows], 0.0)
-    speed = np.where(flown[:, None], log.rotor_speed[rows], 0.0)
-    time_s = step * np.arange(len(rows))
-    return replace(rows_of_log(log, rows), time_s=time_s, vel_w=still, rotor_speed=speed)
+    count, ends = len(log.time_s), (round(before_s / step), round(after_s / step))
+    longer = rows(log, np.pad(np.arange(count), ends, mode="edge"))
+    flown = np.pad(np.ones((count, 1)), (ends, (0, 0)))
+    time_s = step * np.arange(len(flown))
+    return replace(
+        longer, time_s=time_s, vel_w=flown * longer.vel_w, rotor_speed=flown * longer.rotor_speed
+    )
 
 
 @pytest.mark.parametrize("ground_s", [(0.0, 0.0), (0.0, 6.0), (30.0, 0.0)])
@@ -155,7 +148,7 @@ def test_a_log_without_a_stretch_is_left_out_and_an_error_only_where_it_is_the_o
 
 
 def test_logs_too_slow_for_the_torque_are_diagnosed_by_their_force(pair):
-    found = ready([rows_of_log(log, np.arange(0, len(log.time_s), 4)) for log in pair], VEHICLE)
+    found = ready([rows(log, slice(None, None, 4)) for log in pair], VEHICLE)
     assert found.views == (FORCE,) and set(found.smoothed) == {FORCE.name}
     assert found.notes[0].startswith("torque: not examined, as") and "log faster" in found.notes[0]
 

@@ -73,15 +73,6 @@ def test_a_flight_may_begin_on_its_side():
     assert force_w == pytest.approx([0.0, 0.0, 1.0], abs=0.1)
 
 
-def test_flights_share_their_drag():
-    logs, paths, _ = zip(*(flown(seed, end_s=5.0) for seed in range(6)), strict=True)
-
-    def off(found):
-        return np.mean([np.std(a.vel_w - v) for a, v in zip(found, paths, strict=True)])
-
-    assert off(by_inertia(logs)) < 0.95 * off([by_inertia([log])[0] for log in logs])
-
-
 def test_thrust_and_drag_are_identified_without_a_pose():
     found = identify([flown(seed)[0] for seed in range(3)], VEHICLE)
     numbers = {number.key: number for number in found.numbers}
