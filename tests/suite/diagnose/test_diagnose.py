@@ -230,7 +230,8 @@ def logged(truth, ways, seed):
 def test_every_effect_is_a_candidate_and_tested():
     assert set(HIDDEN) == set(nameable_effects())
     among = candidates(make_space(GIVEN), True, ("acc_b", "command"))
-    assert {candidate.name for candidate in among} >= set(HIDDEN)
+    # Gusts have a test of their own, not a fitted parameter.
+    assert {candidate.name for candidate in among} >= set(HIDDEN) - {"gusts"}
 
 
 @pytest.mark.slow

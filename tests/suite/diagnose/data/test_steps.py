@@ -8,6 +8,7 @@ from suite.diagnose.data.steps import (
     rows_show_torque,
     step_grid,
     torque_between_rows,
+    with_hidden_torque,
     with_lost_rows,
 )
 from tests.support.vehicles import PLAIN, with_lag
@@ -71,3 +72,9 @@ def test_a_rate_loop_between_rows_turns_less_than_the_rows_show(lag, share):
     np.testing.assert_allclose(torque_between_rows(vehicle, 0.01)[0], share, rtol=0.01)
     assert not torque_between_rows(vehicle, 0.002).any()  # as often as the loop samples
     assert rows_show_torque(vehicle, 0.01) == (lag >= 0.01)
+
+
+def test_torque_that_rows_do_not_show_is_added_about_its_axis_alone():
+    wave = 2.0 * np.sin(np.arange(40) / 3.0)[:, None] * [1.0, 1.0, -1.0, -1.0]
+    more = with_hidden_torque(900.0 + wave, PLAIN, 0.01)
+    np.testing.assert_allclose(more - 900.0, 1.1 * wave, atol=0.02)

@@ -152,7 +152,7 @@ def without_voltage(logs):
 
 
 def test_a_file_without_motors_gets_them_and_keeps_its_voltage_for_flights_without_one():
-    logs, bare = known.logs("pwm", 0), replace(known.start(), motors=None)
+    logs, bare = known.logs("pwm", 0)[:3], replace(known.start(), motors=None)
     begun = identify(logs, bare, leave=TURNING)
     motors = begun.vehicle.motors
     assert motors is not None and motors.voltage_exponent > 0.0
