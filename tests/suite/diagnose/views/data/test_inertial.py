@@ -85,7 +85,7 @@ def test_thrust_and_drag_are_identified_without_a_pose():
 
 def test_a_drag_of_slow_flights_is_identified_where_the_gyro_drifts():
     """As in logs whose gyro was sampled too rarely: the tilt drifts by 0.03 rad a second."""
-    slow = {"end_s": 20.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
+    slow = {"end_s": 30.0, "speed": 0.3, "gyro_walk": 0.1, "acc_noise": 0.05}
     found = identify([flown(seed, **slow)[0] for seed in range(3)], VEHICLE)
     drag = next(n for n in found.numbers if n.key == "effects.linear_drag.coefficient")
     spans = [span for span in drag.ci95[:2] if span is not None]
