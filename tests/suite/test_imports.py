@@ -1,13 +1,12 @@
 """Imports go one way, rooms open empty, and the trainer needs jax, numpy and pure Python only."""
 
 import ast
+import functools
 import json
 import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
-
-import pytest
 
 from suite.cli import COMMANDS
 from suite.experiments import EXPERIMENTS
@@ -28,9 +27,25 @@ DOORS = (
 )  # fmt: skip
 
 
+@functools.cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def statements(node, of_types=True):
+    """Yield the import statements below a node; with `of_types` those for type checkers too."""
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        yield node
+    elif of_types or getattr(getattr(node, "test", None), "id", "") != "TYPE_CHECKING":
+        if isinstance(node, ast.mod | ast.stmt | ast.ExceptHandler | ast.match_case):
+            for child in ast.iter_child_nodes(node):
+                yield from statements(child, of_types)
+
+
 def imported(path, top_level_only=False):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in tree.body if top_level_only else ast.walk(tree):
+    """Yield the names of the modules that a file imports."""
+    tree = tree_of(path)
+    for node in tree.body if top_level_only else statements(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -38,15 +53,12 @@ def imported(path, top_level_only=False):
             yield node.module or ""
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_imports_go_one_way(room):
-    to_the_right = ROOMS[ROOMS.index(room) + 1 :]
+def test_imports_go_one_way():
     wrong = [
         f"{path.relative_to(ROOT)} imports {name}"
         for path in FILES
-        if path.relative_to(ROOT).parts[0] == room
         for name in imported(path)
-        if name.split(".")[0] in to_the_right
+        if name.split(".")[0] in ROOMS[ROOMS.index(path.relative_to(ROOT).parts[0]) + 1 :]
     ]
     assert not wrong
 
@@ -58,21 +70,16 @@ def _module(path):
 
 def test_no_two_files_import_each_other():
     """Imports inside functions count, those for type checkers alone do not."""
-    modules = {_module(path) for path in FILES}
-    graph = {}
-    for path in FILES:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-                node.body = []
+    modules, graph = {_module(path): path for path in FILES}, {}
+    for name, path in modules.items():
         used = {
-            name
-            for node in ast.walk(tree)
+            found
+            for node in statements(tree_of(path), of_types=False)
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
-            for name in (f"{node.module}.{alias.name}", node.module)
+            for found in (f"{node.module}.{alias.name}", node.module)
         }
-        graph[_module(path)] = (used & modules) - {_module(path)}
+        graph[name] = used & modules.keys() - {name}
     TopologicalSorter(graph).prepare()  # raises where there is a circle, and names it
 
 

@@ -15,8 +15,8 @@ from tests.support.vehicles import PLAIN, with_effects, with_lag
 
 LAGGED = with_lag(PLAIN, 0.02)
 WAYS = (
-    Trajectory("figure_eight", 1.2, speed=4.0, size=2.0, turn="wobble"),
-    Trajectory("climb", 1.0, speed=2.0, size=1.5),
+    Trajectory("figure_eight", 0.6, speed=4.0, size=2.0, turn="wobble"),
+    Trajectory("climb", 0.5, speed=2.0, size=1.5),
 )
 CONDITIONS = Conditions(733.0, 90.0, 0.3, 1e-4, 0.01, 0.7, 0.05)
 

@@ -1,6 +1,5 @@
 """`suite check` on flights, and what diagnose and identify do of a log with an open fault."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,9 @@ from eval.logs.faults.finding import Finding, findings_of
 from eval.logs.files import write_columns
 from eval.logs.flight_log import columns_from_log, read_flight, write_flight
 from eval.quadrotor.vehicle_file import save_vehicle
-from suite import cli
 from suite.experiments.injected.flights import as_log
 from tests.eval.logs.faults.test_kinds import good
+from tests.support.commands import answer, refused
 from tests.support.vehicles import PLAIN
 
 
@@ -32,24 +31,27 @@ def flight(tmp_path):
 
 
 def checked(tmp_path, capsys, path, *options):
-    line = ["check", str(path), "--vehicle", str(tmp_path / "plain.toml"), "--json", *options]
-    assert cli.main(line) == 0
-    return json.loads(capsys.readouterr().out)
+    return answer(capsys, "check --vehicle", tmp_path / "plain.toml", path, *options)
 
 
 def test_a_fault_is_reported_with_its_fix_and_put_right(tmp_path, capsys, flight):
-    path = flight(1.0 / 0.0174532925)
-    answer = checked(tmp_path, capsys, path)
-    (found,) = (f for f in answer["findings"] if f["fault"] == "gyro_scale")
+    path, fix = flight(1.0 / 0.0174532925), ("--fix", "--out", tmp_path / "checked")
+    found = gyro_scale(checked(tmp_path, capsys, path))
     assert found["status"] == "doubt" and found["fix"].startswith("--read rate=0.01745")
     assert found["flight"] == str(path) and found["confidence"] > 0.9
     assert abs(found["size"] - 57.3) < 2.0
-    answer = checked(tmp_path, capsys, path, "--fix", "--out", str(tmp_path / "checked"))
-    assert {f["status"] for f in answer["findings"] if f["fault"] == "gyro_scale"} == {"corrected"}
-    fixed = read_flight(answer["written"][0])
+    answered = checked(tmp_path, capsys, path, *fix)
+    assert gyro_scale(answered)["status"] == "corrected"
+    fixed = read_flight(answered["written"][0])
     np.testing.assert_allclose(fixed.rate_b, good(end=10.0)["rate"], rtol=1e-6, atol=1e-9)
-    again = checked(tmp_path, capsys, answer["written"][0])
+    again = checked(tmp_path, capsys, answered["written"][0])
     assert not [f for f in again["findings"] if f["status"] == "doubt"]
+
+
+def gyro_scale(answered):
+    """Return the one finding about the gyro's scale."""
+    (found,) = (f for f in answered["findings"] if f["fault"] == "gyro_scale")
+    return found
 
 
 def test_a_log_beyond_all_limits_is_checked_and_corrected_but_not_diagnosed(tmp_path, capsys):
@@ -59,33 +61,30 @@ def test_a_log_beyond_all_limits_is_checked_and_corrected_but_not_diagnosed(tmp_
     path = write_columns(tmp_path / "flight.csv", columns_from_log(log), "{}")
     with pytest.raises(FlightLogError, match="200 rad/s.*suite check names the fault"):
         read_flight(path)
-    answer = checked(tmp_path, capsys, path, "--fix", "--out", str(tmp_path / "checked"))
-    assert "corrected" in {f["status"] for f in answer["findings"] if f["fault"] == "gyro_scale"}
-    fixed = read_flight(answer["written"][0])
+    answered = checked(tmp_path, capsys, path, "--fix", "--out", tmp_path / "checked")
+    assert gyro_scale(answered)["status"] == "corrected"
+    fixed = read_flight(answered["written"][0])
     np.testing.assert_allclose(fixed.rate_b, parts["rate"], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("command", ["diagnose", "identify"])
-def test_nothing_is_concluded_of_a_log_with_an_open_fault(tmp_path, capsys, flight, command):
+def test_nothing_is_concluded_of_a_log_with_an_open_fault(tmp_path, capsys, flight):
     path, out = flight(1.2), tmp_path / "out.toml"
-    line = [command, str(path), "--vehicle", str(tmp_path / "plain.toml"), "--out", str(out)]
-    assert cli.main(line) == 2
-    said = capsys.readouterr().err
-    assert "gyro_scale" in said and "--read rate=0.8" in said and "--accept gyro_scale" in said
-    assert not out.exists()
-    assert cli.main([*line, "--accept", "gyro_scales"]) == 2
-    assert "gyro_scale" in capsys.readouterr().err
+    for command in ("diagnose", "identify"):
+        line = (command, "--vehicle", tmp_path / "plain.toml", "--out", out, path)
+        said = refused(capsys, *line, lines=3)
+        assert "gyro_scale" in said and "--read rate=0.8" in said and "--accept gyro_scale" in said
+        assert not out.exists()
+        assert "gyro_scale" in refused(capsys, *line, "--accept", "gyro_scales")
 
 
 def test_what_an_import_left_open_is_repeated(tmp_path, capsys, flight):
     doubt = Finding("doubt", "motors", "6 motors turn", "motor_count", 6.0, 0.97, "none")
     path = flight(1.0, about={"findings": [doubt._asdict()]})
     assert findings_of(read_flight(path).about) == (doubt,)
-    answer = checked(tmp_path, capsys, path)
-    assert "motor_count" in {f["fault"] for f in answer["findings"]}
-    line = ["diagnose", str(path), "--vehicle", str(tmp_path / "plain.toml")]
-    assert cli.main([*line, "--out", str(tmp_path / "out")]) == 2
-    assert "6 motors turn" in capsys.readouterr().err
+    answered = checked(tmp_path, capsys, path)
+    assert "motor_count" in {f["fault"] for f in answered["findings"]}
+    line = ("diagnose --vehicle", tmp_path / "plain.toml", "--out", tmp_path / "out", path)
+    assert "6 motors turn" in refused(capsys, *line, lines=3)
 
 
 def test_findings_of_earlier_versions_are_read():

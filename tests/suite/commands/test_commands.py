@@ -1,6 +1,5 @@
 """The small commands, and what the options of the train command become."""
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -8,57 +7,49 @@ import pytest
 
 from eval.quadrotor.vehicle_file import load_vehicle
 from policies import shipped
-from suite import cli
 from suite.blind import make
 from suite.commands.train import Config, resolve
 from suite.judging.flying import checkpoint_folder
-from suite.train import run
+from suite.train import run as training
+from tests.support.commands import answer, refused, run
 
 
 def test_tracks_command_lists_and_draws(tmp_path, capfd):
-    assert cli.main(["tracks", "--json"]) == 0
-    families = json.loads(capfd.readouterr().out)["families"]
+    families = answer(capfd, "tracks")["families"]
     assert families["zigzag"]["judged"] and not families["random"]["judged"]
-    args = ["tracks", "zigzag", "--difficulty", "0,9", "--seed", "4", "--out", str(tmp_path)]
-    assert cli.main(args) == 0
+    assert run("tracks zigzag --difficulty 0,9 --seed 4 --out", tmp_path) == 0
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["zigzag-0-4.png", "zigzag-4.png", "zigzag-9-4.png"]
     assert (tmp_path / names[0]).read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["tracks", "elipse"], "Did you mean 'ellipse'?"),
-        (["tracks", "ellipse", "--difficulty", "12"], "level 12 is not 0 to 9"),
-        (["effects", "linear_darg"], "Did you mean 'linear_drag'?"),
-    ],
-)
-def test_wrong_names_are_code_2_and_one_line(args, words, capsys):
-    assert cli.main(args) == 2
-    said = capsys.readouterr().err
-    assert words in said and len(said.strip().splitlines()) == 1
+def test_wrong_names_are_code_2_and_one_line(capsys):
+    for line, words in (
+        ("tracks elipse", "Did you mean 'ellipse'?"),
+        ("tracks ellipse --difficulty 12", "level 12 is not 0 to 9"),
+        ("effects linear_darg", "Did you mean 'linear_drag'?"),
+    ):
+        assert words in refused(capsys, line)
 
 
 def test_effects_command_lists_and_describes(capfd):
-    assert cli.main(["effects", "--json"]) == 0
-    effects = json.loads(capfd.readouterr().out)["effects"]
+    effects = answer(capfd, "effects")["effects"]
     assert effects["linear_drag"]["parameters"]["coefficient"]["unit"] == "1/s"
-    assert cli.main(["effects", "linear_drag"]) == 0
+    assert run("effects linear_drag") == 0
     assert "coefficient x 3 [1/s]" in capfd.readouterr().out
 
 
 def test_the_command_says_which_flights_separate(capsys):
-    assert cli.main(["blind", "plan", "--effects", "linear_drag", "rotor_drag", "--json"]) == 0
-    flights = json.loads(capsys.readouterr().out)["flights"]
+    flights = answer(capsys, "blind plan --effects linear_drag rotor_drag")["flights"]
     assert {flight["kind"] for flight in flights} == {"punches", "figure_eight"}
-    assert cli.main(["blind", "plan"]) == 2
-    assert cli.main(["blind", "score", "--out", "/no/such/set"]) == 2
+    assert run("blind plan") == run("blind score --out /no/such/set") == 2
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
+def test_an_option_of_another_work_is_refused(tmp_path, monkeypatch, capsys):
+    """Taken in silence it would be believed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(make, "make_set", None)
+    for args, words in (
         ("run --set published", "--set is published, but `suite blind run` does not take it, only"),
         ("score --seed 0", "--seed is 0, but `suite blind score` does not take it, only make;"),
         ("run --count 24", "--count is 24, but"),
@@ -67,15 +58,9 @@ def test_the_command_says_which_flights_separate(capsys):
         ("make --effects inflow", "does not take it, only plan; leave it out"),
         ("score --workers 2", "--workers is 2, but `suite blind score` does not take it, "),
         ("plan --effects inflow gusts --out elsewhere", "--out is elsewhere, but"),
-    ],
-)
-def test_an_option_of_another_work_is_refused(args, words, tmp_path, monkeypatch, capsys):
-    """Taken in silence it would be believed."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(make, "make_set", None)
-    assert cli.main(["blind", *args.split()]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert words in said and not list(tmp_path.iterdir())
+    ):
+        assert words in refused(capsys, f"blind {args}")
+    assert not list(tmp_path.iterdir())
 
 
 def test_options_become_settings():
@@ -87,17 +72,16 @@ def test_options_become_settings():
 
 def test_training_goes_on_from_a_shipped_policy_by_its_name(tmp_path, capsys):
     assert checkpoint_folder("race-paper", "--init-from") == shipped.folder("race-paper")
-    assert cli.main(["train", "--init-from", "rac", "--out", str(tmp_path / "run")]) == 2
-    said = capsys.readouterr().err
+    said = refused(capsys, "train --init-from rac --out", tmp_path / "run")
     assert "--init-from rac: " in said and "a shipped policy's name (race, race-paper" in said
     assert not (tmp_path / "run").exists()
 
 
 def test_the_policy_that_is_trained_on_is_not_written_over(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run, "train", None)
+    monkeypatch.setattr(training, "train", None)
     own = shutil.copytree(shipped.folder("race-paper"), tmp_path / "policy")
-    assert cli.main(["train", "--init-from", str(own), "--out", str(tmp_path)]) == 2
-    assert "config.json is also an input and would be overwritten" in capsys.readouterr().err
+    said = refused(capsys, "train --out", tmp_path, "--init-from", own)
+    assert "config.json is also an input and would be overwritten" in said
 
 
 def test_the_command_line_asks_for_model_and_vehicle_together():

@@ -1,84 +1,77 @@
 """`suite identify`, `suite import` and `suite example` from the command line."""
 
-import json
+import shutil
 
 import pytest
 
-from eval.logs.flight_log import read_flight, write_flight
-from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
-from suite import cli
+from eval.logs.flight_log import read_flight
+from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.example.flights import FOLDER, HIDDEN
 from tests.support import foreign_logs as made
-from tests.support import identified as known
+from tests.support.commands import answer, refused, run
+
+FILES = sorted(FOLDER.glob("*.parquet"))
 
 
 def test_a_log_becomes_a_flight_log(tmp_path, capsys):
     log, out = made.write_ulog(tmp_path / "log.ulg"), tmp_path / "flight.parquet"
-    code = cli.main(["import", str(log), "--out", str(out), "--full-thrust", "30"])
-    said = capsys.readouterr().out
-    assert code == 0 and "attitude: the force off body z is" in said
-    flight = read_flight(out)
+    assert run("import --full-thrust 30 --out", out, log) == 0
+    said, flight = capsys.readouterr().out, read_flight(out)
+    assert "attitude: the force off body z is" in said
     assert f"{len(flight.time_s)} rows" in said and flight.about["source"] == "px4"
 
 
 def test_json_is_one_object(tmp_path, capsys):
     log, out = made.write_usd(tmp_path / "log00"), tmp_path / "flight.csv"
-    assert cli.main(["import", str(log), "--out", str(out), "--vehicle", "racer5", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["rows"] == len(read_flight(out).time_s)
-    assert {"status", "signal", "evidence"} < set(answer["findings"][0])
+    found = answer(capsys, "import --vehicle racer5 --out", out, log)
+    assert found["rows"] == len(read_flight(out).time_s)
+    assert {"status", "signal", "evidence"} < set(found["findings"][0])
 
 
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        (["--out", "flight.txt"], "--out is 'flight.txt'"),
-        (["--rate", "0"], "--rate is 0"),
-        (["--full-thrust", "-3"], "--full-thrust is -3"),
-        (["--start", "5", "--end", "2"], "0 <= start < end"),
-        (["--pose-map", "m.toml"], "--pose, which is not given"),
-        (["--vehicle", "racer6"], "racer5"),
-        (["--format", "px5"], "px4"),
-        (["--pose", "nowhere.csv"], "nowhere.csv: cannot be read"),
-        (["--format", "table", "--map", "nowhere.toml"], "nowhere.toml: cannot be read"),
-    ],
-)
-def test_bad_options_are_code_2_in_one_line(tmp_path, capsys, options, reason):
+def test_bad_options_are_code_2_in_one_line(tmp_path, capsys):
     log = made.write_usd(tmp_path / "log00", span=(0, 3))
-    out = tmp_path / "flight.parquet"
-    where = [] if "--out" in options else ["--out", str(out)]
-    code = cli.main(["import", str(log), *where, *options])
-    said = capsys.readouterr().err
-    assert code == 2 and reason in said and "Traceback" not in said and not out.exists()
+    for options, reason in (
+        ("--out flight.txt", "--out is 'flight.txt'"),
+        ("--rate 0", "--rate is 0"),
+        ("--full-thrust -3", "--full-thrust is -3"),
+        ("--start 5 --end 2", "0 <= start < end"),
+        ("--pose-map m.toml", "--pose, which is not given"),
+        ("--vehicle racer6", "racer5"),
+        ("--format px5", "px4"),
+        ("--pose nowhere.csv", "nowhere.csv: cannot be read"),
+        ("--format table --map nowhere.toml", "nowhere.toml: cannot be read"),
+    ):
+        where = "" if "--out" in options else f"--out {tmp_path / 'flight.parquet'}"
+        assert reason in refused(capsys, f"import {log} {where} {options}")
+        assert [path.name for path in tmp_path.iterdir()] == [log.name]
 
 
-def test_a_log_that_is_read_is_not_written_over(tmp_path, capsys):
+def test_files_that_are_read_are_not_written_over(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     log, pose = made.write_usd(tmp_path / "log00", span=(0, 3)), tmp_path / "pose.csv"
     pose.write_text("t\n")
-    table = log.rename(tmp_path / "log.csv")
-    for args in (
-        [str(table), "--out", str(table)],
-        [str(table), "--pose", str(pose), "--out", str(pose)],
+    vehicle, table = shutil.copy(FOLDER / "vehicle.toml", tmp_path), log.rename("log.csv")
+    contents = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for line, path in (
+        (f"import {table} --out {table}", table),
+        (f"import {table} --pose {pose} --out {pose}", pose),
+        (f"identify {FOLDER} --vehicle ./vehicle.toml", "vehicle.toml"),
     ):
-        assert cli.main(["import", *args]) == 2
-        assert f"{args[-1]} is also an input" in capsys.readouterr().err
-    assert pose.read_text() == "t\n"
-
-
-FILES = sorted(FOLDER.glob("*.parquet"))
+        assert f"{path} is also an input" in refused(capsys, line)
+    assert contents == {path: path.read_bytes() for path in tmp_path.iterdir()}
+    said = refused(capsys, f"identify {FOLDER} --vehicle {vehicle} --out v.json")
+    assert "must be .toml" in said
 
 
 def test_the_command_copies_all_a_diagnosis_needs(tmp_path, capsys):
-    assert cli.main(["example", "--out", str(tmp_path / "x"), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["files"] == sorted([*(p.name for p in FILES), "vehicle.toml"])
-    for name in answer["files"]:
-        assert (tmp_path / "x" / name).read_bytes() == (FOLDER / name).read_bytes()
+    files = answer(capsys, "example --out", tmp_path)["files"]
+    assert files == sorted([*(p.name for p in FILES), "vehicle.toml"])
+    for name in files:
+        assert (tmp_path / name).read_bytes() == (FOLDER / name).read_bytes()
 
 
-def test_the_real_flights_come_as_published_with_licence_and_mapping(tmp_path, capsys):
-    assert cli.main(["example", "--real", "--out", str(tmp_path), "--json"]) == 0
-    names = json.loads(capsys.readouterr().out)["files"]
+def test_the_real_flights_come_as_published_and_tell_a_vehicle_at_the_first_try(tmp_path, capsys):
+    names = answer(capsys, "example --real --out", tmp_path)["files"]
     logs = [name for name in names if name.endswith(".csv")]
     assert len(logs) == 2
     for name in logs:
@@ -89,29 +82,24 @@ def test_the_real_flights_come_as_published_with_licence_and_mapping(tmp_path, c
     assert "arXiv 2603.09908" in (tmp_path / "README.md").read_text()
     packed = sum(path.stat().st_size for path in (FOLDER / "real").iterdir() if path.is_file())
     assert packed < 320_000
-
-
-def test_a_real_log_imports_at_the_first_try_and_tells_a_vehicle(tmp_path, capsys):
-    assert cli.main(["example", "--real", "--out", str(tmp_path)]) == 0
     raw, log = tmp_path / "B3_figure8_fast_rep1.csv", tmp_path / "eight.parquet"
-    line = ["--map", str(tmp_path / "nanobench.toml"), "--vehicle", "crazyflie21"]
-    assert cli.main(["import", str(raw), *line, "--out", str(log)]) == 0
-    line = ["--vehicle", "crazyflie21", "--out", str(tmp_path / "mine.toml"), "--json"]
-    capsys.readouterr()
-    assert cli.main(["identify", str(log), *line]) == 0
-    found = json.loads(capsys.readouterr().out)
-    drag = found["parameters"]["effects.linear_drag.coefficient"]["value"]
-    assert 0.3 < drag[0] < 0.6 and 0.3 < drag[1] < 0.6
+    mapping, out = tmp_path / "nanobench.toml", tmp_path / "mine.toml"
+    assert run("import --vehicle crazyflie21 --map", mapping, "--out", log, raw) == 0
+    found = answer(capsys, "identify --vehicle crazyflie21 --out", out, log)
+    drag = found["parameters"]["effects.linear_drag.coefficient"]
+    assert 0.3 < drag["value"][0] < 0.6 and 0.3 < drag["value"][1] < 0.6
+    assert drag["ci95"][0][0] < drag["value"][0] < drag["ci95"][0][1]
     assert any("a crazyflie loop are not fitted" in text for text in found["not_identified"])
+    assert len(found["flights"]) == 1
+    assert list(load_vehicle(out).effects["linear_drag"].coefficient) == drag["value"]
+    assert "effects.linear_drag.coefficient[0]" in out.read_text()
 
 
 @pytest.mark.slow
 def test_the_diagnosis_names_it(tmp_path, capsys):
-    assert cli.main(["example", "--out", str(tmp_path / "x")]) == 0
-    line = [str(tmp_path / "x"), "--vehicle", str(tmp_path / "x" / "vehicle.toml")]
-    capsys.readouterr()
-    assert cli.main(["diagnose", *line, "--out", str(tmp_path / "out"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    assert run("example --out", tmp_path / "x") == 0
+    line = ("diagnose --vehicle", tmp_path / "x" / "vehicle.toml", tmp_path / "x")
+    found = answer(capsys, *line, "--out", tmp_path / "out")
     assert found["verdict"] == "named"
     (effect,) = found["effects"]
     assert effect["name"] == "com_offset" and effect["alternatives"] == []
@@ -122,64 +110,16 @@ def test_the_diagnosis_names_it(tmp_path, capsys):
     assert entry["value"][2] is None and found["gap"]["after"] < 1.15
 
 
-@pytest.fixture
-def flights(tmp_path):
-    folder = tmp_path / "flights"
-    folder.mkdir()
-    for index, log in enumerate(known.logs("rates", 0)[:3]):
-        write_flight(folder / f"{index}.parquet", log)
-    save_vehicle(known.start(), tmp_path / "start.toml")
-    return folder
-
-
-def test_a_vehicle_file_comes_out_with_what_was_told(flights, tmp_path, capsys):
-    out = tmp_path / "mine.toml"
-    line = [str(flights), "--vehicle", str(tmp_path / "start.toml"), "--out", str(out)]
-    assert cli.main(["identify", *line, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["drive"] == "rates"
-    gain = told["parameters"]["controller.rate_gain"]
-    written = load_vehicle(out)
-    assert list(written.controller.rate_gain) == gain["value"]
-    assert gain["ci95"][0][0] < gain["value"][0] < gain["ci95"][0][1]
-    assert "controller.rate_gain[0]" in out.read_text()
-    assert len(told["flights"]) == 3
-
-
-def test_the_file_that_is_started_from_is_not_written_over(flights, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    before = (tmp_path / "start.toml").rename("vehicle.toml").read_text()
-    assert cli.main(["identify", str(flights), "--vehicle", "./vehicle.toml"]) == 2
-    assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
-    assert (tmp_path / "vehicle.toml").read_text() == before
-
-
 def test_an_inertia_that_was_not_told_is_as_it_was_but_for_what_goes_with_the_others(
     tmp_path, monkeypatch, capsys
 ):
     inertia = {"value": [2.5, 2.0, 4.0], "unit": "kg m^2", "ci95": [[2.0, 3.0], None, None]}
     drag = {"value": [0.3, 0.0, 0.0], "unit": "1/s", "ci95": [[0.2, 0.4], None, None]}
-    found = {
-        "drive": "pwm",
-        "parameters": {"inertia": inertia, "effects.linear_drag.coefficient": drag},
-        "not_identified": [],
-        "warnings": ["of a note"],
-    }
+    parameters = {"inertia": inertia, "effects.linear_drag.coefficient": drag}
+    found = {"drive": "pwm", "parameters": parameters, "not_identified": [], "warnings": ["noted"]}
     monkeypatch.setattr("suite.diagnose.identify.run.identify_files", lambda *_: found)
-    line = ["identify", "none", "--vehicle", "reference", "--out", str(tmp_path / "v.toml")]
-    assert cli.main(line) == 0
+    assert run("identify none --vehicle reference --out", tmp_path / "v.toml") == 0
     said = "".join(capsys.readouterr())
     assert "inertia: 2.5 (2 to 3), 2 (as it was), 4 (goes with the others) kg m^2" in said
     assert "coefficient: 0.3 (0.2 to 0.4), 0 (as it was), 0 (as it was) 1/s" in said
-    assert "warning: of a note" in said
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [(["--leave", "wings"], "--leave 'wings': allowed"), (["--out", "v.json"], "must be .toml")],
-)
-def test_what_cannot_be_used_ends_with_2(flights, tmp_path, capsys, options, reason):
-    line = [str(flights), "--vehicle", str(tmp_path / "start.toml")]
-    line += ["--out", str(tmp_path / "v.toml")] if "--out" not in options else []
-    assert cli.main(["identify", *line, *options]) == 2
-    assert reason in capsys.readouterr().err
+    assert "warning: noted" in said

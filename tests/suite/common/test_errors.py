@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 import pytest
 
-from suite.common.errors import explain
+from suite.common.errors import FAILED, UNUSABLE, explain
 from tracks.geometry.scene import Boxes, Counts, Gates, Scene, Spheres, no_rods, pad
 
 
@@ -34,27 +34,36 @@ def test_an_error_raised_on_purpose_in_a_worker_process_is_a_message():
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         with pytest.raises(ValueError, match="more than the 0") as met:
             list(pool.map(_pad_one_box, [0], [[0.0, 0.0, 0.0]]))
-    explained = explain(met.value)
-    assert explained is not None and explained[0] == 2
+    assert (explain(met.value) or (None,))[0] == UNUSABLE
 
 
-def test_what_the_system_refuses_is_one_line_with_the_file():
+def test_what_the_system_refuses_is_one_line_with_the_file_and_a_mistake_of_ours_is_a_bug():
     usage = ("EROFS", "ENAMETOOLONG", "ELOOP", "ENXIO", "EACCES")
-    for name in (*usage, "ENOSPC", "EIO", "EMFILE"):
+    trouble = ("ENOSPC", "EIO", "EMFILE", "EFBIG", "ESTALE", "ENOTCONN", "EREMOTEIO")
+    for name in (*usage, *trouble):
         number = getattr(errno, name)
-        explained = explain(OSError(number, os.strerror(number), "runs/x"))
-        assert explained is not None and explained[0] == (2 if name in usage else 1), name
-        assert "runs/x" in explained[1]
+        code, said = explain(OSError(number, os.strerror(number), "runs/x")) or (None, "")
+        assert code == (UNUSABLE if name in usage else FAILED) and "runs/x" in said, name
+        assert name == "ENOSPC" or os.strerror(number).lower() in said
+    assert explain(OSError(errno.EBADF, "Bad file descriptor")) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("Unable to initialize backend 'cuda': no device\nmore\nlines", "JAX_PLATFORMS is 'cuda'"),
+        ("invalid value for environment variable MUJOCO_GL: glx2", "MUJOCO_GL: glx2; unset it"),
+    ],
+)
+def test_a_platform_or_display_that_is_not_there_is_one_line(words, said, monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    code, text = explain(RuntimeError(words)) or (None, "")
+    assert code == UNUSABLE and said in text and "\n" not in text
 
 
 @pytest.mark.parametrize(("name", "words"), [("x" * 10_000, "xxx"), ("a\0b", "NUL")])
 def test_a_name_that_cannot_be_is_a_short_message(name, words):
     with pytest.raises((OSError, ValueError)) as met:
         open(name)
-    explained = explain(met.value)
-    assert (
-        explained is not None
-        and explained[0] == 2
-        and words in explained[1]
-        and len(explained[1]) < 400
-    )
+    code, said = explain(met.value) or (None, "")
+    assert code == UNUSABLE and words in said and len(said) < 400

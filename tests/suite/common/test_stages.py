@@ -8,6 +8,7 @@ import pytest
 from suite.common.console import Console, duration, size
 from suite.common.provenance import refuse_other_run, run_record, write_run_record
 from suite.common.stages import MARK, Estimate, Stage, announce, claim, run_stages
+from suite.experiments.study.training import training_commit
 from suite.judging.requests import Collection, Evaluation
 
 
@@ -89,8 +90,6 @@ def test_a_folder_of_another_kind_of_run_is_refused(tmp_path):
 
 
 def test_a_run_that_goes_on_keeps_the_commits_that_made_it(tmp_path, monkeypatch):
-    from suite.experiments.study.training import training_commit
-
     for commit in ("aaa", "aaa", "bbb"):
         monkeypatch.setattr(
             "suite.common.provenance.stamp", lambda c=commit, **_: {"git_commit": c}
@@ -112,10 +111,8 @@ def test_progress_without_a_terminal_is_a_plain_line_now_and_then(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 5
     assert lines[0] == "flying: 20 of 100, 40 s left, 3.1 m/s"
-
-
-def test_the_time_left_counts_only_what_was_done_since_it_began(capsys):
-    now = [0.0]
+    # Only what was done since it began counts.
+    now[0] = 0.0
     with Console().progress("training", 100, clock=lambda: now[0], begun=80) as update:
         now[0] = 12.0
         update(90)
@@ -123,11 +120,6 @@ def test_the_time_left_counts_only_what_was_done_since_it_began(capsys):
 
 
 def test_figures_for_people():
-    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == [
-        "0.4 s",
-        "10 s",
-        "1 min 00 s",
-        "3 min 20 s",
-        "2 h 05 min",
-    ]
+    durations = ["0.4 s", "10 s", "1 min 00 s", "3 min 20 s", "2 h 05 min"]
+    assert [duration(s) for s in (0.44, 9.96, 59.6, 200, 7500)] == durations
     assert [size(b) for b in (5, 812e3, 2.06e9)] == ["5 B", "812 kB", "2.1 GB"]

@@ -7,26 +7,17 @@ import eval.judging.judge
 import eval.logs.flight_log
 import suite.judging.collect
 from eval.logs.flight_log import read_flight
-from suite import cli
+from tests.support.commands import answer, refused, run
 
-COURSE = """
-[[gates]]
-center = [0.0, 0.0, 1.3]
-width = 1.0
-height = 1.0
-
-[[gates]]
-center = [5.0, 0.0, 1.3]
-width = 1.0
-height = 1.0
-"""
+GATE = "[[gates]]\ncenter = [{x}, 0.0, 1.3]\nwidth = 1.0\nheight = 1.0\n"
+COURSE = GATE.format(x=0.0) + GATE.format(x=5.0)
+TWO = "collect --track zigzag --difficulty 0 --trials 2 --seed 7 --time-limit-s 1.5"
 
 
 def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkeypatch, capfd):
     out = tmp_path / "flights"
-    args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
-    args += ["--trials", "2", "--seed", "7", "--time-limit-s", "1.5", "--out", str(out)]
-    assert cli.main(args) == 0
+    args = (TWO, "--policy", pilots["pursuit"], "--out", out)
+    assert run(*args) == 0
     logs = sorted(out.glob("*.parquet"))
     assert [log.name for log in logs] == ["zigzag-0-7.parquet", "zigzag-0-8.parquet"]
     log = read_flight(logs[0])
@@ -35,36 +26,30 @@ def test_collect_writes_logs_that_read_back_and_goes_on(pilots, tmp_path, monkey
     found = json.loads((out / "flights.json").read_text())
     assert [row["file"] for row in found["flights"]] == [log.name for log in logs]
     logs[1].unlink()
-    flown = []
-    fly = eval.judging.judge.fly
+    flown, fly = [], eval.judging.judge.fly
 
     def count(policy, trials, *rest, **more):
         flown.extend(trials)
         return fly(policy, trials, *rest, **more)
 
     monkeypatch.setattr(eval.judging.judge, "fly", count)
-    capfd.readouterr()
-    assert cli.main([*args, "--json"]) == 0
+    assert answer(capfd, *args)["flights"] == found["flights"]
     assert [trial.seed for trial in flown] == [8]
-    assert json.loads(capfd.readouterr().out)["flights"] == found["flights"]
 
 
 def test_flights_of_another_course_or_code_are_not_taken_for_its_own(
     pilots, tmp_path, monkeypatch, capfd
 ):
-    track, out = tmp_path / "course.toml", tmp_path / "flights"
-    args = ["collect", "--policy", pilots["diver"], "--track", str(track), "--out", str(out)]
-    track.write_text(COURSE)
-    assert cli.main(args) == 0
-    track.write_text(f"# in other words\n{COURSE}")
-    assert cli.main(args) == 0
+    track = tmp_path / "course.toml"
+    args = ("collect --policy", pilots["diver"], "--track", track, "--out", tmp_path / "flights")
+    for text in (COURSE, f"# in other words\n{COURSE}"):
+        track.write_text(text)
+        assert run(*args) == 0
     with monkeypatch.context() as patch:
         patch.setattr(suite.judging.collect, "git_commit", lambda: "another")
-        assert cli.main(args) == 2
-    assert "another version of the code" in capfd.readouterr().err
+        assert "another version of the code" in refused(capfd, *args)
     track.write_text(COURSE.replace("1.0", "1.1"))
-    assert cli.main(args) == 2
-    assert "another collection" in capfd.readouterr().err
+    assert "another collection" in refused(capfd, *args)
 
 
 def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
@@ -72,17 +57,17 @@ def test_flights_are_the_same_where_policy_and_vehicle_were_moved(
 ):
     vehicle, out = tmp_path / "mine.toml", tmp_path / "flights"
     shutil.copy(root / "eval" / "vehicles" / "racer5.toml", vehicle)
-    args = ["collect", "--policy", pilots["diver"], "--track", "zigzag", "--difficulty", "0"]
-    args += ["--trials", "1", "--out", str(out), "--vehicle"]
-    assert cli.main([*args, str(vehicle)]) == 0
+    line = "collect --track zigzag --difficulty 0 --trials 1 --policy"
+    args = (line, pilots["diver"], "--out", out, "--vehicle")
+    assert run(*args, vehicle) == 0
     moved = vehicle.rename(tmp_path / "moved.toml")
     monkeypatch.setattr(eval.judging.judge, "fly", None)
     (row,) = json.loads((out / "flights.json").read_text())["flights"]
     assert row["file"] is None and row["time_s"] < 1, "a flight of under a second is no log"
     assert not list(out.glob("*.parquet"))
-    assert cli.main([*args, str(moved)]) == 0, "nothing is flown again"
+    assert run(*args, moved) == 0, "nothing is flown again"
     moved.write_text(moved.read_text().replace("mass = 0.75", "mass = 0.76"))
-    assert cli.main([*args, str(moved)]) == 2
+    assert run(*args, moved) == 2
 
 
 def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
@@ -97,11 +82,8 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
         return log
 
     monkeypatch.setattr(eval.logs.flight_log, "log_from_flight", broken)
-    out = tmp_path / "flights"
-    args = ["collect", "--policy", pilots["pursuit"], "--track", "zigzag", "--difficulty", "0"]
-    args += ["--trials", "2", "--seed", "7", "--time-limit-s", "1.5", "--out", str(out)]
-    assert cli.main(args) == 0
-    flights = json.loads((out / "flights.json").read_text())["flights"]
+    assert run(TWO, "--policy", pilots["pursuit"], "--out", tmp_path) == 0
+    flights = json.loads((tmp_path / "flights.json").read_text())["flights"]
     assert [row["file"] for row in flights] == [None, "zigzag-0-8.parquet"]
     said = capfd.readouterr()
     assert "zigzag-0-7.parquet: column rate_x, row 5: 300" in said.err
@@ -109,15 +91,14 @@ def test_a_flight_whose_log_is_refused_does_not_stop_the_others(
 
 
 def test_what_cannot_be_recorded_is_refused(pilots, tmp_path, capfd):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "course.toml").write_text(COURSE)
-    tracks = ",".join(str(tmp_path / name / "course.toml") for name in "ab")
-    for args, words in (
-        (["--track", tracks], "several tracks are called 'course'"),
-        (["--simulator", "reference"], "'reference' records no flights; record in 'mujoco'"),
+    tracks = [tmp_path / name / "course.toml" for name in "ab"]
+    for track in tracks:
+        track.parent.mkdir()
+        track.write_text(COURSE)
+    for option, value, words in (
+        ("--track", ",".join(map(str, tracks)), "several tracks are called 'course'"),
+        ("--simulator", "reference", "'reference' records no flights; record in 'mujoco'"),
     ):
-        asked = ["--policy", pilots["diver"], "--out", str(tmp_path / "out")]
-        assert cli.main(["collect", *args, *asked]) == 2
-        assert words in capfd.readouterr().err
+        asked = ("collect --policy", pilots["diver"], "--out", tmp_path / "out")
+        assert words in refused(capfd, *asked, option, value)
         assert not (tmp_path / "out").exists()

@@ -1,6 +1,5 @@
 """Comparisons of evaluations: published examples, coverage, and what is refused."""
 
-import json
 from math import erf, sqrt
 
 import numpy as np
@@ -96,23 +95,16 @@ def test_runs_are_paired_refused_or_taken_as_seeds(tmp_path):
             compare.run(compare.Config((a, folder) if folder else (a,)), Quiet())
 
 
-@pytest.mark.parametrize(
-    ("summary", "said"),
-    [
+def test_a_summary_that_is_none_and_a_trial_that_is_there_twice_are_refused(tmp_path):
+    run_of(tmp_path, [True])
+    for summary, said in (
         ("[1]", "is a list"),
         ('{"judged": [1]}', "'judged' is missing or not a dict"),
         ("{", "not JSON"),
-    ],
-)
-def test_a_summary_that_is_none_is_refused(tmp_path, summary, said):
-    run_of(tmp_path, [True])
-    (tmp_path / "summary.json").write_text(summary)
-    with pytest.raises(ValueError, match=rf"summary\.json: .*{said}"):
-        read_runs(tmp_path)
-
-
-def test_a_trial_that_is_there_twice_is_refused(tmp_path):
-    run_of(tmp_path, [True])
+    ):
+        (tmp_path / "summary.json").write_text(summary)
+        with pytest.raises(ValueError, match=rf"summary\.json: .*{said}"):
+            read_runs(tmp_path)
     rows = [result(0, True)] * 2
     write_results(tmp_path, rows, table_markdown="", summary={"judged": {}}, seed=0)
     with pytest.raises(ValueError, match="holds a trial twice"):
@@ -132,10 +124,7 @@ def test_two_methods_are_compared_over_their_seeds(tmp_path):
     )
     assert "a difference of +" in found["sentence"] and len(found["spread"]) == 2
     same = read_runs(run_of(tmp_path / "same", [True] * 60))[0]
-    for others, low in (
-        ((), wilson(60, 60).low),
-        ([same, same], paired_success(*[np.ones(60)] * 2).low),
-    ):
+    paired = paired_success(*[np.ones(60)] * 2)
+    for others, low in (((), wilson(60, 60).low), ([same, same], paired.low)):
         found = compare_seeds([same, same], others)["mean"]
         assert found.low == pytest.approx(low) and found.low < found.value - 0.05
-    assert json.loads((tmp_path / "a0" / "summary.json").read_text())["judged"]

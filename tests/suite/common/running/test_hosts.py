@@ -27,37 +27,28 @@ OPEN_MPI = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("asked", "environment", "found"),
-    [
+def test_a_process_finds_its_place_and_alone_it_writes():
+    for asked, environment, found in (
         (ProcessOptions(), {}, Member(0, 1, None)),
         (ProcessOptions("head:7777", 3, 2), {}, Member(2, 3, "head:7777")),
         (ProcessOptions(), SLURM, Member(2, 4, None)),
         (ProcessOptions(), OPEN_MPI, Member(1, 2, None)),
         (ProcessOptions(), {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Member(0, 1, None)),
         (ProcessOptions(processes=1), SLURM, Member(0, 1, None)),
-    ],
-)
-def test_a_process_finds_its_place(asked, environment, found):
-    assert read_member(asked, environment) == found
+    ):
+        assert read_member(asked, environment) == found
+    assert is_writer() and not is_distributed()
 
 
-@pytest.mark.parametrize(
-    ("asked", "words"),
-    [
+def test_options_that_do_not_go_together_are_refused():
+    for asked, words in (
         (ProcessOptions(processes=2), "go together"),
         (ProcessOptions("head:7777", 2, 2), "--process is 2; allowed is 0 to 1"),
         (ProcessOptions("head", 2, 0), "--coordinator is 'head'; allowed is HOST:PORT"),
         (ProcessOptions("head:99999", 2, 0), "allowed is HOST:PORT"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(asked, words):
-    with pytest.raises(ValueError, match=words):
-        read_member(asked, {})
-
-
-def test_alone_it_writes():
-    assert is_writer() and not is_distributed()
+    ):
+        with pytest.raises(ValueError, match=words):
+            read_member(asked, {})
 
 
 MEETING = """
@@ -84,10 +75,27 @@ os._exit(0)
 """
 
 
-def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
+def address():
+    """Return an address of this machine that is free."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        where = f"127.0.0.1:{free.getsockname()[1]}"
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def ends(processes, seconds=300):
+    """Return the exit codes of processes and what they said; end all."""
+    try:
+        said = [
+            "".join(filter(None, process.communicate(timeout=seconds))) for process in processes
+        ]
+        return [process.returncode for process in processes], said
+    finally:
+        for process in processes:
+            process.kill()
+
+
+def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
+    where = address()
     environment = {**os.environ, "PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
     both = [
         subprocess.Popen(
@@ -96,12 +104,8 @@ def test_two_processes_meet_agree_and_hear_that_one_is_gone(tmp_path, root):
         )
         for k in (0, 1)
     ]  # fmt: skip
-    try:
-        said = [process.communicate(timeout=120)[0] for process in both]
-    finally:
-        for process in both:
-            process.kill()
-    assert [process.returncode for process in both] == [9, 0], said
+    codes, said = ends(both, 120)
+    assert codes == [9, 0], said
     assert all("processes differ in the seed. Give" in words for words in said), said
     assert said[1].strip().endswith("gone")
 
@@ -110,16 +114,16 @@ class Trainings:
     """The same training, by one process of two devices or by two of one each."""
 
     def __init__(self, folder, root):
-        self.folder, self.root, self.port = folder, root, 0
+        self.folder, self.root = folder, root
 
-    def start(self, out, *options, seed=0, devices=1):
+    def start(self, out, *options, devices=1):
         code = (
             "import sys, suite.train.training_loop as training_loop\n"
             "from suite.cli import entry\n"
             "training_loop.SAVE_PERIOD_S = 0.2\n"
             "entry()\n"
         )
-        args = ["train", "--recipe", "quick", "--iterations", "120", "--seed", str(seed)]
+        args = ["train", "--recipe", "quick", "--iterations", "120"]
         args += ["--set", "episode.batch=4", "episode.steps=4", "--out", str(self.folder / out)]
         environment = {
             **os.environ, "PYTHONPATH": str(self.root), "JAX_PLATFORMS": "cpu", "NPROC": "2",
@@ -131,32 +135,15 @@ class Trainings:
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    def both(self, out, seeds=(0, 0)):
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            where = f"127.0.0.1:{free.getsockname()[1]}"
-        return [
-            self.start(
-                out, "--coordinator", where, "--processes", "2", "--process", str(k), seed=seeds[k]
-            )
-            for k in (0, 1)
-        ]
+    def both(self, out):
+        where = ("--coordinator", address(), "--processes", "2", "--process")
+        return [self.start(out, *where, str(k)) for k in (0, 1)]
 
     def result(self, out):
         lines = (self.folder / out / "metrics.jsonl").read_text().splitlines()
         clock = ("seconds", "cold", "steps_per_s")
         rows = [{k: v for k, v in json.loads(x).items() if k not in clock} for x in lines]
         return rows, load_arrays(self.folder / out / "policy", kind="policy").arrays
-
-
-def ends(processes, seconds=300):
-    """Return the exit codes and what was said on standard error; end all."""
-    try:
-        said = [process.communicate(timeout=seconds)[1] for process in processes]
-        return [process.returncode for process in processes], said
-    finally:
-        for process in processes:
-            process.kill()
 
 
 def rows_there(path):

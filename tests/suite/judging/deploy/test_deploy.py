@@ -6,15 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from policies.formats.c.c_file import load_c
 from policies.formats.c.compiler import find_compiler
 from policies.formats.c.project import random_observations
+from policies.formats.export import export_policy
 from policies.formats.policy_file import load_policy_checkpoint, save_policy
 from policies.policy import load_policy
 from policies.spec import PolicySpec
-from suite import cli
 from suite.judging.deploy import exporting, latency, parity
+from tests.support.commands import answer, refused, run
 from tests.support.pilots import Steady
 from tests.support.policy_files import SPEC, lively
 from tests.support.small_policy import small_checkpoint
@@ -34,10 +36,8 @@ def own_cache(monkeypatch, tmp_path_factory):
 
 @needs_cc
 def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_path, capsys):
-    asked = ["export", "--policy", str(folder), "--format", "c", "--out", str(tmp_path), "--json"]
-    assert cli.main(asked) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["parity"]["steps"] == 1000 and answer["parity"]["worst"] <= 1e-4
+    found = answer(capsys, "export --format c --policy", folder, "--out", tmp_path)
+    assert found["parity"]["steps"] == 1000 and found["parity"]["worst"] <= 1e-4
     names = {"policy.h", "policy.c", "vectors.h", "main.c", "CMakeLists.txt", exporting.CARD}
     assert {path.name for path in tmp_path.iterdir()} == {*names, exporting.NOTE}
     text = (tmp_path / exporting.CARD).read_text()
@@ -48,24 +48,20 @@ def test_the_command_writes_c_and_a_card_that_says_how_near_it_is(folder, tmp_pa
 
 @needs_cc
 def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
-    spec = load_policy_checkpoint(folder).spec
-    monkeypatch.setattr(
-        exporting, "observed_flights", lambda policy: random_observations(spec, 30, seed=3)
-    )
-    asked = ["export", str(folder), "--format", "c", "--dtype", "int8", "--out", str(tmp_path)]
-    assert cli.main(asked) == 0
+    observed = random_observations(load_policy_checkpoint(folder).spec, 30, seed=3)
+    monkeypatch.setattr(exporting, "observed_flights", lambda policy: observed)
+    assert run("export --format c --dtype int8 --out", tmp_path, folder) == 0
     assert "on flights" in capsys.readouterr().out
     assert load_policy(tmp_path, trust=True).name == "tiny-int8.c"
 
 
 def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
     for args, message in (
-        (["--format", "tflite"], "unknown format 'tflite'"),
-        (["--format", "onnx", "--dtype", "int8"], "supports float32 only"),
-        (["--policy", "race-paper"], "give one"),
+        ("--format tflite", "unknown format 'tflite'"),
+        ("--format onnx --dtype int8", "supports float32 only"),
+        ("--policy race-paper", "give one"),
     ):
-        assert cli.main(["export", str(folder), "--out", str(tmp_path), *args]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, f"export {args} --out {tmp_path}", folder)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -79,31 +75,23 @@ def test_an_export_of_another_policy_is_not_written_over(
     one, other = (tmp_path / run / "policy" for run in "ab")
     out = tmp_path / "out"
 
-    def export(policy):
-        return cli.main(["export", str(policy), "--format", wanted, "--out", str(out)])
-
+    asked = f"export --format {wanted} --out {out}"
     shutil.copytree(folder, one)
     assert "not compared here" in parity.parity(out, load_policy_checkpoint(one), None).sentence
     save_policy(other, lively(SPEC, 3), SPEC, seed=1)
-    assert export(one) == export(one) == 0
+    assert run(asked, one) == run(asked, one) == 0
     kept = (out / file).read_bytes()
-    capsys.readouterr()
-    assert export(other) == 2
-    said = capsys.readouterr().err
-    assert (
-        f"{file} was exported from {one} and would be overwritten by the export of {other}" in said
-    )
+    said = f"{file} was exported from {one} and would be overwritten by the export of {other}"
+    assert said in refused(capsys, asked, other)
     assert (out / file).read_bytes() == kept
     shutil.rmtree(one)
     shutil.copytree(other, one)
-    assert export(one) == 0, "trained on, it is the same policy's"
-    assert export(other) == 0, "and now that of its content, too"
+    assert run(asked, one) == 0, "trained on, it is the same policy's"
+    assert run(asked, other) == 0, "and now that of its content, too"
     (out / exporting.NOTE).unlink()
-    assert export(other) == 2
-    assert f"{file} was exported from an unrecorded policy" in capsys.readouterr().err
+    assert f"{file} was exported from an unrecorded policy" in refused(capsys, asked, other)
     (out / exporting.NOTE).write_text("[]")
-    assert export(other) == 2
-    assert "not a record of exports" in capsys.readouterr().err
+    assert "not a record of exports" in refused(capsys, asked, other)
 
 
 def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
@@ -122,12 +110,10 @@ def test_a_card_has_the_success_of_a_shipped_policys_card(folder):
 def test_the_card_of_a_policy_is_not_written_over(tmp_path, folder, capsys):
     own = shutil.copytree(folder, tmp_path / "own")
     (own / exporting.CARD).write_text("mine")
-    assert cli.main(["export", str(own), "--format", "c", "--out", str(own)]) == 2
-    assert "card.md is also an input and would be overwritten" in capsys.readouterr().err
-    assert {path.name for path in own.iterdir()} == {
-        *(p.name for p in folder.iterdir()),
-        exporting.CARD,
-    }
+    said = refused(capsys, "export --format c --out", own, own)
+    assert "card.md is also an input and would be overwritten" in said
+    names = {path.name for path in folder.iterdir()}
+    assert {path.name for path in own.iterdir()} == {*names, exporting.CARD}
 
 
 def test_what_a_policy_is_given_on_flights_is_kept(monkeypatch):
@@ -156,9 +142,6 @@ def test_rows_in_which_nothing_flies_are_no_observations():
 
 @needs_cc
 def test_the_engines_that_are_timed_are_one_policy(folder, tmp_path):
-    torch = pytest.importorskip("torch")
-    from policies.formats.export import export_policy
-
     export_policy(folder, tmp_path, ["c"])
     checkpoint = load_policy_checkpoint(folder)
     in_c = latency.c_step(load_c(tmp_path, trust=True))

@@ -75,19 +75,16 @@ def test_a_velocity_is_in_the_frame_that_its_message_says():
         np.testing.assert_allclose(state.vel_w, vel_w, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changed", "reason"),
-    [
+def test_a_state_in_other_frames_or_of_a_failed_estimator_is_not_flown(bench):
+    for changed, reason in (
         ({"frames": (20, 12)}, "in frames 20 and 12, allowed are 1"),
         ({"frames": (1, 8)}, "in frames 1 and 8, allowed are 1"),
         ({"quality": -1}, "estimator has failed"),
-    ],
-)
-def test_a_state_in_other_frames_or_of_a_failed_estimator_is_not_flown(bench, changed, reason):
-    one = bench()
-    one.show()
-    one.companion.receive([odometry(**changed)])
-    assert reason in one.companion.over
+    ):
+        one = bench()
+        one.show()
+        one.companion.receive([odometry(**changed)])
+        assert reason in one.companion.over
 
 
 def test_of_a_backlog_the_newest_state_is_flown_and_gates_are_counted_in_all(bench):
@@ -128,7 +125,7 @@ def test_clocks_may_drift_apart(bench):
         while one.now < begin + 30.0:
             one.show()
             one.tell(one.state(time_s=stamp + drift * (one.now - begin)))
-            one.now += 0.05
+            one.now += 0.09
         assert one.companion.flying, one.companion.over
 
 
@@ -242,16 +239,6 @@ def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(ben
     assert one.companion.over == "no state for 0.1 s"
 
 
-def test_another_system_is_not_listened_to(bench):
-    one = bench().fly()
-    other = Wire(9, 2)
-    far = one.state(pos_w=np.array([0.0, 900.0, 1.0]))
-    assert one.companion.receive([other.encode(far)]) == []
-    assert one.companion.flying and "foreign" in one.companion.events[-1]
-    old = one.state(time_s=one.now - 0.04)
-    assert one.tell(old) == [] and one.companion.flying
-
-
 def test_depth_images_of_another_size_are_said_once(bench):
     one = bench()
     one.image = np.full((48, 64), 5.0)
@@ -263,11 +250,11 @@ def test_depth_images_of_another_size_are_said_once(bench):
     assert one.companion.wrong_image_size in said[0]
 
 
-@pytest.mark.parametrize(("off_m", "jumped"), [(0.45, False), (0.55, True)])
-def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads(off_m, jumped):
+def test_a_state_may_lie_half_a_metre_off_where_its_speed_leads():
     """0.1 s at 3 m/s, and so much more."""
     level, still = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
     vel_w = np.array([3.0, 0.0, 0.0])
     last = State(1.0, still, level, vel_w, still)
-    state = State(1.1, np.array([0.3 + off_m, 0.0, 0.0]), level, vel_w, still)
-    assert (jump_fault(last, state, Limits()) is not None) == jumped
+    for off_m, jumped in ((0.45, False), (0.55, True)):
+        state = State(1.1, np.array([0.3 + off_m, 0.0, 0.0]), level, vel_w, still)
+        assert (jump_fault(last, state, Limits()) is not None) == jumped

@@ -13,7 +13,6 @@ from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules, TrialSpec, track_of
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
-from suite import cli
 from suite.judging.link import fly, server
 from suite.judging.link.companion import Companion, Row
 from suite.judging.link.flights import Flight, delays, fly_link, totals, warm_up, write_log
@@ -31,19 +30,22 @@ from suite.judging.link.messages import (
 from suite.judging.link.simulated import LOST_S, SimulatedVehicle
 from suite.judging.link.udp import UdpLink
 from suite.judging.link.watchdog import Limits
-from suite.judging.requests import Evaluation
-from suite.judging.trials import read_trial_set
+from tests.support.commands import answer, refused, run
 from tests.support.pilots import Pursuit
 from tracks.geometry.rotation import quat_to_rot
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
 
 
+def turned(rng):
+    """Return an attitude as a random quaternion."""
+    quat = rng.normal(size=4)
+    return quat / np.linalg.norm(quat)
+
+
 def test_frames_are_one_half_turn_about_x():
     rng = np.random.default_rng(0)
-    quat = rng.normal(size=4)
-    quat /= np.linalg.norm(quat)
-    vector = rng.normal(size=3)
+    quat, vector = turned(rng), rng.normal(size=3)
     assert (flip_axes(flip_axes(vector)) == vector).all()
     there = quat_to_rot(flip_quat(quat)) @ flip_axes(vector)
     np.testing.assert_allclose(there, flip_axes(quat_to_rot(quat) @ vector), atol=1e-12)
@@ -53,10 +55,8 @@ def test_frames_are_one_half_turn_about_x():
 
 def test_states_set_points_and_words_come_as_they_went():
     rng = np.random.default_rng(1)
-    quat = rng.normal(size=4)
-    quat /= np.linalg.norm(quat)
     place, vel, rate = rng.normal(size=(3, 3))
-    state = State(12.345678, place, quat, vel, rate)
+    state = State(12.345678, place, turned(rng), vel, rate)
     vehicle, companion = Wire(1, 2), Wire(2, 1)
     (found,) = companion.decode([vehicle.encode(state)])
     assert isinstance(found, State)
@@ -150,12 +150,8 @@ def test_both_ends_agree_on_the_flight(flown, tmp_path):
     assert log.about["handed_over"] is None and log.about["events"]
     assert log.action_b is not None and log.action_b.shape == (len(rows), 3)
     assert log.gate is not None and log.gate.max() == companion.gate
-    row = {
-        **sim.result("p")._asdict(),
-        "handed_over": None,
-        "vehicle_slips": 0,
-        "missed_decisions": 0,
-    }
+    row = {**sim.result("p")._asdict(), "handed_over": None}
+    row |= {"vehicle_slips": 0, "missed_decisions": 0}
     assert totals([Flight(row, rows)], Limits())["set_points"] == len(rows)
 
 
@@ -183,103 +179,95 @@ def test_without_set_points_the_vehicle_brakes_by_itself(flown):
     assert sim.over or speed[-1] < 0.4 * speed[int(LOST_S / sim.dt)]
 
 
-def test_datagrams_are_taken_from_one_caller(bench):
-    waiting = UdpLink("udpin:127.0.0.1:0")
-    first, second = (UdpLink(f"udpout:127.0.0.1:{waiting.port}") for _ in range(2))
-    try:
-        first.send([b"one"])
-        assert waiting.receive(1.0) == [b"one"]
-        second.send([b"two"])
-        first.send([b"three"])
-        assert waiting.receive(1.0) == [b"three"] and waiting.strangers == 1
-        waiting.send([b"back"])
-        assert first.receive(1.0) == [b"back"]
-        # Nobody listens: words are lost and nothing is raised.
-        waiting.close()
-        first.send([b"gone"])
-        assert first.receive(0.01) == []
-    finally:
-        first.close()
-        second.close()
+@pytest.fixture
+def links():
+    """Make links that are closed after the test."""
+    made = []
+
+    def link(address, *rest):
+        made.append(UdpLink(address, *rest))
+        return made[-1]
+
+    yield link
+    for one in made:
+        one.close()
 
 
-def test_who_does_not_speak_for_the_vehicle_does_not_take_the_link(bench):
-    waiting = UdpLink("udpin:127.0.0.1:0", bench().companion._wire.is_from_peer)
-    stranger, other, vehicle = (UdpLink(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
-    try:
-        stranger.send([b"anybody there?"])
-        other.send([Wire(9, 2).encode(bench().state())])
-        assert waiting.receive(1.0) == [] and waiting.receive(0.2) == []
-        said = Wire(1, 2).encode(bench().state())
-        vehicle.send([said])
-        assert waiting.receive(1.0) == [said] and waiting.strangers == 2
-    finally:
-        for link in (waiting, stranger, other, vehicle):
-            link.close()
+def test_datagrams_are_taken_from_one_caller(links):
+    waiting = links("udpin:127.0.0.1:0")
+    first, second = (links(f"udpout:127.0.0.1:{waiting.port}") for _ in range(2))
+    first.send([b"one"])
+    assert waiting.receive(1.0) == [b"one"]
+    second.send([b"two"])
+    first.send([b"three"])
+    assert waiting.receive(1.0) == [b"three"] and waiting.strangers == 1
+    waiting.send([b"back"])
+    assert first.receive(1.0) == [b"back"]
+    # Nobody listens: words are lost and nothing is raised.
+    waiting.close()
+    first.send([b"gone"])
+    assert first.receive(0.01) == []
 
 
-def test_addresses_that_cannot_be_are_refused():
-    taken = UdpLink("udpin:127.0.0.1:0")
+def test_who_does_not_speak_for_the_vehicle_does_not_take_the_link(bench, links):
+    waiting = links("udpin:127.0.0.1:0", bench().companion._wire.is_from_peer)
+    stranger, other, vehicle = (links(f"udpout:127.0.0.1:{waiting.port}") for _ in range(3))
+    stranger.send([b"anybody there?"])
+    other.send([Wire(9, 2).encode(bench().state())])
+    assert waiting.receive(1.0) == [] and waiting.receive(0.2) == []
+    said = Wire(1, 2).encode(bench().state())
+    vehicle.send([said])
+    assert waiting.receive(1.0) == [said] and waiting.strangers == 2
+
+
+def test_addresses_that_cannot_be_are_refused(links):
+    taken = links("udpin:127.0.0.1:0")
     wrong = ["tcp:1.2.3.4:5", "udpin:14550", "udpin:127.0.0.1:99999", "udpin:203.0.113.1:14550"]
     for address in (*wrong, f"udpin:127.0.0.1:{taken.port}", "udpout:no host of this name:14550"):
         with pytest.raises(ValueError, match=f"--link {address}"):
             UdpLink(address)
-    taken.close()
 
 
-def test_a_link_on_which_nobody_is_ends_by_itself(bench):
-    one = bench()
-    warm_up(one.policy)
-    link, times = UdpLink("udpin:127.0.0.1:0"), iter(np.arange(0.0, 100.0, 0.5))
-    try:
-        fly_link(one.companion, link, clock=lambda: next(times), wait_s=3.0)
-    finally:
-        link.close()
-    assert not one.companion.rows and one.companion.over is None
+def test_a_link_on_which_nobody_is_ends_and_a_vehicle_that_waits_is_called(
+    bench, links, monkeypatch
+):
+    monkeypatch.setattr("suite.judging.link.flights.gc.collect", lambda: 0)  # of all tests' objects
+    vehicle = links("udpin:127.0.0.1:0")
+    for address in ("udpin:127.0.0.1:0", f"udpout:127.0.0.1:{vehicle.port}"):
+        one, times = bench(), iter(np.arange(0.0, 100.0, 0.3))
+        warm_up(one.policy)
+        fly_link(one.companion, links(address), clock=lambda: next(times), wait_s=3.0)  # noqa: B023
+        assert not one.companion.rows and one.companion.over is None
+    heard = vehicle.receive(1.0)
+    assert 2 <= len(heard) <= 4 and all(Wire(1, 2).is_from_peer(datagram) for datagram in heard)
+    assert Wire(1, 2).decode(heard) == []
 
 
-def test_a_vehicle_that_waits_to_be_called_is_called(bench):
-    one = bench()
-    vehicle = UdpLink("udpin:127.0.0.1:0")
-    link, times = UdpLink(f"udpout:127.0.0.1:{vehicle.port}"), iter(np.arange(0.0, 100.0, 0.3))
-    try:
-        fly_link(one.companion, link, clock=lambda: next(times), wait_s=3.0)
-        heard = vehicle.receive(1.0)
-        assert 2 <= len(heard) <= 4 and all(Wire(1, 2).is_from_peer(datagram) for datagram in heard)
-        assert Wire(1, 2).decode(heard) == []
-    finally:
-        link.close()
-        vehicle.close()
-
-
-def printed(capsys):
-    return " ".join(capsys.readouterr().err.split())
+REAL = "fly --link udpin:127.0.0.1:0 --out"
 
 
 def test_a_real_vehicle_needs_the_operators_word(capsys, tmp_path, monkeypatch):
-    asked = ["fly", "--out", str(tmp_path), "--link", "udpin:127.0.0.1:0"]
-    assert cli.main(asked) == 2
-    assert "docs/fly.md" in capsys.readouterr().err
-    assert cli.main([*asked, "--silence-s", "-1"]) == 2
-    assert "silence-s" in capsys.readouterr().err
-    assert cli.main([*asked, "--confirm", "--trials", "3"]) == 2
-    assert "--link flies one flight" in capsys.readouterr().err
+    assert "docs/fly.md" in refused(capsys, REAL, tmp_path)
+    assert "silence-s" in refused(capsys, REAL, tmp_path, "--silence-s", "-1")
+    confirmed = (REAL, tmp_path, "--confirm")
+    assert "--link flies one flight" in refused(capsys, *confirmed, "--trials", "3")
 
-    def refused(companion, link):
+    def outside(companion, link):
         companion.over = "outside the box at 0.0, 0.0, -3.0 m"
 
-    monkeypatch.setattr(fly, "fly_link", lambda companion, link: None)
-    assert cli.main([*asked, "--confirm"]) == 1
-    assert "no vehicle sent a state (ODOMETRY) and a depth image within 30 s" in printed(capsys)
-    monkeypatch.setattr(fly, "fly_link", refused)
-    assert cli.main([*asked, "--confirm"]) == 1
-    assert "before the first set point: outside the box at 0.0, 0.0, -3.0 m" in printed(capsys)
+    for fly_nowhere, words in (
+        (lambda companion, link: None,
+         "no vehicle sent a state (ODOMETRY) and a depth image within 30 s"),
+        (outside, "before the first set point: outside the box at 0.0, 0.0, -3.0 m"),
+    ):  # fmt: skip
+        monkeypatch.setattr(fly, "fly_link", fly_nowhere)
+        assert run(*confirmed) == 1
+        assert words in printed(capsys)
 
 
 def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
     capsys, tmp_path, monkeypatch
 ):
-    asked = ["fly", "--out", str(tmp_path), "--link", "udpin:127.0.0.1:0", "--confirm"]
     sent = []
 
     def ended(companion, link):
@@ -287,11 +275,14 @@ def test_an_operator_who_ends_a_flight_is_told_to_the_vehicle_and_its_log_stays(
 
     monkeypatch.setattr(fly, "fly_link", ended)
     monkeypatch.setattr(UdpLink, "send", lambda self, datagrams: sent.extend(datagrams))
-    assert cli.main(asked) == 1
+    assert run(REAL, tmp_path, "--confirm") == 1
     assert "the operator" in printed(capsys) and len(sent) == 1 and b"the operator" in sent[0]
     (tmp_path / "zigzag-0-0.parquet").write_text("the log of a flight that ended by an error")
-    assert cli.main(asked) == 2
-    assert "holds an earlier flight" in printed(capsys)
+    assert "holds an earlier flight" in refused(capsys, REAL, tmp_path, "--confirm")
+
+
+def printed(capsys):
+    return " ".join(capsys.readouterr().err.split())
 
 
 def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first(
@@ -306,57 +297,48 @@ def test_flights_before_an_interrupt_are_kept_and_the_judges_refusal_comes_first
         raise KeyboardInterrupt
 
     monkeypatch.setattr(fly, "fly_simulated", interrupted)
-    asked = ["fly", "--policy", "race", "--trials", "2", "--time-limit-s", "0.2"]
-    assert cli.main([*asked, "--out", str(tmp_path / "a")]) == 130
+    asked = "fly --policy race --trials 2 --time-limit-s 0.2 --out"
+    assert run(asked, tmp_path / "a") == 130
     answer = json.loads((tmp_path / "a" / "fly.json").read_text())
     assert (answer["trials"], answer["successes"], answer["judge_successes"]) == (1, 1, 0)
     config = json.loads((tmp_path / "a" / "run.json").read_text())["config"]
     assert config["policy"]["name"] == "race" and config["limits"]["silence_s"] == 0.1
     assert config["link"] == "simulated" and config["evaluation"]["time_limit_s"] == 0.2
-    capsys.readouterr()
     fast = load_policy("race")
     assert isinstance(fast, BlockPolicy)
     fast = replace(fast, spec=replace(fast.spec, rate_hz=2000.0))
     monkeypatch.setattr(fly, "load_in_manner", lambda *_: fast)
-    assert cli.main([*asked, "--out", str(tmp_path / "b")]) == 2
-    assert "decides at 2000 Hz" in printed(capsys) and not (tmp_path / "b").exists()
+    assert "decides at 2000 Hz" in refused(capsys, asked, tmp_path / "b")
+    assert not (tmp_path / "b").exists()
 
 
-def test_real_time_flies_a_track_file_as_often_as_is_asked(root, tmp_path, capsys):
+def test_two_tracks_of_one_name_are_refused(root, tmp_path, capsys):
+    """Their logs would have one name."""
     yard = root / "tracks" / "examples" / "yard.toml"
-    asked = Evaluation(track=str(yard), trials=3)
-    assert len(read_trial_set(asked).trials) == 1
-    assert [trial.seed for trial in read_trial_set(asked, real_time=True).trials] == [0, 1, 2]
     shutil.copytree(yard.parent, tmp_path / "other")
     both = f"{yard},{tmp_path / 'other' / 'yard.toml'}"
-    assert cli.main(["fly", "--track", both, "--out", str(tmp_path / "out")]) == 2
-    assert "several tracks are called 'yard'" in printed(capsys)
+    said = refused(capsys, "fly --out", tmp_path / "out", "--track", both)
+    assert "several tracks are called 'yard'" in said
 
 
 @pytest.mark.slow
 def test_a_flight_in_real_time_over_the_loopback(tmp_path, capsys):
     """Whether it finishes is the machine's affair: a busy one is handed over from."""
     assert server.WAIT_S > 1
-    code = cli.main(["fly", "--trials", "1", "--out", str(tmp_path), "--json"])
-    answer = json.loads(capsys.readouterr().out)
-    assert code == 0 and answer["trials"] == 1
-    (flight,) = answer["flights"]
+    (flight,) = answer(capsys, "fly --trials 1 --out", tmp_path)["flights"]
     assert flight["success"] or flight["handed_over"] or flight["vehicle_slips"]
 
 
 def test_a_speed_and_the_judges_monitor_fly_in_real_time_too(capsys, tmp_path, monkeypatch):
-    asked, flown = ["fly", "--out", str(tmp_path), "--policy"], []
-    assert cli.main([*asked, "race-paper", "--speed", "0.3"]) == 2
-    assert "--speed 0.3: race-paper takes no speed" in capsys.readouterr().err
+    asked, flown = ("fly --out", tmp_path, "--policy"), []
+    said = refused(capsys, *asked, "race-paper", "--speed", "0.3")
+    assert "--speed 0.3: race-paper takes no speed" in said
     monkeypatch.setattr(fly, "_fly_real_vehicle", lambda policy, *_: flown.append(policy) or {})
-    link = ["--link", "udpin:127.0.0.1:0", "--confirm"]
-    assert cli.main([*asked, "race", "--speed", "0.3", *link]) == 0
-    assert cli.main([*asked, "race", *link]) == 0
+    asked = (*asked, "race", "--link", "udpin:127.0.0.1:0", "--confirm")
+    assert run(*asked, "--speed", "0.3") == run(*asked) == 0
     assert [policy.spec.speed for policy in flown] == [0.3, load_policy("race").spec.speed]
-    capsys.readouterr()
-    assert cli.main([*asked, "race", *link, "--monitor", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    found = answer(capsys, *asked, "--monitor")
     policy = flown[-1]
     assert isinstance(policy, Monitored) and isinstance(policy.policy, BlockPolicy)
     assert policy.policy.block == 1
-    assert (answer["policy"]["name"], answer["interventions"]) == ("race+monitor", 0)
+    assert (found["policy"]["name"], found["interventions"]) == ("race+monitor", 0)

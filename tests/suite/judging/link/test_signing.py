@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from suite import cli
 from suite.judging.link.messages import OperatorText, SetPoint, Wire, signing_key
+from tests.support.commands import refused
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed (the extra mavlink)")
 
@@ -52,5 +52,4 @@ def test_a_key_is_of_a_file_with_a_phrase_and_of_a_real_link(tmp_path, capsys, m
         signing_key(tmp_path / "empty")
     with pytest.raises(ValueError, match="cannot be read"):
         signing_key(Path("nowhere"))
-    assert cli.main(["fly", "--signing-key", "empty"]) == 2
-    assert "--signing-key needs --link" in capsys.readouterr().err
+    assert "--signing-key needs --link" in refused(capsys, "fly --signing-key empty")
