@@ -1,5 +1,6 @@
-"""Pieces on a real cluster of two nodes: results by number, what goes wrong, what dies."""
+"""Pieces of work in processes and on a cluster: results by number, what goes wrong, what dies."""
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -8,14 +9,18 @@ import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 
 import pytest
 
+from suite.common.errors import explain
 from tests.support.cluster import cluster
-from tracks.common.work import WorkerDied, run_pieces, worker_count
+from tracks.common.work import WorkerDied, core_shares, run_pieces, worker_count
 from tracks.common.work.cluster import UnusableCluster
 from tracks.common.work.pickling import software
+
+CORES = sorted(os.sched_getaffinity(0))
 
 
 @pytest.fixture(scope="module")
@@ -24,17 +29,42 @@ def two_nodes(tmp_path_factory):
         yield found
 
 
+@pytest.fixture(scope="module", params=["processes", "cluster"])
+def two(request):
+    """Two workers: processes of this machine, or the nodes of a cluster."""
+    return 2 if request.param == "processes" else request.getfixturevalue("two_nodes").address
+
+
 def tens(table, piece):
-    time.sleep(0.1)  # else one node may do them all before the other has begun
+    time.sleep(0.1)  # else one worker may do them all before the other has begun
     for item in piece:
         yield item, table[0] * item, os.getpid()
+
+
+def load(name):
+    from policies.policy import load_policy
+
+    yield load_policy(name)
 
 
 def gone_wrong(how, piece):
     yield "before"
     if how == "refuse":
         raise ValueError("wrong policy file")
+    if how == "break":
+        raise ZeroDivisionError
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dies_once(folder, piece):
+    """End the process at the second result of piece 1, the first time that it is begun."""
+    time.sleep(0.3)
+    yield piece, 0
+    mark = Path(folder, str(piece))
+    if piece == 1 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    yield piece, 1
 
 
 def lived(folder, piece):
@@ -45,34 +75,104 @@ def lived(folder, piece):
     yield piece * piece
 
 
-def test_results_of_all_pieces_come_with_their_numbers_from_both_nodes(two_nodes):
-    found, pieces = [], [[k, k + 1] for k in range(40)] + [[]]
+def where(piece):
+    yield piece, tuple(sorted(os.sched_getaffinity(0)))
+
+
+def slow(piece):
+    for number in range(1000):
+        yield number
+        time.sleep(0.3)
+
+
+def test_every_result_comes_with_the_number_of_its_piece(two):
+    pieces = [[k, k + 1] for k in range(20)] + [[]]
     work = partial(tens, MappingProxyType({0: 10}))
-    run_pieces(work, iter(pieces), two_nodes.address, lambda *entry: found.append(entry))
-    assert sorted((n, item, ten) for n, (item, ten, _) in found) == [
-        (n, item, 10 * item) for n, piece in enumerate(pieces) for item in piece
-    ]
-    others = {pid for _, (_, _, pid) in found} - {os.getpid()}
-    assert len(others) == 2 == worker_count(two_nodes.address)
+    wanted = [(n, item, 10 * item) for n, piece in enumerate(pieces) for item in piece]
+    for workers in (1, two):
+        found = []
+        run_pieces(work, iter(pieces), workers, lambda *entry: found.append(entry))  # noqa: B023
+        assert sorted((n, item, ten) for n, (item, ten, _) in found) == wanted
+        others = {pid for _, (_, _, pid) in found} - {os.getpid()}
+        assert len(others) == worker_count(workers) - (workers == 1)
+    assert multiprocessing.active_children() == []
 
 
-def test_what_goes_wrong_there_is_said_here_and_a_bug_is_no_message_to_the_user(two_nodes):
-    from suite.common.errors import explain
-
-    with pytest.raises(ValueError, match="^wrong policy file$") as caught:
-        run_pieces(partial(gone_wrong, "refuse"), [1, 2, 3], two_nodes.address, lambda *_: None)
+@pytest.mark.parametrize(
+    ("how", "error", "text"),
+    [("refuse", ValueError, "^wrong policy file$"), ("break", ZeroDivisionError, None)],
+)
+def test_what_goes_wrong_there_is_said_here(two, how, error, text):
+    with pytest.raises(error, match=text) as caught:
+        run_pieces(partial(gone_wrong, how), [1, 2, 3], two, lambda *_: None)
     assert "in gone_wrong" in str(caught.value.__cause__)
     assert explain(caught.value) is None, "a test's own error is not the suite's"
+    assert multiprocessing.active_children() == []
+
+
+def test_a_refusal_there_is_a_message_to_the_user(two):
     with pytest.raises(ValueError) as caught:
-        run_pieces(load, ["no-such-policy"], two_nodes.address, lambda *_: None)
+        run_pieces(load, ["no-such-policy"], two, lambda *_: None)
     code, message = explain(caught.value) or (0, "")
     assert code == 2 and "no-such-policy" in message
 
 
-def load(name):
-    from policies.policy import load_policy
+def test_an_interrupt_ends_it_at_once_and_keeps_what_came(two):
+    found, started = [], time.monotonic()
 
-    yield load_policy(name)
+    def keep(number, result):
+        found.append(result)
+        raise KeyboardInterrupt
+
+    work = slow if two == 2 else partial(tens, {0: 1})
+    with pytest.raises(KeyboardInterrupt):
+        run_pieces(work, [[k] for k in range(200)], two, keep)
+    assert len(found) == 1 and multiprocessing.active_children() == []
+    assert time.monotonic() - started < 100, "in processes the pieces take 30,000 s"
+
+
+def test_a_piece_whose_process_died_is_done_again_and_once_only(tmp_path):
+    found = []
+    pieces = range(4)
+    run_pieces(partial(dies_once, str(tmp_path)), pieces, 2, lambda *entry: found.append(entry))
+    assert set(found) == {(n, (n, k)) for n in pieces for k in (0, 1)}
+    assert found.count((1, (1, 0))) == 2 and len(found) == 9
+    with pytest.raises(WorkerDied, match="exit code -9.*fewer processes"):
+        run_pieces(partial(gone_wrong, "kill"), [1, 2, 3], 2, lambda *_: None)
+    assert multiprocessing.active_children() == []
+
+
+def test_no_core_is_in_two_shares(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 6, 7, 9})
+    assert core_shares(2) == [[3, 5], [6, 7]]
+    assert core_shares(1) == [[3, 5, 6, 7, 9]]
+
+
+@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
+def test_pinned_processes_share_no_core():
+    found = {}
+    run_pieces(where, range(6), 2, lambda _, result: found.update([result]), pinned=True)
+    assert set(found.values()) <= set(map(tuple, core_shares(2)))
+
+
+def test_processes_end_with_the_one_they_work_for(tmp_path, root):
+    code = (
+        "import os, signal\n"
+        "from tests.tracks.common.work.test_pieces import slow\n"
+        "from tracks.common.work import run_pieces\n"
+        "def keep(number, result):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "if __name__ == '__main__':\n"
+        "    run_pieces(slow, [1, 2], 2, keep)\n"
+    )
+    program = tmp_path / "program.py"
+    program.write_text(code)
+    # The pipe closes when the last process that holds it has ended: before the 300 s of a piece.
+    done = subprocess.run(
+        [sys.executable, program], capture_output=True, timeout=60,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert done.returncode == -signal.SIGKILL
 
 
 def test_a_machine_that_would_come_to_other_numbers_is_refused(two_nodes, monkeypatch):
@@ -143,18 +243,6 @@ def test_messages_are_encrypted_where_the_address_says_so(tmp_path, monkeypatch)
         with dask.config.set({"distributed.comm.tls.ca-file": None}):
             with pytest.raises(UnusableCluster):
                 worker_count(found.address)
-
-
-def test_an_interrupt_ends_it_and_keeps_what_came(two_nodes):
-    found = []
-
-    def keep(number, result):
-        found.append(result)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_pieces(partial(tens, {0: 1}), [[k] for k in range(200)], two_nodes.address, keep)
-    assert len(found) == 1
 
 
 def test_a_node_that_dies_costs_its_pieces_once_and_a_piece_that_kills_ends_the_work(
