@@ -4,13 +4,13 @@ Every writer follows the public description of its format and shares no code wit
 Another flight than this one is written by giving its function of time in place of `fly`.
 """
 
-import csv
 import struct
 from zlib import crc32
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tests.support.imported import write
 from tests.support.known_flight import fly, ned, ned_quat
 from tests.support.ros_messages import ACTUATORS, DEFINITIONS, IMU, ODOMETRY, TARGET
 
@@ -187,14 +187,8 @@ def write_mocap(
     if turn is not None:
         rot = rot * turn
     rot = rot * Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
-    quat = rot.as_quat(scalar_first=True)
-    with path.open("w", newline="") as file:
-        table = csv.writer(file)
-        names = ["pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"]
-        table.writerow(["time", *names])
-        stamps = (time - offset) / (1 + drift)
-        table.writerows(np.column_stack([stamps, truth.pos, quat]).tolist())
-    return path
+    parts = {"time": (time - offset) / (1 + drift), "pos": truth.pos}
+    return write(path, parts | {"quat": rot.as_quat(scalar_first=True)})
 
 
 def write_usd(

@@ -109,17 +109,6 @@ def test_a_limit_that_this_process_is_under_stays_the_models(tmp_path):
     assert done.stdout.split() == ["state"], done.stderr
 
 
-def test_a_model_that_fails_while_it_runs_is_one_line(tmp_path):
-    nodes = [
-        helper.make_node("Reshape", ["state", "shape"], ["x"]),
-        helper.make_node("MatMul", ["x", "w"], ["action"]),
-    ]
-    path = save_onnx(tmp_path, onnx_model(nodes, [WEIGHT, tensor("shape", [7, 12])]))
-    with pytest.raises(PolicyError, match="it.onnx: fails while it runs") as refused:
-        load_policy(path)
-    assert len(str(refused.value).splitlines()) == 1
-
-
 def test_after_a_death_or_no_answer_the_next_question_goes_to_a_fresh_process(monkeypatch):
     model = plain()
     np.testing.assert_array_equal(model.run(FEED)[0], np.ones((2, 3)))

@@ -76,18 +76,20 @@ def test_a_damaged_archive_is_refused(exported, tmp_path, change, said, in_proce
         load_policy(path, trust=True)
 
 
-class Reactive(torch.nn.Module):
-    """A policy without memory."""
-
-    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        """Return the action."""
-        return state[:, 6:9] - state[:, 0:3] + 0.0 * image.mean((1, 2))[:, None]
+def module(forward):
+    """Return a module with this method."""
+    return type("Module", (torch.nn.Module,), {"forward": forward})()
 
 
-def program(folder, module, *inputs, free=True):
+def reactive(self, state, image):
+    """Answer without a memory."""
+    return state[:, 6:9] - state[:, 0:3] + 0.0 * image.mean((1, 2))[:, None]
+
+
+def program(folder, model, *inputs, free=True):
     """Save a module as a torch exported program."""
     dynamic = tuple({0: torch.export.Dim("batch")} for _ in inputs) if free else None
-    made = torch.export.export(module, inputs, dynamic_shapes=dynamic)
+    made = torch.export.export(model, inputs, dynamic_shapes=dynamic)
     torch.export.save(made, folder / "it.pt2")
     return folder / "it.pt2"
 
@@ -98,7 +100,7 @@ def zeros(rows, *more):
 
 @pytest.mark.parametrize(("rows", "free"), [(2, True), (5, False), (1, False)])
 def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free, in_process):
-    policy = load_policy(program(tmp_path, Reactive(), *zeros(rows), free=free), trust=True)
+    policy = load_policy(program(tmp_path, module(reactive), *zeros(rows), free=free), trust=True)
     assert isinstance(policy, BlockPolicy)
     assert policy.block == (64 if free else rows)
     state = np.random.default_rng(0).normal(size=(7, 12)).astype(np.float32)
@@ -106,33 +108,22 @@ def test_a_policy_without_memory_and_of_any_batch_flies(tmp_path, rows, free, in
     assert policy.hidden_shape == (0,)
 
 
-class Renamed(torch.nn.Module):
-    def forward(self, obs, image):
-        return obs[:, :3]
-
-
-class TooMany(torch.nn.Module):
-    def forward(self, state, image):
-        return state[:, :3], state
-
-
-class TooFew(torch.nn.Module):
-    def forward(self, state, image, hidden):
-        return state[:, :3] + hidden[:, :3]
-
-
 @pytest.mark.parametrize(
-    ("module", "inputs", "said"),
+    ("forward", "inputs", "said"),
     [
-        (Renamed(), zeros(2), "inputs are obs, image; expected state, image"),
-        (TooMany(), zeros(2), "gives 2 outputs"),
-        (TooFew(), zeros(2, torch.zeros(2, 4)), "gives 1 outputs"),
-        (Reactive(), (torch.zeros(2, 13), torch.zeros(2, 24, 32)), r"'state'.*\(batch, 12\)"),
+        (lambda self, obs, image: obs[:, :3], zeros(2), "inputs are obs, image; expected state"),
+        (lambda self, state, image: (state[:, :3], state), zeros(2), "gives 2 outputs"),
+        (
+            lambda self, state, image, hidden: state[:, :3] + hidden[:, :3],
+            zeros(2, torch.zeros(2, 4)),
+            "gives 1 outputs",
+        ),
+        (reactive, (torch.zeros(2, 13), torch.zeros(2, 24, 32)), r"'state'.*\(batch, 12\)"),
     ],
 )
-def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, module, inputs, said, in_process):
+def test_a_program_that_does_not_fit_is_told_what_does(tmp_path, forward, inputs, said, in_process):
     with pytest.raises(PolicyError, match=said):
-        load_policy(program(tmp_path, module, *inputs), trust=True)
+        load_policy(program(tmp_path, module(forward), *inputs), trust=True)
 
 
 class Failing(torch.nn.Module):

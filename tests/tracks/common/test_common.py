@@ -18,9 +18,8 @@ from rich.console import Console
 from tracks.common import names as registry
 from tracks.common import provenance
 from tracks.common.grid import Cell, html_table, markdown, rich_table, table
-from tracks.common.masks import everywhere, make_contiguous, nowhere, select
+from tracks.common.masks import everywhere, nowhere, select
 from tracks.common.names import Registry, closest, unknown_name
-from tracks.common.provenance import VERSION, git_commit, stamp
 from tracks.common.toml_table import read_toml, to_toml
 
 KEYS = st.text("abcdefgh_", min_size=1, max_size=6)
@@ -51,12 +50,6 @@ def test_a_wrong_name_is_answered_with_the_nearest_and_the_list():
     part, none = (str(unknown_name("effect", name, EFFECTS)) for name in ("drag", "xy"))
     assert "Did you mean 'linear_drag', 'quadratic_drag', 'rotor_drag'?" in part
     assert "Did you mean" not in none and "Known: linear_drag" in none
-
-
-def test_every_header_says_schema_version_commit_and_seed():
-    header = stamp(3, 11)
-    assert (header["schema"], header["seed"]) == (3, 11)
-    assert (header["suite_version"], header["git_commit"]) == (VERSION, git_commit())
 
 
 @given(TABLES)
@@ -108,13 +101,6 @@ def test_rows_are_chosen_by_a_mask_through_tuples_and_dicts(xp, mask):
     # Nothing is known of a mask of JAX: its program is the same whatever the mask holds.
     known = [everywhere(xp.asarray(mask)), nowhere(xp.asarray(mask))]
     assert known == ([all(mask), not any(mask)] if xp is np else [False, False])
-
-
-def test_packed_lays_rows_one_after_another():
-    across = np.arange(6.0).reshape(2, 3).T
-    (again,) = make_contiguous((across,))
-    np.testing.assert_array_equal(again, across)
-    assert again.flags.c_contiguous and not across.flags.c_contiguous
 
 
 def git(root, *what):

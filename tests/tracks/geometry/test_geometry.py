@@ -102,15 +102,6 @@ def test_the_frame_surrounds_the_opening_and_nothing_else(opening):
     assert not inside_boxes(boxes, off).any()
 
 
-def test_repeated_corners_park_their_bars():
-    padded = one_gate(np.concatenate([IRREGULAR, IRREGULAR[-1:], IRREGULAR[-1:]]))
-    plain, boxes = frame_boxes(one_gate(IRREGULAR)), frame_boxes(padded)
-    kept = boxes.center_w[:, 2] > PARKED_Z / 2
-    assert kept.sum() == 4
-    for field, expected in zip(boxes, plain, strict=True):
-        assert np.allclose(field[kept], expected)
-
-
 def test_openings_are_counter_clockwise_and_round_ones_keep_their_clear_radius():
     for opening in (rectangle(1.0, 0.5), regular_polygon(12, 0.6)):
         after = np.roll(opening, -1, axis=0)

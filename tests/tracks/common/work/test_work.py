@@ -1,6 +1,5 @@
 """Who works and with how many threads; what travels to another machine, and what it must share."""
 
-import copy
 import errno
 import os
 import subprocess
@@ -14,15 +13,7 @@ from eval.logs.columns import FlightLogError
 from suite.cli import main
 from suite.common.errors import explain
 from tracks.common.work import MOST, processes, read_workers, threads
-from tracks.common.work.pickling import (
-    PACKAGES,
-    differences,
-    failure,
-    pack,
-    remote_error,
-    software,
-    unpack,
-)
+from tracks.common.work.pickling import failure, pack, remote_error, unpack
 from tracks.common.work.threads import one_thread_a_product, set_threads, share_threads
 
 
@@ -48,12 +39,6 @@ def test_workers_are_a_number_or_an_address(text, workers):
 def test_others_are_refused_with_what_is_allowed(text):
     with pytest.raises(ValueError, match=r"^--workers is '.{0,80}'; allowed is 1 to 256.*tcp://"):
         read_workers(text)
-
-
-def test_the_software_is_told_apart_by_name():
-    ours = software()
-    assert set(PACKAGES) < set(ours) and differences(copy.copy(ours), ours) == ""
-    assert differences({**ours, "jax": "0.1"}, ours) == f"jax 0.1 there, {ours['jax']} here"
 
 
 class Stubborn(ValueError):
