@@ -34,21 +34,6 @@ class Pursuit:
 
 
 @dataclass
-class Steady:
-    """Always gives the same action."""
-
-    action_b: tuple[float, ...] = (0.0, 0.0, 0.0)
-    spec: PolicySpec = field(default_factory=PolicySpec)
-    name: str = "steady"
-
-    def start(self, n):
-        return np.zeros((n, 1), np.float32)
-
-    def act(self, hidden, state, image, fresh):
-        return np.tile(np.array(self.action_b, np.float32), (len(state), 1)), hidden
-
-
-@dataclass
 class Scripted:
     """Wants one acceleration in body axes after the other, then goes on with the last."""
 
@@ -63,6 +48,13 @@ class Scripted:
         done = np.where(fresh[:, None], np.float32(0), hidden)
         which = np.minimum(done[:, 0].astype(int), len(self.actions_b) - 1)
         return self.actions_b[which].astype(np.float32), done + np.float32(1)
+
+
+class Steady(Scripted):
+    """Always gives the same action."""
+
+    def __init__(self, action_b=(0.0, 0.0, 0.0), spec=None, name="steady"):
+        super().__init__(np.array([action_b]), spec or PolicySpec(), name)
 
 
 class RandomNetwork:

@@ -25,7 +25,7 @@ from suite.diagnose.report.page import page
 from suite.diagnose.thresholds import Thresholds
 from tests.support.broken_logs import BREAKAGES
 from tests.support.diagnosis_flights import fly, fly_all
-from tests.support.pendulum import Pendulum
+from tests.support.real_flights import Pendulum
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects, with_lag
 from tracks.common.files import plain, to_json
 
