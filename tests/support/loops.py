@@ -11,21 +11,14 @@ from eval.worlds.trial import Rules, TrialResult
 
 
 class Small:
-    """Makes a loop cheap, counts what it does, and stops it where it is told to."""
+    """Makes a loop cheap, counts what it does, and stops it after a number of flights."""
 
     def __init__(self, monkeypatch):
         self.flown, self.trained = [], []
-        self.stop_after: tuple[str, int] | None = None
+        self.stop_after: int | None = None
         self._fly = eval.judging.judge.fly
         monkeypatch.setattr(eval.judging.judge, "fly", self.fly)
         monkeypatch.setattr(suite.train.run, "make_update", self.make_update)
-
-    def count(self, kind):
-        """Raise as Ctrl-C does at the given (kind, number), once."""
-        done = len(self.flown) if kind == "fly" else len(self.trained)
-        if self.stop_after == (kind, done):
-            self.stop_after = None
-            raise KeyboardInterrupt
 
     def fly(self, policy, trials, vehicle, world, options, on_result, *rest, **more):
         # Flights that are recorded are measured and fitted, which takes longer ones.
@@ -35,7 +28,8 @@ class Small:
         def keep(result, flight):
             on_result(result, flight)
             self.flown.append(result.trial)
-            self.count("fly")
+            if len(self.flown) == self.stop_after:
+                raise KeyboardInterrupt
 
         return self._fly(policy, trials, vehicle, world, options, keep, *rest, **more)
 
@@ -49,7 +43,6 @@ class Small:
                 push += 1e-2 + float(np.ravel(delta[min(delta)])[0])
             params = jax.tree.map(lambda leaf: leaf + 1e-2 * push, state.params)
             self.trained.append((config, delta is not None, np.asarray(worlds.pos_w)))
-            self.count("train")
             return state._replace(params=params, iteration=state.iteration + 1), numbers
 
         return update

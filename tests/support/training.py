@@ -6,8 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from policies.formats.checkpoint import load_arrays
+from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from policies.spec import PolicySpec
+from suite.common import curve
 from suite.train.config import (
     EpisodeConfig,
     LossConfig,
@@ -47,6 +50,21 @@ def loss_of(config, encode=blind):
         return make_rollout(weighted)(params, embedding_shift, worlds, KEY, encode, delta)[0]
 
     return loss
+
+
+def assert_gradient(value_and_gradient, params, names, step, rel):
+    """Compare gradients by `params` with central differences along random directions."""
+    gradient, rng = value_and_gradient(params)[1], np.random.default_rng(0)
+    for name in names:
+        direction = rng.normal(size=params[name].shape)
+        ahead, behind = (
+            value_and_gradient({**params, name: params[name] + h * direction})[0]
+            for h in (step, -step)
+        )
+        slope = float(ahead - behind) / (2 * step)
+        assert abs(slope) > 1e-4, name
+        found = float((gradient[name] * direction).sum())
+        assert abs(found - slope) <= rel * abs(slope), f"{name}: {found} is not {slope}"
 
 
 def small_config(batch=4, steps=6, physics=None, loss=None, optimizer=None, **episode):
@@ -136,3 +154,19 @@ def largest_difference(tree, expected):
         float(np.abs(np.asarray(a) - np.asarray(b)).max() / (np.abs(np.asarray(b)).max() + 1e-12))
         for a, b in pairs
     )
+
+
+def assert_same_run(folder, other):
+    """Compare state, curve and policy of two runs to the bit, but for the machine's speed."""
+    for load in (
+        lambda one: load_arrays(one / "state", kind="training").arrays,
+        lambda one: load_policy_checkpoint(one / "policy").params,
+    ):
+        ours, theirs = load(folder), load(other)
+        assert ours.keys() == theirs.keys()
+        for name, value in theirs.items():
+            np.testing.assert_array_equal(ours[name], value, err_msg=name)
+    rows = curve.read(folder), curve.read(other)
+    for row in (*rows[0], *rows[1]):
+        assert all(row.pop(key) >= 0 for key in ("steps_per_s", "seconds", "cold"))
+    assert rows[0] == rows[1]

@@ -51,23 +51,21 @@ def logs():
         found.append(log_from_flight(flight, f"{result.track}.parquet"))
 
     spec = PolicySpec(rate_hz=15.0, camera=Camera(width=8, height=8))
-    fly(
-        Pursuit(speed=3.0, gain=1.5, spec=spec),
-        [TrialSpec(name, 0, 0) for name in tracks],
-        TRUE,
-        options=JudgeOptions(slots=4, workers=1, rules=Rules(time_limit_s=3.0)),
-        on_result=keep,
-        record=Record(),
-        tracks=tracks,
-    )
+    pilot, trials = Pursuit(speed=3.0, gain=1.5, spec=spec), [TrialSpec(k, 0, 0) for k in tracks]
+    options = JudgeOptions(slots=4, workers=1, rules=Rules(time_limit_s=3.0))
+    fly(pilot, trials, TRUE, options=options, on_result=keep, record=Record(), tracks=tracks)
     return found
 
 
-def errors_of(logs, vehicle, delta=None, horizon_s=1.0):
-    config = QuadrotorConfig(vehicle)
-    windows, cut = cut_quadrotor_windows(logs, config, horizon_s, 0.3)
-    replay = partial(replay_quadrotor, config, cut)
-    pos, vel = jax.jit(partial(window_errors, replay))(windows, delta)
+def replayed(logs, config, horizon_s, stride_s):
+    """Return windows of the logs, and a function (windows, network) that flies them again."""
+    windows, cut = cut_quadrotor_windows(logs, config, horizon_s, stride_s)
+    return windows, jax.jit(partial(replay_quadrotor, config, cut))
+
+
+def errors_of(logs, vehicle):
+    windows, replay = replayed(logs, QuadrotorConfig(vehicle), 1.0, 0.3)
+    pos, vel = window_errors(replay, windows, None)
     return np.asarray(pos), np.asarray(vel), windows
 
 
@@ -98,9 +96,7 @@ def test_windows_start_at_decisions_with_what_was_under_way(logs):
 
 def test_a_constant_delta_acts_as_the_action(logs):
     push = np.array([1.0, -0.5, 0.2], np.float32)
-    config = QuadrotorConfig(TRUE)
-    windows, cut = cut_quadrotor_windows(logs, config, 0.5, 0.3)
-    replay = jax.jit(partial(replay_quadrotor, config, cut))
+    windows, replay = replayed(logs, QuadrotorConfig(TRUE), 0.5, 0.3)
     delta = delta_network.init(jax.random.key(0))
     # Two programs, which round alike to the last digit or two.
     np.testing.assert_allclose(replay(windows, None)[0], replay(windows, delta)[0], rtol=1e-6)
@@ -145,9 +141,8 @@ def test_a_fit_cuts_the_error_and_says_what_it_corrects(logs, tmp_path):
 
 def test_a_firmwares_rate_loop_replays_too(logs):
     """Its memory is of the loop, which looks for the first time where a window starts."""
-    config = QuadrotorConfig(load_vehicle("crazyflie21"))
-    windows, cut = cut_quadrotor_windows(logs[:1], config, 0.5, 0.3)
-    pos_w, vel_w, _ = jax.jit(partial(replay_quadrotor, config, cut))(windows, None)
+    windows, replay = replayed(logs[:1], QuadrotorConfig(load_vehicle("crazyflie21")), 0.5, 0.3)
+    pos_w, vel_w, _ = replay(windows, None)
     assert np.all(np.isfinite(pos_w)) and np.all(np.isfinite(vel_w))
 
 
@@ -165,12 +160,9 @@ def test_windows_of_two_parts_have_one_grid(logs):
 
 
 def test_a_load_on_a_line_hangs_still_where_a_window_starts_and_then_swings(logs):
-    loaded = with_effects(
-        TRUE, **{k: tuple(v) for k, v in TRUE.effects.items()}, slung_load=(0.1, 0.5)
-    )
-    config = QuadrotorConfig(loaded)
-    windows, cut = cut_quadrotor_windows(logs[:1], config, 0.5, 0.5)
-    pos_w, _, _ = jax.jit(partial(replay_quadrotor, config, cut))(windows, None)
-    sunk = np.asarray(pos_w)[:, -1, 2] - windows.pos_w[:, -1, 2]
+    own = {name: tuple(values) for name, values in TRUE.effects.items()}
+    loaded = QuadrotorConfig(with_effects(TRUE, **own, slung_load=(0.1, 0.5)))
+    windows, replay = replayed(logs[:1], loaded, 0.5, 0.5)
+    sunk = np.asarray(replay(windows, None)[0])[:, -1, 2] - windows.pos_w[:, -1, 2]
     # 0.1 kg under 0.75 kg that nobody lifts more for: g m / (M + m) t^2 / 2.
     np.testing.assert_allclose(sunk, -0.5 * 9.81 * 0.1 / 0.85 * 0.5**2, rtol=0.3)

@@ -1,5 +1,6 @@
 """From flight logs to a checkpoint with its report, and the dynamics that it may correct."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,95 +43,85 @@ def test_logs_become_a_checkpoint_with_its_report(tmp_path):
     assert len(flight_files(twice)) == 3, "a flight that is named twice counts once"
 
 
-@pytest.mark.parametrize("dynamics", [PHYSICS, QuadrotorConfig(load_vehicle("reference"))])
-@pytest.mark.parametrize("missing", ["action_y", "policy_step", "decisions", "cmd_thrust"])
+QUAD = QuadrotorConfig(load_vehicle("reference"))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "missing"),
+    [(PHYSICS, "action_y"), (PHYSICS, "decisions"), (QUAD, "policy_step"), (QUAD, "cmd_thrust")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
 def test_flights_without_what_a_fit_needs_are_refused(tmp_path, dynamics, missing):
-    if missing == "cmd_thrust" and dynamics is PHYSICS:
-        pytest.skip("the point mass needs no commands")
     for i, log in enumerate(fly(nominal_model(PHYSICS), 2, seconds=1.5)):
         extra = {name: column for name, column in log.extra.items() if name != missing}
         if missing == "decisions":
             extra["policy_step"] = np.zeros(len(log.time_s))
-        speeds = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
-        commands = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
-        given = speeds if missing == "cmd_thrust" else commands
+        given = {"thrust_cmd": np.full_like(log.time_s, 9.81), "rate_cmd_b": log.rate_b}
+        if missing == "cmd_thrust":
+            given = {"rotor_speed": np.full((len(log.time_s), 4), 900.0)}
         write_flight(tmp_path / f"{i}.parquet", replace(log, extra=extra, **given))
     with pytest.raises(ValueError, match=r"record (longer )?flights with suite collect"):
         fit_delta(FitConfig(), dynamics, [tmp_path], tmp_path / "out", Console())
 
 
+@pytest.fixture(scope="module")
+def logs():
+    return fly(nominal_model(PHYSICS), 7, seconds=1.5)
+
+
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.99])
-def test_a_split_has_no_overlap_and_leaves_nobody_out(share):
-    logs = fly(nominal_model(PointMassConfig()), 7, seconds=1.5)
+def test_a_split_has_no_overlap_and_leaves_nobody_out(logs, share):
+    splits = []
     for seed in range(5):
-        known, held = split(logs, share, seed)
-        names = [log.name for log in (*known, *held)]
-        assert sorted(names) == sorted(log.name for log in logs) and len(set(names)) == 7
+        known, held = ([log.name for log in part] for part in split(logs, share, seed))
+        assert sorted(known + held) == sorted(log.name for log in logs)
         assert known and len(held) == min(6, max(1, round(share * 7)))
-    assert [log.name for log in split(logs, 0.5, 0)[1]] != [
-        log.name for log in split(logs, 0.5, 1)[1]
-    ]
+        splits.append(tuple(held))
+    assert len(set(splits)) > 1, "another seed holds out others"
 
 
-def test_a_flight_shorter_than_a_window_is_not_what_is_held_out():
-    logs = fly(nominal_model(PointMassConfig()), 3, seconds=1.5)
-    crash = fly(nominal_model(PointMassConfig()), 1, seconds=0.8)[0]
-    crash = replace(crash, name="crash")
+def test_what_cannot_be_split_is_refused(logs):
+    with pytest.raises(ValueError, match="1 flight given, at least 2"):
+        split(logs[:1], 0.25, 0)
+    for share in (0.0, 1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"held_out is {share}"):
+            split(logs, share, 0)
+
+
+def test_a_flight_shorter_than_a_window_is_not_what_is_held_out(logs):
+    crash = replace(fly(nominal_model(PHYSICS), 1, seconds=0.8)[0], name="crash")
     kept, words = long_enough([*logs, crash], 1.0)
     assert [log.name for log in kept] == [log.name for log in logs]
     assert words == ["crash: left out, it lasts 0.77 s and a window 1 s"]
     assert long_enough([logs[0], crash], 1.0) == ([logs[0], crash], [])
 
 
-def test_what_cannot_be_split_is_refused():
-    log = fly(nominal_model(PointMassConfig()), 1, seconds=1.5)
-    with pytest.raises(ValueError, match="1 flight given, at least 2"):
-        split(log, 0.25, 0)
-    for share in (0.0, 1.0, float("nan")):
-        with pytest.raises(ValueError, match=f"held_out is {share}"):
-            split(log * 2, share, 0)
+def corrects(fitted, flown, rate_hz=15.0):
+    """Check a run's dynamics against those that a checkpoint of 15 Hz has, as JSON has them."""
+    fit = None if fitted is None else {"rate_hz": 15.03, **describe_dynamics(fitted)}
+    kept = json.loads(json.dumps(plain(fit or {})))
+    check_corrects(kept, flown, rate_hz, Path("runs/delta/delta"))
 
 
-WHERE = Path("runs/delta/delta")
-
-
-def kept(dynamics):
-    """Return what stands in the checkpoint, as JSON gives it back."""
-    import json
-
-    return json.loads(json.dumps(plain({"iterations": 3, **describe_dynamics(dynamics)})))
-
-
-def test_the_middle_of_the_ranges_is_what_counts():
+def test_the_middle_of_the_ranges_and_the_rate_count():
     physics = race().physics
-    check_corrects(kept(physics), physics, 15.0, WHERE)
-    check_corrects(kept(physics), replace(physics, drag=(0.0, 0.9), lag_std=0.0), 15.0, WHERE)
-    check_corrects({}, physics, 15.0, WHERE)
+    corrects(None, physics)
+    corrects(physics, replace(physics, drag=(0.0, 0.9), lag_std=0.0))
     words = "drag 0.45 0.45 1.1 1/s.* this run's has .*drag 0.45 0.45 0.45 1/s.*--recipe"
     with pytest.raises(ValueError, match=words):
-        check_corrects(kept(physics), race_paper().physics, 15.0, WHERE)
+        corrects(physics, race_paper().physics)
     with pytest.raises(ValueError, match="delay 1 decisions; take"):
-        check_corrects(kept(physics), replace(physics, action_delay=(0.5, 1.5)), 15.0, WHERE)
+        corrects(physics, replace(physics, action_delay=(0.5, 1.5)))
+    with pytest.raises(ValueError, match="with 15 decisions a second, and this run has 30: .*=15"):
+        corrects(physics, physics, rate_hz=30.0)
 
 
 def test_of_a_vehicle_all_but_its_name_counts():
-    vehicle = load_vehicle("reference")
-    stored = kept(QuadrotorConfig(vehicle))
-    check_corrects(
-        stored, QuadrotorConfig(replace(vehicle, name="mine"), mass_std=0.0), 15.0, WHERE
-    )
-    other = replace(with_lag(vehicle, 0.05), name="other")
+    renamed = replace(QUAD, vehicle=replace(QUAD.vehicle, name="mine"), mass_std=0.0)
+    corrects(QUAD, renamed)
+    other = QuadrotorConfig(replace(with_lag(QUAD.vehicle, 0.05), name="other"))
     with pytest.raises(ValueError, match="another vehicle than 'other'; take its --vehicle"):
-        check_corrects(stored, QuadrotorConfig(other), 15.0, WHERE)
-    with pytest.raises(ValueError, match="corrects --model quad, and this run has --model point"):
-        check_corrects(stored, PointMassConfig(), 15.0, WHERE)
-    with pytest.raises(ValueError, match="corrects --model point, and this run has --model quad"):
-        check_corrects({}, QuadrotorConfig(vehicle), 15.0, WHERE)
-
-
-def test_a_network_that_steps_at_another_rate_is_refused():
-    physics = race().physics
-    fit = {**kept(physics), "rate_hz": 15.03}
-    check_corrects(fit, physics, 15.0, WHERE)
-    with pytest.raises(ValueError, match="with 15 decisions a second, and this run has 30: .*=15"):
-        check_corrects(fit, physics, 30.0, WHERE)
+        corrects(QUAD, other)
+    for fitted, flown, words in ((QUAD, PHYSICS, "quad, .* point"), (None, QUAD, "point, .* quad")):
+        with pytest.raises(ValueError, match=f"corrects --model {words}"):
+            corrects(fitted, flown)

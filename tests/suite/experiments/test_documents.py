@@ -1,23 +1,50 @@
-"""Documents at a small size: conditions, training seeds, the paper's table, several worlds."""
+"""Documents at a small size: flights are a fifth of a second long, a few at a time."""
 
 import json
+from dataclasses import replace
+from itertools import product
 
 import pytest
 
 from eval.worlds import rotorpy as rotorpy_world
+from eval.worlds.trial import Rules
 from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
-from suite.experiments.study import disturbed
+from suite.experiments.study import disturbed, judging
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
 from tests.support.loops import trial_result
 
 
-def test_robustness(sky, tmp_path, capfd):
-    only = ["--only", "wind", "mass_offset", "gate-pose error"]
-    args = [*only, "--trials", "1", "--difficulty", "0", "--policy", "race-paper"]
+class Sky:
+    """Counts the trials that are flown, and stops at a given one."""
+
+    def __init__(self, monkeypatch):
+        self.flown = []
+        self.stop_after = None
+        self._fly = judging.fly_share
+        monkeypatch.setattr(judging, "fly_share", self.fly)
+        monkeypatch.setattr(judging, "usable_cores", lambda: 1)
+
+    def fly(self, task, share):
+        options = replace(task.options, slots=8, rules=Rules(time_limit_s=0.2))
+        for index, result, flight in self._fly(replace(task, options=options), share):
+            self.flown.append((task.policy.name, task.vehicle, options.sensors, result.trial))
+            yield index, result, flight
+            if self.stop_after == len(self.flown):
+                self.stop_after = None
+                raise KeyboardInterrupt
+
+
+@pytest.fixture
+def sky(monkeypatch):
+    return Sky(monkeypatch)
+
+
+def test_robustness(sky, tmp_path):
+    args = "--trials 1 --difficulty 0 --policy race-paper --only wind mass_offset".split()
     sky.stop_after = 5
-    assert reproduce(tmp_path, "robustness", *args) == 130
-    assert reproduce(tmp_path, "robustness", *args) == 0
+    assert reproduce(tmp_path, "robustness", *args, "gate-pose error") == 130
+    assert reproduce(tmp_path, "robustness", *args, "gate-pose error") == 0
     # Undisturbed once for all, two signs of mass, four winds, four gate errors; three tracks.
     assert len(sky.flown) == 3 * (1 + 2 + 4 + 4)
     winds = {flight[1].effects["constant_wind"].velocity for flight in sky.flown
@@ -32,11 +59,10 @@ def test_robustness(sky, tmp_path, capfd):
 
 
 def test_perception(sky, tmp_path):
-    args = ["--only", "vio", "stereo", "--difficulty", "0,3", "--trials", "1", "--growing-trials"]
+    args = "--only vio stereo --difficulty 0,3 --trials 1 --growing-trials 1 --policy race-paper"
     trained = tmp_path / "trained"
     another_racer(trained, 3)
-    args += ["1", "--policy", "race-paper", "--policy", str(trained)]
-    assert reproduce(tmp_path, "perception", *args) == 0
+    assert reproduce(tmp_path, "perception", *args.split(), "--policy", str(trained)) == 0
     # Two policies: perfect and a preset on two levels, and the preset at three more magnitudes on
     # one of them. The first policy: one model at two magnitudes.
     assert len(sky.flown) == 2 * 3 * (2 * 2 + 3) + 3 * 2, "magnitude 1 of a preset is that preset"
@@ -53,31 +79,28 @@ def test_perception(sky, tmp_path):
 
 
 def test_table2_and_all_levels(sky, tmp_path, capfd):
-    sky.stop_after = 11
-    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7") == 130
+    sky.stop_after, sizes = 11, ("--trials", "1", "--seed", "7")
+    assert reproduce(tmp_path, "table2", *sizes) == 130
     assert not (tmp_path / "docs").exists() and len(sky.flown) == 11
-    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7") == 0
+    assert reproduce(tmp_path, "table2", *sizes) == 0
     assert "11 of 30 trials were flown before" in capfd.readouterr().err
     assert len(sky.flown) == len(set(trial for *_, trial in sky.flown)) == 30
     text, numbers = page(tmp_path, "table2")
-    assert {(cell["track"], cell["difficulty"]) for cell in numbers["cells"]} == {
-        (track, level) for track in ("zigzag", "circular", "ellipse") for level in range(10)
-    }
+    cells = {(cell["track"], cell["difficulty"]) for cell in numbers["cells"]}
+    assert cells == set(product(("zigzag", "circular", "ellipse"), range(10)))
     # In a second nobody finishes: every cell misses what is asked of it, and says by how much.
     assert all(goal["success_miss"] > 0 for goal in numbers["goals"]["ours"])
     assert "| 90.0 points | 97 % | 97.0 points |" in text
     assert "| paper, with Delta Action Model | 9 | 7/10 | 6.1 |" in text
     assert "seeds: 7 to 7, 1 trials per cell" in text
     # Other documents find the flights of this one.
-    asked = ("--trials", "1", "--seed", "7", "--difficulty", "0", "--only", "wind")
-    assert reproduce(tmp_path, "robustness", *asked) == 0
+    assert reproduce(tmp_path, "robustness", *sizes, "--difficulty", "0", "--only", "wind") == 0
     assert len(sky.flown) == 30 + 3 * 4, "the undisturbed is there"
-    # A second time nothing is flown and the same is written.
     capfd.readouterr()
-    assert reproduce(tmp_path, "table2", "--trials", "1", "--seed", "7", "--json") == 0
+    assert reproduce(tmp_path, "table2", *sizes, "--json") == 0
     said = json.loads(capfd.readouterr().out)
     assert said["out"].endswith("table2.md") and len(said["cells"]) == 30
-    assert len(sky.flown) == 30 + 3 * 4
+    assert len(sky.flown) == 30 + 3 * 4, "a second time nothing is flown"
 
 
 @pytest.fixture

@@ -1,11 +1,13 @@
-"""The page of an accelerator, at a small size on the CPU."""
+"""The page of an accelerator, at a small size on the CPU, and the operations that it counts."""
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import pytest
 
-from suite import cli
 from suite.experiments import gpu
+from suite.experiments.study.speed import best_time, count_operations, multiplying_rate, peak_memory
 from suite.train.recipes import named_recipe
 from tests.support.documents import page, reproduce
 
@@ -42,17 +44,6 @@ def test_the_page_has_speeds_a_training_and_the_cpus_outcomes(tmp_path, monkeypa
     assert "## A short training" in text
 
 
-def test_a_training_whose_speed_is_not_measured_is_refused(tmp_path, capsys):
-    assert reproduce(tmp_path, "gpu", "--worlds", "4", "8", "--train-worlds", "6") == 2
-    assert "--train-worlds is 6, allowed are those of --worlds: 4 8" in capsys.readouterr().err
-
-
-def test_thousands_of_worlds_without_a_gpu_are_refused_with_what_to_do(tmp_path, capsys):
-    assert reproduce(tmp_path, "gpu") == 2
-    said = capsys.readouterr().err
-    assert "JAX finds no GPU here" in said and "--worlds 64" in said
-
-
 def test_worlds_that_are_repeated_have_numbers_of_their_own(monkeypatch):
     monkeypatch.setattr(gpu, "SAMPLED", 2)
     phase = gpu.last_phase(gpu.Config(), "quadrotor", 5)
@@ -61,6 +52,40 @@ def test_worlds_that_are_repeated_have_numbers_of_their_own(monkeypatch):
     assert (worlds.pos_w[0] == worlds.pos_w[2]).all() and (worlds.pos_w[0] != worlds.pos_w[1]).any()
 
 
-def test_help_says_which_training_it_is(capsys):
-    assert cli.main(["reproduce", "gpu", "--help"]) == 0
-    assert "recipe gpu" in capsys.readouterr().out
+A, B = jnp.ones((3, 4)), jnp.ones((4, 5))
+LOOPED = 6
+
+
+def looped(a):
+    return jax.lax.scan(lambda c, _: (c @ c, None), a, None, length=LOOPED)[0]
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "operations"),
+    [
+        (lambda a, b: a @ b, (A, B), 2 * 3 * 4 * 5),
+        (lambda a: a + 1.0, (A,), 12),
+        (jax.jit(looped), (jnp.ones((4, 4)),), LOOPED * 2 * 4**3),
+        (
+            # 2 images of 1 x 6 x 6, 3 kernels of 1 x 3 x 3, at 4 x 4 places each.
+            lambda x, k: jax.lax.conv(x, k, (1, 1), "VALID"),
+            (jnp.ones((2, 1, 6, 6)), jnp.ones((3, 1, 3, 3))),
+            2 * 2 * 3 * 16 * 9,
+        ),
+        (
+            lambda a: jax.lax.cond(a[0, 0] > 0, lambda a: a @ a, lambda a: a, a),
+            (jnp.ones((4, 4)),),
+            pytest.approx(2 * 4**3, abs=4),
+        ),
+    ],
+)
+def test_operations_are_counted_by_hand(function, given, operations):
+    assert count_operations(function, *given) == operations
+
+
+def test_a_time_is_of_the_fastest_call_and_memory_is_of_this_process(monkeypatch):
+    clock = iter([0.0, 3.0, 10.0, 11.0, 20.0, 25.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(clock))
+    assert best_time(lambda: A, repeats=3) == 1.0
+    monkeypatch.undo()
+    assert peak_memory() > 1e7 and 1e6 < multiplying_rate(64) < 1e15

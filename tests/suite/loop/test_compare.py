@@ -10,9 +10,8 @@ from suite.loop.tables import cell_grid, comparison_grids, overall_grid, verdict
 from tests.support.loops import trial_result
 
 
-def _result(seed, success, v_mean, gates=8, level=0):
-    flown = trial_result(seed, success, level)
-    return flown._replace(gates_passed=gates, v_max=v_mean + 1, v_mean=v_mean)
+def _result(seed, success, v_mean, level=0):
+    return trial_result(seed, success, level)._replace(v_max=v_mean + 1, v_mean=v_mean)
 
 
 def test_differences_are_of_the_same_trials():
@@ -20,18 +19,12 @@ def test_differences_are_of_the_same_trials():
     speed = np.linspace(2, 6, n)
     won = {"before": 10, "without": 20, "with": 30}
     results = {
-        name: [
-            _result(k, k < count, speed[k] + 0.5 * (name == "with"), 8 if k < count else 3, k % 2)
-            for k in range(n)
-        ]
+        name: [_result(k, k < count, speed[k] + 0.5 * (name == "with"), k % 2) for k in range(n)]
         for name, count in won.items()
     }
     lines = compare(results)
-    assert [(line.track, line.difficulty, line.trials) for line in lines] == [
-        ("zigzag", 0, 20),
-        ("zigzag", 1, 20),
-        ("all", None, 40),
-    ]
+    cells = [(line.track, line.difficulty, line.trials) for line in lines]
+    assert cells == [("zigzag", 0, 20), ("zigzag", 1, 20), ("all", None, 40)]
     overall = lines[-1]
     assert [m.value for m in overall.success] == pytest.approx([0.25, 0.5, 0.75, 0.25, 0.5])
     # 10 pairs, all one way: 2 / 2^10 by hand.

@@ -42,27 +42,20 @@ def test_ends_are_cut_and_noise_is_of_its_size(logs):
 
 
 def test_crashed_flights_lose_their_end_and_short_ones_are_left_out(logs, tmp_path):
-    flights, rows = tmp_path / "flights", []
-    ends = ("collision", "timeout", "finished")
-    for number, (log, ended_by) in enumerate(zip(logs, ends, strict=True)):
-        # The last is too short to be used.
-        kept = log if number < 2 else cut_end(log, log.duration_s - 1.2)
-        write_flight(flights / f"{number}.parquet", kept)
-        rows.append({"file": f"{number}.parquet", "track": "zigzag", "difficulty": 0})
-        rows[-1]["ended_by"] = ended_by
-    rows.append({"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"})
+    flights, out = tmp_path / "flights", tmp_path / "out"
+    rows = [{"file": None, "track": "zigzag", "difficulty": 0, "ended_by": "collision"}]
+    # The last is too short to be used.
+    flown = (*logs[:2], cut_end(logs[2], logs[2].duration_s - 1.2))
+    for log, ended_by in zip(flown, ("collision", "timeout", "finished"), strict=True):
+        file = write_flight(flights / f"{ended_by}.parquet", log)
+        rows.append({**rows[0], "file": file.name, "ended_by": ended_by})
     (flights / "flights.json").write_text(json.dumps({"flights": rows}))
-    files = add_measurement_noise(flights, tmp_path / "out", 0)
-    assert [file.name for file in files] == ["0.parquet", "1.parquet"]
-    before, after = (
-        [read_flights([folder / file.name])[0][0].duration_s for file in files]
-        for folder in (flights, tmp_path / "out")
-    )
-    assert before[0] - after[0] == pytest.approx(CONTACT_MARGIN_S, abs=0.034)
-    assert before[1] == after[1]
-    for row in rows:
-        row["file"] = None
-    (flights / "flights.json").write_text(json.dumps({"flights": rows}))
+    files = add_measurement_noise(flights, out, 0)
+    assert [file.name for file in files] == ["collision.parquet", "timeout.parquet"]
+    kept = [read_flights([file])[0][0].duration_s for file in files]
+    assert logs[0].duration_s - kept[0] == pytest.approx(CONTACT_MARGIN_S, abs=0.034)
+    assert logs[1].duration_s == kept[1]
+    (flights / "flights.json").write_text(json.dumps({"flights": rows[:1]}))
     with pytest.raises(ValueError, match="no flight in .* is 1.5 s long"):
         add_measurement_noise(flights, tmp_path / "none", 0)
 

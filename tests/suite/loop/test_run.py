@@ -1,28 +1,45 @@
-"""suite loop: from training to the report, interrupted anywhere, refused where it does not fit.
+"""suite loop: from training or a hidden effect to the report, interrupted anywhere.
 
-The gradient step is a stand-in, since compiling the real one three times takes minutes and is
-tested with the trainer; trials are cut short. All else is what a person runs.
+The gradient step is a stand-in, since compiling the real one three times takes minutes; trials are
+cut short. With a hidden effect the diagnosis and the fits are stand-ins as well. All of them have
+tests of their own; all else is what a person runs.
 """
 
 import json
+import shutil
+from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
+from eval.effects.body import ComOffset, TorqueTrim
 from eval.judging.results import read_trials
 from eval.logs.flight_log import read_flights
+from eval.quadrotor.vehicle_file import load_vehicle, save_vehicle
+from eval.vehicles.vehicle import with_effects
 from policies.formats.checkpoint import WEIGHTS
+from policies.formats.policy_file import load_policy_checkpoint, save_delta
+from policies.networks import delta_network
 from suite import cli
-from suite.loop.compare import VARIANTS
+from suite.common.console import Quiet
+from suite.delta.run import flight_files
+from suite.loop import hidden_effect, work
+from suite.loop.compare import policy_results
+from suite.loop.config import HiddenLoopConfig, resolve
+from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effects
+from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.tables import CAVEAT
-from tests.support.loops import Small
+from tests.support.engines import STAND_IN
+from tests.support.loops import Small, trial_result
 
-TUNED = ["--recipe", "quick", "--track", "zigzag", "--difficulty", "0", "--trials", "3"]
-TUNED += ["--flights", "3", "--finetune-iterations", "2", "--fit-iterations", "3"]
-TUNED += ["--seed", "4", "--set", "episode.batch=2"]
-ARGS = [*TUNED, "--iterations", "3"]
-STAGES = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
-STAGES += ["eval-without", "eval-with", "replays"]
+EXAMPLE = "examples/hidden.toml"
+SIZES = "loop --recipe quick --track zigzag --difficulty 0 --trials 3 --flights 3"
+SIZES += " --finetune-iterations 2 --seed 4 --set episode.batch=2"
+TUNE = [*SIZES.split(), "--fit-iterations", "3"]
+TRAIN = [*TUNE, "--iterations", "3"]
+HIDDEN = [*SIZES.split(), "--hidden-vehicle", EXAMPLE]
+TUNED = [variant.name for variant in LOOP.variants if variant.tuned]
 
 
 @pytest.fixture(scope="module")
@@ -31,98 +48,66 @@ def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("loop") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         small = Small(patch)
-        assert cli.main(["loop", *ARGS, "--out", str(out)]) == 0
+        assert cli.main([*TRAIN, "--out", str(out)]) == 0
     return out, small
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory, root):
+    """Return the folder of a finished loop with a hidden effect, and what it did."""
+    out = tmp_path_factory.mktemp("hidden") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        stub = Stub(patch)
+        assert cli.main([*HIDDEN, "--out", str(out)]) == 0
+    return out, stub
+
+
+def finished(out, stages, pictures):
+    """Return a loop's numbers, table and page, having checked what holds for all."""
+    for name in ("table.md", "loop.json", "report.html", "recording.rrd", "run.json"):
+        assert (out / name).stat().st_size > 100, name
+    found = json.loads((out / "loop.json").read_text())
+    assert list(found["stage_seconds"]) == stages
+    assert all((out / name / "stage.json").is_file() for name in stages)
+    table, page = (out / "table.md").read_text(), (out / "report.html").read_text()
+    assert found["verdict"] in table
+    assert page.count("data:image/png;base64,") == pictures
+    assert "<script" not in page and "http" not in page
+    assert all((out / line.split('"')[0]).is_file() for line in page.split('href="')[1:])
+    return found, table, page
 
 
 def test_the_loop_leaves_tables_report_and_recording(whole):
     out, _ = whole
-    for name in ("table.md", "loop.json", "report.html", "recording.rrd", "run.json"):
-        assert (out / name).stat().st_size > 100, name
-    for name in STAGES:
-        assert (out / name / "stage.json").is_file(), name
+    stages = ["train", "eval-before", "flights", "delta", "tuned-without", "tuned-with"]
+    found, table, _ = finished(out, [*stages, "eval-without", "eval-with", "replays"], 5)
+    assert set(found) >= {"schema", "suite_version", "git_commit", "seed", "comparison", "delta"}
+    assert [line["track"] for line in found["comparison"]] == ["zigzag", "all"]
+    assert CAVEAT in table and "point mass, lag, drag and delay fitted" in table
     recording = (out / "recording.rrd").read_bytes()
     assert b"before, zigzag level 0 seed 4" in recording
     assert b"tuned with delta, zigzag level 0 seed 4" in recording
-    found = json.loads((out / "loop.json").read_text())
-    assert set(found) >= {"schema", "suite_version", "git_commit", "seed", "comparison", "delta"}
-    assert [line["track"] for line in found["comparison"]] == ["zigzag", "all"]
-    assert list(found["stage_seconds"]) == STAGES
-    table = (out / "table.md").read_text()
-    assert found["verdict"] in table and CAVEAT in table
-    assert "point mass, lag, drag and delay fitted" in table
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5
-    assert "<script" not in page and "http" not in page
-    assert all((out / line.split('"')[0]).is_file() for line in page.split('href="')[1:])
 
 
-def test_recorded_flights_are_never_judged_and_all_policies_fly_the_same_trials(whole):
-    out, _ = whole
-    judged = [read_trials(out / f"eval-{name}" / "trials.parquet") for name in VARIANTS]
-    assert [row.trial for row in judged[0]] == [("zigzag", 0, seed) for seed in (4, 5, 6)]
-    assert all([r.trial for r in rows] == [r.trial for r in judged[0]] for rows in judged)
-    logs, _ = read_flights(sorted((out / "flights").glob("*.parquet")))
-    recorded = {log.about["seed"] for log in logs}
-    assert recorded == {100_004, 100_005, 100_006}
-    assert not recorded & {row.seed for row in judged[0]}
+def test_the_control_sees_the_tracks_of_the_corrected_training_and_new_ones(whole):
+    trained = whole[1].trained
+    assert [with_delta for _, with_delta, _ in trained] == [False] * 5 + [True] * 2
+    for (config, _, pos_w), (config_2, _, pos_2_w) in zip(trained[3:5], trained[5:], strict=True):
+        assert config == config_2 and np.array_equal(pos_w, pos_2_w)
+    assert not np.array_equal(trained[0][2], trained[3][2]), "fine-tuning sees new tracks"
 
 
-def test_the_control_costs_the_same_training_on_the_same_tracks(whole):
-    _, small = whole
-    first, control, corrected = small.trained[:3], small.trained[3:5], small.trained[5:]
-    assert [with_delta for _, with_delta, _ in small.trained] == [False] * 5 + [True] * 2
-    assert len(control) == len(corrected) == 2
-    for one, two in zip(control, corrected, strict=True):
-        assert one[0] == two[0]
-        np.testing.assert_array_equal(one[2], two[2])
-    assert not np.array_equal(first[0][2], control[0][2]), "fine-tuning sees new tracks"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["fly", "train"])
-def test_a_loop_stopped_again_and_again_comes_to_the_same(
-    whole, kind, tmp_path, monkeypatch, capfd
-):
-    out, _ = whole
-    again = tmp_path / "again"
-    small = Small(monkeypatch)
-    # In the middle of each training, or of the recording, a judgement and the replays.
-    stops = [2, 4, 6] if kind == "train" else [4, 8, 13]
-    for number in stops:
-        small.stop_after = (kind, number)
-        assert cli.main(["loop", *ARGS, "--out", str(again)]) == 130
-        assert not (again / "loop.json").exists()
-    assert cli.main(["loop", *ARGS, "--out", str(again)]) == 0
-    assert "done before" in capfd.readouterr().err
-    for name in ("train", "tuned-without", "tuned-with"):
-        one, two = (run / name / "policy" / WEIGHTS for run in (out, again))
-        assert one.read_bytes() == two.read_bytes(), name
-        one, two = (run / name / "metrics.jsonl" for run in (out, again))
-        rows = [[json.loads(line) for line in path.read_text().splitlines()] for path in (one, two)]
-        assert [r["iteration"] for r in rows[0]] == [r["iteration"] for r in rows[1]]
-    for name in VARIANTS:
-        one, two = (run / f"eval-{name}" / "trials.parquet" for run in (out, again))
-        assert read_trials(one) == read_trials(two)
-    assert (out / "table.md").read_text() == (again / "table.md").read_text()
-
-
-def test_a_finished_loop_is_only_told_again(whole, monkeypatch, capfd):
+def test_a_finished_loop_is_only_told_again_and_another_one_refused(whole, monkeypatch, capfd):
     out, _ = whole
     small = Small(monkeypatch)
     before = (out / "table.md").read_text()
-    assert cli.main(["loop", *ARGS, "--out", str(out), "--json"]) == 0
+    assert cli.main([*TRAIN, "--out", str(out), "--json"]) == 0
     said = json.loads(capfd.readouterr().out)
-    assert not small.flown and not small.trained
     assert said["verdict"] in before and (out / "table.md").read_text() == before
-
-
-def test_another_configuration_is_refused(whole, monkeypatch, capfd):
-    out, _ = whole
-    small = Small(monkeypatch)
-    other = list(ARGS)
+    other = list(TRAIN)
     other[other.index("--trials") + 1] = "5"
-    assert cli.main(["loop", *other, "--out", str(out)]) == 2
+    assert cli.main([*other, "--out", str(out)]) == 2
     said = capfd.readouterr().err
     assert "trials is 3 there, 5 here" in said and "another --out" in said
     assert not small.flown and not small.trained
@@ -131,9 +116,9 @@ def test_another_configuration_is_refused(whole, monkeypatch, capfd):
 def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch):
     """In the middle of judging, and of recording: what was flown counts."""
     given, small = whole[0] / "train" / "policy", Small(monkeypatch)
-    args = ["loop", *TUNED, "--policy", str(given), "--out"]
+    args = [*TUNE, "--policy", str(given), "--out"]
     for place, flown in (("one", 1), ("two", 4), ("three", 6)):
-        small.stop_after = ("fly", flown)
+        small.stop_after = flown
         assert cli.main([*args, str(tmp_path / place)]) == 130
         assert len(small.flown) == flown
         (tmp_path / place).rename(tmp_path / {"one": "two", "two": "three"}.get(place, "end"))
@@ -144,3 +129,179 @@ def test_a_loop_goes_on_where_its_folder_was_moved(whole, tmp_path, monkeypatch)
     one, two = (read_trials(run / "eval-before" / "trials.parquet") for run in (whole[0], end))
     flown = [[row._replace(policy="") for row in rows] for rows in (one, two)]
     assert flown[0] == flown[1], "as in the loop that trained it and was never stopped"
+
+
+def answer(effects):
+    return {
+        "verdict": "named" if effects else "unknown",
+        "effects": effects,
+        "gap": {"before": 9.0, "after": 1.1, "noise_floor": 1.0},
+        "unexplained": {"share": 0.0, "where": None},
+    }
+
+
+NAMED = {
+    "name": "com_offset",
+    "alternatives": ["torque_trim"],
+    "parameters": {"offset": {"value": [0.011, 0.0, None], "unit": "m", "ci95": None}},
+}
+
+
+FOUND = ComOffset((0.011, 0.0, 0.0))
+
+
+class Stub(Small):
+    """Also in place of the diagnosis and the fits."""
+
+    def __init__(self, monkeypatch, effects=(NAMED,)):
+        super().__init__(monkeypatch)
+        self.effects, self.diagnosed, self.fitted = list(effects), [], []
+        monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
+        monkeypatch.setattr(work, "fit_delta", self.fit)
+
+    def diagnose(self, paths, vehicle, out, console, *, drive, seed):
+        logs, _ = read_flights(paths)
+        self.diagnosed.append((vehicle, drive, [log.name for log in logs]))
+        base = load_vehicle(vehicle)
+        corrected = {**base.effects, "com_offset": FOUND}
+        out.mkdir(parents=True, exist_ok=True)
+        save_vehicle(replace(base, effects=corrected), out / "vehicle.toml", "found")
+        (out / "report.html").write_text("<p>diagnosis</p>")
+        (out / "diagnosis.json").write_text(json.dumps(answer(self.effects)))
+
+    def fit(self, config, quad, paths, out, console):
+        self.fitted.append((quad.vehicle, sorted(path.name for path in flight_files(paths))))
+        params = delta_network.init(jax.random.key(0))
+        shift = 0.01 if "com_offset" in quad.vehicle.effects else 0.02
+        params = {k: np.asarray(v) + shift for k, v in params.items()}
+        save_delta(out / "delta", params, seed=0, fit={"model": "quad"})
+        errors = {"position_m": 0.1, "velocity_m_s": 0.2}
+        stored = {"without": errors, "delta_action": errors}
+        (out / "delta.json").write_text(json.dumps(stored))
+        (out / "table.md").write_text("| fitted |\n")
+
+
+def test_a_loop_with_a_hidden_effect_leaves_tables_report_and_recording(hidden):
+    stages = ["given", "eval-nominal", "eval-before", "flights", "measured", "diagnosis"]
+    stages += ["delta-control", "delta-named", *(f"tuned-{name}" for name in TUNED)]
+    stages += [*(f"eval-{name}" for name in TUNED), "replays"]
+    found, table, page = finished(hidden[0], stages, 4)
+    assert [one["name"] for one in found["standings"]] == list(LABELS)
+    assert found["diagnosis"]["effects"][0]["name"] == "com_offset"
+    assert "com_offset (or torque_trim)" in found["verdict"]
+    assert all(f"| {label} |" in table for label in LABELS.values())
+    assert "com_offset (offset [0.012, 0.0, 0.0] m)." in page
+    rows = page.replace("\n", "")
+    assert "<td>offset x [m]</td><td>0.011</td><td></td>" in rows
+    assert "<td>offset z [m]</td><td>not identifiable</td>" in rows
+
+
+def test_only_the_judge_flies_the_hidden_vehicle(hidden):
+    out, stub = hidden
+    rows = {name: read_trials(out / f"eval-{name}" / "trials.parquet") for name in LABELS}
+    for name, trials in rows.items():
+        assert {row.vehicle for row in trials} == {"reference" if name == "nominal" else "hidden"}
+        assert [row.trial for row in trials] == [("zigzag", 0, seed) for seed in (4, 5, 6)]
+    assert [vehicle for vehicle, _, _ in stub.diagnosed] == ["reference"]
+    offsets = [config.quadrotor.vehicle.effects.get("com_offset") for config, _, _ in stub.trained]
+    assert offsets == [None] * 4 + [FOUND] * 4
+    assert [with_delta for _, with_delta, _ in stub.trained] == [False, False, True, True] * 2
+    corrected = [vehicle.effects.get("com_offset") for vehicle, _ in stub.fitted]
+    assert corrected == [None, FOUND]
+
+
+def test_all_are_tuned_alike_on_the_same_tracks(hidden):
+    out, stub = hidden
+    for k in (0, 1):
+        starts = [worlds for _, _, worlds in stub.trained[k::2]]
+        assert all(np.array_equal(starts[0], other) for other in starts[1:])
+    plain = [config for config, _, _ in stub.trained]
+    assert all(one.optimizer == plain[0].optimizer and one.loss == plain[0].loss for one in plain)
+    weights = [load_policy_checkpoint(out / f"tuned-{name}" / "policy") for name in TUNED]
+    values = [float(np.ravel(one.params["action.weight"])[0]) for one in weights]
+    # The stand-in leans by the tracks and the delta alone: named and control agree, delta differs.
+    assert values[0] == values[2] and len({values[0], values[1], values[3]}) == 3
+
+
+def test_measured_flights_are_others_than_the_judged_and_noisy(hidden):
+    out, stub = hidden
+    exact, _ = read_flights(sorted((out / "flights").glob("*.parquet")))
+    logs, _ = read_flights(sorted((out / "measured").glob("*.parquet")))
+    assert {log.about["seed"] for log in logs} <= {100_004, 100_005, 100_006}
+    assert stub.diagnosed[0][1] == "commands"
+    one = next(log for log in exact if log.about["seed"] == logs[0].about["seed"])
+    count = len(logs[0].time_s)
+    assert one.time_s[-1] - logs[0].time_s[-1] <= CONTACT_MARGIN_S + 0.011
+    spread = (logs[0].pos_w - one.pos_w[:count]).std()
+    assert spread == pytest.approx(Noise().pos, rel=0.2)
+    assert one.thrust_cmd is not None and one.action_b is not None
+    np.testing.assert_array_equal(logs[0].thrust_cmd, one.thrust_cmd[:count])
+    np.testing.assert_array_equal(logs[0].action_b, one.action_b[:count])
+
+
+def test_where_nothing_is_named_the_loop_ends_and_says_so(
+    hidden, tmp_path, monkeypatch, root, capfd
+):
+    monkeypatch.chdir(root)
+    out = tmp_path / "out"
+    left_out = shutil.ignore_patterns("diagnosis", "loop.json", "table.md")
+    shutil.copytree(hidden[0], out, ignore=left_out)
+    stub = Stub(monkeypatch, effects=())
+    assert cli.main([*HIDDEN, "--out", str(out)]) == 1
+    said = capfd.readouterr().err
+    assert "has the verdict unknown and names nothing to correct" in said and "--flights" in said
+    assert not stub.trained and not (out / "loop.json").exists()
+
+
+def test_the_example_hides_one_effect(root):
+    true, simulated = load_vehicle(root / EXAMPLE), load_vehicle("reference")
+    assert true.mass == simulated.mass and true.rotors == simulated.rotors
+    assert true.controller == simulated.controller
+    assert set(true.effects) - set(simulated.effects) == {"com_offset"}
+    assert hidden_effects(simulated, true) == "com_offset (offset [0.012, 0.0, 0.0] m)"
+    assert hidden_effects(true, simulated) == "no com_offset"
+    assert hidden_effects(simulated, replace(simulated, mass=0.8)) == "other nominal values"
+    trimmed = with_effects(simulated, {"torque_trim": TorqueTrim(np.array([0.01, 0.0, 0.0]))})
+    stored = hidden_effects(simulated, replace(trimmed, mass=0.8))
+    assert stored == "torque_trim (torque [0.01, 0.0, 0.0] N m); other nominal values"
+
+
+def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root, tmp_path):
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("eval.worlds.rotorpy.rotorpy", lambda: STAND_IN)
+    config, same = (
+        resolve(recipe="quick", simulator="rotorpy", hidden_vehicle=name)
+        for name in ("examples/rotorpy.toml", None)
+    )
+    assert isinstance(config, HiddenLoopConfig) and isinstance(same, HiddenLoopConfig)
+    run = work.LoopRun(LOOP, config, tmp_path, Quiet())
+    judged = [work._evaluation(run, variant) for variant in LOOP.variants]
+    flown = [(one.simulator, one.vehicle) for one in judged]
+    assert flown == [("mujoco", "reference"), *[("rotorpy", "examples/rotorpy.toml")] * 5]
+    assert hidden_effect.vehicle_phrase(config) == "the simulator rotorpy"
+    assert same.true_vehicle == "reference"
+    effects, simulator = describe_hidden(config)
+    assert "rotor_drag (coefficient 7.8e-05 kg/rad)" in effects and "no linear_drag" in effects
+    assert "the rotors' drag acts at each hub" in simulator
+    effects, simulator = describe_hidden(same)
+    assert effects == "The hidden vehicle's file is that of the simulation."
+    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in simulator
+
+
+@pytest.mark.parametrize(
+    ("nominal", "control", "named", "words"),
+    [
+        (39, 12, 36, ("25 % of 40 trials succeed, with the simulation's vehicle 98 %",
+                      "more than the same fine-tuning without it (30 %; difference +60 points [+")),
+        (40, 20, 20, ("not significantly different from the same fine-tuning without it",)),
+        (39, 10, 40, ("and not significantly different from the policy where nothing is hidden",)),
+        (20, 10, 40, ("and above the policy where nothing is hidden",)),
+        (40, 10, 20, ("and below the policy where nothing is hidden",)),
+    ],
+)  # fmt: skip
+def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, words):
+    won = {"nominal": nominal, "before": 10, "control": control, "named": named}
+    results = {name: [trial_result(k, k < count) for k in range(40)] for name, count in won.items()}
+    standings = policy_results(results, ("before", "control", "nominal"))
+    said = hidden_effect.verdict(standings, answer([NAMED]), 40)
+    assert all(one in said for one in words), said

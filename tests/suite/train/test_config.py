@@ -26,15 +26,9 @@ from tests.support.training import small_config
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"height_spread": -1.0}, "episode.height_spread is -1.0, allowed is 0 to 100"),
-        ({"height_spread": float("nan")}, "episode.height_spread is nan"),
-        ({"batch": 0}, "episode.batch is 0, allowed is 1 to 1000000"),
-        ({"stop_from": 1.5}, "episode.stop_from is 1.5, allowed is 0 to 1"),
-        ({"gates": 9}, "episode.gates is 9, allowed is 1 to 8"),
         ({"difficulty": (0.5, 0.2)}, "episode.difficulty is .*lower end of the range first"),
         ({"physics": {"action_delay": (0.0, 3.0)}}, "physics.action_delay is .*allowed is 0 to 2"),
         ({"steps": 6, "image_stride": 4}, "image_stride is 4, allowed are divisors .*6"),
-        ({"seed": -1}, "seed is -1, allowed is 0 to 4294967295"),
         ({"seed": 2**32}, "seed is 4294967296, allowed"),
     ],
 )
@@ -47,21 +41,14 @@ def test_worlds_that_cannot_be_made_are_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_every_recipe_is_within_the_limits(name):
-    check_phases(named_recipe(name))
-
-
 def test_settings_are_changed_by_name():
-    changes = ("loss.progress=1.2", "episode.batch = 8", "physics.drag=(0, 0.5)", "seed=3")
-    config = override(TrainConfig(), changes)
-    assert config.loss.progress == 1.2 and config.episode.batch == 8 and config.seed == 3
-    assert config.physics.drag == (0.0, 0.5) and isinstance(config.physics.drag[0], float)
-    whole = override(TrainConfig(), ["loss.progress=1"]).loss.progress
-    assert isinstance(whole, float) and whole == 1.0
-    assert override(TrainConfig(), ["loss.crash_depth_m=inf"]).loss.crash_depth_m == math.inf
-    camera = override(TrainConfig(), ["spec.camera.width=48"]).spec.camera
-    assert camera.width == 48 and camera.height == TrainConfig().spec.camera.height
+    changes = ["loss.progress=1", "episode.batch = 8", "physics.drag=(0, 0.5)", "seed=3"]
+    changes += ["loss.crash_depth_m=inf", "spec.camera.width=48"]
+    config, plain = override(TrainConfig(), changes), TrainConfig()
+    assert (config.loss.progress, *config.physics.drag) == (1.0, 0.0, 0.5)
+    assert {type(one) for one in (config.loss.progress, *config.physics.drag)} == {float}
+    assert (config.episode.batch, config.seed, config.loss.crash_depth_m) == (8, 3, math.inf)
+    assert config.spec.camera == replace(plain.spec.camera, width=48)
 
 
 def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
@@ -72,25 +59,21 @@ def test_what_only_the_point_mass_reads_is_refused_through_quadrotors():
     assert override(run, ["physics.image_delay=2"]).physics.image_delay == 2
 
 
-@pytest.mark.parametrize(
-    ("change", "need", "given"),
-    [
-        ("loss.projection_decay=1", "loss.projection", "3"),
-        ("loss.speed_range=(3, 9)", "spec.speed_input", "True"),
-        ("episode.race_share=0.9", "spec.speed_input", "True"),
-    ],
-)
-def test_what_would_do_nothing_is_refused(change, need, given):
+def test_what_would_do_nothing_is_refused():
     run = named_recipe("race-paper")
-    with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
-        override(run, [change])
-    # In whatever order they are given.
-    assert override(run, [change, f"{need}={given}"]) == override(run, [f"{need}={given}", change])
+    for change, need, given in (
+        ("loss.projection_decay=1", "loss.projection", "3"),
+        ("episode.race_share=0.9", "spec.speed_input", "True"),
+    ):
+        with pytest.raises(ValueError, match=rf"has no effect while {need} is (0|False)"):
+            override(run, [change])
+        both = [change, f"{need}={given}"]
+        assert override(run, both) == override(run, both[::-1])
 
 
-def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
+def test_only_a_setting_that_the_command_sets_itself_is_refused():
     check_owned(["loss.progress=1"], {"loss.prog": "", "spec": ""})
-    with pytest.raises(ValueError, match=r"--set 'spec.rate_hz=30': this command sets spec"):
+    with pytest.raises(ValueError, match=r"'spec.rate_hz=30': this command sets spec.*; take"):
         check_owned(["spec.rate_hz=30"], {"spec": "take another policy"})
 
 
@@ -98,14 +81,11 @@ def test_what_a_command_sets_itself_is_refused_with_what_to_do_instead():
     ("change", "words"),
     [
         ("loss.progres=1", "Did you mean 'progress'"),
-        ("los.progress=1", "Did you mean 'loss'"),
         ("loss=1", "has parts, set one of clearance"),
         ("loss.progress.more=1", "'more' is below a setting that has no parts"),
         ("quadrotor.mass_std=0.1", "this run has no quadrotor; take a recipe"),
-        ("loss.progress=inf", "loss.progress is inf, allowed is"),
         ("loss.progress", "write FIELD=VALUE"),
         ("loss.progress=fast", "'fast' does not fit, the setting is like"),
-        ("episode.batch=3.5", "(int)"),
         ("physics.drag=(1,2,3)", "(tuple)"),
         ("physics.drag=(1,'a')", "(float)"),
     ],
@@ -116,18 +96,8 @@ def test_wrong_settings_are_refused_by_name(change, words):
     assert words in str(error.value) and change in str(error.value)
 
 
-def test_a_model_is_asked_for_by_name_or_the_recipes_own():
-    own = named_recipe("race-paper")
-    quad = with_model(own, "quad", "racer5")
-    assert quad.quadrotor is not None and quad.quadrotor.vehicle.name == "racer5"
-    assert with_model(quad, "point", None) == own == with_model(own, None, None)
-    with pytest.raises(ValueError, match="the point mass has none: add --model quad"):
-        with_model(own, None, "reference")
-
-
-def test_the_default_recipe_varies_its_quadrotors_widely_around_any_vehicle_that_is_asked_for():
+def test_spreads_go_with_the_size_of_the_vehicle_that_is_asked_for():
     own = named_recipe("race")
-    check(own)
     assert own.quadrotor is not None and own.quadrotor.vehicle.name == "racer5"
     other = with_model(own, "quad", "crazyflie21").quadrotor
     assert other is not None and other.vehicle.name == "crazyflie21"
@@ -138,22 +108,19 @@ def test_the_default_recipe_varies_its_quadrotors_widely_around_any_vehicle_that
     assert 0.2 < other.com_std_m / own.quadrotor.com_std_m < 0.5
     sizes = {"trim_std": own.quadrotor.trim_std, "com_std_m": own.quadrotor.com_std_m}
     assert replace(other, vehicle=own.quadrotor.vehicle, **sizes) == own.quadrotor
-    again = with_model(own, "quad", "racer5")
-    assert again == own, "to the bit"
-    assert with_model(own, "point", None).quadrotor is None
-    check_phases(with_model(own, "point", None))
+    assert with_model(own, "quad", "racer5") == own, "to the bit"
 
 
 def test_another_rate_keeps_rollouts_and_delays_in_seconds():
     slow = phase_configs(named_recipe("race"))[0]
     fast = at_rate(slow, 30.0)
-    check(fast)
     assert (fast.episode.steps, fast.episode.image_stride) == (180, 6)
     assert fast.physics.action_delay == (0.0, 2.0), "not 3: the point mass holds no more"
     assert at_rate(fast, 15.0).episode == slow.episode and at_rate(slow, 15.0) == slow
     odd = at_rate(slow, 20.0)
-    check(odd)
     assert (odd.episode.steps, odd.episode.image_stride) == (120, 4)
+    for config in (fast, odd):
+        check(config)
     late = at_rate(named_recipe("paper"), 30.0).physics
     assert (late.state_delay, late.image_delay) == (2, 4)
 
@@ -166,16 +133,12 @@ def test_the_papers_recipe_has_the_papers_weights():
     assert (losses.BARRIER_HEIGHT, losses.BARRIER_SLOPE, losses.FIELD_DECAY) == (2.0, -32.0, 0.3)
 
 
-RUN = with_iterations(
-    TrainConfig(
-        phases=(
-            Phase(0.5),
-            Phase(0.3, ("loss.progress=2.0", "optimizer.rate=1e-3")),
-            Phase(0.2, ("spec.rate_hz=30.0",)),
-        )
-    ),
-    10,
+PHASES = (
+    Phase(0.5),
+    Phase(0.3, ("loss.progress=2.0", "optimizer.rate=1e-3")),
+    Phase(0.2, ("spec.rate_hz=30.0",)),
 )
+RUN = with_iterations(TrainConfig(phases=PHASES), 10)
 
 
 def test_a_phase_changes_what_it_says_and_keeps_what_came_before():
@@ -188,14 +151,15 @@ def test_a_phase_changes_what_it_says_and_keeps_what_came_before():
     assert phase_configs(TrainConfig()) == (TrainConfig(),)
 
 
-def test_phases_share_any_number_of_iterations_without_a_rest():
-    recipe = named_recipe("race")
-    for total in (3, 7, 100, 4500, 4501):
-        ends = phase_ends(with_iterations(recipe, total))
-        assert ends[-1] == total and list(ends) == sorted(ends)
+def test_recipes_are_within_the_limits_and_their_phases_share_any_number_of_iterations():
+    for recipe in map(named_recipe, RECIPES):
+        check_phases(recipe)
+        for total in (3, 7, 100, 4500, 4501):
+            ends = phase_ends(with_iterations(recipe, total))
+            assert ends[-1] == total and list(ends) == sorted(ends)
 
 
-def test_a_users_change_holds_in_every_phase_or_in_the_one_that_is_named():
+def test_a_change_holds_in_every_phase_or_in_the_one_that_is_named():
     everywhere = phase_configs(with_changes(RUN, ["loss.progress=0.4"]))
     assert [one.loss.progress for one in everywhere] == [0.4] * 3
     assert everywhere[1].optimizer.rate == 1e-3, "other changes of the phase stay"
@@ -204,30 +168,24 @@ def test_a_users_change_holds_in_every_phase_or_in_the_one_that_is_named():
     assert [one.loss.jerk for one in alone] == [0.5] * 3
     always = phase_configs(in_every_phase(RUN, "loss", progress=0.7))
     assert [one.loss.progress for one in always] == [0.7] * 3
-
-
-def test_quadrotors_leave_every_phase():
+    for number in ("0", "4", "x"):
+        with pytest.raises(ValueError, match="this run has 3 phases"):
+            with_changes(RUN, [f"phases.{number}.loss.progress=1"])
     recipe = without_quadrotor(named_recipe("race"))
     check_phases(recipe)
     assert all(one.quadrotor is None for one in phase_configs(recipe))
 
 
 @pytest.mark.parametrize(
-    ("phases", "words"),
+    ("second", "words"),
     [
-        ((Phase(0.5), Phase(0.4)), "shares of phases add up to 0.9, allowed is 1"),
-        ((Phase(0.5), Phase(0.5, ("loss.progres=1",))), "phase 2: .*Did you mean 'progress'"),
-        ((Phase(0.5), Phase(0.5, ("episode.batch=2",))), "phase 2 changes episode.batch"),
-        ((Phase(0.5), Phase(0.5, ("spec.hidden_size=64",))), "phase 2 changes spec"),
-        ((Phase(0.5), Phase(0.5, ("episode.image_stride=7",))), "image_stride is 7"),
+        (Phase(0.4), "shares of phases add up to 0.9, allowed is 1"),
+        (Phase(0.5, ("loss.progres=1",)), "phase 2: .*Did you mean 'progress'"),
+        (Phase(0.5, ("episode.batch=2",)), "phase 2 changes episode.batch"),
+        (Phase(0.5, ("spec.hidden_size=64",)), "phase 2 changes spec"),
+        (Phase(0.5, ("episode.image_stride=7",)), "image_stride is 7"),
     ],
 )
-def test_phases_that_cannot_be_trained_are_refused(phases, words):
+def test_phases_that_cannot_be_trained_are_refused(second, words):
     with pytest.raises(ValueError, match=words):
-        check_phases(replace(RUN, phases=phases))
-
-
-def test_a_change_of_a_phase_that_is_not_there_is_refused():
-    for number in ("0", "4", "x"):
-        with pytest.raises(ValueError, match="this run has 3 phases"):
-            with_changes(RUN, [f"phases.{number}.loss.progress=1"])
+        check_phases(replace(RUN, phases=(Phase(0.5), second)))

@@ -1,4 +1,4 @@
-"""The whole rollout and its gradient: what is cut out of it, images outside the loop, the field."""
+"""A step, the whole rollout and its gradient: what is cut out of it, images, the field."""
 
 from dataclasses import replace
 from functools import partial
@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from policies.networks import delta_network, network
-from policies.observation import observe
+from policies.networks import network
 from suite.train import losses, rollout
-from suite.train.config import PointMassConfig
+from suite.train.config import LossConfig, PointMassConfig
 from suite.train.dynamics import point_mass
 from suite.train.dynamics.interface import make_dynamics
 from suite.train.gradient import encoder_gradient, sampled_encoder_gradient
-from suite.train.losses import UNIT_FIELD
-from suite.train.rollout import make_rollout, view_in
-from suite.train.step import target_gate
+from suite.train.losses import UNIT_FIELD, speed_to_goal
+from suite.train.rollout import view_in
+from suite.train.step import BEYOND_M, PATH_SAMPLES, approach_shift, make_step, target_gate
 from suite.train.worlds import sample_worlds
 from tests.support.canonical import NOISY, gradient_of
 from tests.support.training import (
     KEY,
     SPEC,
-    blind,
+    assert_gradient,
     boxes_worlds,
     doubled,
     fresh_params,
@@ -34,12 +33,6 @@ from tests.support.training import (
 )
 from tracks.geometry.field import attractive_field, magnetic_field
 
-TILTED = Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix()
-
-
-CONFIG = small_config(batch=3, steps=4)
-plain_gradient = jax.jit(jax.grad(loss_of(CONFIG)))
-
 
 @pytest.fixture(scope="module")
 def two_pass():
@@ -48,46 +41,26 @@ def two_pass():
     return NOISY, worlds, params, *gradient_of(NOISY)(params, worlds, KEY, None)
 
 
-def test_records_are_those_of_the_flight(two_pass):
-    config, worlds, _, _, loss, records = two_pass
-    assert records.image.shape == (6, 4, 20, 20) and records.pos_w.shape == (6, 4, 3)
-    assert float(sum(term.mean() for term in records.terms.values())) == pytest.approx(
-        float(loss), rel=1e-5
-    )
-    first = np.linalg.norm(np.array(records.pos_w[0]) - worlds.pos_w, axis=-1)
-    assert np.all(first < 8 * 0.05)
-    assert np.ptp(np.array(records.image)) > 1
-
-
 def test_training_casts_one_ray_a_pixel_whatever_the_camera_casts_in_flight(monkeypatch):
-    config, cast = small_config(), []
+    camera = replace(SPEC.camera, rays=2)
+    config, cast = replace(small_config(), spec=replace(SPEC, camera=camera)), []
     worlds = boxes_worlds(config)
-    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
 
     def spy(scene, pos_w, rot_w, rays, *_):
-        cast.append(rays)
+        cast.append(rays.shape)
         return jnp.ones((len(pos_w), len(rays)))
 
     monkeypatch.setattr(rollout, "depth_image", spy)
-
-    @partial(jax.jit, static_argnums=0)
-    def rays_of(rays, state):
-        camera = replace(SPEC.camera, rays=rays)
-        observer = rollout.make_observer(replace(config, spec=replace(SPEC, camera=camera)))
-        observer.observe(
-            worlds, state, jnp.asarray(worlds.target), state.pos_w, jax.random.split(KEY, 4)
-        )
-        return cast[-1]
-
-    one, two = rays_of(1, state), rays_of(2, state)
-    assert one.shape == (SPEC.camera.height * SPEC.camera.width, 3)
-    np.testing.assert_array_equal(one, two)
+    state = make_dynamics(config).start(worlds.constants, *map(jnp.asarray, worlds[1:4]))
+    now = state, worlds.target, state.pos_w, jax.random.split(KEY, 4)
+    jax.eval_shape(partial(rollout.make_observer(config).observe, worlds), *now)
+    assert cast == [(camera.height * camera.width, 3)]
 
 
 @pytest.fixture
 def held_attitude(float64, monkeypatch):
     """Hold the attitude: its gradient is cut on purpose, so differences must not move it."""
-    held = jnp.asarray(TILTED)
+    held = jnp.asarray(Rotation.from_euler("ZYX", [0.7, -0.3, 0.2]).as_matrix())
     monkeypatch.setattr(
         point_mass, "attitude", lambda thrust, _: jnp.broadcast_to(held, (*thrust.shape[:-1], 3, 3))
     )
@@ -103,32 +76,8 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(held_attitude, monk
     monkeypatch.setattr(losses, "BARRIER_SLOPE", -4.0)  # smooth enough for differences
     both = jax.jit(jax.value_and_grad(loss_of(config)))
     params, worlds = doubled(fresh_params()), doubled(boxes_worlds(config))
-    gradient = both(params, worlds)[1]
-    rng = np.random.default_rng(0)
-    for name in ("state.weight", "gru.weight_hidden", "gru.bias_input", "action.weight"):
-        direction = rng.normal(size=params[name].shape)
-        ahead, behind = (
-            both({**params, name: params[name] + h * direction}, worlds)[0] for h in (1e-5, -1e-5)
-        )
-        slope = float(ahead - behind) / 2e-5
-        assert abs(slope) > 1e-4
-        assert float((gradient[name] * direction).sum()) == pytest.approx(slope, rel=1e-5)
-
-
-def fly(params, worlds):
-    """Return positions and velocities (T, B, 3) of a blind flight: a plain loop of its own."""
-    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
-    batch = worlds.pos_w.shape[0]
-    hidden, action = jnp.zeros((batch, SPEC.hidden_size)), jnp.zeros((batch, 3))
-    positions, velocities = [], []
-    _, target_w = target_gate(worlds.scene.gates, worlds.target)
-    for _ in range(CONFIG.episode.steps):
-        state = observe(CONFIG.spec, view_in(worlds, body, worlds.target), action).state
-        action, hidden = network.recur(params, hidden, blind(params, state), state)
-        body = point_mass.step(body, worlds.constants, action, target_w, 0.916)
-        positions.append(body.pos_w)
-        velocities.append(body.vel_w)
-    return jnp.stack(positions), jnp.stack(velocities)
+    names = ("state.weight", "gru.weight_hidden", "gru.bias_input", "action.weight")
+    assert_gradient(lambda params: both(params, worlds), params, names, 1e-5, rel=1e-5)
 
 
 @jax.jit
@@ -137,24 +86,6 @@ def pull_at(worlds, pos_w, vel_w):
     gate, _ = target_gate(worlds.scene.gates, worlds.target)
     field = magnetic_field(gate.center_w, gate.rot_w, gate.opening_g, pos_w)
     return attractive_field(field, vel_w, 0.3) / (2e-5 * UNIT_FIELD) ** 0.7
-
-
-def test_the_field_enters_as_the_paper_says(float64):
-    """Eq. final_optimization: the gradient changes by -u_A pulled back through the positions."""
-    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
-    with_field, without = (plain_gradient(params, worlds, None, gain) for gain in (0.42, 0.0))
-    change = jax.tree.map(jnp.subtract, with_field, without)
-
-    @jax.jit
-    def pulled_back(params):
-        (pos, vel), back = jax.vjp(lambda p: fly(p, worlds), params)
-        pull = 0.42 * pull_at(worlds, pos, vel)
-        return back((-pull / (pos.shape[0] * pos.shape[1]), jnp.zeros_like(vel)))[0]
-
-    expected = pulled_back(params)
-    used = [name for name in expected if np.abs(np.array(expected[name])).max() > 0]
-    assert {"state.weight", "gru.weight_input", "action.weight"} <= set(used)
-    assert largest_difference({k: change[k] for k in used}, {k: expected[k] for k in used}) < 1e-6
 
 
 def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps=8, batch=6):
@@ -178,7 +109,8 @@ def test_the_fields_strength_depends_on_neither_horizon_nor_batch(float64, steps
 
 
 def test_images_carry_no_gradient_to_the_state(float64):
-    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
+    config = small_config(batch=3, steps=4)
+    worlds, params = doubled(boxes_worlds(config)), doubled(fresh_params())
 
     @jax.jit
     def start_gradient(free, held):
@@ -186,26 +118,12 @@ def test_images_carry_no_gradient_to_the_state(float64):
             bright = image.mean((1, 2))[:, None] * jnp.ones(SPEC.hidden_size)
             return free * bright + held * jax.lax.stop_gradient(bright)
 
-        loss = loss_of(CONFIG, encode)
+        loss = loss_of(config, encode)
         return jax.grad(lambda p: loss(params, worlds._replace(pos_w=p)))(worlds.pos_w)
 
     seen = start_gradient(1.0, 0.0)
     np.testing.assert_allclose(seen, start_gradient(0.0, 1.0), atol=1e-12)
     assert np.abs(np.array(seen - start_gradient(0.0, 0.0))).max() > 1e-6
-
-
-def test_a_delta_action_is_frozen_and_changes_the_gradient(float64):
-    worlds, params = doubled(boxes_worlds(CONFIG)), doubled(fresh_params())
-    delta = doubled(delta_network.init(jax.random.key(1)))
-    base, unmoved = (plain_gradient(params, worlds, d, 0.0) for d in (None, delta))
-    used = [name for name in base if np.abs(np.array(base[name])).max() > 0]
-
-    def apart(gradient):
-        return largest_difference({k: gradient[k] for k in used}, {k: base[k] for k in used})
-
-    assert unmoved.keys() == params.keys() and apart(unmoved) < 1e-9
-    delta["output.weight"] += 0.5
-    assert apart(plain_gradient(params, worlds, delta, 0.0)) > 1e-2
 
 
 def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
@@ -226,32 +144,15 @@ def test_a_world_that_crashed_deep_leaves_the_loss(two_pass):
     assert not np.any(total[1:, :2]) and np.all(total[1:, 2:] > 0)
 
 
-def test_the_policy_is_shown_the_gate_after_the_next(monkeypatch):
+def test_the_policy_is_shown_the_gate_after_the_next():
     """The second gate's centre, the last one's where none comes after, and both directions."""
-    seen = []
-
-    def spy(spec, view, action_b, speed):
-        shown = view.second_w, view.axis_w, view.second_axis_w
-        jax.debug.callback(lambda *shown: seen.append(shown), *shown)
-        return observe(spec, view, action_b, speed)
-
-    monkeypatch.setattr(rollout, "observe", spy)
-    config = replace(small_config(3, 1), spec=replace(SPEC, second_gate=True, gate_axis=True))
-    worlds = boxes_worlds(config)._replace(target=np.array([0, 3, 7], np.int32))
-
-    @jax.jit
-    def fly(params):
-        embedding_shift = jnp.zeros((1, 3, SPEC.hidden_size))
-        make_rollout(config)(params, embedding_shift, worlds, KEY, blind)
-
-    fly(fresh_params(config.spec))  # nothing is returned, so little is compiled
-    jax.effects_barrier()
-    center = worlds.scene.gates.center_w
-    expected = [center[0, 1], center[1, 4], center[2, 7]]
-    np.testing.assert_allclose(seen[0][0], expected, atol=1e-6)
-    rot = worlds.scene.gates.rot_w
-    for found, numbers in zip(seen[0][1:], ([0, 3, 7], [1, 4, 7]), strict=True):
-        np.testing.assert_allclose(found, rot[range(3), numbers, :, 0], atol=1e-6)
+    worlds = boxes_worlds(small_config(3))
+    target = jnp.asarray([0, 3, 7])
+    body = point_mass.start(worlds.pos_w, worlds.vel_w, worlds.heading_w)
+    seen, gates, rows = view_in(worlds, body, target), worlds.scene.gates, range(3)
+    np.testing.assert_array_equal(seen.second_w, gates.center_w[rows, [1, 4, 7]])
+    np.testing.assert_array_equal(seen.axis_w, gates.rot_w[rows, target, :, 0])
+    np.testing.assert_array_equal(seen.second_axis_w, gates.rot_w[rows, [1, 4, 7], :, 0])
 
 
 def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
@@ -265,7 +166,7 @@ def test_a_state_on_its_way_at_the_start_is_that_of_the_start():
     assert found.shape == (2, 2, config.spec.state_size)
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, :3], axis=-1), 3.0, rtol=1e-6)
-    to_gate = target_gate(worlds.scene.gates, worlds.target)[1] - worlds.pos_w
+    to_gate = worlds.scene.gates.center_w[range(2), worlds.target] - worlds.pos_w
     far = np.linalg.norm(to_gate, axis=-1)
     np.testing.assert_allclose(np.linalg.norm(found[:, 0, 6:9], axis=-1), far, rtol=1e-5)
     np.testing.assert_array_equal(found[:, 0, -1], worlds.speed_command)
@@ -306,9 +207,6 @@ def test_a_world_that_has_passed_its_last_gate_leaves_the_loss_where_that_is_the
     assert np.array_equal(np.asarray(records.alive) == 0, after & finish)
 
 
-whole_gradient = jax.jit(encoder_gradient)
-
-
 def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
     """The sums run in another order in float32: 1e-4 of each array's largest entry."""
     config, worlds, params, gradient, loss, _ = two_pass
@@ -320,25 +218,78 @@ def test_images_outside_the_loop_give_the_gradient_of_the_plain_loop(two_pass):
     assert largest_difference(gradient, expected) < 1e-4
 
 
-def test_the_encoders_gradient_does_not_depend_on_its_chunks(two_pass, monkeypatch):
-    params = two_pass[2]
-    rng = np.random.default_rng(0)
-    images = jnp.asarray(rng.normal(size=(12, 20, 20)), jnp.float32)
-    cotangents = jnp.asarray(rng.normal(size=(12, 8)), jnp.float32)
-    inputs = params, images, cotangents
-    whole = whole_gradient(*inputs)
-    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
-    in_chunks = jax.jit(lambda *inputs: encoder_gradient(*inputs))
-    assert largest_difference(in_chunks(*inputs), whole) < 1e-5
-
-
-def test_the_encoders_gradient_from_every_other_image_is_right_on_average(two_pass):
+def test_the_encoders_gradient_is_that_of_its_chunks_and_on_average_of_every_other_image(
+    two_pass, monkeypatch
+):
     params, rng = two_pass[2], np.random.default_rng(1)
     images = jnp.asarray(rng.normal(size=(6, 2, 20, 20)), jnp.float32)
     cotangents = jnp.asarray(rng.normal(size=(6, 2, 8)), jnp.float32)
-    whole = whole_gradient(params, images.reshape(12, 20, 20), cotangents.reshape(12, 8))
+    inputs = params, images.reshape(12, 20, 20), cotangents.reshape(12, 8)
+    whole = jax.jit(encoder_gradient)(*inputs)
     keys = {int(jax.random.randint(key, (), 0, 2)): key for key in jax.random.split(KEY, 8)}
     sampled = jax.jit(sampled_encoder_gradient, static_argnums=3)
     halves = [sampled(params, images, cotangents, 2, keys[k]) for k in (0, 1)]
     mean = jax.tree.map(lambda one, other: (one + other) / 2, *halves)
     assert largest_difference(mean, whole) < 1e-5
+    monkeypatch.setattr("suite.train.gradient.CHUNK", 5)
+    in_chunks = jax.jit(lambda *inputs: encoder_gradient(*inputs))
+    assert largest_difference(in_chunks(*inputs), whole) < 1e-5
+
+
+stepped = jax.jit(make_step, static_argnums=0)
+
+
+@pytest.mark.parametrize(
+    ("place_g", "shift"),
+    [
+        ((-4.0, 0.2, 0.1), 0.0),  # on the axis: straight on
+        ((-4.0, 0.0, 1.0), 0.7),  # as much before the gate as it is off the axis, less 0.3
+        ((0.0, 0.0, 1.2), 0.9),  # above the frame
+        ((0.8, 0.6, 0.0), 1.1),  # beyond the plane
+        ((2.0, 3.0, 0.0), 1.5),  # at most so far
+    ],
+)
+def test_the_point_before_the_gate_that_progress_is_measured_to(place_g, shift):
+    config = LossConfig(approach_m=1.5)
+    found = approach_shift(config, jnp.array([place_g]))
+    np.testing.assert_allclose(found, [shift], atol=1e-6)
+    assert approach_shift(LossConfig(), jnp.array([place_g])) == 0.0
+
+
+@pytest.mark.parametrize(("pass_first", "speed"), [(False, -3.0), (True, 3.0)])
+def test_a_step_through_a_gate_and_its_numbers(pass_first, speed):
+    """From 0.1 m before the first gate to 0.1 m behind it at 3 m/s; the second is straight on."""
+    worlds = boxes_worlds(small_config(2))
+    gates = worlds.scene.gates
+    forward, center = gates.rot_w[:, 0, :, 0], np.array(gates.center_w)
+    center[:, 1] = center[:, 0] + 4 * forward
+    worlds = worlds._replace(scene=worlds.scene._replace(gates=gates._replace(center_w=center)))
+    before, after = (
+        point_mass.start(center[:, 0] + x * forward, 3 * forward, worlds.heading_w)
+        for x in (-0.1, 0.1)
+    )
+    after = after._replace(acc_w=jnp.asarray([[1.0, 0, 0], [0, 2.0, 0]]))
+    config = LossConfig(pass_first=pass_first)
+    step = stepped(config, worlds, before, after, jnp.zeros(2, int))
+    assert step.passed.all()
+    np.testing.assert_allclose(speed_to_goal(step), [speed, speed], atol=1e-3)
+    aim = center[:, int(pass_first)]
+    turn = gates.rot_w[:, int(pass_first)]
+    place = np.einsum("bij,bi->bj", turn, np.array(after.pos_w) - aim)
+    np.testing.assert_allclose(step.place_g, place, atol=1e-4)
+    np.testing.assert_allclose(step.jerk_w, after.acc_w / worlds.constants.time_step[:, None])
+    assert step.gap.shape == (2, PATH_SAMPLES)
+    np.testing.assert_allclose(step.clearance, step.gap.min(-1) + config.safety_radius_m, atol=1e-6)
+    past = stepped(config, worlds, before, after, jnp.full(2, 8))
+    assert not past.passed.any(), "all gates are passed already"
+
+
+def test_above_the_frame_the_goal_is_before_the_gate_and_past_the_last_gate_beyond_it():
+    """1.2 m above the gate the straight way to its centre leads down through the bar."""
+    worlds = boxes_worlds(small_config(2))
+    gates, above = worlds.scene.gates, np.array([0.0, 0.0, 1.2], np.float32)
+    center, turn = (array[[0, 1], [0, -1]] for array in (gates.center_w, gates.rot_w))
+    body = point_mass.start(center + turn @ above, 0.0 * center, worlds.heading_w)
+    step = stepped(LossConfig(approach_m=1.5), worlds, body, body, np.array([0, 8]))
+    ahead_m = np.array([[-0.9], [BEYOND_M]])
+    np.testing.assert_allclose(step.goal_w, center + ahead_m * turn[:, :, 0], atol=1e-5)

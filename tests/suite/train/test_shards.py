@@ -13,22 +13,14 @@ from suite.train.config import check
 from suite.train.shards import check_processes, curve_numbers, flight_numbers, sample_hidden
 from suite.train.update import make_update, start_state
 from tests.support.canonical import NOISY, gradient_of, update_of
-from tests.support.training import (
-    boxes_worlds,
-    fresh_params,
-    largest_difference,
-    small_config,
-)
+from tests.support.training import boxes_worlds, fresh_params, largest_difference, small_config
 
 KEY = jax.random.key(3)
 
 
-def test_a_batch_that_the_shards_do_not_divide_is_refused():
+def test_shards_divide_the_batch_and_processes_the_shards(monkeypatch):
     with pytest.raises(ValueError, match=r"episode\.batch is 6, allowed are multiples of episode"):
         check(small_config(batch=6, shards=4))
-
-
-def test_several_processes_divide_the_shards(monkeypatch):
     monkeypatch.setattr(shards.jax, "process_count", lambda: 3)
     with pytest.raises(ValueError, match="shards is 4, allowed with 3 processes are multiples of"):
         check_processes(small_config(batch=8, shards=4))
@@ -41,14 +33,6 @@ def sharded():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "usable_cores", lambda: 2)
         return config, make_update(config)
-
-
-def updated(config, update):
-    """Return state and numbers after three updates; the first one's rate is 0."""
-    state = start_state(config)
-    for number in range(3):
-        state, numbers = update(state, boxes_worlds(config, number))
-    return state, numbers
 
 
 def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(sharded, monkeypatch):
@@ -76,11 +60,14 @@ def test_two_threads_compute_shards_at_once_and_come_to_the_same_bits(sharded, m
 
 def test_shards_have_the_gradient_of_the_whole_batch(sharded):
     """The sums run in another order; noise is a world's own, whichever shard it is in."""
-    state, numbers = updated(*sharded)
-    expected, curve = updated(NOISY, update_of(NOISY))
-    assert largest_difference(state.params, expected.params) < 1e-3
-    assert largest_difference(state.hidden, expected.hidden) < 1e-3
-    assert largest_difference(numbers, curve) < 1e-3
+    ends = []
+    for config, update in (sharded, (NOISY, update_of(NOISY))):
+        state = start_state(config)
+        for number in range(3):  # the first one's rate is 0
+            state, numbers = update(state, boxes_worlds(config, number))
+        ends.append((state.params, state.hidden, numbers))
+    for found, expected in zip(*ends, strict=True):
+        assert largest_difference(found, expected) < 1e-3
 
 
 def test_the_curve_is_of_steps_that_count():
@@ -96,9 +83,8 @@ def test_the_curve_is_of_steps_that_count():
     )
     shard = shards.Shard(gradient, flight_numbers(loss, records), records.hidden[0])
     numbers = curve_numbers(shard)
-    first = np.mean(records.speed[0])
-    assert numbers["speed"] == pytest.approx(first, rel=1e-6)
-    assert numbers["speed_max"] == pytest.approx(first, rel=1e-6)
+    for name in ("speed", "speed_max"):
+        assert numbers[name] == pytest.approx(np.mean(records.speed[0]), rel=1e-6)
     assert numbers["collided"] == numbers["gates"] == 0 and "counted" not in numbers
     assert numbers["memory"] == pytest.approx(np.abs(records.hidden).mean())
     assert 0 < numbers["memory"] < 0.5, "a fresh network's is far from saturated"

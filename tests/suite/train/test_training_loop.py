@@ -43,17 +43,17 @@ def counting(iterations=10, stop=None, bad=None) -> RunPhase:
     return RunPhase(iterations, SPEC, 24, numbers, lambda: update, str)
 
 
-def run_in(folder, config=CONFIG, start=None):
+def train(folder, *phases, config=CONFIG, start=None, seen=None):
+    """Train in a folder; the list `seen` gets the parameters of each measurement."""
     origin = {"config": plain(config), "from": start, "delta": None}
-    return Run(config, config.seed, origin, folder, Estimate(1.0, 1.0))
+    run = Run(config, config.seed, origin, folder, Estimate(1.0, 1.0))
 
-
-def watch_of(seen):
     def measure(params):
         seen.append(params)
         return {"speed": float(len(seen))}
 
-    return Watch(4, measure)
+    watch = None if seen is None else Watch(4, measure)
+    return train_in_folder(phases, run, FRESH, Console(), watch)
 
 
 def measured(folder):
@@ -62,30 +62,25 @@ def measured(folder):
 
 def test_the_outcome_is_of_the_last_tenth_and_the_policy_is_measured_on_the_way(tmp_path):
     seen = []
-    outcome = train_in_folder([counting(20)], run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    outcome = train(tmp_path, counting(20), seen=seen)
     assert outcome.iterations == 20 and outcome.policy == tmp_path / "policy"
     assert outcome.last["loss"] == (100.0 - 18 + 100.0 - 19) / 2
     assert measured(tmp_path) == [0, 4, 8, 12, 16, 20] and len(seen) == 6
     rows = curve.read(tmp_path)
     assert [row["loss"] for row in rows] == [100.0 - i for i in range(20)]
     assert [row["cold"] for row in rows] == [True] + [False] * 19
-    train_in_folder([counting(20)], run_in(tmp_path), FRESH, Console(), watch_of(seen))
+    train(tmp_path, counting(20), seen=seen)
     assert len(seen) == 6, "a finished run is neither trained nor measured again"
-
-
-def test_a_finished_run_without_its_curve_says_so(tmp_path):
-    train_in_folder([counting()], run_in(tmp_path), FRESH, Console(), watch_of([]))
     (tmp_path / "metrics.jsonl").unlink()
     with pytest.raises(ValueError, match=r"without its curve, metrics\.jsonl: put that back, use"):
-        train_in_folder([counting()], run_in(tmp_path), FRESH, Console(), watch_of([]))
+        train(tmp_path, counting(20))
 
 
 def test_a_stopped_run_goes_on_with_its_curve_and_its_measurements(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        train_in_folder([counting(stop=6)], run_in(tmp_path), FRESH, Console(), watch_of([]))
+        train(tmp_path, counting(stop=6), seen=[])
     assert len(curve.read(tmp_path)) == 6 and measured(tmp_path) == [0, 4]
-    whole = train_in_folder([counting()], run_in(tmp_path), FRESH, Console(), watch_of([]))
-    assert whole.iterations == 10
+    assert train(tmp_path, counting(), seen=[]).iterations == 10
     assert [row["iteration"] for row in curve.read(tmp_path)] == list(range(10))
     assert measured(tmp_path) == [0, 4, 8, 10]
 
@@ -97,17 +92,17 @@ def test_rows_of_a_save_that_was_cut_off_are_computed_again(tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(module, "save_arrays", full)
         with pytest.raises(OSError, match="No space"):
-            train_in_folder([counting(3)], run_in(tmp_path), FRESH, Console())
+            train(tmp_path, counting(3))
     assert len(curve.read(tmp_path)) == 3 and not (tmp_path / "state").exists()
-    train_in_folder([counting(3)], run_in(tmp_path), FRESH, Console())
+    train(tmp_path, counting(3))
     assert [row["iteration"] for row in curve.read(tmp_path)] == [0, 1, 2]
 
 
 def test_a_number_that_is_not_finite_ends_the_run_with_the_last_good_state(tmp_path):
     with pytest.raises(WorkFailed, match="diverged at iteration 3: loss not finite.*clip"):
-        train_in_folder([counting(bad=3)], run_in(tmp_path), FRESH, Console())
+        train(tmp_path, counting(bad=3))
     assert len(curve.read(tmp_path)) == 3
-    outcome = train_in_folder([counting()], run_in(tmp_path), FRESH, Console())
+    outcome = train(tmp_path, counting())
     assert outcome.iterations == 10 and np.isfinite(outcome.last["loss"])
 
 
@@ -115,34 +110,31 @@ def test_a_run_on_several_threads_does_not_go_on_with_one_and_goes_on_with_more(
     tmp_path, monkeypatch
 ):
     monkeypatch.setenv("NPROC", "2")
-    train_in_folder([counting(2)], run_in(tmp_path), FRESH, Console())
+    train(tmp_path, counting(2))
     monkeypatch.setenv("NPROC", "1")
     with pytest.raises(ValueError, match=r"with 2 threads .* there are 1: .* Set NPROC=2"):
-        train_in_folder([counting(4)], run_in(tmp_path), FRESH, Console())
+        train(tmp_path, counting(4))
     monkeypatch.setenv("NPROC", "16")
-    assert train_in_folder([counting(4)], run_in(tmp_path), FRESH, Console()).iterations == 4
+    assert train(tmp_path, counting(4)).iterations == 4
 
 
 def test_a_folder_of_another_run_is_refused_by_what_differs(tmp_path):
-    train_in_folder([counting(2)], run_in(tmp_path), FRESH, Console())
-    with pytest.raises(ValueError, match=r"another run \(seed is 0 there, 9 here\); repeat"):
-        train_in_folder([counting(2)], run_in(tmp_path, replace(CONFIG, seed=9)), FRESH, Console())
+    train(tmp_path, counting(2))
     changed = replace(CONFIG, loss=replace(CONFIG.loss, progress=9.0))
-    with pytest.raises(ValueError, match=r"\(loss\.progress is 1\.2 there, 9\.0 here\)"):
-        train_in_folder([counting(2)], run_in(tmp_path, changed), FRESH, Console())
-    with pytest.raises(ValueError, match="another --from"):
-        train_in_folder([counting(2)], run_in(tmp_path, start="a digest"), FRESH, Console())
-
-
-def test_a_run_of_a_version_with_more_settings_is_refused_by_their_names(tmp_path):
-    train_in_folder([counting(2)], run_in(tmp_path), FRESH, Console())
+    for other, words in (
+        ({"config": replace(CONFIG, seed=9)}, r"another run \(seed is 0 there, 9 here\); repeat"),
+        ({"config": changed}, r"\(loss\.progress is 1\.2 there, 9\.0 here\)"),
+        ({"start": "a digest"}, "another --from"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            train(tmp_path, counting(2), **other)
+    # The folder is of a version with a further setting.
     path = tmp_path / "state" / "config.json"
     record = json.loads(path.read_text())
     record["training"]["config"]["loss"]["survival"] = 0.0
     path.write_text(json.dumps(record))
-    words = r"\(loss\.survival is 0\.0 there, None here\); repeat its options"
-    with pytest.raises(ValueError, match=words):
-        train_in_folder([counting(4)], run_in(tmp_path), FRESH, Console())
+    with pytest.raises(ValueError, match=r"\(loss\.survival is 0\.0 there, None here\); repeat"):
+        train(tmp_path, counting(4))
 
 
 def test_phases_follow_each_other_and_a_stop_at_a_boundary_begins_the_next_one_once(tmp_path):
@@ -155,20 +147,19 @@ def test_phases_follow_each_other_and_a_stop_at_a_boundary_begins_the_next_one_o
 
     def phases(stop=None):
         first, second = counting(4, stop=stop), counting(7, stop=stop)
-        return [first, second._replace(spec=fast, begin=begin)]
+        return first, second._replace(spec=fast, begin=begin)
 
-    (whole := tmp_path / "whole").mkdir()
-    train_in_folder(phases(), run_in(whole), FRESH, Console())
+    train(tmp_path / "whole", *phases())
+    whole = load_policy_checkpoint(tmp_path / "whole" / "policy")
     assert begun == [4]
-    for stop, specs in ((4, SPEC), (5, fast)):
+    for stop, spec, begins in ((4, SPEC, [4, 4]), (5, fast, [4])):
         begun.clear()
         folder = tmp_path / str(stop)
         with pytest.raises(KeyboardInterrupt):
-            train_in_folder(phases(stop), run_in(folder), FRESH, Console())
-        assert load_policy_checkpoint(folder / "policy").spec.rate_hz == specs.rate_hz
-        assert train_in_folder(phases(), run_in(folder), FRESH, Console()).iterations == 7
-        assert begun == ([4, 4] if stop == 4 else [4])
-        ours, theirs = (load_policy_checkpoint(f / "policy") for f in (folder, whole))
-        for name, value in theirs.params.items():
+            train(folder, *phases(stop))
+        assert load_policy_checkpoint(folder / "policy").spec.rate_hz == spec.rate_hz
+        assert train(folder, *phases()).iterations == 7 and begun == begins
+        ours = load_policy_checkpoint(folder / "policy")
+        for name, value in whole.params.items():
             np.testing.assert_array_equal(ours.params[name], value, err_msg=name)
         assert [row["iteration"] for row in curve.read(folder)] == list(range(7))

@@ -1,7 +1,6 @@
 """The validation on worlds built by hand: who coasts through, who must hit, and when it ends."""
 
 from dataclasses import replace
-from functools import cache
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,7 @@ CONFIG = small_config(
     batch=2, gates=2, physics={"drag": (0.0, 0.0), "wind_std": (0, 0, 0), "time_step_std": 0.0}
 )
 FLOWN = validation_worlds(CONFIG, 2, 9, 1.0)
-SPEED, FAR = 6.0, 50.0
+SPEED = 6.0
 
 
 def params():
@@ -33,43 +32,32 @@ def note(worlds, before, body, target):
     return jnp.ones_like(body.pos_w[:, 0]) * (1 + target)
 
 
-@cache
-def flight():
-    """Return the flight, compiled once."""
-    return make_flight(FLOWN, note)
+@pytest.fixture(scope="module")
+def measure():
+    """Return a function from worlds to what coasting through them comes to."""
+    flight = make_flight(FLOWN, note)
+    return lambda worlds: mean_scores(flight(params(), worlds))
 
 
-def measure(worlds):
-    """Return what coasting through these worlds comes to."""
-    return mean_scores(flight()(params(), worlds))
-
-
-def straight(wall_x):
+def straight(wall_x=50.0):
     """Return two worlds: gates 2 m and 4 m ahead, 6 m/s, and a wall across the second's path."""
     return straight_worlds(sample_worlds(FLOWN, 0), SPEED, wall_x)
 
 
-def test_a_straight_flight_through_two_gates_is_a_success():
-    numbers = measure(straight(wall_x=FAR))
+def test_a_straight_flight_through_two_gates_is_a_success(measure):
+    numbers = measure(straight())
     assert numbers["success_cross"] == numbers["collision_free"] == 1.0
     assert numbers["gates"] == 2 and numbers["v_max"] == pytest.approx(SPEED)
     # 0.2 m a step: the first gate in step 10 or 11 and the last in step 20 or 21, the trial's end.
     assert numbers["reward"] == pytest.approx(10 * 1 + 10 * 2, abs=2)
 
 
-def test_a_wall_in_one_of_two_worlds_is_one_collision_and_ends_that_trial():
+def test_a_wall_is_a_collision_that_ends_the_trial_but_not_behind_the_last_gate(measure):
     numbers = measure(straight(wall_x=3.0))
     assert numbers["success_cross"] == numbers["collision_free"] == 0.5
     assert numbers["gates"] == 1.5 and numbers["v_max"] == pytest.approx(SPEED)
-
-
-def test_a_wall_behind_the_last_gate_is_no_collision():
     assert measure(straight(wall_x=5.5))["collision_free"] == 1.0
-
-
-def test_whoever_falls_faster_than_the_policy_can_brake_collides():
-    worlds = straight(wall_x=FAR)
-    falling = worlds._replace(vel_w=np.array([[0, 0, -20]] * 2, np.float32))
+    falling = straight()._replace(vel_w=np.array([[0, 0, -20]] * 2, np.float32))
     numbers = measure(falling)
     assert numbers["collision_free"] == numbers["success_cross"] == numbers["gates"] == 0.0
 
@@ -99,9 +87,7 @@ def test_worlds_are_fresh_fixed_and_all_at_rest():
     assert (one.fov_scale == 1).all()
     trained = sample_worlds(validation_worlds(CONFIG, 5, CONFIG.seed, 2.0), 0)
     assert not np.array_equal(one.pos_w, trained.pos_w)
-
-
-def test_a_policy_that_takes_a_speed_is_asked_for_its_own():
+    # A policy that takes a speed is commanded its own.
     spec = replace(CONFIG.spec, speed_input=True)
     asked = replace(CONFIG, spec=spec, episode=replace(CONFIG.episode, race_share=0.5))
     worlds = sample_worlds(validation_worlds(asked, 40, 9, 2.0), 0)

@@ -33,7 +33,6 @@ def test_mapped_it_flies_what_the_batch_of_the_trainers_ppo_flies(worlds):
     action = np.array([[0.1, 0.2, -0.1], [0.5, 0.0, 0.3], [-3.0, 0.0, 0.0]], np.float32)
     _, after, reward, done, info = step(KEYS, state, action, worlds)
     assert not done.any() and not info["truncated"].any()
-
     race = ENV._race
 
     @jax.jit
@@ -42,10 +41,9 @@ def test_mapped_it_flies_what_the_batch_of_the_trainers_ppo_flies(worlds):
         return race.fly(own, race.start(own), wanted, world_keys(KEYS[0], own))
 
     flown = fly(worlds, 20.0 * np.clip(action, -1, 1))
-    np.testing.assert_allclose(
-        after.episode.state.vel_w[:, 0], flown[0].state.vel_w, rtol=1e-4, atol=1e-4
-    )
-    assert np.abs(after.episode.state.vel_w - state.episode.state.vel_w).max() > 0.1
+    before_w, after_w = state.episode.state.vel_w, after.episode.state.vel_w
+    np.testing.assert_allclose(after_w[:, 0], flown[0].state.vel_w, rtol=1e-4, atol=1e-4)
+    assert np.abs(after_w - before_w).max() > 0.1
     np.testing.assert_allclose(reward, 0.01 * flown[1].reward.total(), rtol=1e-3, atol=1e-4)
 
 
@@ -69,22 +67,5 @@ def test_an_episode_that_ends_starts_another_and_says_why(worlds):
     assert ended[2]["truncated"][2]
 
 
-@pytest.mark.slow
-def test_the_motion_is_differentiable_in_the_action(worlds):
-    state = jax.tree.map(lambda leaf: np.asarray(leaf)[0], reset(KEYS, worlds)[1])
-
-    def forward(action):
-        _, after, *_ = ENV.step(KEYS[0], state, action, worlds)
-        return after.episode.state.vel_w.sum()
-
-    both = jax.jit(jax.value_and_grad(forward))
-    at, along = jnp.asarray([0.1, 0.0, 0.2]), jnp.asarray([0.3, -0.2, 0.9])
-    found = both(at)[1] @ along
-    each = (both(at + 0.01 * along)[0] - both(at - 0.01 * along)[0]) / 0.02
-    assert float(found) == pytest.approx(float(each), rel=0.02) and abs(found) > 0.1
-
-
 def test_its_contract_is_that_of_the_judges_environments():
-    config = RaceConfig(spec=ENV.config.spec)
-    assert ENV.contract == Races(config, 1).contract
-    assert ENV.spec.action.scale == (20.0,)
+    assert ENV.contract == Races(RaceConfig(spec=ENV.config.spec), 1).contract

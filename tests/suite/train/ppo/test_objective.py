@@ -27,19 +27,16 @@ def test_advantages_are_those_of_a_plain_loop():
     done[6] = [True, False, False, True]
     discount, trace = 0.9, 0.7
     expected = np.zeros_like(reward)
-    for world in range(4):
-        for first in range(7):
-            # The sum of later errors, each discounted, up to the end of its own episode.
-            for step in range(first, 7):
-                after = 0.0 if done[step, world] else discount * value[step + 1, world]
-                error = reward[step, world] + after - value[step, world]
-                expected[first, world] += (discount * trace) ** (step - first) * error
-                if done[step, world]:
-                    break
-    found = jax.jit(advantages)(
-        jnp.asarray(reward), jnp.asarray(value), jnp.asarray(done), discount, trace
-    )
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    for world, first in np.ndindex(4, 7):
+        # The sum of later errors, each discounted, up to the end of its own episode.
+        for step in range(first, 7):
+            after = 0.0 if done[step, world] else discount * value[step + 1, world]
+            error = reward[step, world] + after - value[step, world]
+            expected[first, world] += (discount * trace) ** (step - first) * error
+            if done[step, world]:
+                break
+    arrays = map(jnp.asarray, (reward, value, done))
+    np.testing.assert_allclose(jax.jit(advantages)(*arrays, discount, trace), expected, rtol=1e-12)
 
 
 def rollout_of(actor, seed=1, done=False):
@@ -103,12 +100,10 @@ def test_a_change_beyond_the_clip_is_not_rewarded(ratio, advantage, gain, learns
     actor = actor_of()
     embeddings, sequences = rollout_of(actor)
     sequences = sequences._replace(
-        log_prob=sequences.log_prob - np.log(ratio),
-        advantage=np.full((STEPS, BATCH), advantage),
+        log_prob=sequences.log_prob - np.log(ratio), advantage=np.full((STEPS, BATCH), advantage)
     )
-    (loss, numbers), gradient = loss_and_slope(
-        replace(CONFIG, clip=0.2), actor, embeddings, sequences
-    )
+    config = replace(CONFIG, clip=0.2)
+    (loss, numbers), gradient = loss_and_slope(config, actor, embeddings, sequences)
     assert float(loss) == pytest.approx(-gain) and float(numbers["clipped"]) == 1
     assert bool(np.any(gradient.params["action.weight"])) == learns
 
@@ -130,6 +125,5 @@ def test_entropy_widens_the_exploration():
     actor = actor_of()
     embeddings, sequences = rollout_of(actor)
     sequences = sequences._replace(advantage=jnp.zeros((STEPS, BATCH)))
-    config = replace(CONFIG, entropy=0.3)
-    _, gradient = loss_and_slope(config, actor, embeddings, sequences)
+    _, gradient = loss_and_slope(replace(CONFIG, entropy=0.3), actor, embeddings, sequences)
     np.testing.assert_allclose(gradient.log_deviation, -0.3 * np.ones(3), rtol=1e-12)

@@ -8,17 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from policies.formats.checkpoint import load_arrays
 from policies.formats.policy_file import load_policy_checkpoint
 from policies.networks import network
 from suite.common import curve
 from suite.common.console import Console
 from suite.train.ppo import update as run
-from suite.train.ppo.config import PpoConfig, ppo_like
+from suite.train.ppo.config import ppo_like
 from suite.train.ppo.objective import Actor, Sequences, action_means
 from suite.train.ppo.rollout import log_probability, make_rollout
-from suite.train.recipes import named_recipe
-from tests.support.training import SPEC, boxes_worlds, fresh_params, small_config
+from tests.support.training import SPEC, assert_same_run, boxes_worlds, fresh_params, small_config
 
 DELAYS = {"image_delay": 2, "state_delay": 1, "depth_noise": 0.02}
 CONFIG = replace(
@@ -34,12 +32,6 @@ make_update = cache(run.make_update)
 def _small_scenes(monkeypatch):
     monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
     monkeypatch.setattr(run, "make_update", make_update)
-
-
-def rows(folder):
-    found = curve.read(folder)
-    assert all(row.pop(key) >= 0 for row in found for key in ("steps_per_s", "seconds", "cold"))
-    return found
 
 
 def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch):
@@ -62,23 +54,9 @@ def test_a_stopped_run_resumes_exactly_and_leaves_a_policy(tmp_path, monkeypatch
     assert [row["iteration"] for row in curve.read(stopped)] == [0]
     monkeypatch.setattr(run, "sample_worlds", boxes_worlds)
     run.train_ppo(CONFIG, stopped, Console())
-    ours, theirs = (load_arrays(f / "state", kind="training").arrays for f in (stopped, whole))
-    assert ours.keys() == theirs.keys()
-    for name, value in theirs.items():
-        np.testing.assert_array_equal(ours[name], value, err_msg=name)
-    assert rows(stopped) == rows(whole)
+    assert_same_run(stopped, whole)
     with pytest.raises(ValueError, match="holds another run.*discount"):
         run.train_ppo(replace(CONFIG, discount=0.5), whole, Console())
-
-
-def test_ppo_like_a_training_has_its_worlds_and_ppos_own_settings():
-    config = replace(named_recipe("race"), seed=4)
-    found = ppo_like(config, iterations=7)
-    for part in ("spec", "physics", "quadrotor", "loss", "episode", "seed"):
-        assert getattr(found, part) == getattr(config, part), part
-    assert found.iterations == 7 and found.rate == PpoConfig().rate
-    assert found.shared == replace(config, optimizer=found.shared.optimizer, phases=())
-    assert found.shared.optimizer.iterations == 7
 
 
 def test_minibatches_and_strides_that_do_not_divide_are_refused(tmp_path):
@@ -132,11 +110,8 @@ def test_the_learner_meets_the_actions_density_that_the_rollout_recorded():
 
 
 def test_a_world_that_crashed_starts_again_as_it_started():
-    worlds = crashing(boxes_worlds(CONFIG.shared))
-    _, records = flown(worlds)
-    again = int(np.argmax(records.done[:, 0])) + 1
-    np.testing.assert_allclose(
-        records.critic_inputs[again, 0], records.critic_inputs[0, 0], atol=1e-6
-    )
+    _, records = flown(crashing(boxes_worlds(CONFIG.shared)))
+    again, seen = int(np.argmax(records.done[:, 0])) + 1, records.critic_inputs
+    np.testing.assert_allclose(seen[again, 0], seen[0, 0], atol=1e-6)
     np.testing.assert_array_equal(records.state[again, 0], records.state[0, 0])
-    assert not np.allclose(records.critic_inputs[again, 1], records.critic_inputs[0, 1])
+    assert not np.allclose(seen[again, 1], seen[0, 1])

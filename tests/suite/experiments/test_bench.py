@@ -1,0 +1,130 @@
+"""Benchmarks time both sides in turn, on the same worlds, loss, gradient, trials and error."""
+
+import json
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from policies.formats.c.compiler import find_compiler
+from policies.formats.torch_twin import torch_twin
+from suite import cli
+from suite.common.errors import WorkFailed
+from suite.diagnose.data.noise import noise_of
+from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
+from suite.experiments.bench import diagnose, judge, policy, sysid_baseline, train
+from suite.experiments.bench.compare import Comparison, Figure, compare_times, in_turn
+from suite.experiments.bench.rigid_body import make_task
+from suite.experiments.bench.torch_baseline import Baseline, to_torch
+from suite.train.gradient import make_gradient
+from tests.support.small_policy import small_checkpoint
+from tests.support.training import fresh_params
+from tracks.geometry.scene import PARKED_Z
+
+
+def test_both_sides_compute_the_same_loss_and_gradient():
+    """Ours leaves far solids out of images, so not to the last digit."""
+    base = train.bench_config(6, 12)
+    config = replace(base, physics=replace(base.physics, depth_noise=0.0))
+    worlds, params = train.bench_worlds(config), fresh_params(config.spec)
+    kinds = (worlds.scene.boxes, *worlds.scene[2:5])
+    assert sum(part.center_w.shape[1] for part in kinds) == 64 == sum(train.SOLIDS)
+    assert all(np.all(part.center_w[..., 2] > PARKED_Z / 2) for part in kinds)
+    gradient, loss, _ = jax.jit(make_gradient(config))(params, worlds, jax.random.key(0), None)
+    baseline = Baseline(config, {name: np.asarray(value) for name, value in params.items()})
+    theirs = baseline.loss(to_torch(worlds))
+    theirs.backward()
+    assert float(loss) == pytest.approx(float(theirs.detach()), rel=1e-3, abs=1e-4)
+    ours = torch_twin({name: np.asarray(value) for name, value in gradient.items()}, config.spec)
+    expected = dict(ours.named_parameters())
+    for name, value in baseline.network.named_parameters():
+        size = float(expected[name].abs().max())
+        assert value.grad is not None and size > 0
+        assert float((value.grad - expected[name]).abs().max()) < 0.01 * size, name
+
+
+def test_the_baseline_refuses_what_its_recipe_does_not_have():
+    base = train.bench_config(2, 3)
+    params = {name: np.asarray(value) for name, value in fresh_params(base.spec).items()}
+    for part, change in (("loss", {"projection": 1.0}), ("spec", {"gate_axis": True})):
+        config = replace(base, **{part: replace(getattr(base, part), **change)})
+        with pytest.raises(ValueError, match=f"{part}.{next(iter(change))} is .* recipe paper"):
+            Baseline(config, params)
+
+
+def test_both_sides_have_the_same_residuals():
+    task = make_task(20_000, 2.5)
+    model = RolloutModel(
+        task.nominal, task.space, rotor_input=True, voltage=False, integrator="euler"
+    )
+    begin = start_estimate(model, task.windows)
+    residual = model.residual(begin.theta, begin.free, task.windows)
+    noise = noise_of(residual, task.windows)
+    problem = sysid_baseline.prepare(task, noise)
+    theirs = np.array(problem.residual(task.array("start"), problem.params)[0])
+    theirs = theirs.reshape(len(task.windows.flight), -1, 12)
+    ours = -residual[:, 1:, :12] / noise[:12]
+    # The first tenth of a second: then 5 mm of the centre of mass have not turned much over, and
+    # attitude errors as rotation vector and as twice a quaternion's part are the same.
+    near = np.asarray(task.windows.row_s)[:, 1:] < 0.1
+    seen = np.asarray(task.windows.valid)[:, 1:, :12] & near[..., None]
+    assert seen.any(axis=(0, 1)).all()
+    np.testing.assert_allclose(theirs[seen], ours[seen], rtol=2e-3, atol=2e-2)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
+def test_every_engine_is_timed_and_the_ratio_is_of_the_times(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder, run = str(small_checkpoint(tmp_path)), policy.run
+    monkeypatch.setattr(policy, "run", lambda asked: run(asked, rounds=1))
+    assert cli.main(["bench", "policy", "--policy", folder, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["details"]["policy"] == Path(folder).name
+    ours, baseline = answer["ours"]["value"], answer["baseline"]["value"]
+    assert answer["ratio"] == pytest.approx(baseline / ours)
+    rows = {name: row for name, row in answer["details"].items() if isinstance(row, dict)}
+    assert set(rows) >= {"C float32", "C int8", "ONNX Runtime", "torch"}
+    for row in rows.values():
+        assert 0 < row["median_us"] <= row["p99_us"] <= row["max_us"]
+    assert rows["C int8"]["weight_bytes"] < 0.4 * rows["C float32"]["weight_bytes"]
+    estimate = rows["C float32"]["estimate_cortex_m7_480mhz_ms"]
+    assert estimate == pytest.approx(rows["C float32"]["multiply_adds"] * 3.0 / 480e3)
+
+
+def test_bench_times_both_sides_in_turn():
+    calls = []
+    ticks = count()
+    sides = {
+        "ours": lambda: calls.append("ours"),
+        "baseline": lambda: (calls.append("baseline"), next(ticks), next(ticks)),
+    }
+    taken = in_turn(sides, 3, clock=lambda: next(ticks))
+    assert calls == ["ours", "baseline"] * 4
+    assert taken == {"ours": [1] * 3, "baseline": [3] * 3}
+    assert compare_times("a", taken, 6.0, "steps/s", {}).baseline == Figure(2.0, "steps/s")
+    assert in_turn(sides, 3, most_s=0.0).keys() == {"ours", "baseline"} and len(calls) == 12
+    figures = Figure(6.0, "steps/s"), Figure(2.0, "steps/s")
+    assert Comparison("a", *figures).ratio == pytest.approx(3.0)
+
+
+def test_without_a_compiler_or_packages_it_says_what_to_install(monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(WorkFailed, match="no C compiler"):
+        policy.run()
+    monkeypatch.setattr(sysid_baseline, "is_installed", lambda: False)
+    with pytest.raises(WorkFailed, match=r"pip install 'mujoco\[sysid\]'"):
+        diagnose.run()
+
+
+def test_both_sides_fly_the_same_trials_to_the_same_end(tmp_path, monkeypatch, capsys):
+    folder, run = str(small_checkpoint(tmp_path)), judge.run
+    monkeypatch.setattr(judge, "run", lambda: run(folder, trials=3, time_limit_s=0.2))
+    assert cli.main(["bench", "judge", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["ours"]["value"] > 0 and answer["baseline"]["value"] > 0
+    assert answer["ratio"] == answer["ours"]["value"] / answer["baseline"]["value"]
+    assert answer["details"]["trials_that_end_alike"] == 3
+    assert answer["details"]["images_a_trial"] > 1
