@@ -160,10 +160,12 @@ def diagnose_flights(
     Raises:
         ValueError: for flights or a vehicle that cannot be used.
     """
+    from suite.diagnose.config import Config
     from suite.diagnose.run import diagnose_files
 
-    paths, before = [Path(f) for f in flights], [Path(f) for f in reference]
-    return diagnose_files(paths, str(vehicle), Path(out), _console(progress), reference=before)
+    paths, before = (tuple(Path(f) for f in given) for given in (flights, reference))
+    config = Config(flights=paths, vehicle=str(vehicle), reference=before, out=Path(out))
+    return diagnose_files(config, _console(progress))
 
 
 def identify_vehicle(

@@ -32,7 +32,7 @@ from eval.quadrotor.plant import (
     uses_rotor_acc,
 )
 from eval.quadrotor.rotors import RotorStep, acceleration, follow, steady
-from eval.quadrotor.stepper import Feedback, Inputs, loop_update, prepend_start, wanted_speed
+from eval.quadrotor.stepper import Inputs, loop_update, prepend_start, wanted_speed
 from tracks.geometry.rotation import exp_rot
 
 INTEGRATORS = ("continuous", "euler")
@@ -92,7 +92,6 @@ def fly(
     rotor_speed: Array,
     start_s: Array,
     integrator: str = "continuous",
-    feedback: Feedback | None = None,
 ) -> Flight:
     """Simulate T steps from `motion` in JAX, and return the states after them.
 
@@ -105,7 +104,6 @@ def fly(
         rotor_speed: (..., 4) rotor speeds at the start [rad/s].
         start_s: (...,) time of the first step since the start of the flight [s].
         integrator: one of `INTEGRATORS`.
-        feedback: computes a push (an additional acceleration) that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
@@ -122,18 +120,12 @@ def fly(
     total = _wrench(plant, motion, rotors, first_inputs, start_s)
     start = start._replace(air=_difference(total, _still(plant, rotors)))
 
-    def one_step(carry: Any, row: tuple[Array, Steps, Inputs]) -> tuple[Any, Any]:
-        (now, motion, time_s, memory), (index, span, row_inputs) = carry, row
-        if feedback is not None:
-            memory, push_b = feedback.act(memory, motion, row_inputs, index)
-            row_inputs = row_inputs._replace(push_b=push_b)
+    def one_step(carry: Any, row: tuple[Steps, Inputs]) -> tuple[Any, Any]:
+        (now, motion, time_s), (span, row_inputs) = carry, row
         now, motion, acc_b = step(plant, now, motion, span, row_inputs, time_s, integrator)
-        carry = (now, motion, time_s + span.length_s, memory)
-        return carry, (motion, now.rotor_speed, acc_b)
+        return (now, motion, time_s + span.length_s), (motion, now.rotor_speed, acc_b)
 
-    first_carry = (start, motion, start_s, None if feedback is None else feedback.start)
-    rows = (jnp.arange(len(steps.length_s)), steps, inputs)
-    _, (motions, speeds, acc_b) = jax.lax.scan(one_step, first_carry, rows)
+    _, (motions, speeds, acc_b) = jax.lax.scan(one_step, (start, motion, start_s), (steps, inputs))
     motions, speeds = prepend_start((motion, rotor_speed), (motions, speeds))
     return Flight(motions, speeds, acc_b)
 

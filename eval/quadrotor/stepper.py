@@ -10,7 +10,7 @@ rotor time constant.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,15 +66,6 @@ class Inputs(NamedTuple):
     speed_cmd: Array | None = None
     """(..., 4) commanded rotor speeds, instead of a command [rad/s]. The command delay and the
     rotors' response act on them."""
-
-
-class Feedback(NamedTuple):
-    """A function of the simulated state, such as a network, that computes `Inputs.push_b`."""
-
-    start: Any
-    """State of the function at the start."""
-    act: Callable[[Any, Motion, Inputs, Array], tuple[Any, Array]]
-    """Maps (state, motion, inputs, number of the step) to (state, `Inputs.push_b`)."""
 
 
 class Rollout(NamedTuple):
@@ -249,7 +240,6 @@ def rollout(
     inputs: Inputs,
     state: PlantState | None = None,
     start_s: Array | float = 0.0,
-    feedback: Feedback | None = None,
 ) -> Rollout:
     """Simulate T steps from `motion` in JAX, and return the states after them.
 
@@ -259,7 +249,6 @@ def rollout(
         inputs: (T, ...) inputs of the steps.
         state: (...) plant's state at the start; None: that of a hover.
         start_s: (...,) time since the start of the flight at the first step [s].
-        feedback: computes a push that replaces `inputs.push_b`.
     """
     import jax
     import jax.numpy as jnp
@@ -269,17 +258,11 @@ def rollout(
     steps = jnp.arange(len(jax.tree.leaves(inputs)[0]))
 
     def one_step(carry: Any, row: tuple[Array, Inputs]) -> tuple[Any, Any]:
-        state, motion, memory = carry
-        index, row_inputs = row
-        if feedback is not None:
-            memory, push_b = feedback.act(memory, motion, row_inputs, index)
-            row_inputs = row_inputs._replace(push_b=push_b)
+        (state, motion), (index, row_inputs) = carry, row
         state, motion, wrench = step(plant, state, motion, row_inputs, start_s + index * plant.dt)
-        acc_b = wrench.force_b / mass_of(plant)
-        return (state, motion, memory), (motion, state.rotor_speed, acc_b)
+        return (state, motion), (motion, state.rotor_speed, wrench.force_b / mass_of(plant))
 
-    begin = (start, motion, None if feedback is None else feedback.start)
-    (last, _, _), (motions, speeds, acc_b) = jax.lax.scan(one_step, begin, (steps, inputs))
+    (last, _), (motions, speeds, acc_b) = jax.lax.scan(one_step, (start, motion), (steps, inputs))
     motions, speeds = prepend_start((motion, start.rotor_speed), (motions, speeds))
     return Rollout(motions, speeds, acc_b, last)
 

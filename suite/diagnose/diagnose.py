@@ -20,10 +20,10 @@ from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import examine, one_cause, without_names
 from suite.diagnose.sources.rollout_source import pose_delays
 from suite.diagnose.sources.rollouts import by_rollouts
-from suite.diagnose.sources.source import DiagnosisInput, Finding, Source, SourceSet, TestedEffect
+from suite.diagnose.sources.source import DiagnosisInput, Finding, Source, SourceSet
 from suite.diagnose.sources.views import by_views
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict.actuators import integrator_of
+from suite.diagnose.verdict.actuators import TestedEffect, integrator_of
 
 SourceMaker = Callable[[DiagnosisInput, Sequence[Source]], SourceSet | None]
 """Function that makes sources from the input and the sources made before; None if it makes none."""

@@ -1,4 +1,4 @@
-"""Plans flights that separate effects which the diagnosed flights do not, and simulates them.
+"""Plans flights that separate effects which the diagnosed flights do not.
 
 Two effects are separated if only one of them explains the flights. Each planned flight is a
 trajectory. Its parameters are in `plan.json`, and its set points in a CSV for autopilots: position,
@@ -14,20 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from eval.flights.follow import FlightFailed
-from eval.flights.simulate import Sensors, fly, log_of
 from eval.flights.trajectory import Trajectory
-from eval.logs.flight_log import write_flight
-from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.data.windows import SLICES
 from suite.diagnose.estimate.parameters import effects_in
 from tracks.common.files import write_json, write_text
 from tracks.common.provenance import stamp
 from tracks.input.reading import read_json
 
 RATE_HZ = 100.0
-"""Rate of the set points, and largest rate of simulated logs. The rate of a log is the rate loop's
-frequency divided by a whole number [Hz]."""
+"""Rate of the set points [Hz]."""
 SECOND_DIRECTION = 2.1
 """Rotation about z of the second flight of each trajectory [rad]. Each trajectory is flown twice,
 so that one flight can be held out."""
@@ -37,10 +31,6 @@ MEASURES = {
     "scale": "Better still: weigh the vehicle.",
 }
 """Advice on further measurements, by their names in `Separation.measure`."""
-ROTOR_NOISE, VOLTAGE_NOISE = 5.0, 0.02
-"""Noise of rotor speeds [rad/s] and voltage [V], if the diagnosed logs lack these signals."""
-FLIGHTS = "flights"
-"""Folder of the simulated logs, in the plan's folder."""
 
 
 def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[str]]:
@@ -48,117 +38,19 @@ def trajectories_for(result: Mapping[str, Any]) -> tuple[list[Trajectory], list[
 
     `result` is the content of diagnosis.json.
     """
-    trajectories: list[Trajectory] = []
-    words: list[str] = []
+    trajectories, words = list[Trajectory](), list[str]()
     for effect in result["effects"]:
-        if not effect["alternatives"]:
-            continue
-        names = {effect["name"], *effect["alternatives"]}
-        entries = separations_of(names)
-        trajectories += plan_for(names)
-        if not entries:
-            together = " from ".join(sorted(names))
-            words.append(f"To separate {together}: fly fast, with changes of thrust and heading.")
-        for entry in entries:
-            words.append(f"To separate {' from '.join(entry.pair)}: {entry.words}.")
-            words += [MEASURES[name] for name in entry.measure]
+        if effect["alternatives"]:
+            names = {effect["name"], *effect["alternatives"]}
+            trajectories += plan_for(names)
+            words += [advice(effect["name"], rival) for rival in effect["alternatives"]]
+            words += [MEASURES[key] for entry in separations_of(names) for key in entry.measure]
     flights = [
         flight
         for trajectory in dict.fromkeys(trajectories)
         for flight in (trajectory, replace(trajectory, direction=SECOND_DIRECTION))
     ]
     return flights, list(dict.fromkeys(words))
-
-
-def write_plan_of(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the plan for a diagnosis into `folder`, and return the plan; it may have no flights.
-
-    `result` is the content of diagnosis.json. An earlier plan in `folder` is removed with its
-    simulated logs, so that they are not mistaken for the new ones.
-    """
-    remove_plan(folder)
-    trajectories, words = trajectories_for(result)
-    if not trajectories:
-        return {
-            "flights": [],
-            "words": ["No effects are left to separate: no flight is planned."],
-        }
-    return write_plan(folder, trajectories, words)
-
-
-def fly_plan(
-    plan: dict[str, Any],
-    sigma: np.ndarray,
-    nominal: Vehicle,
-    truth: Vehicle,
-    folder: Path,
-    seed: int,
-) -> dict[str, Any]:
-    """Fly `plan` in MuJoCo, and write logs with the noise of the diagnosed ones.
-
-    Args:
-        plan: result of `write_plan_of`.
-        sigma: (19,) standard deviation of the noise of each channel, in the channel's unit; NaN for
-            a channel that is not logged.
-        nominal: the vehicle that the position controller assumes.
-        truth: the vehicle that flies.
-        folder: the plan's folder.
-        seed: seed of noise and random wind.
-
-    Returns:
-        The plan, with the path of each flight's log in `flown`, and with `warnings` about flights
-        that failed.
-    """
-    frequency = truth.controller.frequency
-    rate_hz = frequency / max(1, round(frequency / RATE_HZ))
-    sensors = _sensors(sigma, rate_hz, plan["words"])
-    flights, warnings = [], []
-    for number, flight in enumerate(plan["flights"], 1):
-        trajectory = Trajectory(**flight["trajectory"])
-        rng = np.random.default_rng([seed, number])
-        try:
-            (recording,) = fly(
-                nominal, truth, [trajectory], rate_hz, rng=rng, has_voltage=bool(sensors.voltage)
-            )
-        except FlightFailed as error:
-            warnings.append(f"plan: {flight['file']} could not be flown: {error}")
-            flights.append(flight)
-            continue
-        name = f"{FLIGHTS}/plan_{number}_{trajectory.kind}.parquet"
-        log = log_of(recording, truth, sensors, rng, name)
-        metadata = {"source": "suite diagnose --fly", "vehicle": truth.name, "seed": seed}
-        (folder / FLIGHTS).mkdir(parents=True, exist_ok=True)
-        write_flight(folder / name, replace(log, about={**log.about, **metadata}))
-        flights.append({**flight, "flown": name})
-    plan = {**plan, "flights": flights}
-    if flights:
-        write_json(folder / NAME, {**plan, **stamp(SCHEMA, seed)})
-    return {**plan, "warnings": warnings}
-
-
-def _sensors(sigma: np.ndarray, rate_hz: float, words: list[str]) -> Sensors:
-    """Return sensors with the noise of the diagnosed logs.
-
-    Rotor speeds and voltage are logged as well if the advice in `words` mentions them.
-    """
-
-    def noise(group: str) -> float:
-        """Return the RMS noise of a group of channels; 0 (not logged) if it has none."""
-        values = sigma[SLICES[group]]
-        return float(np.sqrt(np.mean(values**2))) if np.isfinite(values).all() else 0.0
-
-    wanted = " ".join(words)
-    return Sensors(
-        "as diagnosed",
-        rate_hz,
-        pos=noise("position"),
-        attitude=noise("attitude"),
-        gyro=noise("rates"),
-        vel=noise("velocity"),
-        acc=noise("accelerometer"),
-        rotor=noise("rotor speed") or (ROTOR_NOISE if "rotor speeds" in wanted else 0.0),
-        voltage=VOLTAGE_NOISE if "voltage" in wanted else 0.0,
-    )
 
 
 SCHEMA = 1
@@ -171,8 +63,6 @@ COLUMNS = (
 """Columns of a CSV: time [s]; position [m], velocity [m/s] and acceleration [m/s^2] in the world
 frame; yaw [rad]."""
 NAME = "plan.json"
-KEYS = ("file", "flown")
-"""Keys of a flight's files in plan.json: its set points, and its log if it was simulated."""
 
 
 def remove_plan(folder: Path) -> None:
@@ -181,7 +71,7 @@ def remove_plan(folder: Path) -> None:
     if not path.is_file():
         return
     try:
-        listed = [flight.get(key) for flight in read_json(path)["flights"] for key in KEYS]
+        listed = [flight.get("file") for flight in read_json(path)["flights"]]
     except (ValueError, KeyError, TypeError, AttributeError):
         return  # another program's file, which will be overwritten
     for name in listed:
@@ -192,16 +82,19 @@ def remove_plan(folder: Path) -> None:
 
 
 def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -> dict[str, Any]:
-    """Write plan.json and the set points of each flight into `folder`.
+    """Write plan.json and the set points of each flight into `folder`; without flights, nothing.
 
     Args:
-        folder: folder for the files.
+        folder: folder for the files. An earlier plan in it is removed.
         ways: one trajectory for each flight.
         words: advice for people, which the plan contains.
 
     Returns:
         The content of plan.json.
     """
+    remove_plan(folder)
+    if not ways:
+        return {"flights": [], "words": ["No effects are left to separate: no flight is planned."]}
     folder.mkdir(parents=True, exist_ok=True)
     flights = []
     for number, way in enumerate(ways, 1):
@@ -218,7 +111,6 @@ def write_plan(folder: Path, ways: Sequence[Trajectory], words: Sequence[str]) -
                 "room": np.ptp(wanted.pos_w, axis=0).tolist(),
                 "top_speed": float(np.linalg.norm(wanted.vel_w, axis=1).max()),
                 "top_acceleration": float(np.linalg.norm(wanted.acc_w, axis=1).max()),
-                "flown": None,
             }
         )
     plan = {"flights": flights, "words": list(words)}

@@ -271,13 +271,6 @@ class Thresholds:
     standard errors."""
     profile_fall: float = 1.92
     """Fall of the log-likelihood at the ends of a 95 % interval (Wilks 1938)."""
-    check_stride_s: float = 0.5
-    """Time between windows in the comparison with a black box [s]."""
-    slow_share: float = 0.6
-    """Share of the windows to which a black box is fitted: the slowest ones. The faster windows are
-    held out."""
-    least_judged: int = 6
-    """Least number of windows to fit, and to hold out, in that comparison."""
 
 
 THRESHOLDS = Thresholds()

@@ -207,19 +207,19 @@ def _diagnosis_stage(run: LoopRun) -> Stage:
     """Return the stage that names the effects that the simulation's vehicle file lacks."""
 
     def work(folder: Path) -> None:
+        from suite.diagnose.config import Config
         from suite.diagnose.run import diagnose_files
 
         selected = json.loads((run.logs / "diagnosed.json").read_text(encoding="utf-8"))
-        paths = [run.logs / name for name in selected["files"]]
+        config = Config(
+            flights=tuple(run.logs / name for name in selected["files"]),
+            vehicle=run.config.vehicle,
+            out=folder,
+            drive=INPUT_SOURCE,
+            seed=run.config.seed,
+        )
         try:
-            diagnose_files(
-                paths,
-                run.config.vehicle,
-                folder,
-                run.console,
-                drive=INPUT_SOURCE,
-                seed=run.config.seed,
-            )
+            diagnose_files(config, run.console)
         except ValueError as error:
             raise WorkFailed(f"the flights in {run.logs} cannot be diagnosed: {error}") from error
 

@@ -3,7 +3,6 @@
 Eight programs are shown in docs/start.md; a file that is not in the table here fails.
 """
 
-import inspect
 import json
 import re
 import runpy
@@ -26,7 +25,7 @@ from suite.train.overrides import override
 from tests.support.policy_files import InProcess
 from tests.support.short import cut_short
 
-RECIPE, DIAGNOSE = train_command.named_recipe, diagnose_run.diagnose_files
+RECIPE = train_command.named_recipe
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = {
     "fly_and_plot": (["."], "8 gates, finished", ["trial.png", "trial.gif", "trial.rrd"]),
@@ -101,11 +100,10 @@ def test_the_example_runs(name, short, tmp_path, monkeypatch, capsys):
         assert (tmp_path / file).stat().st_size > 0
 
 
-def diagnosed(paths, vehicle, out, console, **options):
+def diagnosed(config, console):
     """Stand for the diagnosis, which tests/suite/commands/test_example.py makes in full (slow)."""
-    inspect.signature(DIAGNOSE).bind(paths, vehicle, out, console, **options)
-    assert load_vehicle(vehicle) and len(read_flights(flight_files(paths))[0]) == 3
-    (out / "report.html").write_text("as the command writes it")
+    assert load_vehicle(config.vehicle) and len(read_flights(flight_files(config.flights))[0]) == 3
+    (config.out / "report.html").write_text("as the command writes it")
     entry = {"value": [0.004, 0.001, None], "ci95": [[0.003, 0.005], [0.0, 0.002], None]}
     return {
         "verdict": "named",

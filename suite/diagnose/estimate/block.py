@@ -139,6 +139,15 @@ class NormalEquations(NamedTuple):
         rows = slice(None) if inside is None else inside
         return self.hessian[rows].sum(axis=0), self.gradient[rows].sum(axis=0)
 
+    def chi2_at(self, change: np.ndarray) -> np.ndarray:
+        """Return the squared error (B,) of each stretch after a change (K,) of the parameters.
+
+        The change may differ between the stretches, (B, K).
+        """
+        change = np.broadcast_to(change, self.gradient.shape)
+        quadratic = np.einsum("bi,bij,bj->b", change, self.hessian, change)
+        return self.chi2 - 2.0 * (self.gradient * change).sum(axis=1) + quadratic
+
 
 def products(slope: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return J'J (B, K, K) and J'r (B, K) of `slope` (B, M, K) and `residual` (B, M, 1)."""

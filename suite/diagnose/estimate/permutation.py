@@ -1,8 +1,13 @@
-"""Cross-validated gain of each candidate effect, and its p-value by a permutation test.
+"""Gain of each candidate effect, and its p-value by draws of the null hypothesis.
 
-The gain is the fall of the squared error on windows (1 s of a flight) that the fit left out. The
-p-value is the probability of such a gain under the null hypothesis, that no effect is missing. The
-distribution of gains under this hypothesis is called the null below.
+The gain is the fall of the squared error. The p-value is the probability that the best of all
+candidates gains as much under the null hypothesis, that no effect is missing. The distribution of
+gains under this hypothesis is called the null below.
+
+Where windows (1 s of a flight) are fitted, a gain is cross-validated, and the null is drawn by a
+permutation test. Where a few flights are compared by their mean residuals, most candidates look
+alike, so a Bonferroni correction by their number would be too strict. There the null is drawn from
+the known noise: it is the smallest p-value of all candidates (Westfall and Young 1993).
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from suite.diagnose.estimate.gauss_newton import NormalEquations, solve
 from suite.diagnose.estimate.parameters import Candidate, ParameterSpace
@@ -167,8 +173,12 @@ def permutation_test(
         noise = _noise_gradients(hessian, draws, rng)
         drawn = [(noise[:, i].sum(axis=1), noise[:, o].sum(axis=1)) for i, o in folds]
     null = np.max([gain_by_chance(group) for group in groups], axis=0) - gain_by_chance(always)
-    p_values = [float((1 + (null >= fall).sum()) / (1 + draws)) for fall in falls]
-    return falls, p_values, float(np.quantile(null, 0.99))
+    return falls, [_p_value(null >= fall) for fall in falls], float(np.quantile(null, 0.99))
+
+
+def _p_value(as_extreme: np.ndarray) -> float:
+    """Return a p-value from draws of the null; `as_extreme` (D,) is true for those that count."""
+    return float((1 + as_extreme.sum()) / (1 + len(as_extreme)))
 
 
 def _noise_gradients(hessian: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
@@ -177,3 +187,48 @@ def _noise_gradients(hessian: np.ndarray, draws: int, rng: np.random.Generator) 
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     normal = rng.standard_normal((draws, *hessian.shape[:2], 1))
     return (root @ normal)[..., 0]
+
+
+def corrected_p_values(
+    gains: Sequence[float],
+    slope: np.ndarray,
+    groups: Sequence[Sequence[int]],
+    always: Sequence[int],
+    variance_ratios: np.ndarray,
+    rng: np.random.Generator,
+) -> list[float]:
+    """Return for each group the probability that the best of all groups gains as much by chance.
+
+    Args:
+        gains: fall of chi-square by each group, after the columns `always` are fitted.
+        slope: (F, 3, P) derivative of F flights' means by P parameters (columns), in units of
+            independent noise.
+        groups: columns that are fitted together, such as all parameters of a candidate.
+        always: columns that are always fitted.
+        variance_ratios: (D, 3) draws of each axis's estimated variance over the true variance. The
+            smallest possible p-value is 1 / (D + 1).
+        rng: generator of the noise. If it has drawn `variance_ratios`, it must not be seeded again.
+    """
+    draws = len(variance_ratios)
+    noise = rng.standard_normal((draws, len(slope), 3))
+    noise = (noise / np.sqrt(variance_ratios)[:, None]).reshape(draws, -1)
+    slope = slope.reshape(-1, slope.shape[-1])
+    slope = slope / np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
+    fitted = _orthonormal_basis(slope[:, list(always)])
+    free = slope - fitted @ (fitted.T @ slope)
+    # Groups differ in size, so they are compared by their p-values and not by their gains.
+    smallest = np.ones(draws)
+    for group in groups:
+        gain = ((noise @ _orthonormal_basis(free[:, list(group)])) ** 2).sum(axis=1)
+        smallest = np.minimum(smallest, chi2.sf(gain, len(group)))
+    pairs = zip(gains, groups, strict=True)
+    return [_p_value(smallest <= chi2.sf(max(gain, 0.0), len(group))) for gain, group in pairs]
+
+
+def _orthonormal_basis(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (M, R) of the span of `columns` (M, K).
+
+    The columns must have unit length or be 0, as smaller singular values count as dependence.
+    """
+    directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return directions[:, sizes > 1e-6]

@@ -19,7 +19,7 @@ from eval.effects.interface import Sample
 from eval.effects.log_faults import pose_delay, to_logged, to_true
 from eval.quadrotor.continuous import Carry, Steps, fly, turn_rotors, update_loop
 from eval.quadrotor.plant import Motion, Plant, Wrench, unpack_command
-from eval.quadrotor.stepper import Feedback, Inputs, wanted_speed
+from eval.quadrotor.stepper import Inputs, wanted_speed
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.windows import (
     CHANNELS,
@@ -52,7 +52,6 @@ def fly_windows(
     offset: Any,
     windows: FlightWindows,
     push: Any = None,
-    feedback: Feedback | None = None,
 ) -> Flown:
     """Simulate B windows from their measured start states.
 
@@ -66,7 +65,6 @@ def fly_windows(
             of the rotor speeds, at the knots if these are the input, else at the start.
         windows: B windows.
         push: (B, KNOTS, 6) additional force and torque at the knots, see `Inputs.push_b`.
-        feedback: a function that computes such forces from the state, in place of `push`.
     """
     burn_in = windows.burn_in_rate_b.shape[1]
     edge_s, sample_s = jnp.asarray(windows.edge_s), jnp.asarray(windows.sample_s)
@@ -103,7 +101,7 @@ def fly_windows(
     )
     spans = jax.tree.map(lambda field: field[burn_in:], spans)
     begin_s = jnp.asarray(windows.start_s)
-    flown = fly(plant, motion, spans, inputs, begin_speed, begin_s, integrator, feedback)
+    flown = fly(plant, motion, spans, inputs, begin_speed, begin_s, integrator)
     force_b = jnp.concatenate([flown.acc_b[:1], flown.acc_b])
     along = (flown.motion, flown.rotor_speed, force_b)
     return Flown(*jax.tree.map(lambda field: jnp.moveaxis(field, 0, 1), along))

@@ -21,7 +21,6 @@ from eval.effects import EFFECTS
 from eval.effects.interface import Constants
 from eval.quadrotor.loops import Loop, loop_of
 from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
-from eval.quadrotor.stepper import Feedback
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
 from suite.diagnose.data.steps import LONGEST_S, step_s
@@ -270,7 +269,7 @@ class RolloutModel:
         self._kind = (space.layout, rotor_input, voltage, integrator)
         self._linear = _slopes(*self._kind)
         self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
-        """Takes (theta, offset, windows, push, feedback) to (simulated - measured, the simulated
+        """Takes (theta, offset, windows, push) to (simulated - measured, the simulated
         states); the caller compiles it."""
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
@@ -387,13 +386,10 @@ def _flight(
         offset: Any,
         windows: FlightWindows,
         push: Any = None,
-        feedback: Feedback | None = None,
     ) -> tuple[Any, Flown]:
         values = effects_at(layout, given.base, theta)
         plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
-        flown = fly_windows(
-            plant, values, rotor_input, voltage, integrator, offset, windows, push, feedback
-        )
+        flown = fly_windows(plant, values, rotor_input, voltage, integrator, offset, windows, push)
         return difference(values, integrator, flown, windows), flown
 
     return fly

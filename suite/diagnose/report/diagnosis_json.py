@@ -11,16 +11,11 @@ from eval.effects import EFFECTS
 from suite.diagnose.diagnose import Diagnosis
 from suite.diagnose.estimate.parameters import ParameterSpace
 from suite.diagnose.plan import advice
-from suite.diagnose.report.summary import answer, short_name
+from suite.diagnose.report.summary import headline, short_name
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.source import Finding
 from suite.diagnose.verdict.actuators import ActuatorMismatch
-from suite.diagnose.verdict.black_box import BlackBoxComparison, BlackBoxComparisons
-from suite.diagnose.verdict.gap import EffectSize, Gap
-
-LEAST_SHOWN = 0.001
-"""A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
-m/s^2 or rad/s^2)."""
+from suite.diagnose.verdict.gap import EffectSize
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -60,7 +55,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "reference": list(diagnosis.references),
     }
-    return {"headline": headline(diagnosis, entries), **entries}
+    return {"headline": headline(entries), **entries}
 
 
 def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -68,6 +63,8 @@ def gap_json(diagnosis: Diagnosis) -> dict[str, Any]:
     main, seed, limits = diagnosis.main, diagnosis.seed, diagnosis.limits
     return {
         "measure": main.source.measure,
+        "of": main.source.subject,
+        "unit": main.source.unit,
         "before": main.before.rms,
         "after": main.after.rms,
         "noise_floor": main.before.floor,
@@ -217,63 +214,6 @@ def _motor_number(space: ParameterSpace, index: int) -> int:
     return (space.entries[index].component or 0) + 1
 
 
-def headline(diagnosis: Diagnosis, entries: Mapping[str, Any]) -> str:
-    """Return the answer in a few sentences; `entries` are the other entries of the JSON."""
-    main, words = diagnosis.main, [answer(entries)]
-    if diagnosis.named:
-        source = main.source
-        words.append(
-            f"On held-out flights the {source.subject} falls from {_figure(main.before.rms)} to "
-            f"{_figure(main.after.rms)} {source.unit}."
-        )
-    words += [effect.words or f"Named: {effect.name}." for effect in diagnosis.tested]
-    if diagnosis.verdict.where:
-        words.append(f"Unexplained: {diagnosis.verdict.where}.")
-    return " ".join(words)
-
-
-def _figure(value: float) -> str:
-    """Return a gap as text; logs without noise give values such as 1e-10."""
-    return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
-
-
 def actuators_json(mismatches: Sequence[ActuatorMismatch]) -> list[dict[str, Any]]:
     """Return the entry `actuators`: measured rotor speeds compared with commanded ones."""
     return [{**one._asdict(), "followed": one.followed} for one in mismatches]
-
-
-def black_box_json(comparisons: BlackBoxComparisons, seed: int) -> dict[str, Any]:
-    """Return the entry `black_box`, with intervals by draws from `seed`."""
-    outside = comparisons.outside
-    return {
-        "held_out": _comparison(comparisons.held_out, seed),
-        "outside": outside and _comparison(outside, seed),
-        "split_m_s": comparisons.split_m_s,
-        "seconds": comparisons.seconds,
-    }
-
-
-def _comparison(comparison: BlackBoxComparison, seed: int) -> dict[str, Any]:
-    """Return the gaps of the given vehicle, the named effects and the black box.
-
-    All are computed on the same stretches.
-    """
-    return {
-        "judged_on": comparison.judged_on,
-        "stretches": {"fitted": comparison.fitted, "judged": comparison.judged},
-        "before": _gap(comparison.before, seed),
-        "named": None if comparison.named is None else _gap(comparison.named, seed),
-        "black_box": _gap(comparison.black_box, seed),
-    }
-
-
-def _gap(gap: Gap, seed: int) -> dict[str, Any]:
-    """Return a gap with its interval, and the errors of rollouts by horizon and group."""
-    return {
-        "gap": gap.rms,
-        "ci95": gap.ci95(seed),
-        "rollouts": {
-            horizon: {group: value.error for group, value in groups.items()}
-            for horizon, groups in gap.channels.items()
-        },
-    }

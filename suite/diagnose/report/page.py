@@ -22,7 +22,14 @@ from suite.diagnose.report.sections import (
     residual_section,
     rivals_section,
 )
-from suite.diagnose.report.summary import cells, components, grid, next_steps, short_name
+from suite.diagnose.report.summary import (
+    cells,
+    components,
+    grid,
+    next_steps,
+    short_name,
+    superscripts,
+)
 from tracks.common.grid import Cell, Grid
 
 TITLES = {
@@ -41,7 +48,6 @@ FILES = (
 """Files next to the report, and their description."""
 LEAST_FLOOR = 1e-9
 """Least noise floor, in any unit, of a channel that a log measured."""
-NOTHING_NAMED = "Nothing was named: the vehicle file is unchanged."
 TOTALS = (
     "Values are totals: they replace those of the vehicle file. Of the gap: the share that this "
     "effect removes when it is added last. Chance gives a false name with a probability of at most "
@@ -68,12 +74,10 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
     gap, flown = result["gap"], diagnosis.main.source.rollouts
     after = f" → {gap['after']:.3g}" if result["effects"] else ""
     facts = {
-        "verdict": result["verdict"],
-        "gap on held-out flights": f"{gap['before']:.3g}{after} {diagnosis.main.source.unit}",
+        "gap on held-out flights": superscripts(f"{gap['before']:.3g}{after} {gap['unit']}"),
         "noise floor": f"{gap['noise_floor']:.3g}",
         "held out": _few(gap["held_out"]),
         "driven by": result["driven_by"],
-        "took": f"{result['seconds']:.0f} s",
     }
     if diagnosis.references:
         facts["reference"] = f"{len(diagnosis.references)} flights"
@@ -96,7 +100,7 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
             *_measured(diagnosis),
             *([Section("Warnings", result["warnings"])] if result["warnings"] else []),
             *_findings(result.get("findings", ())),
-            Section("The answer in numbers", _answer(result)),
+            *_answer(result),
             _written(result, toml, files),
             *(replace(section, folded=True) for section in details),
         ],
@@ -156,11 +160,11 @@ def channels_grid(channels: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Gr
     return Grid("", headers, rows, note=CHANNELS)
 
 
-def _answer(result: Mapping[str, Any]) -> list[Part]:
-    """Return the named effects, their equations and their parameters."""
+def _answer(result: Mapping[str, Any]) -> list[Section]:
+    """Return a section with the named effects, their equations and their parameters, if any."""
     effects = result["effects"]
     if not effects:
-        return [NOTHING_NAMED]
+        return []
     rows = [
         (
             effect["name"],
@@ -171,7 +175,7 @@ def _answer(result: Mapping[str, Any]) -> list[Part]:
             "exempt" if effect["gap_removed"] is None else f"{100 * effect['gap_removed']:.0f} %",
         )
         for effect in effects
-        for component in sorted(components(effect), key=lambda one: not one.is_significant)
+        for component in components(effect)
     ]
     names = [effect["name"] for effect in effects]
     words: list[Part] = [f"{name}: {EFFECTS[name].equation}." for name in names]
@@ -180,12 +184,12 @@ def _answer(result: Mapping[str, Any]) -> list[Part]:
         "effect", "not distinguishable from", "view", "parameter", "total", "95 %", "of the gap"
     ]  # fmt: skip
     note = TOTALS.format(chance=max(effect["p_value"] for effect in effects))
-    return [*words, grid("", headers, rows, note)]
+    return [Section("The answer in numbers", [*words, grid("", headers, rows, note)])]
 
 
 def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
     """Return the section on written files and planned flights."""
-    words = NOTHING_NAMED
+    words = "Nothing was named: the vehicle file is unchanged."
     if result["effects"]:
         words = "The vehicle file with the named effects, for every other command (--vehicle)."
     links = [(path, words) for path, words in FILES if path in files]
@@ -200,10 +204,9 @@ def _written(result: Mapping[str, Any], toml: str, files: set[str]) -> Section:
                 f"{flight['top_speed']:.1f} m/s",
                 f"{flight['top_acceleration']:.1f} m/s²",
                 " x ".join(f"{size:.1f}" for size in flight["room"]) + " m",
-                flight["flown"] or "",
             )
             for flight in plan["flights"]
         ]
-        headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs", "flown as"]
+        headers = ["flight", "kind", "lasts", "speed", "acceleration", "needs"]
         parts.append(grid("Flights to fly next", headers, rows, " ".join(plan["words"])))
     return Section("What was written", parts)

@@ -11,19 +11,10 @@ from typing import Any
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
-from suite.common.report import Details, Part, Picture, Section
+from suite.common.report import Part, Section
 from suite.diagnose.data.windows import SLICES, UNITS
 from suite.diagnose.diagnose import Diagnosis
-from suite.diagnose.report.charts import (
-    AFTER,
-    BEFORE,
-    WRONG,
-    black_box_chart,
-    gains_chart,
-    gap_chart,
-    labelled_gaps,
-)
-from suite.diagnose.report.summary import cells, grid, short_name
+from suite.diagnose.report.summary import cells, grid, short_name, superscripts
 from suite.diagnose.sources.rollout_source import of_rollouts
 from tracks.common.grid import Cell, Grid
 
@@ -124,15 +115,6 @@ def _mismatch(mismatch: Mapping[str, Any]) -> Grid:
     return grid(f"Compared with the {mismatch['commanded_by']}", ["", ""], rows, note)
 
 
-HORIZON = "0.5 s"
-"""Length of the rollouts in the comparison with the black box."""
-BLACK_BOX = (
-    "For comparison, a Delta Action Model was fitted to the same flights: a recurrent network that "
-    "corrects the body's acceleration and angular acceleration from velocity, attitude and "
-    "command. It is fitted by gradients through the same rollouts. It names no cause, and has no "
-    "number to write into a vehicle file."
-)
-"""Explanation of the black box."""
 LEAST_P = 0.0005
 """P-values up to this are not printed. The null distribution (without any effect) has about two
 thousand draws, so smaller values are not resolved."""
@@ -145,26 +127,28 @@ def candidates_section(diagnosis: Diagnosis) -> Section:
         scores, limits = finding.search.first, finding.source.limits
         if not scores:
             continue
+        chance = ""
+        if scores[0].chance > 0.0:
+            chance = f" By chance the best gain is above {scores[0].chance:.1f} once in 100."
         named = {candidate.label for candidate in finding.search.candidates}
         rows = [
-            f"{s.candidate.label:32}{s.gain:>12.1f}"
-            + (f"{s.p_value:>8.4f}  " if s.p_value > LEAST_P else " " * 10)
-            + ("named" if s.candidate.label in named else "")
+            (
+                s.candidate.label,
+                f"{s.gain:.1f}",
+                f"{s.p_value:.4f}" if s.p_value > LEAST_P else "",
+                "named" if s.candidate.label in named else "",
+            )
             for s in scores
         ]
-        head = f"{'effect':32}{'gain':>12}{'p':>8}"
-        parts += [
-            f"{finding.source.name.capitalize()}: all {len(scores)} candidates, each fitted alone "
-            "before anything was named. The gain is the fall of the whitened squared error on "
-            "stretches that were left out of its fit; p is the probability that the best of all "
-            f"candidates gains as much by chance, left out up to {LEAST_P:g}. Effects are named "
-            f"one after another while p is at most {limits.name_p_value:g}; then all are refitted "
-            "jointly.",
-            Picture(
-                gains_chart(scores, scores[0].chance, named), "The best fourteen; blue were named."
-            ),
-            Details("all candidates", "\n".join([head, *rows])),
-        ]
+        words = (
+            f"All {len(scores)} candidates, each fitted alone before anything was named. The gain "
+            "is the fall of the whitened squared error on stretches that were left out of its fit; "
+            "p is the probability that the best of all candidates gains as much by chance, left "
+            f"out up to {LEAST_P:g}. Effects are named one after another while p is at most "
+            f"{limits.name_p_value:g}; then all are refitted jointly.{chance}"
+        )
+        title = finding.source.name.capitalize()
+        parts.append(grid(title, ["effect", "gain", "p", ""], rows, words))
     return Section("The candidates", parts)
 
 
@@ -195,7 +179,8 @@ def residual_section(result: Mapping[str, Any]) -> Section:
     remaining = result["unexplained"]
     words = "No structure beyond the measurement noise remains."
     if remaining["where"]:
-        words = f"{100 * remaining['share']:.0f} % of the gap remains: {remaining['where']}."
+        share, where = 100 * remaining["share"], superscripts(remaining["where"])
+        words = f"{share:.0f} % of the gap remains: {where}."
     parts: list[Part] = [words]
     if remaining.get("shapes"):
         shapes = remaining["shapes"]
@@ -213,54 +198,34 @@ def residual_section(result: Mapping[str, Any]) -> Section:
 
 
 def evidence_section(diagnosis: Diagnosis, result: Mapping[str, Any]) -> Section:
-    """Return the gaps on held-out flights, in a chart and a table.
+    """Return a table of the gaps on held-out flights.
 
     They are those of the vehicle as given, with the named effects, and with a wrong effect.
     """
-    seed, main = diagnosis.seed, diagnosis.main
-    gaps = [("as given", main.before, BEFORE)]
+    main = diagnosis.main
+    gaps = {"as given": main.before}
     if main.control is not None:
-        gaps.append((f"wrong: {main.control[0]}", main.control[1], WRONG))
+        gaps[f"wrong: {main.control[0]}"] = main.control[1]
     if len(main.without) > 1:
-        gaps += [(f"without {label}", gap, BEFORE) for label, gap in main.without.items()]
+        gaps |= {f"without {label}": gap for label, gap in main.without.items()}
     if main.names:
-        gaps.append(("with the named effects", main.after, AFTER))
-    before, floor = main.before.rms, main.before.floor
-    rows = [
-        (label, *_gap_cells(gap.rms, gap.ci95(seed), before, floor, 3)) for label, gap, _ in gaps
-    ]
-    held = ", ".join(result["gap"]["held_out"])
-    words = f"{main.source.measure}. Held out of search and fits: {held}."
+        gaps["with the named effects"] = main.after
+    before, floor, rows = main.before.rms, main.before.floor, []
+    for label, gap in gaps.items():
+        (low, high), removed = gap.ci95(diagnosis.seed), ""
+        if gap.rms != before and before > floor:
+            removed = f"{100 * (before - gap.rms) / (before - floor):.0f} %"
+        rows.append((label, f"{gap.rms:.3f}", f"{low:.3f} to {high:.3f}", removed))
+    words = (
+        f"{main.source.measure}. Held out of search and fits: "
+        f"{', '.join(result['gap']['held_out'])}. The noise floor is {floor:.3g}."
+    )
     note = (
         "95 %: bootstrap over blocks of neighbouring stretches. Wrong: the best effect that is "
         "neither named nor an alternative, fitted to the same flights in the same way."
     )
-    flown, start_speed = main.source.rollouts, None
-    if flown is not None:
-        start_speed = np.linalg.norm(np.asarray(flown.held.vel_w), axis=1)
-    parts: list[Part] = [
-        words,
-        Picture(gap_chart(gaps, start_speed, seed), "Bars are 95 %; dots are rollouts."),
-        grid("", ["vehicle", "gap", "95 %", "of the gap removed"], rows, note),
-    ]
-    if flown is not None:
-        parts += _black_box(result.get("black_box"))
-    return Section("The evidence", parts)
-
-
-def _black_box(result: Mapping[str, Any] | None) -> list[Part]:
-    """Return the comparison with a Delta Action Model; `result` is its JSON, None without one."""
-    if result is None:
-        return [
-            "suite diagnose --compare-delta compares this with a black box, on the same flights "
-            "and on faster ones than those of its fit."
-        ]
-    sides = [side for side in (result["held_out"], result["outside"]) if side]
-    chart = Picture(black_box_chart(sides), "Bars are 95 %; 1 is the noise floor.")
-    parts: list[Part] = [BLACK_BOX, chart, *map(_comparison, sides)]
-    if result["outside"] is None:
-        parts.append("There are too few stretches to fit slow ones and test on fast ones.")
-    return parts
+    headers = ["vehicle", "gap", "95 %", "of the gap removed"]
+    return Section("The evidence", [words, grid("", headers, rows, note)])
 
 
 AGREEMENT = (
@@ -283,40 +248,3 @@ def agreement_section(diagnosis: Diagnosis) -> Section:
             title = f"{finding.source.name}: {named.candidate.label}"
             parts.append(grid(title, ["fitted flight", "gain"], rows, AGREEMENT))
     return Section("Do the flights agree", [*parts, *diagnosis.flights.compares])
-
-
-def _comparison(side: Mapping[str, Any]) -> Grid:
-    """Return a table of the gaps of the given vehicle, the named effects and the black box.
-
-    `side` is one of the two comparisons in `black_box` of diagnosis.json.
-    """
-    before = side["before"]["gap"]
-    rows = [
-        (
-            label,
-            *_gap_cells(gap["gap"], gap["ci95"], before, 1.0, 2),
-            *(f"{error:.3g}" for error in gap["rollouts"][HORIZON].values()),
-        )
-        for label, gap, _ in labelled_gaps(side)
-    ]
-    names = [f"{group} [{UNITS[group]}]" for group in side["before"]["rollouts"][HORIZON]]
-    headers = ["", "gap", "95 %", "removed", *names]
-    count = side["stretches"]
-    note = (
-        f"{count['fitted']} stretches fitted, {count['judged']} tested. The last columns: RMS "
-        f"errors of rollouts of {HORIZON}."
-    )
-    return grid(f"On {side['judged_on']}", headers, rows, note)
-
-
-def _gap_cells(
-    gap: float, ci95: Sequence[float], before: float, floor: float, digits: int
-) -> tuple[str, str, str]:
-    """Return as texts a gap, its interval, and the share of the gap that was removed.
-
-    The share is that of the gap `before` minus the noise floor.
-    """
-    removed = ""
-    if gap != before and before > floor:
-        removed = f"{100 * (before - gap) / (before - floor):.0f} %"
-    return f"{gap:.{digits}f}", f"{ci95[0]:.{digits}f} to {ci95[1]:.{digits}f}", removed

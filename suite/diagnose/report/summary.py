@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from eval.effects import EFFECTS
+from suite.diagnose.verdict.gap import EffectSize
 from tracks.common.grid import Cell, Grid
 
 VERDICTS = {
@@ -33,13 +34,41 @@ USE = "Use the corrected vehicle: give vehicle.toml to suite eval, train and loo
 CHECK = "Run suite check on these logs: a wrong unit, sign, order or clock resembles physics."
 
 
-def answer(result: Mapping[str, Any]) -> str:
-    """Return the named effects, their sizes, and a sentence for the verdict.
+def headline(result: Mapping[str, Any]) -> str:
+    """Return the answer in a few sentences: effects, sizes, verdict, gap, and what remains.
 
     Args:
         result: content of diagnosis.json.
     """
+    words, gap = [answer(result)], result["gap"]
+    if gap["after"] < gap["before"]:
+        words.append(
+            f"On held-out flights the {gap['of']} falls from {_figure(gap['before'])} to "
+            f"{_figure(gap['after'])} {gap['unit']}."
+        )
+    if result["unexplained"]["where"]:
+        words.append(f"Unexplained: {result['unexplained']['where']}.")
+    return superscripts(" ".join(words))
+
+
+def superscripts(text: str) -> str:
+    """Return `text` with the powers of its units as people write them."""
+    return text.replace("^2", "²")
+
+
+def _figure(value: float) -> str:
+    """Return a gap as text; logs without noise give values such as 1e-10."""
+    return f"{value:.3g}" if value >= LEAST_SHOWN else f"less than {LEAST_SHOWN:g}"
+
+
+def answer(result: Mapping[str, Any]) -> str:
+    """Return the named effects, their sizes, and a sentence for the verdict."""
     words = [_effect_words(effect) for effect in result["effects"]]
+    if words:
+        is_change = bool(result["reference"])
+        words.insert(
+            0, "Changed in the vehicle:" if is_change else "Wrong or missing in the vehicle file:"
+        )
     words.append((CHANGES if result["reference"] else VERDICTS)[result["verdict"]])
     if result["verdict"] == "no_gap" and result["negligible"]:
         names = ", ".join(entry["name"] for entry in result["negligible"])
@@ -51,20 +80,15 @@ def _effect_words(effect: Mapping[str, Any]) -> str:
     """Return a sentence on a named effect, and one on its size on these flights."""
     names = " or ".join([effect["name"], *effect["alternatives"]])
     summary = EFFECTS[effect["name"]].summary if effect["name"] in EFFECTS else "An effect"
-    values = []
-    for component in components(effect):
-        if component.is_significant:
-            label, _, unit = component.label.partition(" [")
-            unit = unit.rstrip("]")
-            values.append(f"{label} {component.value:.3g} {'' if unit == '1' else unit}".rstrip())
-    words = f"{summary} ({names}){': ' if values else ''}{', '.join(values)}."
-    size = effect.get("size")
-    if size is None:
+    values = ", ".join(
+        f"{one.name} {one.value:.3g} {'' if one.unit == '1' else one.unit}".rstrip()
+        for one in components(effect)
+        if one.is_significant
+    )
+    words = f"{summary} ({names}){': ' if values else ''}{values}."
+    if effect["size"] is None:
         return words
-    parts = [f"{size['force']:.2g} m/s²", f"{size['torque']:.2g} rad/s²"]
-    if size["drift"] is not None:
-        parts.append(f"{size['drift']:.2g} m after one second")
-    return f"{words} On these flights it causes {', '.join(parts[:-1])} and {parts[-1]} (RMS)."
+    return f"{words} On these flights it causes {EffectSize(**effect['size']).words()} (RMS)."
 
 
 def next_steps(result: Mapping[str, Any]) -> list[str]:
@@ -126,10 +150,11 @@ def _unknown(result: Mapping[str, Any]) -> Iterator[str]:
 
 def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield advice on the remaining error: what it depends on, and an oscillating force."""
-    if result["unexplained"]["where"]:
-        yield (
-            "Search for the cause of the unexplained error; the report's section Remaining error "
-            "shows the quantity that it depends on."
+    where = result["unexplained"]["where"]
+    if where:
+        yield superscripts(
+            f"Search for the cause of the unexplained error: {where}. The report's section "
+            "Remaining error has its size, and the quantities that it depends on."
         )
     swing = result["unexplained"].get("swing")  # an oscillating force, as of a load on a line
     if swing:
@@ -141,6 +166,9 @@ def _unexplained(result: Mapping[str, Any]) -> Iterator[str]:
 
 _STEPS = {"no_gap": _no_gap, "named": _explained, "partly": _partly, "unknown": _unknown}
 """Functions that yield the advice, by verdict."""
+LEAST_SHOWN = 0.001
+"""A smaller gap is printed as "less than" this value, in the unit of the gap (times the noise,
+m/s^2 or rad/s^2)."""
 NOT_IDENTIFIABLE = "not identifiable"
 """Text in place of a value that these flights do not identify."""
 
@@ -148,14 +176,21 @@ NOT_IDENTIFIABLE = "not identifiable"
 class Component(NamedTuple):
     """One value of a named effect, for people: a parameter, or one axis of it."""
 
-    label: str
-    """Name of the parameter, axis and unit."""
+    name: str
+    """Name of the parameter, with its axis or motor."""
+    unit: str
+    """Unit; empty for a number that counts."""
     value: float | None
     """Value, or None if it is not identifiable."""
-    ci95: tuple[float, float] | None
+    ci95: Sequence[float] | None
     """95 % interval."""
     neutral: float | None
     """Value at which the effect does not act, if it is the same for every vehicle."""
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
     def is_significant(self) -> bool:
@@ -193,34 +228,31 @@ def in_digits(number: float, interval: Sequence[float]) -> str:
     return f"{number:.{-last_power}f}"
 
 
-def components(effect: Mapping[str, Any]) -> Iterator[Component]:
-    """Yield the components of a named `effect`, an entry of `effects` in diagnosis.json."""
+def components(effect: Mapping[str, Any]) -> list[Component]:
+    """Return the components of a named `effect` in diagnosis.json, significant ones first."""
+    return sorted(_components(effect), key=lambda component: not component.is_significant)
+
+
+def _components(effect: Mapping[str, Any]) -> Iterator[Component]:
+    """Yield the components of a named effect in the order of its parameters."""
     parameters = EFFECTS[effect["name"]].parameters if effect["name"] in EFFECTS else ()
     neutrals = {p.name: p.neutral for p in parameters if not callable(p.neutral)}
     by_motor = {p.name for p in parameters if p.one_at_a_time}
+    motors = effect["parameters"].get("index", {}).get("value")
     for name, entry in effect["parameters"].items():
         value, span, unit = entry["value"], entry["ci95"], entry["unit"]
         if name == "index" and by_motor:
             # The numbers of the motors. Those of several motors are in the labels below instead.
             if not isinstance(value, list):
-                is_certain = span is None or span[0] == span[1]
-                yield Component(name, value, None if is_certain else _pair(span), None)
-            continue
-        neutral = neutrals.get(name)
-        if not isinstance(value, list):
-            yield Component(f"{name} [{unit}]", value, _pair(span), neutral)
-            continue
-        motors = effect["parameters"].get("index", {}).get("value")
-        axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
-        if name in by_motor and isinstance(motors, list):
-            axes = motors
-        for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
-            yield Component(f"{name} {axis} [{unit}]", number, _pair(pair), neutral)
-
-
-def _pair(span: Sequence[float] | None) -> tuple[float, float] | None:
-    """Return an interval of diagnosis.json, a list or None, as a tuple or None."""
-    return None if span is None else (float(span[0]), float(span[1]))
+                yield Component(name, "", value, None if span[0] == span[1] else span, None)
+        elif not isinstance(value, list):
+            yield Component(name, unit, value, span, neutrals.get(name))
+        else:
+            axes = "xyz" if len(value) <= 3 else range(1, len(value) + 1)
+            if name in by_motor and isinstance(motors, list):
+                axes = motors
+            for axis, number, pair in zip(axes, value, span or [None] * len(value), strict=False):
+                yield Component(f"{name} {axis}", unit, number, pair, neutrals.get(name))
 
 
 def cells(*texts: str) -> list[Cell]:

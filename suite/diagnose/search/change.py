@@ -4,7 +4,7 @@ The vehicle file need not be right: the residual of the reference flights (its m
 dependence on velocity) is subtracted from the residual of the later flights. The reference flights
 also show how much flights of an unchanged vehicle differ (`rotor_spread`). Their mean has an error,
 too, which is common to all later flights. A change is named if it is large compared with that
-spread; all candidates are tested together (`search/chance.py`).
+spread; all candidates are tested together (`estimate/permutation.py`).
 
 Some effects, such as a drag, only act in motion, and hardly change the mean of a flight. So where
 no mean has changed, each candidate is fitted to each flight alone. The fitted values of the
@@ -14,18 +14,18 @@ reference flights and of the later ones are compared by Welch's test (Welch 1947
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import ttest_ind
 
 from suite.diagnose.data.view import SmoothedFlight
-from suite.diagnose.estimate.block import Block, Estimate, NormalEquations
+from suite.diagnose.estimate.block import Block, Estimate, NormalEquations, without_nuisance
 from suite.diagnose.estimate.gauss_newton import chi2_fall, fit
 from suite.diagnose.estimate.parameters import Candidate, at_bound, usual_first
-from suite.diagnose.estimate.permutation import CandidateScore
+from suite.diagnose.estimate.permutation import CandidateScore, corrected_p_values
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
 from suite.diagnose.evidence.moments import (
     ViewData,
@@ -38,7 +38,6 @@ from suite.diagnose.evidence.moments import (
     whitened,
 )
 from suite.diagnose.evidence.views import ViewBlock, ViewEvidence, view_candidates
-from suite.diagnose.search.chance import RotorSpread, corrected_p_values, rotor_gain
 from suite.diagnose.search.evaluation import Evaluation, NamedEffect, SearchResult
 
 
@@ -94,6 +93,79 @@ def less_reference_residual(
     mean = means_of(data.residual, data.flight).mean(axis=0)
     later = replace(reference, flights=flights)
     return replace(later, carried=_motion_inputs(later, theta) / spread @ slope_of_error + mean)
+
+
+@dataclass(frozen=True)
+class RotorSpread:
+    """Spread from flight to flight of one unchanged vehicle, relative to a rotor's thrust."""
+
+    share: float
+    """Standard deviation from flight to flight, relative to a rotor's thrust, pooled over all
+    axes."""
+    freedom: int
+    """Degrees of freedom of this pooled estimate."""
+    along: Mapping[str, np.ndarray]
+    """(3,) standard deviation along each axis, by view (force or torque): a weighted mean of the
+    estimate of the axis alone and the pooled estimate."""
+    freedom_along: Mapping[str, np.ndarray]
+    """(3,) degrees of freedom of the estimate of each axis alone, by view."""
+    prior: int
+    """Weight of the pooled estimate in `along`, in degrees of freedom."""
+
+    def variance_ratios(self, view: str, draws: int, rng: np.random.Generator) -> np.ndarray:
+        """Return draws (D, 3) of the estimated variance over the true one, by axis of `view`.
+
+        All axes have the same true variance here. Where the estimate is too small by chance, any
+        change seems too large, which the draws take into account.
+        """
+        freedom = np.concatenate(list(self.freedom_along.values()))
+        square = rng.chisquare(np.maximum(freedom, 1e-9), (draws, len(freedom)))
+        pooled = square.sum(axis=1, keepdims=True) / max(self.freedom, 1)
+        axes = 3 * list(self.freedom_along).index(view) + np.arange(3)
+        return _moderated(pooled, square[:, axes], freedom[axes], self.prior)
+
+
+def _moderated(
+    pooled: np.ndarray | float, square: np.ndarray, freedom: np.ndarray, prior: int
+) -> np.ndarray:
+    """Return a weighted mean of the pooled variance and of each axis's own (Smyth 2004).
+
+    `square` is the sum of squares of an axis with `freedom`, and `prior` the weight of `pooled`.
+    """
+    return (prior * pooled + square) / (prior + freedom)
+
+
+def rotor_gain(task: ViewEvidence) -> np.ndarray:
+    """Return the accelerations (3,) by a relative change of a rotor's thrust, in the view's unit.
+
+    Along each axis this is the root of the sum of the four rotors' squared accelerations.
+    """
+    space = task.model.space
+    weak_motor = [i for i, entry in enumerate(space.entries) if entry.effect == "weak_motor"]
+    slope = task.residuals(space.array("start"), weak_motor).slope.mean(axis=0)
+    return np.sqrt((slope**2).sum(axis=1))
+
+
+def rotor_spread(sets: Sequence[ViewEvidence]) -> RotorSpread:
+    """Return the spread of flights within each of `sets` (the reference and later flights)."""
+    square: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3))
+    freedom: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
+    for task in sets:
+        data, gain = task.residuals(task.start.theta), rotor_gain(task)
+        means = means_of(data.residual, data.flight)
+        axes = gain > task.limits.least_rotor_gain * gain.max()
+        if task.view.in_world:
+            axes &= np.arange(3) == 2  # rotors only push along body z
+        deviation = (means - means.mean(axis=0)) / np.where(axes, gain, np.inf)
+        square[task.view.name] += (deviation**2).sum(axis=0)
+        freedom[task.view.name] += axes * (len(means) - 1)
+    count = int(sum(by_axis.sum() for by_axis in freedom.values()))
+    share = float(np.sqrt(sum(by_axis.sum() for by_axis in square.values()) / max(count, 1)))
+    prior = sets[0].limits.spread_freedom
+    along = {
+        name: np.sqrt(_moderated(share**2, square[name], freedom[name], prior)) for name in square
+    }
+    return RotorSpread(share, count, along, dict(freedom), prior)
 
 
 @dataclass(frozen=True)
@@ -213,32 +285,23 @@ def within_flights(data: ViewData) -> ViewData:
     )
 
 
-def fit_each_flight(inside: ViewData, indices: Sequence[int], scatter: np.ndarray) -> np.ndarray:
-    """Return the change (F, K) of K parameters that fits each of F flights alone.
+def equations_by_flight(inside: ViewData, scatter: np.ndarray) -> NormalEquations:
+    """Return the normal equations of each flight alone, along all parameters.
 
     Args:
         inside: residuals without the flights' means, from `within_flights`.
-        indices: places of the fitted parameters in the vector of all.
         scatter: (3,) noise along each axis.
     """
-    changes = []
-    for number in np.unique(inside.flight):
-        rows = inside.flight == number
-        slope = inside.slope[rows][..., list(indices)] / scatter[:, None]
-        residual = (inside.residual[rows] / scatter).ravel()
-        changes.append(np.linalg.lstsq(slope.reshape(-1, len(indices)), residual, rcond=1e-6)[0])
-    return np.array(changes)
+    numbers, place = np.unique(inside.flight, return_inverse=True)
+    residual, slope = inside.residual / scatter, inside.slope / scatter[:, None]
+    along, start_s = range(slope.shape[2]), np.zeros(len(numbers))
+    return without_nuisance(residual, slope, along, place.ravel(), numbers, start_s).equations
 
 
-class _MotionChange(NamedTuple):
-    """A candidate whose parameters differ between the reference flights and the later ones."""
-
-    name: NamedEffect
-    before: np.ndarray
-    """(K,) change of the candidate's parameters that fits the reference flights, from those that
-    the search starts with."""
-    theta: np.ndarray
-    """(P,) all parameters; the candidate's have the values that fit the later flights."""
+def fit_each_flight(equations: NormalEquations) -> np.ndarray:
+    """Return the change (F, K) of the K parameters of `equations` that fits each flight alone."""
+    inverse = np.linalg.pinv(equations.hessian, 1e-12, hermitian=True)
+    return (inverse @ equations.gradient[..., None])[..., 0]
 
 
 def search_motion_change(
@@ -254,27 +317,34 @@ def search_motion_change(
         task: evidence of the flights after it.
         among: the candidates.
     """
-    start, limits = fit_balance(reference), task.limits
+    start, limits, space = fit_balance(reference), task.limits, task.space
     sets = [within_flights(one.residuals(start, None)) for one in (reference, task)]
     if min(len(np.unique(one.flight)) for one in sets) < 2:
         return None
-    weights, space = weights_of(sets[1], limits), task.space
+    weights = weights_of(sets[1], limits)
     evidence = replace(task, weights=weights)
     acting = view_candidates(among, evidence.linearise(Estimate(start)))
     tests = sum(len(one.indices) for one in acting)
-    changes = []
+    equations = [equations_by_flight(one, weights.scatter) for one in sets]
+    # Names with the parameters (P,) of the later flights and of the reference flights.
+    changes = list[tuple[NamedEffect, np.ndarray, np.ndarray]]()
     for candidate in acting:
         indices = list(candidate.indices)
-        before, after = (fit_each_flight(one, indices, weights.scatter) for one in sets)
+        earlier, later = (one.along_numbers(indices) for one in equations)
+        before, after = fit_each_flight(earlier), fit_each_flight(later)
         _, p_values = ttest_ind(before, after, equal_var=False)
         p_value = float(np.nan_to_num(np.asarray(p_values), nan=1.0).min()) * tests
         if p_value > limits.change_p_value:
             continue
         mean_before, mean_after = before.mean(axis=0), after.mean(axis=0)
-        gains, total = _error_falls(sets[1], indices, mean_before, after, weights.scatter)
-        share = float(gains.sum() / total)
-        theta = start.copy()
+        # The fall of each later flight's error by the mean of the fits to all other later flights.
+        by_others = (after.sum(axis=0) - after) / (len(after) - 1)
+        unchanged = later.chi2_at(mean_before)
+        gains = unchanged - later.chi2_at(by_others)
+        share = float(gains.sum() / max(unchanged.sum(), 1e-12))
+        theta, theta_before = start.copy(), start.copy()
         theta[indices] += mean_after
+        theta_before[indices] += mean_before
         # Reject values that are physically impossible by more than noise.
         possible = np.clip(theta, space.array("low"), space.array("high"))
         beyond = np.linalg.norm((possible - theta)[indices])
@@ -284,43 +354,16 @@ def search_motion_change(
         if flights_agree(gains) and share >= limits.least_view_share:
             by_flight = tuple(gains.tolist())
             name = NamedEffect(candidate, p_value, sum(by_flight), gains=by_flight, share=share)
-            changes.append(_MotionChange(name, mean_before, possible))
+            changes.append((name, possible, theta_before))
     if not changes:
         return None
     # Of the candidates that explain about as much as the best, the most usual one is named.
-    least = (1.0 - limits.rival_share) * max(one.name.share for one in changes)
-    close = [one for one in changes if one.name.share >= least]
-    best, *alternatives = sorted(
-        close, key=lambda one: usual_first(space, one.theta, one.name.candidate)
-    )
-    indices = list(best.name.candidate.indices)
-    theta_before = start.copy()
-    theta_before[indices] += best.before
-    rivals = tuple(dict.fromkeys(other.name.candidate.name for other in alternatives))
-    at = Estimate(best.theta)
-    last = Evaluation(evidence, at, evidence.linearise(at, sorted(indices)))
-    named = (replace(best.name, rivals=rivals),)
-    return SearchResult(named, Estimate(theta_before), last, last, [], 0.0)
-
-
-def _error_falls(
-    inside: ViewData, indices: list[int], before: np.ndarray, after: np.ndarray, scatter: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the fall (F,) of each later flight's squared error, and the sum of the old errors.
-
-    The old errors are those with the parameters of the reference flights, `before` (K,). The new
-    errors are with parameters that fit later flights, `after` (F, K): for each flight, with the
-    mean of the fits to all other later flights.
-    """
-    falls, total = [], 0.0
-    for place, number in enumerate(np.unique(inside.flight)):
-        rows = inside.flight == number
-        slope = inside.slope[rows][..., indices]
-        by_others = np.delete(after, place, axis=0).mean(axis=0)
-        errors = [
-            float((((inside.residual[rows] - slope @ change) / scatter) ** 2).sum())
-            for change in (before, by_others)
-        ]
-        falls.append(errors[0] - errors[1])
-        total += errors[0]
-    return np.array(falls), max(total, 1e-12)
+    least = (1.0 - limits.rival_share) * max(name.share for name, *_ in changes)
+    close = [one for one in changes if one[0].share >= least]
+    close.sort(key=lambda one: usual_first(space, one[1], one[0].candidate))
+    name, at, theta_before = close[0][0], Estimate(close[0][1]), close[0][2]
+    rivals = tuple(dict.fromkeys(other.candidate.name for other, *_ in close[1:]))
+    block = evidence.linearise(at, sorted(name.candidate.indices))
+    last = Evaluation(evidence, at, block)
+    named = (replace(name, rivals=rivals),)
+    return SearchResult(named, Estimate(theta_before), last, last, [])

@@ -141,8 +141,6 @@ class SearchResult:
     model leaves more than noise: then the whole residual counts as noise."""
     first: list[CandidateScore]
     """Scores of all candidates before any effect was named, best first."""
-    explained: float
-    """Fall of chi-square by the named effects."""
 
     @property
     def estimate(self) -> Estimate:
@@ -180,9 +178,7 @@ class SearchResult:
         if self.judged is not self.last:
             block = self.last.evidence.linearise(judged.at, indices)
             last = Evaluation(self.last.evidence, judged.at, block)
-        chi2_without = self.explained + float(self.last.equations.chi2.sum())
-        explained = chi2_without - float(last.equations.chi2.sum()) if named else 0.0
-        return replace(self, named=tuple(named), last=last, judged=judged, explained=explained)
+        return replace(self, named=tuple(named), last=last, judged=judged)
 
     def fitted_anew(self, begin: Estimate, indices: Sequence[int]) -> Estimate:
         """Return the estimate with only the parameters at `indices` fitted, from `begin`."""

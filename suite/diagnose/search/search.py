@@ -40,7 +40,6 @@ class SearchTask(NamedTuple):
     """Receives a line for people about each step."""
     seed: int
     """Seed of the permutation test."""
-    limits: Thresholds
 
 
 class _Trial(NamedTuple):
@@ -72,7 +71,7 @@ def search(
         known: result of `evidence.estimate_noise(start)`, if it was computed before.
     """
     limits = evidence.limits
-    task = SearchTask(among, say, seed, limits)
+    task = SearchTask(among, say, seed)
     current = evaluated_at(known or evidence.estimate_noise(start), start, among)
     first = _scores(task, current, [], among)
     named: list[NamedEffect] = []
@@ -99,11 +98,7 @@ def search(
         judged = _final_fit(misfit[0], at, named)
         block = last.evidence.linearise(judged.at, _indices(named))
         last = Evaluation(last.evidence, judged.at, block)
-    explained = 0.0
-    if named:
-        _, without = fit(last.evidence, start, [], limits=limits)
-        explained = float((without.residual**2).sum() - last.equations.chi2.sum())
-    return SearchResult(tuple(named), start, last, judged, first, explained)
+    return SearchResult(tuple(named), start, last, judged, first)
 
 
 def _indices(named: Sequence[NamedEffect]) -> list[int]:
@@ -153,7 +148,7 @@ def _best_candidate(
         tested: candidate of a name that was taken out of `current`, to be tested against the other
             candidates. If given, all that could replace it are fitted, significant or not.
     """
-    limits, evidence, space = task.limits, current.evidence, current.evidence.space
+    evidence, limits, space = current.evidence, current.evidence.limits, current.evidence.space
     others = _indices(named)
     unnamed = [c for c in among if not set(c.indices) & set(others)]
     scores = {s.candidate: s for s in known or _scores(task, current, others, unnamed)}
@@ -268,11 +263,11 @@ def _settle(
 
     Returned are the names and the fit with them.
     """
-    for _ in range(task.limits.settle_rounds):
+    for _ in range(evidence.limits.settle_rounds):
         before = [name.candidate for name in named]
         if not before:
             break
-        at, _ = fit(evidence, at, indices_of(before), limits=task.limits)
+        at, _ = fit(evidence, at, indices_of(before), limits=evidence.limits)
         place = 0
         while place < len(named):
             count = len(named)

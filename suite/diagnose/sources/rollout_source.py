@@ -33,8 +33,9 @@ from suite.diagnose.evidence.rollouts import (
 )
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import Remaining, Series, Source, TestedEffect, sizes_by_effect
+from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, residual_swing
 from suite.diagnose.verdict.gap import (
     FORCE_S,
@@ -195,21 +196,14 @@ class RolloutSource(Source):
         force_p_values = [p for axis, p in residual.coloured.items() if axis.startswith("force")]
         if not any(p <= limits.colour_p_value for p in force_p_values):
             return residual, None
-        wind = find_turbulence(model, found.estimate.theta, equations, limits)
-        # Wind is not named if a force that is a simple function of the state explains more.
-        shape = residual.shapes[0]
-        if wind is None or (shape.p_value <= limits.shape_p_value and shape.gain > wind.ratio):
+        found_wind = find_turbulence(model, found.estimate.theta, equations, limits)
+        if found_wind is None:
             return residual, None
-        sizes = (("intensity", "m/s", wind.intensity, wind.intensity_ci95),
-                 ("length", "m", wind.length, wind.length_ci95))  # fmt: skip
-        parameters = {
-            name: {"value": value, "unit": unit, "ci95": list(ci95)}
-            for name, unit, value, ci95 in sizes
-        }
-        p_value = float(np.exp(-wind.ratio))  # ratio: log-likelihood with minus without wind
-        return residual, TestedEffect(
-            wind.effect, wind.values, parameters, None, p_value, self.name
-        )
+        # Wind is not named if a force that is a simple function of the state explains more.
+        (wind, log_ratio), shape = found_wind, residual.shapes[0]
+        if shape.p_value <= limits.shape_p_value and shape.gain > log_ratio:
+            return residual, None
+        return residual, wind
 
     def _swing(self, theta: np.ndarray) -> Swing | None:
         """Return an oscillating force in the flights' force errors at `theta` (P,), if any.

@@ -26,32 +26,13 @@ from suite.diagnose.evidence.evidence import Evidence
 from suite.diagnose.search.evaluation import NamedEffect, SearchResult
 from suite.diagnose.search.search import search
 from suite.diagnose.thresholds import Thresholds
+from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
 from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
 from suite.diagnose.verdict.rollout_gap import Rollouts
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
-
-
-class TestedEffect(NamedTuple):
-    """An effect that a separate test named, not the search: rotor lag or random wind.
-
-    (The rotor lag is the time constant with which rotors follow their commands.)
-    """
-
-    name: str
-    values: Any
-    """The effect's entry in a vehicle file."""
-    parameters: Mapping[str, Any]
-    """Value, unit and 95 % interval of each parameter, as in diagnosis.json."""
-    gap_removed: float | None
-    """Share of the gap that the effect explains."""
-    p_value: float
-    view: str
-    """Name of the source in which it was found."""
-    words: str = ""
-    """A sentence for people, if the size of the effect needs an explanation."""
 
 
 class Remaining(NamedTuple):

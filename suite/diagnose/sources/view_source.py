@@ -212,7 +212,7 @@ class MotionSource(ViewSource):
         found = search_motion_change(self.reference, self.fitted, self.candidates)
         evidence, block = self.weighed
         unchanged = Evaluation(evidence, self.start, block)
-        return found or SearchResult((), self.start, unchanged, unchanged, [], 0.0)
+        return found or SearchResult((), self.start, unchanged, unchanged, [])
 
 
 class Shares(NamedTuple):

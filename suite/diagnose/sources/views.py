@@ -22,12 +22,16 @@ from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.search.chance import RotorSpread, rotor_spread
-from suite.diagnose.search.change import change_evidence, less_reference_residual
-from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet, TestedEffect
+from suite.diagnose.search.change import (
+    RotorSpread,
+    change_evidence,
+    less_reference_residual,
+    rotor_spread,
+)
+from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.sources.view_source import MotionSource, ViewSource
 from suite.diagnose.thresholds import Thresholds
-from suite.diagnose.verdict.actuators import LAG, RotorLag, find_rotor_lag
+from suite.diagnose.verdict.actuators import find_rotor_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
 """Estimated duration on two cores: fixed part, and for each row [s]."""
@@ -96,26 +100,9 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         held_names,
         flights.source,
         (*flights.notes, *not_shown, *left_out),
-        (_lag_effect(lag),) if lag else (),
+        (lag,) if lag else (),
         _spread_words(spread, len(references)),
     )
-
-
-def _lag_effect(lag: RotorLag) -> TestedEffect:
-    """Return the rotors' lag (their time constant) as a named effect.
-
-    A separate test finds it, since force and torque do not depend on it.
-    """
-    low, high = max(lag.time_constant - lag.half_width, 0.0), lag.time_constant + lag.half_width
-    parameters = {
-        "time_constant": {"value": lag.time_constant, "unit": "s", "ci95": [low, high]},
-    }
-    words = (
-        f"{LAG}: the rotors follow their commands with a time constant of "
-        f"{lag.time_constant:.3g} s instead of {lag.known:.3g} s."
-    )
-    values = EFFECTS[LAG].values(lag.time_constant)
-    return TestedEffect(LAG, values, parameters, lag.closed, lag.p_value, "commands", words)
 
 
 def _descriptions(view: View) -> dict[str, Any]:

@@ -10,15 +10,16 @@ diagnosis chooses the model's input (commands or measured rotor speeds) and esti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
+from eval.effects import EFFECTS
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.continuous import INTEGRATORS
 from eval.quadrotor.plant import Command, Plant, make_plant
@@ -27,6 +28,21 @@ from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.sampling import follow_lag, hold, interpolate, on_every_row
 from suite.diagnose.data.steps import has_firmware_loop, rotor_mixer, step_s
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+
+class TestedEffect(NamedTuple):
+    """An effect that a separate test named, not the search: rotor lag or random wind."""
+
+    name: str
+    values: Any
+    """The effect's entry in a vehicle file."""
+    parameters: Mapping[str, Any]
+    """Value, unit and 95 % interval of each parameter, as in diagnosis.json."""
+    gap_removed: float | None
+    """Share of the gap that the effect explains."""
+    p_value: float
+    view: str
+    """Name of the source in which it was found."""
 
 
 class ActuatorMismatch(NamedTuple):
@@ -83,23 +99,11 @@ def actuator_mismatches(
     Returned is one mismatch for each of the two comparisons that the logs allow. Logs without
     measured rotor speeds are ignored, and so are the effects of `vehicle`.
     """
-    plant = make_plant(vehicle, step_s(vehicle), {})
-    mismatches = []
-    for commanded_by, commanded_of in (
-        ("nominal rate loop", partial(rate_loop_speeds, plant=plant)),
-        ("logged motor commands", _logged_speeds),
-    ):
-        stretches: list[_Stretch] = []
-        for log in logs:
-            rows = sum(len(stretch.row) for stretch in stretches)
-            if rows * step_s(vehicle) < limits.actuator_flight_s:
-                stretches += _stretches(log, vehicle, commanded_of, limits)
-        if stretches:
-            mismatches.append(_mismatch(commanded_by, stretches, vehicle, limits))
-    return mismatches
+    mismatches = (_mismatch(commanded_by, logs, vehicle, limits) for commanded_by in COMMANDED)
+    return [mismatch for mismatch in mismatches if mismatch is not None]
 
 
-def rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
+def _rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
     """Return the rotor speeds commanded by the rate loop of `plant` at the measured body rates.
 
     `step_time_s` (S,) are the starts of the time steps [s]. None where the log has no commands. The
@@ -118,24 +122,27 @@ def rate_loop_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> C
     return commanded
 
 
-def _logged_speeds(log: FlightLog, step_time_s: np.ndarray) -> Commanded | None:
+def _logged_speeds(log: FlightLog, step_time_s: np.ndarray, plant: Plant) -> Commanded | None:
     """Return the rotor speeds that the log has as motor commands; None where it has none."""
+    del plant
     command = log.rotor_speed_cmd
     if command is None:
         return None
     return lambda delay_s: hold(step_time_s - delay_s, log.time_s, command)
 
 
+RATE_LOOP = "nominal rate loop"
+COMMANDED = {RATE_LOOP: _rate_loop_speeds, "logged motor commands": _logged_speeds}
+"""What commands rotor speeds, and the function that computes them."""
+
+
 def _stretches(
-    log: FlightLog,
-    vehicle: Vehicle,
-    commanded_of: Callable[[FlightLog, np.ndarray], Commanded | None],
-    limits: Thresholds,
+    log: FlightLog, plant: Plant, commanded_by: str, limits: Thresholds
 ) -> list[_Stretch]:
     """Return the stretches of `log` that have measured and commanded rotor speeds."""
     if log.rotor_speed is None:
         return []
-    dt, stretches = step_s(vehicle), []
+    dt, stretches = plant.dt, []
     rate_b = on_every_row(log, limits).rate_b
     complete = np.isfinite(log.rotor_speed).all(axis=1) & np.isfinite(rate_b).all(axis=1)
     complete_rows = np.flatnonzero(complete)
@@ -147,7 +154,7 @@ def _stretches(
         if time_s[-1] < 4.0 * limits.lag_settled_s:  # too short next to the time left out below
             continue
         step_time_s = log.time_s[rows[0]] + dt * np.arange(int(time_s[-1] / dt) + 1)
-        commanded = commanded_of(log, step_time_s)
+        commanded = COMMANDED[commanded_by](log, step_time_s, plant)
         if commanded is None or not np.isfinite(commanded(0.0)).all():
             continue
         step = np.round(time_s / dt).astype(int)
@@ -158,10 +165,19 @@ def _stretches(
 
 
 def _mismatch(
-    commanded_by: str, stretches: Sequence[_Stretch], vehicle: Vehicle, limits: Thresholds
-) -> ActuatorMismatch:
-    """Fit lag, delay and scales of the rotors, and return how the rotor speeds differ."""
-    dt, nominal_lag = step_s(vehicle), vehicle.rotors.time_constant
+    commanded_by: str, logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds
+) -> ActuatorMismatch | None:
+    """Fit lag, delay and scales of the rotors, and return how the rotor speeds differ.
+
+    None where no log has both commanded and measured rotor speeds.
+    """
+    dt, nominal_lag, stretches = step_s(vehicle), vehicle.rotors.time_constant, list[_Stretch]()
+    plant = make_plant(vehicle, dt, {})
+    for log in logs:
+        if sum(len(stretch.row) for stretch in stretches) * dt < limits.actuator_flight_s:
+            stretches += _stretches(log, plant, commanded_by, limits)
+    if not stretches:
+        return None
     measured = np.concatenate([stretch.measured for stretch in stretches])
 
     def commanded(delay: float) -> list[np.ndarray]:
@@ -310,8 +326,7 @@ def flown_by_other_controller(
     delay, lag = float(plant.constants.delay), float(plant.constants.time_constant)
     error, variation, count = 0.0, 0.0, 0
     for log in logs:
-        commanded_of = partial(rate_loop_speeds, plant=plant)
-        for stretch in _stretches(log, vehicle, commanded_of, limits):
+        for stretch in _stretches(log, plant, RATE_LOOP, limits):
             commanded = _at_rows(stretch.commanded(delay), stretch.row, dt, lag)
             bin_of_row = (stretch.row * dt / limits.speed_mean_s).astype(int)
             used_bins, bin_index = np.unique(bin_of_row, return_inverse=True)
@@ -331,24 +346,9 @@ LAG = "motor_lag"
 """Name of the rotor lag in the catalogue of effects."""
 
 
-class RotorLag(NamedTuple):
-    """A time constant of the rotors that differs significantly from the vehicle file's."""
-
-    time_constant: float
-    """Estimate [s]."""
-    known: float
-    """The vehicle file's time constant [s]."""
-    half_width: float
-    """Half the 95 % interval over flights, plus half a time step of the model [s]."""
-    closed: float
-    """Share of the rotor speeds' squared error under the vehicle's lag that this lag removes."""
-    p_value: float
-    """p-value of the hypothesis that the vehicle file's lag is right."""
-
-
 def find_rotor_lag(
     logs: Sequence[FlightLog], vehicle: Vehicle, limits: Thresholds = THRESHOLDS
-) -> RotorLag | None:
+) -> TestedEffect | None:
     """Return the rotors' lag where it differs significantly from that of `vehicle`, else None.
 
     Args:
@@ -362,12 +362,13 @@ def find_rotor_lag(
     effect = vehicle.effects.get(LAG)
     known = vehicle.rotors.time_constant if effect is None else float(effect.time_constant)
     vehicle = replace(vehicle, rotors=replace(vehicle.rotors, time_constant=known))
-    mismatches = []
-    for log in logs:
-        mismatch = _loop_mismatch(log, vehicle, limits)
-        unexplained = 1.0 - limits.lag_followed_share
-        if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2:
-            mismatches.append(mismatch)
+    by_flight = [_mismatch(RATE_LOOP, [log], vehicle, limits) for log in logs if not log.partial]
+    unexplained = 1.0 - limits.lag_followed_share
+    mismatches = [
+        mismatch
+        for mismatch in by_flight
+        if mismatch is not None and mismatch.rms_fitted**2 <= unexplained * mismatch.spread**2
+    ]
     if len(mismatches) < limits.lag_least_flights:
         return None
     lags = np.array([mismatch.time_constant for mismatch in mismatches])
@@ -382,18 +383,7 @@ def find_rotor_lag(
     if difference <= half_width or closed < limits.lag_closed_share:
         return None
     t = (difference - half_step) / max(standard_error, 1e-9)
-    return RotorLag(
-        time_constant=float(lags.mean()),
-        known=known,
-        half_width=half_width,
-        closed=closed,
-        p_value=float(2.0 * stats.t.sf(t, len(lags) - 1)),
-    )
-
-
-def _loop_mismatch(log: FlightLog, vehicle: Vehicle, limits: Thresholds) -> ActuatorMismatch | None:
-    """Return the mismatch with the nominal rate loop; None where the log lacks a signal for it."""
-    if log.partial or log.rate_cmd_b is None or log.rotor_speed is None:
-        return None
-    mismatches = actuator_mismatches([log], vehicle, limits)
-    return next((one for one in mismatches if one.commanded_by == "nominal rate loop"), None)
+    lag, low = float(lags.mean()), max(float(lags.mean()) - half_width, 0.0)
+    parameters = {"time_constant": {"value": lag, "unit": "s", "ci95": [low, lag + half_width]}}
+    p_value = float(2.0 * stats.t.sf(t, len(lags) - 1))
+    return TestedEffect(LAG, EFFECTS[LAG].values(lag), parameters, closed, p_value, "commands")

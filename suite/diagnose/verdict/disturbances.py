@@ -33,6 +33,7 @@ from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.residual_structure import DisturbanceEquations
 
 STEP_HZ = 0.01
@@ -245,38 +246,16 @@ def _peak_shares(
     return float(np.sqrt(residual / max(measured, 1e-12))), peak / max(total, 1e-12)
 
 
-class Turbulence(NamedTuple):
-    """Estimated random wind."""
-
-    intensity: float
-    """Standard deviation of the wind's speed [m/s]."""
-    intensity_ci95: tuple[float, float]
-    length: float
-    """Length scale [m]."""
-    length_ci95: tuple[float, float]
-    ratio: float
-    """Logarithm of the likelihood ratio of this wind to no wind."""
-
-    @property
-    def effect(self) -> str:
-        """Name of the wind in the catalogue."""
-        return GUSTS.name
-
-    @property
-    def values(self) -> Gusts:
-        """Values of the effect in a vehicle file."""
-        return Gusts(self.intensity, self.length)
-
-
 def find_turbulence(
     model: RolloutModel,
     theta: np.ndarray,
     disturbance: DisturbanceEquations,
     limits: Thresholds = THRESHOLDS,
-) -> Turbulence | None:
+) -> tuple[TestedEffect, float] | None:
     """Return the random wind that explains the residual of `model` at `theta` (P,), or None.
 
     None also without a drag that transmits it, with a better random force, or by outliers alone.
+    With the wind comes the logarithm of the likelihood ratio of this wind to no wind.
     """
     transmission = _wind_transmission(model, theta, disturbance.knot)
     if np.abs(transmission).max() < 1e-6:
@@ -293,13 +272,16 @@ def find_turbulence(
         return None
     likely = table >= ratio - limits.profile_fall  # 95 % by the profile likelihood
     likely_m, likely_intensity = lengths_m[likely.any(axis=1)], intensities[likely.any(axis=0)]
-    return Turbulence(
-        float(intensities[j]),
-        (float(likely_intensity[0]), float(likely_intensity[-1])),
-        float(lengths_m[i]),
-        (float(likely_m[0]), float(likely_m[-1])),
-        ratio,
-    )
+    intensity, length = float(intensities[j]), float(lengths_m[i])
+    parameters = {
+        name: {"value": value, "unit": unit, "ci95": [float(inside[0]), float(inside[-1])]}
+        for name, value, unit, inside in (
+            ("intensity", intensity, "m/s", likely_intensity),
+            ("length", length, "m", likely_m),
+        )
+    }
+    values, p_value = Gusts(intensity, length), float(np.exp(-ratio))
+    return TestedEffect(GUSTS.name, values, parameters, None, p_value, "whole"), ratio
 
 
 def _wind_transmission(model: RolloutModel, theta: np.ndarray, knot: Flown) -> np.ndarray:

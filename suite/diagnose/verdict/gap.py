@@ -121,9 +121,10 @@ class EffectSize(NamedTuple):
         return self.force >= force or self.torque >= torque or (self.drift or 0.0) >= drift
 
     def words(self) -> str:
-        """Return the size as a line for people."""
-        drift = "" if self.drift is None else f", {self.drift:.2g} m after 1 s"
-        return f"{self.force:.2g} m/s^2, {self.torque:.2g} rad/s^2{drift}"
+        """Return the size as text for people."""
+        values = {"m/s²": self.force, "rad/s²": self.torque, "m after one second": self.drift}
+        parts = [f"{value:.2g} {unit}" for unit, value in values.items() if value] or ["nothing"]
+        return " and ".join([*([", ".join(parts[:-1])] if parts[1:] else []), parts[-1]])
 
 
 def rollout_size(shift: np.ndarray, windows: FlightWindows) -> EffectSize:

@@ -39,7 +39,7 @@ def test_files_come_out_whole_and_bad_flights_are_named(written):
     assert any("bad.csv" in warning for warning in found["warnings"])
     names = {effect["name"] for effect in found["effects"]}
     assert names and set(load_vehicle(written / "vehicle.toml").effects) == names
-    assert found["seed"] == 3 and found["black_box"] is None
+    assert found["seed"] == 3
     assert found["actuators"][0]["followed"] > 0.9
     assert found["plan"]["flights"] == [] or found["effects"][0]["alternatives"]
 
@@ -51,7 +51,7 @@ def test_every_step_is_in_the_report(written):
     folded = re.findall(r'class="section"><summary>(.*?)</summary>', text)
     assert [head for head in folded if head in STEPS] == list(STEPS)
     assert "Actuators, apart from the air" in folded
-    assert text.count("data:image/png;base64,") >= 3
+    assert text.count("data:image/png;base64,") == 1
     assert "<script" not in text and not re.search(r'(src|href)="https?:', text)
     for link in re.findall(r'href="([^"]+)"', text):
         assert (written / link).is_file()
@@ -88,15 +88,9 @@ def test_a_file_with_a_load_on_a_line_is_refused_before_flights_are_read(command
 
 def test_what_is_read_is_not_written_over(tmp_path, capsys):
     save_vehicle(PLAIN, tmp_path / "vehicle.toml")
-    flown = tmp_path / "plan" / "flights" / "plan_1_circle.parquet"
-    flown.parent.mkdir(parents=True)
-    flown.write_bytes(b"a log")
     own, out = str(tmp_path / "vehicle.toml"), ["--out", str(tmp_path)]
-    for args in (["--vehicle", own], ["--vehicle", "reference", "--fly", own],
-                 ["--vehicle", "reference", "--fly", "reference"]):  # fmt: skip
-        assert main(["diagnose", str(flown), *args, *out]) == 2
-        said = "plan_1_circle.parquet" if own not in args else "vehicle.toml"
-        assert f"{said} is also an input and would be overwritten" in capsys.readouterr().err
+    assert main(["diagnose", str(tmp_path), "--vehicle", own, *out]) == 2
+    assert "vehicle.toml is also an input and would be overwritten" in capsys.readouterr().err
 
 
 def test_flights_that_are_too_short_or_missing_are_refused(tmp_path, capsys):

