@@ -103,38 +103,30 @@ def test_a_wrong_command_or_option_is_code_2(command, capsys, line, words):
     assert said.out == "" and words in said.err and "Traceback" not in said.err
 
 
-@pytest.mark.parametrize(
-    ("line", "track", "levels"),
-    [
+def test_a_list_may_have_commas_or_spaces_and_some_options_may_be_given_again():
+    for line, track, levels in (
         ("--track zigzag circular", "zigzag,circular", "0,3"),
         ("--track zigzag,circular --seed 3", "zigzag,circular", "0,3"),
         ("--difficulty=0 3 --track all", "all", "0,3"),
         ("--seed 3 --difficulty 0 3,9", "all", "0,3,9"),
         ("--difficulty 0-2 5 --seed 3", "all", "0-2,5"),
-    ],
-)
-def test_a_list_may_have_commas_or_spaces(line, track, levels):
-    _, config = cli.parse("eval", line.split())
-    assert (config.flown.track, config.flown.difficulty) == (track, levels)
-
-
-def test_every_list_may_have_commas_but_within_a_value():
+    ):
+        flown = cli.parse("eval", line.split())[1].flown
+        assert (flown.track, flown.difficulty) == (track, levels)
     assert cli.parse("eval", ["--speed", "0.3,1"])[1].flown.speed == (0.3, 1.0)
     assert cli.parse("export", ["--format=c,onnx"])[1].formats == ("c", "onnx")
+    config = cli.parse("reproduce", "simulators --simulator mjx --simulator rotorpy".split())[1]
+    assert config.experiment.simulator == ("mjx", "rotorpy")
+    # As a shell expands runs/seed*/policy.
+    for line in ("--policy a --policy b", "--policy a b --seed 3"):
+        assert cli.parse("eval", line.split())[1].flown.policies == ("a", "b")
+    # A comma within a value is no list's.
     training = cli.parse("train", ["--set", "spec.camera.fov_deg=87,58", "loss.progress=2"])[1]
     assert training.set == ("spec.camera.fov_deg=87,58", "loss.progress=2")
     line = "a,b.parquet --vehicle x --reference c,d.parquet --relevance 0,0,0"
     config = cli.parse("diagnose", line.split())[1]
     assert list(map(str, config.flights + config.reference)) == ["a,b.parquet", "c,d.parquet"]
     assert config.relevance == (0.0, 0.0, 0.0)
-
-
-def test_options_of_one_value_each_may_be_given_again():
-    config = cli.parse("reproduce", "simulators --simulator mjx --simulator rotorpy".split())[1]
-    assert config.experiment.simulator == ("mjx", "rotorpy")
-    # As a shell expands runs/seed*/policy.
-    for line in ("--policy a --policy b", "--policy a b --seed 3"):
-        assert cli.parse("eval", line.split())[1].flown.policies == ("a", "b")
 
 
 def test_a_word_behind_a_list_may_be_a_positional_one(tmp_path, capsys):
@@ -277,9 +269,7 @@ def test_what_other_commands_take_by_name_is_listed(capfd):
 
 def test_a_shell_is_given_every_command_with_its_options(capsys):
     assert cli.main(["completion", "bash"]) == 0
-    script = capsys.readouterr().out
-    lines = {
-        line.split(")")[0].strip(): line for line in script.splitlines() if ") options=" in line
-    }
+    cases = [line for line in capsys.readouterr().out.splitlines() if ") options=" in line]
+    lines = {line.split(")")[0].strip(): line for line in cases}
     assert set(lines) == set(cli.COMMANDS)
     assert "--simulator" in lines["eval"] and "--no-delta" in lines["loop"]

@@ -140,14 +140,12 @@ for name in json.loads(sys.argv[2]):
     __import__(name)
 import numpy as np
 from policies.formats import policy_file
-from policies.networks import delta_network, tree_arrays
+from policies.networks import tree_arrays
 from policies.policy import load_policy
 stored = policy_file.load_policy_checkpoint(pathlib.Path(sys.argv[3]))
-arrays = tree_arrays.tree_to_arrays(stored.params)
-tree_arrays.tree_from_arrays(stored.params, arrays, "here")
-folder = pathlib.Path(sys.argv[4]) / "again"
-policy_file.save_policy(folder, stored.params, stored.spec, seed=1)
-policy = load_policy(folder)
+tree_arrays.tree_from_arrays(stored.params, tree_arrays.tree_to_arrays(stored.params), "here")
+policy_file.save_policy(pathlib.Path(sys.argv[4]), stored.params, stored.spec, seed=1)
+policy = load_policy(pathlib.Path(sys.argv[4]))
 state, image = np.zeros((2, 12)), np.zeros((2, 24, 32))
 action, _ = policy.act(policy.start(2), state, image, np.ones(2, bool))
 assert np.isfinite(action).all()
@@ -188,5 +186,5 @@ def test_a_bare_machine_trains_and_flies_our_policies(tmp_path):
         if path.relative_to(ROOT).parts[:2] == ("suite", "train") and path.name != "__init__.py"
     )
     policy = small_checkpoint(tmp_path)
-    said = _said(BARE, BARE_HAS_NOT, trainer, str(policy), str(tmp_path))
+    said = _said(BARE, BARE_HAS_NOT, trainer, str(policy), str(tmp_path / "again"))
     assert "torch is blocked" in said

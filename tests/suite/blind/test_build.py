@@ -24,6 +24,7 @@ def test_a_case_is_the_same_to_the_bit_and_its_seed_matters(made_set, monkeypatc
     monkeypatch.setattr(module, "_expected_names", lambda *_: {})  # how strong it is takes longest
     first, again = build(SINGLE), made_set / "cases" / "case_001" / "flight_1.parquet"
     np.testing.assert_array_equal(first.logs[0].pos_w, read_flight(again).pos_w)
+    assert (first.logs[0].integrator, first.logs[0].step_s) == ("euler", 0.002)
     stored = open_answers(made_set)["case_001"]
     (effect,), (kept,) = plain(first.answer)["effects"], stored.pop("effects")
     assert {"kind", "verdict"} <= set(stored) and stored["verdict"] == "named"
@@ -62,9 +63,8 @@ def test_physics_outside_the_catalogue_moves_the_vehicle():
 
 
 def test_a_hanging_load_weighs_what_it_weighs():
-    flight = fly(
-        BARE, BARE, [Trajectory("hover", 1.0)], extra=make_outside("slung_load", 0.03, BARE.mass)
-    )[0]
+    load = make_outside("slung_load", 0.03, BARE.mass)
+    flight = fly(BARE, BARE, [Trajectory("hover", 0.2)], extra=load)[0]
     assert flight.extra.force_b[0, 2] == pytest.approx(-0.03 * 9.81, rel=1e-6)
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from eval.logs.flight_log import read_flight
 from eval.quadrotor.vehicle_file import load_vehicle
-from suite import cli
 from suite.blind import make as make_module
 from suite.blind.build import build
 from suite.blind.make import make_set, open_answers
@@ -15,6 +14,7 @@ from suite.blind.run import run_set
 from suite.blind.score import report, score_set
 from suite.common.console import Console
 from tests.support.blind import NULL
+from tests.support.commands import answer, refused
 from tracks.common.files import write_json
 
 
@@ -58,10 +58,8 @@ def test_without_its_simulator_nothing_is_begun(tmp_path, monkeypatch, capsys):
     """A folder that says whose set it is would be refused for another's."""
     monkeypatch.setitem(sys.modules, "torchdiffeq", None)
     out = tmp_path / "out"
-    assert cli.main(["blind", "make", "--simulator", "rotorpy", "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert "pip install 'diffracing-suite[rotorpy]'" in said and len(said.splitlines()) == 1
-    assert not out.exists()
+    said = refused(capsys, "blind make --simulator rotorpy --out", out)
+    assert "pip install 'diffracing-suite[rotorpy]'" in said and not out.exists()
     with pytest.raises(ValueError, match="count = 0"):
         make_set(out, 5, 0, Console())
     assert not out.exists()
@@ -76,11 +74,10 @@ def test_a_diagnosis_runs_over_a_set_and_is_scored(small_set):
         if out.name == "case_002" and seen.count("case_002") == 1:
             raise RuntimeError("lost its way")
         named = {"name": "linear_drag", "alternatives": [], "parameters": {}}
-        effects = [named] if out.name == "case_001" else []
-        write_json(
-            out / "diagnosis.json",
-            {"verdict": "named" if effects else "no_gap", "effects": effects, "gap": {}},
-        )
+        found = {"verdict": "no_gap", "effects": [], "gap": {}}
+        if out.name == "case_001":
+            found |= {"verdict": "named", "effects": [named]}
+        write_json(out / "diagnosis.json", found)
 
     with pytest.raises(ValueError, match="no case was diagnosed yet; do that with"):
         score_set(small_set)
@@ -102,8 +99,7 @@ def test_a_case_that_was_not_run_has_not_failed(small_set, capsys):
 
     with pytest.raises(KeyboardInterrupt):
         run_set(small_set, diagnose, Console())
-    assert cli.main(["blind", "score", "--out", str(small_set), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = answer(capsys, "blind score --out", small_set)
     assert ([v["case"] for v in said["cases"]], said["not_run"]) == (["case_001"], ["case_002"])
     failed = next(s for s in said["shares"] if s["what"] == "diagnosis failed")
     assert (failed["count"], failed["of"]) == (0, 1)

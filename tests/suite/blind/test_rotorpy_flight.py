@@ -11,7 +11,7 @@ from suite.blind.rotorpy_flight import check_effects, fly_rotorpy, hub_damping
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tracks.geometry.rotation import to_world
 
-WAYS = [Trajectory("figure_eight", 0.6, speed=2.0), Trajectory("hover", 0.3)]
+WAYS = [Trajectory("figure_eight", 0.4, speed=2.0), Trajectory("hover", 0.2)]
 LAGGED = with_lag(PLAIN, 0.03)
 G = np.array([0.0, 0.0, 9.81])
 
@@ -26,7 +26,7 @@ def test_flights_side_by_side_are_each_as_if_alone_and_move_as_their_acceleromet
     pytest.importorskip("rotorpy")
     truth = with_effects(LAGGED, rotor_drag=(4e-4,))
     eight, hover = fly_rotorpy(LAGGED, truth, WAYS, 100.0)
-    assert (len(eight.time_s), len(hover.time_s), eight.period) == (300, 150, 5)
+    assert (len(eight.time_s), len(hover.time_s), eight.period) == (200, 100, 5)
     assert eight.integrator is None
     (alone,) = fly_rotorpy(LAGGED, truth, WAYS[1:], 100.0)
     np.testing.assert_allclose(alone.motion.pos_w, hover.motion.pos_w, atol=1e-9)
@@ -47,7 +47,7 @@ def test_without_air_it_flies_as_mujoco_does():
 def test_a_flight_into_the_ground_fails():
     pytest.importorskip("rotorpy")
     with pytest.raises(FlightFailed, match=r"flight 1 failed at \d\.\d\d s"):
-        fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.5, height=0.0)], 100.0)
+        fly_rotorpy(LAGGED, LAGGED, [Trajectory("hover", 0.3, height=0.0)], 100.0)
 
 
 K = 2e-6

@@ -11,15 +11,10 @@ from tracks.common.files import write_json
 TRUTH = {
     "kind": "single",
     "effects": [
-        {
-            "name": "rotor_drag",
-            "parameters": {"coefficient": 3e-5},
-            "multiple": 2.0,
-            "required": ["linear_drag"],
-            "allowed": ["linear_drag", "quadratic_drag"],
-        }
+        {"name": "rotor_drag", "parameters": {"coefficient": 3e-5}, "multiple": 2.0,
+         "required": ["linear_drag"], "allowed": ["linear_drag", "quadratic_drag"]}
     ],
-}
+}  # fmt: skip
 NULL = {"kind": "null", "effects": []}
 OUTSIDE = {"kind": "outside", "effects": [], "outside": {"name": "tether", "multiple": 6.0}}
 
@@ -36,11 +31,13 @@ def hidden(name, **parameters):
 
 
 def said(*effects, verdict="named", after=0.5, floor=0.5):
-    return {
-        "verdict": verdict,
-        "effects": list(effects),
-        "gap": {"after": after, "noise_floor": floor},
-    }
+    gap = {"after": after, "noise_floor": floor}
+    return {"verdict": verdict, "effects": list(effects), "gap": gap}
+
+
+def score(truth, *effects):
+    """Return the verdict on a diagnosis that names effects."""
+    return score_case("c", truth, said(*effects), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +56,7 @@ def said(*effects, verdict="named", after=0.5, floor=0.5):
     ],
 )
 def test_sets_are_held_to_what_the_data_can_tell(effects, found, extra):
-    verdict = score_case("c", TRUTH, said(*effects), 1.0)
+    verdict = score(TRUTH, *effects)
     assert (verdict.found, verdict.extra) == (found, extra)
     assert verdict.exact == (found and not extra)
 
@@ -67,25 +64,22 @@ def test_sets_are_held_to_what_the_data_can_tell(effects, found, extra):
 def test_two_effects_need_both():
     pair = {"kind": "pair", "effects": [*TRUTH["effects"], *hidden("mass_offset")["effects"]]}
     one, other = effect("rotor_drag", "linear_drag"), effect("mass_offset")
-    assert score_case("c", pair, said(other, one), 1.0).exact
-    assert not score_case("c", pair, said(one), 1.0).found
+    assert score(pair, other, one).exact
+    assert not score(pair, one).found
 
 
 def test_intervals_count_by_component_and_leave_out_what_cannot_be_seen():
     truth = hidden("com_offset", offset=[0.001, 0.002, None])
     found = effect("com_offset", offset=[[0.0, 0.002], [0.003, 0.004], None])
-    assert score_case("c", truth, said(found), 1.0).covered == (True, False)
+    assert score(truth, found).covered == (True, False)
     other = effect("torque_trim", "com_offset", offset=[[0.0, 1.0]])
-    assert score_case("c", truth, said(other), 1.0).covered == ()
-
-
-def test_a_weak_motor_is_matched_by_its_number():
+    assert score(truth, other).covered == ()
+    # A weak motor is matched by its number.
     truth = hidden("weak_motor", scale=[1.0, 1.0, 0.9, 1.0])
     found = effect("weak_motor", scale=[0.88, 0.92])
-    found["parameters"]["index"] = {"value": 3}
-    assert score_case("c", truth, said(found), 1.0).covered == (True,)
-    found["parameters"]["index"] = {"value": 2}
-    assert score_case("c", truth, said(found), 1.0).covered == (False,)
+    for number, covered in ((3, True), (2, False)):
+        found["parameters"]["index"] = {"value": number}
+        assert score(truth, found).covered == (covered,)
 
 
 def test_the_table_counts_and_the_files_are_written(tmp_path):
@@ -137,6 +131,5 @@ def test_damping_by_moving_hubs_is_there_where_its_size_is_right():
 
     right = found(0.0, 0.0, 0.06)
     assert (right.exact, right.extra, right.brought) == (True, 0, 1)
-    assert found(0.0, 0.0, 0.2).extra == found(0.06, 0.0, 0.0).extra == 1
-    assert found(0.2, 0.0, 0.06).extra == 1
+    assert all(found(*size).extra == 1 for size in ((0, 0, 0.2), (0.06, 0, 0), (0.2, 0, 0.06)))
     assert score_case("c", TRUTH, said(drag), 1.0, hubs).exact

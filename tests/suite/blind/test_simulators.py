@@ -12,8 +12,6 @@ from suite.blind.simulators import simulator_for
 SINGLE = Case(
     "single", ("linear_drag",), 6.0, "bare", "estimator", (6, 70_001), simulator="continuous"
 )
-NULL = Case("null", (), 0.0, "dragged", "capture", (6, 70_002), simulator="continuous")
-
 pytestmark = pytest.mark.usefixtures("short_flights")
 
 
@@ -25,6 +23,7 @@ def test_a_continuous_cases_vehicle_has_the_loop_that_flew(monkeypatch):
     conditions = first.answer["conditions"]
     assert first.nominal.controller.frequency == conditions["loop_hz"]
     assert first.nominal.name == "bare" and not first.nominal.effects
+    assert first.logs[0].integrator is None
     about = dict(first.logs[0].about)
     assert about == {"source": "suite blind", "vehicle": "bare"}, "nothing of the conditions"
     spacing = np.median(np.diff(first.logs[0].time_s))
@@ -43,15 +42,8 @@ def test_a_continuous_case_is_as_strong_as_it_says():
     assert hidden["sigma"] > 2.0 and "linear_drag" not in hidden["allowed"]
 
 
-def test_only_the_simulator_with_a_step_says_so():
-    assert build(NULL).logs[0].integrator is None
-    flat = Case("null", (), 0.0, "dragged", "capture", (5, 2))
-    log = build(flat).logs[0]
-    assert (log.integrator, log.step_s) == ("euler", 0.002)
-
-
 def test_conditions_are_drawn_from_the_cases_seed():
-    simulator = simulator_for(NULL, np.random.default_rng(3))
+    simulator = simulator_for(SINGLE, np.random.default_rng(3))
     drawn = draw_conditions(np.random.default_rng(3))
     assert simulator.conditions["row_hz"] == drawn.row_hz
     assert simulator.nominal.controller.frequency == drawn.loop_hz
