@@ -41,11 +41,11 @@ def lines(path):
     return path.read_text().splitlines() if path.is_file() else []
 
 
-def when(happens, then, seconds=200):
+def when(happens, then):
     """Do `then` beside as soon as `happens`."""
 
     def wait():
-        until = time.monotonic() + seconds
+        until = time.monotonic() + 200.0
         while not happens() and time.monotonic() < until:
             time.sleep(0.05)
         then()

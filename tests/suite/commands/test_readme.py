@@ -34,6 +34,7 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 SENTENCE = re.compile(r"`suite ([^`]+)`")
 MADE_UP = {"hello", "COMMAND"}
 """Commands that a page speaks of and that are none."""
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = {
     f"{page.name}-{number}": (bool(marked), body)
@@ -59,19 +60,24 @@ def _check(words):
             if "--help" not in args:
                 cli.parse(name, args)
         case ["make", *targets]:
-            makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
             for target in targets:
-                if "=" not in target:
-                    assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+                assert "=" in target or re.search(rf"^{target}:", MAKEFILE, re.MULTILINE), target
+
+
+@contextlib.contextmanager
+def _named(where):
+    """Say where a wrong command stands."""
+    try:
+        yield
+    except (AssertionError, SystemExit) as error:
+        raise AssertionError(f"{where}: {error}") from error
 
 
 def test_every_command_is_one_that_exists():
     for where, (_, body) in BLOCKS.items():
         for words in _commands(body):
-            try:
+            with _named(f"{where}: {shlex.join(words)}"):
                 _check(words)
-            except (AssertionError, SystemExit) as error:
-                raise AssertionError(f"{where}: {shlex.join(words)}: {error}") from error
 
 
 @functools.cache
@@ -101,10 +107,8 @@ def test_commands_within_a_sentence_exist_and_none_hides_in_another_fence():
             hides = kind != "sh" and re.match(r"(suite|make|pip) ", body)
             assert not hides, f"{page.name}: fence it with ```sh: {body}"
         for words in SENTENCE.findall(FENCE.sub("", text)):
-            try:
+            with _named(f"{page.name}: suite {words}"):
                 _check_sentence(words)
-            except (AssertionError, SystemExit) as error:
-                raise AssertionError(f"{page.name}: suite {words}: {error}") from error
 
 
 def test_what_does_not_exist_is_found():
