@@ -7,6 +7,7 @@ their own.
 
 import json
 import resource
+import shutil
 import time
 import warnings
 from dataclasses import replace
@@ -127,45 +128,46 @@ def foreign_reader(kind):
 
 def drawn_and_used(kind, folder):
     """Return the strategy of a kind of input, and what uses one."""
-    recipe = with_quadrotor(named_recipe("race"), load_vehicle("racer5"))
-    odd = folder / "odd"
-
-    def filed(read, name="odd"):
-        def use(data):
-            path = folder / name
-            path.write_bytes(data)
-            read(path)
-
-        return use
-
-    if kind in FOREIGN:
-        valid = a_foreign_file(kind, folder)
-        read = filed(foreign_reader(kind), f"odd.{kind}")
-        read(valid)
-        return mutated_bytes(valid), read
     if kind == "set":
+        recipe = with_quadrotor(named_recipe("race"), load_vehicle("racer5"))
         return changes(recipe), lambda change: check(override(recipe, [change]))
-    if kind in TOML:
-        valid, read = TOML[kind]
-        text = (ROOT / valid).read_text("utf-8")
-        read(ROOT / valid)
-        return mutated_toml(text), filed(read, "odd.toml")
-    if kind == "checkpoint":
+    name, ending = "odd", Path(kind).suffix
+    if kind in FOREIGN:
+        name, valid, read = f"odd.{kind}", a_foreign_file(kind, folder), foreign_reader(kind)
+        drawn = mutated_bytes(valid)
+    elif kind in TOML:
+        place, read = TOML[kind]
+        for mesh in (ROOT / place).parent.glob("*.obj"):
+            shutil.copy(mesh, folder)
+        name, valid = "odd.toml", (ROOT / place).read_bytes()
+        drawn = mutated_toml(valid.decode())
+    elif kind == "checkpoint":
         source = shipped.folder("race-paper")
         (folder / "weights.safetensors").write_bytes((source / "weights.safetensors").read_bytes())
-        config = json.loads((source / "config.json").read_text())
-        return mutated_json(config), filed(lambda _: load_policy_checkpoint(folder), "config.json")
-    if kind == "policy.onnx":
-        return mutated_bytes(onnx_model().SerializeToString()), filed(read_checked, "odd.onnx")
-    if kind in ("flight.parquet", "flight.csv"):
-        ending = Path(kind).suffix
-        return mutated_bytes(a_flight(folder, ending)), filed(read_flight, f"odd{ending}")
-    if kind == "run.json":
-        record = {"config": plain(Evaluation())}
-        return mutated_json(record), filed(lambda _: read_evaluation(folder), "run.json")
-    Journal(odd, {"a": 1}).close()
-    line = odd.read_bytes() + b'{"track": "zigzag", "difficulty": 0, "seed": 0}\n'
-    return mutated_bytes(line), filed(lambda path: Journal(path, {"a": 1}).close())
+        name, valid = "config.json", (source / "config.json").read_bytes()
+        drawn, read = mutated_json(json.loads(valid)), lambda _: load_policy_checkpoint(folder)
+    elif kind == "policy.onnx":
+        name, valid, read = "odd.onnx", onnx_model().SerializeToString(), read_checked
+        drawn = mutated_bytes(valid)
+    elif kind in ("flight.parquet", "flight.csv"):
+        name, valid, read = f"odd{ending}", a_flight(folder, ending), read_flight
+        drawn = mutated_bytes(valid)
+    elif kind == "run.json":
+        name, record = "run.json", {"config": plain(Evaluation())}
+        valid = json.dumps(record).encode()
+        drawn, read = mutated_json(record), lambda _: read_evaluation(folder)
+    else:
+        Journal(folder / name, {"a": 1}).close()
+        line = b'{"track": "zigzag", "difficulty": 0, "seed": 0}\n'
+        valid = (folder / name).read_bytes()
+        drawn, read = mutated_bytes(valid + line), lambda path: Journal(path, {"a": 1}).close()
+
+    def filed(data):
+        (folder / name).write_bytes(data)
+        read(folder / name)
+
+    filed(valid)
+    return drawn, filed
 
 
 def fuzz(kind, folder, count, part=0):
