@@ -22,8 +22,8 @@ from suite.commands import train as train_command
 from suite.delta.run import flight_files
 from suite.diagnose import run as diagnose_run
 from suite.train.overrides import override
+from tests.support.judged_cells import cut_short
 from tests.support.policy_files import InProcess
-from tests.support.short import cut_short
 
 RECIPE = train_command.named_recipe
 ROOT = Path(__file__).resolve().parents[2]

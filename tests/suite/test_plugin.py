@@ -17,7 +17,7 @@ RUN = """
 import sys
 import pytest
 from suite.cli import main
-from tests.support.short import cut_short
+from tests.support.judged_cells import cut_short
 cut_short(pytest.MonkeyPatch(), 1.0)
 for line in sys.stdin.read().splitlines():
     code = main([*line.split(), "--json"])

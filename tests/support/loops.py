@@ -7,7 +7,7 @@ import numpy as np
 
 import eval.judging.judge
 import suite.train.run
-from eval.worlds.trial import Rules, TrialResult
+from eval.worlds.trial import Rules
 
 
 class Small:
@@ -46,13 +46,3 @@ class Small:
             return state._replace(params=params, iteration=state.iteration + 1), numbers
 
         return update
-
-
-def trial_result(seed, success, level=0):
-    """Return a trial of the zigzag that was won, or that ended after three gates."""
-    counts = ("gates_8s", "gates_035", "bad_actions", "limited_actions", "late_actions")
-    rest = dict.fromkeys(counts, 0)
-    return TrialResult(
-        "zigzag", level, seed, "p", "v", "w", success, 8 if success else 3, "finished", None,
-        0.0, 0.0, 0.0, 5.0, 4.0, 3.0, **rest,
-    )  # fmt: skip

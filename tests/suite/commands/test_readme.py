@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from suite import cli
-from tests.support.short import cut_short
+from tests.support.judged_cells import cut_short
 
 ROOT = Path(__file__).resolve().parents[3]
 ARCHIVE = sorted((ROOT / "docs/archive").glob("*.md"))

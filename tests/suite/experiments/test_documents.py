@@ -10,9 +10,9 @@ from eval.worlds import rotorpy as rotorpy_world
 from eval.worlds.trial import Rules
 from suite.experiments.simulators import REASONS, Config, changed_trials, conditions
 from suite.experiments.study import disturbed, judging
+from tests.support import judged_cells
 from tests.support.documents import another_racer, page, reproduce
 from tests.support.engines import STAND_IN
-from tests.support.loops import trial_result
 
 
 class Sky:
@@ -130,7 +130,8 @@ def test_why_is_told_by_the_controls(rotorpy):
     won = {base: "1111", single: "0111", aired: "1011", other: "0001"}
     tested = [
         disturbed.ConditionResult(
-            one, {"p": [trial_result(k, digit == "1") for k, digit in enumerate(won[one.name])]}
+            one,
+            {"p": [judged_cells.result(k, digit == "1") for k, digit in enumerate(won[one.name])]},
         )
         for one in flown_in
     ]

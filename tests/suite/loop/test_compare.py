@@ -7,11 +7,11 @@ from eval.judging.statistics import bootstrap_mean
 from suite.loop.compare import CellComparison, compare, policy_results
 from suite.loop.hidden_effect import LABELS
 from suite.loop.tables import cell_grid, comparison_grids, overall_grid, verdict
-from tests.support.loops import trial_result
+from tests.support.judged_cells import result
 
 
 def _result(seed, success, v_mean, level=0):
-    return trial_result(seed, success, level)._replace(v_max=v_mean + 1, v_mean=v_mean)
+    return result(seed, success, "p", level)._replace(v_max=v_mean + 1, v_mean=v_mean)
 
 
 def test_differences_are_of_the_same_trials():
@@ -65,7 +65,7 @@ def test_bootstrap_of_a_mean_is_that_of_the_central_limit():
 def test_standings_are_paired_by_trial():
     won = {"nominal": 39, "before": 10, "control": 12, "delta": 20, "named": 36, "both": 40}
     results = {
-        name: [trial_result(k, k < count, k % 2) for k in range(40)] for name, count in won.items()
+        name: [result(k, k < count, "p", k % 2) for k in range(40)] for name, count in won.items()
     }
     stand = policy_results(results, ("before", "control", "nominal"))
     named = stand[4]

@@ -31,7 +31,8 @@ from suite.loop.hidden_effect import LABELS, LOOP, describe_hidden, hidden_effec
 from suite.loop.measured import CONTACT_MARGIN_S, Noise
 from suite.loop.tables import CAVEAT
 from tests.support.engines import STAND_IN
-from tests.support.loops import Small, trial_result
+from tests.support.judged_cells import result
+from tests.support.loops import Small
 
 EXAMPLE = "examples/hidden.toml"
 SIZES = "loop --recipe quick --track zigzag --difficulty 0 --trials 3 --flights 3"
@@ -302,7 +303,7 @@ def test_all_but_the_first_judging_are_in_the_other_simulator(monkeypatch, root,
 )  # fmt: skip
 def test_the_verdict_claims_what_the_intervals_hold(nominal, control, named, words):
     won = {"nominal": nominal, "before": 10, "control": control, "named": named}
-    results = {name: [trial_result(k, k < count) for k in range(40)] for name, count in won.items()}
+    results = {name: [result(k, k < count) for k in range(40)] for name, count in won.items()}
     standings = policy_results(results, ("before", "control", "nominal"))
     said = hidden_effect.verdict(standings, answer([NAMED]), 40)
     assert all(one in said for one in words), said
