@@ -26,8 +26,7 @@ class Writer:
 
 def test_numbers_reach_tensorboard_from_the_first_step_that_is_computed(tmp_path, monkeypatch):
     monkeypatch.setattr(Writer, "made", [])
-    package = types.ModuleType("tensorboardX")
-    package.SummaryWriter = Writer  # type: ignore[attr-defined]
+    package = types.SimpleNamespace(SummaryWriter=Writer)
     monkeypatch.setitem(sys.modules, "tensorboardX", package)
     mirror = curve.tensorboard(tmp_path)
     mirror([])

@@ -4,8 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import pytest
-
 import eval.judging.judge
 from eval.judging.results import read_trials
 from suite.commands import view
@@ -110,20 +108,17 @@ def test_a_trial_ends_at_the_time_that_is_given_and_is_seen_so_again(pilots, tmp
     assert "--time-limit-s is 0.0, allowed is" in words
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("{run} --seed 3", "--seed is 3, but"),
-        ("{run} --speed 0.5", "--speed is 0.5, but"),
-        ("{run} --track zigzag", "flown again unchanged"),
+def test_options_that_do_not_fit_are_refused(tmp_path, capsys):
+    (tmp_path / "trials.parquet").touch()
+    for line, words in (
+        (f"{tmp_path} --seed 3", "--seed is 3, but"),
+        (f"{tmp_path} --speed 0.5", "--speed is 0.5, but"),
+        (f"{tmp_path} --track zigzag", "flown again unchanged"),
         ("race --pick failed", "--pick is failed, but race is not a finished run"),
         ("race-paper --difficulty 0 --speed 0.4", "--speed 0.4: race-paper takes no speed"),
         ("race --difficulty 0 --speed 1.4", "--speed is 1.4"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(line, words, tmp_path, capsys):
-    (tmp_path / "trials.parquet").touch()
-    assert words in refused(capsys, f"view --out {tmp_path} {line.format(run=tmp_path)}")
+    ):
+        assert words in refused(capsys, f"view --out {tmp_path} {line}")
 
 
 def test_a_recording_shows_who_flew_and_asks_for_a_speed(pilots, tmp_path):

@@ -68,14 +68,6 @@ def test_a_command_inside_a_period_meets_the_rates_of_the_last_tick():
     assert run.state[-1, 0, RATE][0] == pytest.approx(end, rel=1e-9)
 
 
-def test_the_last_command_holds_until_the_next_arrives():
-    late = with_effects(command_delay=(0.013,))
-    commands = [(HOVER + 1.0, 0, 0, 0), (HOVER - 1.0, 0, 0, 0), (HOVER + 1.0, 0, 0, 0)]
-    run = flown(late, [0.0, 0.01, 0.031, 0.04], commands)
-    # Up from 13 to 23 ms, down from 23 to 40 ms; the third command would come at 44 ms.
-    assert run.state[-1, 0, VEL][2] == pytest.approx(0.010 - 0.017, abs=1e-9)
-
-
 def test_a_push_is_felt_and_kept():
     def push(seen, force_b, length_s):
         assert force_b[0, 2] == pytest.approx(0.75 * HOVER)

@@ -57,7 +57,6 @@ def test_int8_is_scaled_by_flights(folder, tmp_path, monkeypatch, capsys):
 
 def test_what_cannot_be_exported_is_refused(folder, tmp_path, capsys):
     for args, message in (
-        ("--format tflite", "unknown format 'tflite'"),
         ("--format onnx --dtype int8", "supports float32 only"),
         ("--policy race-paper", "give one"),
     ):
