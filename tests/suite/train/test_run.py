@@ -117,13 +117,18 @@ run.train(small_config(physics={"depth_noise": 0.02}), Path(sys.argv[1]), Consol
 """
 
 
-def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(whole, tmp_path, root):
+def test_a_bare_machine_trains_and_a_real_kill_while_saving_loses_nothing(
+    whole, tmp_path, root, monkeypatch
+):
     done = subprocess.run(
         [sys.executable, "-c", BARE, str(tmp_path)], capture_output=True, text=True, cwd=root
     )
     assert done.returncode == 9, done.stderr
     assert not (tmp_path / "state").exists()
+    begun = []
+    monkeypatch.setattr(run, "sample_worlds", lambda c, k: begun.append(k) or boxes_worlds(c, k))
     run.train(NOISY, tmp_path, Console())
+    assert begun == [3, 4, 5], "it goes on from the state that was put aside"
     assert_same_run(tmp_path, whole)
 
 

@@ -138,22 +138,25 @@ def test_the_rollouts_gradient_is_that_of_finite_differences(float64, monkeypatc
 
 
 def test_gradients_of_the_motion_fade_as_those_of_the_point_mass(float64):
-    config = QuadrotorConfig(PLAIN, **ALIKE)
-    still, keys = jnp.zeros((1, 3)), jax.random.split(jax.random.key(0), 1)
-    effects = doubled(quadrotor.draw_effects(config, 1, np.random.default_rng(0)))
-    constants = QuadrotorParams(np.full(1, 0.05), effects)
+    """In a step by e^(-alpha dt), whichever part of the motion they come through."""
+    config, still = QuadrotorConfig(PLAIN, **ALIKE), jnp.zeros((1, 3))
+    constants = QuadrotorParams(np.full(1, 0.05), doubled(drawn(config, 1)))
+    keys, ahead = jax.random.split(jax.random.key(0), 1), jnp.asarray([[1.0, 0.0, 0.0]])
+    body = quadrotor_dynamics(config, 0.05, 0.0)[0](constants, still, 3 * ahead, ahead)
+    parts = ("pos_w", "vel_w", "rot_w", "rate_b")
 
-    def end(pos_w, decay):
-        start, step = quadrotor_dynamics(config, 0.05, decay)
-        body = start(constants, pos_w, still, still + jnp.asarray([1.0, 0.0, 0.0]))
+    def after(motion, decay):
+        step = quadrotor_dynamics(config, 0.05, decay)[1]
+        end = step(body._replace(**motion), constants, still, still + 5.0, keys)
+        return [getattr(end, name) for name in parts]
 
-        def one(body, _):
-            return step(body, constants, still, still + 5.0, keys), None
-
-        return jax.lax.scan(one, body, length=3)[0].pos_w[0, 0]
-
-    slope = jax.jit(jax.grad(end), static_argnums=1)(still, 0.916)[0, 0]
-    assert float(slope) == pytest.approx(np.exp(-0.916 * 0.15), rel=1e-9)
+    slopes, motion = jax.jit(jax.jacrev(after), static_argnums=1), body._asdict()
+    motion = {name: motion[name] for name in parts}
+    for whole, faded in zip(slopes(motion, 0.0), slopes(motion, 0.916), strict=True):
+        for name, slope in whole.items():
+            fade = np.exp(-0.916 * 0.05)
+            np.testing.assert_allclose(faded[name], fade * slope, rtol=1e-9, atol=1e-12)
+    assert all(np.any(slope) for slope in slopes(motion, 0.0)[0].values())
 
 
 def drawn(config, batch, seed=0):
