@@ -17,11 +17,14 @@ from scipy.signal import lfilter
 from eval.importers.rows import continuous
 from eval.logs.flight_log import FlightLog
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+from tracks.geometry.rotation import quat_to_rot
 
 MEASURED = ("pos_w", "quat_wxyz", "vel_w", "rate_b", "rotor_speed")
 """Signals of a log that are interpolated between their rows."""
 HELD = ("thrust_cmd", "rate_cmd_b", "torque_cmd_b", "pwm", "rotor_speed_cmd")
 """Signals of a log that are held until their next row."""
+HOLE_STEPS = 4.0
+"""Rows of a signal further apart than this many median steps are a hole on a grid of times."""
 
 
 def on_every_row(log: FlightLog, limits: Thresholds = THRESHOLDS) -> FlightLog:
@@ -154,20 +157,30 @@ def _filled(time_s: np.ndarray, column: np.ndarray, hole_s: float, held: bool) -
     own_rows = np.flatnonzero(np.isfinite(column))
     if len(own_rows) < 2:
         return column
-    interval = np.clip(
-        np.searchsorted(own_rows, np.arange(len(column)), side="right") - 1, 0, len(own_rows) - 2
-    )
-    before, after = own_rows[interval], own_rows[interval + 1]
+    own_s = time_s[own_rows]
+    unknown = in_hole(time_s, own_s, hole_s)
     if held:
-        values = np.where(
-            np.arange(len(column)) >= own_rows[-1], column[own_rows[-1]], column[before]
-        )
+        values = column[own_rows[np.maximum(np.searchsorted(own_s, time_s, side="right") - 1, 0)]]
+        since_last_s = time_s - own_s[-1]
+        unknown &= (since_last_s < 0.0) | (since_last_s > hole_s)
     else:
-        values = np.interp(time_s, time_s[own_rows], column[own_rows])
-    inside = (time_s >= time_s[own_rows[0]]) & (held | (time_s <= time_s[own_rows[-1]]))
-    since_last_s = np.where(time_s >= time_s[own_rows[-1]], time_s - time_s[own_rows[-1]], 0.0)
-    no_hole = (time_s[after] - time_s[before] <= hole_s) & (since_last_s <= hole_s)
-    return np.where(np.isfinite(column), column, np.where(inside & no_hole, values, np.nan))
+        values = np.interp(time_s, own_s, column[own_rows])
+    return np.where(np.isfinite(column), column, np.where(unknown, np.nan, values))
+
+
+def in_hole(at_s: np.ndarray, time_s: np.ndarray, hole_s: float | None = None) -> np.ndarray:
+    """Return whether each of the times `at_s` (S,) is in a hole of a signal, or outside its rows.
+
+    `time_s` (R,) are the times of the signal's own rows. Rows further apart than `hole_s` [s] are a
+    hole; by default, it is `HOLE_STEPS` of their median steps.
+    """
+    if len(time_s) < 2:
+        return np.ones(len(at_s), bool)
+    step_s = np.diff(time_s)
+    if hole_s is None:
+        hole_s = HOLE_STEPS * float(np.median(step_s))
+    row = np.clip(np.searchsorted(time_s, at_s, side="right") - 1, 0, len(time_s) - 2)
+    return (step_s > hole_s)[row] | (at_s < time_s[0]) | (at_s > time_s[-1])
 
 
 def sign_continuous(quat: np.ndarray) -> np.ndarray:
@@ -178,17 +191,28 @@ def sign_continuous(quat: np.ndarray) -> np.ndarray:
     return continued
 
 
-def interpolate(at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray) -> np.ndarray:
+def attitude_at(at_s: np.ndarray, time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
+    """Return the attitudes (S, 3, 3) of quaternions (T, 4) at the times `at_s`; NaN in holes."""
+    mixed = interpolate(at_s, time_s, sign_continuous(quat_wxyz), holes=True)
+    return quat_to_rot(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
+
+
+def interpolate(
+    at_s: np.ndarray, time_s: np.ndarray, series: np.ndarray, holes: bool = False
+) -> np.ndarray:
     """Return `series` (T, K) at the times `at_s` (S,), interpolated between finite values: (S, K).
 
-    `time_s` (T,) are the times of its rows. A column without any finite value becomes 0.
+    `time_s` (T,) are the times of its rows. A column without any finite value becomes 0. With
+    `holes`, a column is NaN in its holes of `HOLE_STEPS` median steps, and outside its own rows.
     """
     columns = []
     for column in series.T:
         finite = np.isfinite(column)
-        columns.append(
-            np.interp(at_s, time_s[finite], column[finite]) if finite.any() else 0.0 * at_s
-        )
+        own_s = time_s[finite]
+        values = np.interp(at_s, own_s, column[finite]) if finite.any() else 0.0 * at_s
+        if holes:
+            values = np.where(in_hole(at_s, own_s), np.nan, values)
+        columns.append(values)
     return np.stack(columns, axis=-1)
 
 

@@ -14,14 +14,13 @@ drive the rotors. `identify.py` calls both fits.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.view import WeakForm
+from suite.diagnose.data.view import FlightRows, WeakForm
 from suite.diagnose.estimate.gauss_newton import TINY
-from suite.diagnose.identify.drive import DrivenVehicle, TrialVehicle
+from suite.diagnose.identify.drive import DRIVES, DrivenVehicle, TrialVehicle
 from suite.diagnose.identify.fit import Z95, Fitted, KnownNumbers, Rows, Unknown, fit, unexplained
 from suite.diagnose.identify.grid import (
     IMU_ACC,
@@ -36,10 +35,6 @@ FORCE_WIDTH_S = 0.4
 """Width of the windows over which forces are averaged [s]."""
 BLOCK_S = 2.0
 """Length of a block of time; errors of different blocks count as independent [s]."""
-THRUST_SIGNALS = {"pwm": "pwm", "rotors": "rotor_speed"}
-"""Signal that determines the thrust, by drive (`DRIVES`); for other drives the commanded thrust."""
-TORQUE_SIGNALS = {**THRUST_SIGNALS, "torques": "torque_cmd_b"}
-"""Signal that determines the torque, by drive."""
 SLOW_M_S = 2.0
 """Largest speed of the windows that are used without an attitude. A drag across the thrust would
 add to the thrust's size, by 0.3 % at this speed and a drag of 0.4 1/s [m/s]."""
@@ -84,7 +79,7 @@ def fit_force(
     """Fit the numbers of thrust and drag.
 
     Args:
-        flights: flights with positions; either all have an attitude, or none has one.
+        flights: flights with velocities; either all have an attitude, or none has one.
         driven: vehicle from which the fit starts, with the drive of its flights.
         unknowns: result of `force_unknowns`.
         fixed: values of numbers that are not fitted, `lag` and `late` (total delay) among them.
@@ -92,13 +87,84 @@ def fit_force(
     Raises:
         NoWholeWindow: if no window has all signals.
     """
-    residuals = [_force_residuals(flight, driven) for flight in flights]
-    held = _without_motion(flights, driven)
+    windows = [_force_windows(flight, driven.drive) for flight in flights]
+    states = [flight.rows(attitude_of_path=True) for flight in flights]
+
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        vehicle = driven.at(numbers)
+        return [
+            one.residuals(vehicle.accelerations(one.flight, state)[0])
+            for one, state in zip(windows, states, strict=True)
+        ]
+
+    held = _without_motion(windows)
     held = [unknown.name for unknown in unknowns if unknown.name in held]
-    return fit(stacked_residuals(residuals, unknowns, fixed, driven.at), unknowns, held)
+    return fit(by_value(residuals, unknowns, fixed), unknowns, held)
 
 
-def _without_motion(flights: Sequence[FlightGrid], driven: DrivenVehicle) -> list[str]:
+class Windows(NamedTuple):
+    """M windows of one flight, over which C measured values are averaged."""
+
+    flight: FlightGrid
+    form: WeakForm
+    """Weights of the windows: `form.mean @ values` are means of `values` over the windows."""
+    measured: np.ndarray
+    """(M, C) measured means; vectors (M, 3) in world axes if there is `to_body`."""
+    offset: np.ndarray
+    """(C,) bool: channels in which the flight has a free constant."""
+    to_body: np.ndarray | None = None
+    """(M, C, 3) rotation of the residuals from world axes to C body axes; None for none."""
+    nuisance: np.ndarray | None = None
+    """(M, C, K) change of the residuals by the uncertainties of a pose by inertia."""
+
+    def residuals(self, modelled: np.ndarray) -> Rows:
+        """Return measured minus modelled means; `modelled` (G, C) are values on the grid."""
+        error = self.measured - self.form.mean @ np.nan_to_num(modelled)
+        if self.to_body is not None:
+            error = (self.to_body @ error[..., None])[..., 0]
+        block = (self.form.middle_s / BLOCK_S).astype(int)  # number of the block of time
+        return Rows(error, block, self.offset, self.nuisance)
+
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Return the means (M, 3, K) of `values`, (G, 3) or (G, 3 K), over the windows."""
+        return np.reshape(self.form.mean @ values, (len(self.form.middle_s), 3, -1))
+
+
+def by_value(
+    residuals: Callable[[dict[str, float]], list[Rows]],
+    unknowns: Sequence[Unknown],
+    fixed: Mapping[str, float],
+) -> Callable[[np.ndarray], list[Rows]]:
+    """Return the `residuals` of numbers by name as a function of the values of `unknowns`.
+
+    `fixed` are the values of the other numbers.
+    """
+    names = [unknown.name for unknown in unknowns]
+    return lambda value: residuals({**fixed, **dict(zip(names, value.tolist(), strict=True))})
+
+
+def _force_windows(flight: FlightGrid, drive: str) -> Windows:
+    """Return the windows of `flight` for its acceleration, where all signals are present."""
+    # The measured acceleration is that of the accelerometer, or follows from the velocity.
+    motion = IMU_ACC if flight.has(IMU_ACC) else "vel_w"
+    attitude = "rot_w" if flight.has("rot_w") else LEANING
+    needs = (motion, DRIVES[drive][0], attitude)
+    form = flight.form(FORCE_WIDTH_S, needs)
+    axes = slice(0, 3)
+    if attitude == LEANING:  # only along the thrust, and only slow flight
+        speed = np.linalg.norm(flight.rows(attitude_of_path=True).vel_w, axis=1)
+        slow, axes = form.mean @ speed < SLOW_M_S, slice(2, 3)
+        form = form.take(slow)
+    to_acceleration = form.mean if motion == IMU_ACC else form.change
+    measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
+    to_body = np.swapaxes(flight.signals[attitude][form.middle_row], 1, 2)[:, axes]
+    windows = Windows(flight, form, measured_w, FORCE_OFFSETS[axes], to_body)
+    if not flight.has(POSE_SLOPE):
+        return windows
+    return windows._replace(nuisance=windows.means(flight.signals[POSE_SLOPE])[:, axes])
+
+
+def _without_motion(flights: Sequence[Windows]) -> list[str]:
     """Return the drags along x and y that flights without a pose do not show, by name.
 
     An estimated velocity that is mostly error has no relation to the force, so its drag would be 0
@@ -106,87 +172,17 @@ def _without_motion(flights: Sequence[FlightGrid], driven: DrivenVehicle) -> lis
     after what the uncertainties of the pose explain is removed from both.
     """
     error, total = np.zeros(2), np.zeros(2)
-    for flight in (one for one in flights if one.has(POSE_SLOPE)):
-        needs = (IMU_ACC, "rot_w", THRUST_SIGNALS.get(driven.drive, "thrust_cmd"))
-        form = flight.form(FORCE_WIDTH_S, needs)
-        vel_b = flight.rows(attitude_of_path=True).vel_b[..., None]
-        draws, slopes = (
-            flight.signals[name].reshape(len(vel_b), 3, -1) for name in (VELOCITY_NOISE, POSE_SLOPE)
-        )
-        both = np.concatenate([vel_b, draws, slopes], axis=-1)[:, :2]
-        both = (form.mean @ both.reshape(len(both), -1)).reshape(-1, *both.shape[1:])
-        values, slopes = np.split(both - both.mean(axis=0), [1 + draws.shape[2]], axis=2)
+    for one in flights:
+        if one.nuisance is None:
+            continue
+        vel_b = one.flight.rows(attitude_of_path=True).vel_b
+        signals = (vel_b, one.flight.signals[VELOCITY_NOISE])
+        values = np.concatenate([one.means(signal) for signal in signals], axis=2)
+        values, slopes = ((v - v.mean(axis=0))[:, :2] for v in (values, one.nuisance))
         values = unexplained(slopes, values, np.full(values.shape[:2], FORCE_ERROR**-2))
         total += (values[..., 0] ** 2).sum(axis=0)
         error += (values[..., 1:] ** 2).mean(axis=-1).sum(axis=0)
     return [f"drag_{axis}" for k, axis in enumerate("xy") if error[k] > MOST_ERROR * total[k]]
-
-
-Model = TypeVar("Model")
-"""What the residuals of a flight are computed from: a trial vehicle, or the numbers by name."""
-ForceResiduals = Callable[[TrialVehicle], Rows]
-"""Function from a trial vehicle to the residuals of one flight."""
-
-
-def stacked_residuals(
-    residuals: Sequence[Callable[[Model], Rows]],
-    unknowns: Sequence[Unknown],
-    fixed: Mapping[str, float],
-    model_at: Callable[[dict[str, float]], Model],
-) -> Callable[[np.ndarray], list[Rows]]:
-    """Return a function from the values of `unknowns` to the residuals of all flights.
-
-    Args:
-        residuals: a function for each flight, from the model to the flight's residuals.
-        unknowns: the numbers that are fitted.
-        fixed: values of the other numbers, by name.
-        model_at: function from all numbers to the model. It is called once for all flights.
-    """
-    names = [unknown.name for unknown in unknowns]
-
-    def evaluate(value: np.ndarray) -> list[Rows]:
-        model = model_at({**fixed, **dict(zip(names, value, strict=True))})
-        return [one(model) for one in residuals]
-
-    return evaluate
-
-
-def _force_residuals(flight: FlightGrid, driven: DrivenVehicle) -> ForceResiduals:
-    """Return a function to measured minus modelled accelerations of `flight` in body axes."""
-    thrust = THRUST_SIGNALS.get(driven.drive, "thrust_cmd")
-    # The measured acceleration is that of the accelerometer, or follows from velocity or position.
-    motion = next(name for name in (IMU_ACC, "vel_w", "pos_w") if flight.has(name))
-    leaning = not flight.has("rot_w")
-    needs = (motion, thrust, LEANING if leaning else "rot_w")
-    # `form` holds the weights of the windows: `form.mean @ values` are means over the windows, and
-    # `form.change @ values` are mean slopes.
-    form, rows = flight.form(FORCE_WIDTH_S, needs), flight.rows(attitude_of_path=True)
-    # A position is differentiated twice, which needs other weights than a velocity.
-    path = flight.form(FORCE_WIDTH_S, needs, slope=True) if motion == "pos_w" else form
-    if leaning:
-        slow = form.mean @ np.linalg.norm(rows.vel_w, axis=1) < SLOW_M_S
-        form, path = form.take(slow), path.take(slow)
-    to_acceleration = path.mean if motion == IMU_ACC else path.change
-    measured_w = to_acceleration @ np.nan_to_num(flight.signals[motion])
-    to_body = np.swapaxes(rows.rot_w[form.middle_row], 1, 2)
-    axes = slice(2 if leaning else 0, 3)  # without an attitude only body z, along the thrust
-
-    nuisance = None
-    if flight.has(POSE_SLOPE):
-        slopes = form.mean @ flight.signals[POSE_SLOPE]
-        nuisance = slopes.reshape(len(slopes), 3, -1)[:, axes]
-
-    def residuals(vehicle: TrialVehicle) -> Rows:
-        acc_w, _ = vehicle.accelerations(flight, rows)
-        error_b = (to_body @ (measured_w - form.mean @ acc_w)[..., None])[..., 0]
-        return Rows(error_b[:, axes], block_of(form), FORCE_OFFSETS[axes], nuisance)
-
-    return residuals
-
-
-def block_of(form: WeakForm) -> np.ndarray:
-    """Return the number (M,) of the block of `BLOCK_S` that contains each window's middle."""
-    return (form.middle_s / BLOCK_S).astype(int)
 
 
 TORQUE_WIDTH_S = 0.2
@@ -205,24 +201,24 @@ LATEST_S, LATE_STEP_S = 0.13, 0.012
 """Largest total delay that is tried for the start of a fit, and the step between trials [s]."""
 
 
-def lag_unknowns(lag_s: float, delay_s: float) -> list[Unknown]:
-    """Return the numbers `late` and `lag` [s].
+def lag_unknowns(lag_s: float, late_s: float) -> list[Unknown]:
+    """Return the numbers `late` and `lag`, which start at `late_s` and `lag_s` [s].
 
     `late` is the total delay from a command to its thrust: the sum of the rotors' `lag` and a pure
     delay. Slow flights identify the sum, but not the lag's share.
     """
-    late = Unknown("late", lag_s + delay_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
+    late = Unknown("late", late_s, -0.02, 0.3, 0.012, 1e-3, 0.0007)
     return [late, Unknown("lag", lag_s, 0.0, 0.3, 0.012, 1e-3, 0.0007)]
 
 
-def torque_unknowns(drive: str, lag_s: float, delay_s: float) -> list[Unknown]:
+def torque_unknowns(drive: str, lag_s: float, late_s: float) -> list[Unknown]:
     """Return the numbers that the torque fit estimates.
 
     All but lag and delay are logarithms of ratios to the start. `inertia_z` is relative to the mean
     of the other two, and keeps this ratio if it is not identifiable. `yaw` is the yaw torque over
     the inertia about z. It is missing if torques are commanded.
     """
-    lags = lag_unknowns(lag_s, delay_s)
+    lags = lag_unknowns(lag_s, late_s)
     inertia = [Unknown(f"inertia_{a}", 0.0, -2.0, 2.0, 0.5, 1e-2, 0.015) for a in "xy"]
     widest_z = 0.5 if drive == "torques" else 0.25
     inertia.append(Unknown("inertia_z", 0.0, -1.0, 1.0, widest_z, 1e-2, 0.015))
@@ -267,82 +263,77 @@ def fit_torque(
         *unknowns,
         *(Unknown(n, fixed[n], -9.0, 9.0, 1.0, steps.get(n, 1e-2)) for n in known.names),
     ]
-    original, held = tuple(unknowns), list(held)
-    forms = [
-        flight.form(TORQUE_WIDTH_S, ("rate_b", TORQUE_SIGNALS[driven.drive]), slope=True)
-        for flight in flights
-    ]
+    held = list(held)
+    windows = [_torque_windows(flight, driven.drive) for flight in flights]
+    states = [flight.rows(attitude_of_path=False) for flight in flights]
     # Correct the bias by noise of the rotor speeds.
     start = driven.at({**fixed, **{unknown.name: unknown.start for unknown in unknowns}})
-    reliability = _reliability(flights, forms, start)
+    reliability = np.ones(3)
+    if driven.drive == "rotors":
+        reliability = _reliability(windows, states, start)
     correction: dict[str, float] = dict(zip(NOISE_BIASED, -0.5 * np.log(reliability), strict=True))
     unknowns = [
         u._replace(method_error=float(np.hypot(u.method_error, Z95 * correction.get(u.name, 0.0))))
         for u in unknowns
     ]
-    measured = [_rate_change(*pair) for pair in zip(flights, forms, strict=True)]
-    flight_residuals = [
-        _torque_residuals(*part, reliability) for part in zip(flights, forms, measured, strict=True)
-    ]
-    residuals = stacked_residuals(flight_residuals, unknowns, fixed, driven.at)
+
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        vehicle = driven.at(numbers)
+        return [
+            one.residuals(TO_RATE_S * _turning(vehicle, one.flight, state, reliability))
+            for one, state in zip(windows, states, strict=True)
+        ]
+
+    compared = by_value(residuals, unknowns, fixed)
     # The fit is linearised, so it needs a start near the right delay.
     if any(unknown.name == "late" for unknown in unknowns):
-        late_s = _best_correlated_delay(unknowns, residuals, measured)
+        measured = [one.measured for one in windows]
+        late_s = _best_correlated_delay(unknowns, compared, measured)
         unknowns = [u._replace(start=late_s) if u.name == "late" else u for u in unknowns]
     while True:
-        fitted = fit(residuals, unknowns, held, known)
+        fitted = fit(compared, unknowns, held, known)
         at_limit = [
             u.name
             for u, value in zip(unknowns, fitted.value, strict=True)
             if u.name in correction and fitted.identifies(u.name) and not u.low < value < u.high
         ]
         if not at_limit:
-            return replace(fitted, unknowns=original)
+            return fitted
         held += at_limit
 
 
-def _torque_residuals(
-    flight: FlightGrid, form: WeakForm, measured: np.ndarray, reliability: np.ndarray
-) -> ForceResiduals:
-    """Return a function to measured minus modelled changes of the body rates of `flight`.
-
-    `measured` (M, 3) are the measured changes, and `reliability` (3,) is from `_reliability`.
-    """
-    rows = flight.rows(attitude_of_path=False)
-
-    def residuals(vehicle: TrialVehicle) -> Rows:
-        _, turn_b = vehicle.accelerations(flight, rows)
-        # Only the part that the rotors cause is noisy.
-        if (reliability < 1.0).any():
-            _, unpowered_b = vehicle.accelerations(flight, rows, powered=False)
-            turn_b = unpowered_b + reliability * (turn_b - unpowered_b)
-        error_b = measured - TO_RATE_S * (form.mean @ turn_b)
-        return Rows(error_b, block_of(form), NO_OFFSETS)
-
-    return residuals
+def _torque_windows(flight: FlightGrid, drive: str) -> Windows:
+    """Return the windows of `flight` for changes of its rates, where all signals are present."""
+    form = flight.form(TORQUE_WIDTH_S, ("rate_b", DRIVES[drive][-1]), slope=True)
+    measured = np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
+    return Windows(flight, form, measured, NO_OFFSETS)
 
 
-def _rate_change(flight: FlightGrid, form: WeakForm) -> np.ndarray:
-    """Return the measured change of the body rates (M, 3) in each window [rad/s]."""
-    return np.asarray(TO_RATE_S * (form.change @ np.nan_to_num(flight.signals["rate_b"])))
+def _turning(
+    vehicle: TrialVehicle, flight: FlightGrid, state: FlightRows, reliability: np.ndarray
+) -> np.ndarray:
+    """Return the modelled angular acceleration (G, 3), corrected by `_reliability` (3,)."""
+    _, turn_b = vehicle.accelerations(flight, state)
+    if (reliability == 1.0).all():
+        return turn_b
+    # Only the part that the rotors cause is noisy.
+    _, unpowered_b = vehicle.accelerations(flight, state, powered=False)
+    return unpowered_b + reliability * (turn_b - unpowered_b)
 
 
 def _reliability(
-    flights: Sequence[FlightGrid], forms: Sequence[WeakForm], vehicle: TrialVehicle
+    windows: Sequence[Windows], states: Sequence[FlightRows], vehicle: TrialVehicle
 ) -> np.ndarray:
     """Return the share (3,) of the modelled torque's variance that is not rotor-speed noise.
 
     Further noise of the same size is added to the rotor speeds, to see how much it changes.
     """
-    if vehicle.driven.drive != "rotors":
-        return np.ones(3)
     noise_power, power = np.zeros(3), np.zeros(3)
-    for flight, form in zip(flights, forms, strict=True):
-        rows = flight.rows(attitude_of_path=False)
+    for (flight, form, *_), state in zip(windows, states, strict=True):
         noisier = flight.signals["rotor_speed"] + flight.signals[ROTOR_NOISE]
         noisy_flight = flight._replace(signals={**flight.signals, "rotor_speed": noisier})
         turn_b, noisy_turn_b = (
-            form.mean @ vehicle.accelerations(one, rows)[1] for one in (flight, noisy_flight)
+            form.mean @ vehicle.accelerations(one, state)[1] for one in (flight, noisy_flight)
         )
         noise_power += ((noisy_turn_b - turn_b) ** 2).sum(axis=0)
         power += (turn_b**2).sum(axis=0)

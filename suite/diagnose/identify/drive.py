@@ -18,7 +18,7 @@ from eval.effects import EFFECTS
 from eval.quadrotor.plant import Plant, Wrench, accelerations, make_plant
 from eval.vehicles.vehicle import MotorMap, Vehicle, motor_speed
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.data.sampling import follow_lag
+from suite.diagnose.data.sampling import follow_lag, hold
 from suite.diagnose.data.steps import LONGEST_S
 from suite.diagnose.data.view import FlightRows
 from suite.diagnose.evidence.moments import accelerations_on, motion_of
@@ -31,7 +31,8 @@ DRIVES = {
     "rates": ("thrust_cmd", "rate_cmd_b"),
     "thrust": ("thrust_cmd",),
 }
-"""Signals that each drive needs. The first drive whose signals all flights have is used."""
+"""Signals that each drive needs: the first determines the thrust, the last the torque. The first
+drive whose signals all flights have is used."""
 KNOWN_MOTORS = ("rotors", "pwm")
 """Drives that determine each rotor's thrust; the others give commands to a controller."""
 LEAST_LAG_S = 1e-4
@@ -251,6 +252,14 @@ def log_inertia_ratio(numbers: Mapping[str, float]) -> np.ndarray:
     return np.array([x, y, 0.5 * (x + y) + z])
 
 
+def possible_inertia(inertia: np.ndarray) -> np.ndarray:
+    """Return the inertia (3,) in which the largest is at most the sum of the others.
+
+    That holds for every rigid body.
+    """
+    return np.minimum(inertia, inertia.sum() - inertia)
+
+
 def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
     """Return `commands` (G, C) as the rotors follow them: delayed, then with a first-order lag.
 
@@ -262,16 +271,14 @@ def after_delay_and_lag(commands: np.ndarray, numbers: Mapping[str, float]) -> n
 
 
 def delayed(values: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return `values` (G, ...) as they were `delay_s` ago.
+    """Return `values` (G, C) as they were `delay_s` ago.
 
     Before the first row, the first value is used. A value is a mean over one step of the grid, so
     its time is the middle of the step.
     """
-    count = len(values)
-    place = np.clip(np.arange(count) - delay_s / STEP_S - 0.5, 0.0, count - 1.0)
-    row = np.minimum(place.astype(int), max(count - 2, 0))
-    fraction = (place - row).reshape(-1, *[1] * (values.ndim - 1))
-    return (1.0 - fraction) * values[row] + fraction * values[np.minimum(row + 1, count - 1)]
+    rows = np.arange(len(values))
+    place = rows - delay_s / STEP_S - 0.5
+    return np.stack([np.interp(place, rows, column) for column in values.T], axis=1)
 
 
 def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
@@ -286,10 +293,8 @@ def lagged(values: np.ndarray, lag_s: float) -> np.ndarray:
 
 def filled(values: np.ndarray) -> np.ndarray:
     """Return `values` (G, C) in which each incomplete row repeats the last complete one."""
-    good = np.isfinite(values).all(axis=1)
-    last = np.maximum.accumulate(np.where(good, np.arange(len(values)), 0))
-    first = int(np.argmax(good))
-    return np.nan_to_num(values[np.maximum(last, first)])
+    rows = np.arange(len(values))
+    return np.nan_to_num(hold(rows, rows, values))
 
 
 MERGED = ("motor_lag", "inertia_scale", "rate_gain")
@@ -331,11 +336,10 @@ def with_merged_effects(vehicle: Vehicle, known_motors: bool) -> Vehicle:
         effects=MappingProxyType({n: v for n, v in vehicle.effects.items() if n not in merged}),
     )
     try:
-        # The scaled inertia is not checked: it may be impossible, and the fit corrects it.
         check_vehicle(result)
     except ValueError as error:
         raise ValueError(f"{vehicle.name} with its {', '.join(merged)}: {error}") from error
-    return replace(result, inertia=_triple(scaled.inertia))
+    return replace(result, inertia=_triple(possible_inertia(scaled.inertia)))
 
 
 def unmodelled_effects(vehicle: Vehicle) -> list[str]:

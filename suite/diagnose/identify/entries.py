@@ -16,7 +16,7 @@ from eval.effects import EFFECTS
 from eval.effects.interface import bound_value
 from eval.vehicles.vehicle import Vehicle
 from eval.vehicles.vehicle_check import check_vehicle
-from suite.diagnose.identify.drive import DrivenVehicle, log_inertia_ratio
+from suite.diagnose.identify.drive import DrivenVehicle, log_inertia_ratio, possible_inertia
 from suite.diagnose.identify.fit import Fitted
 from suite.diagnose.identify.numbers import DELAY, Formula, Number, number_from
 
@@ -30,10 +30,9 @@ def inertia_from(vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:
     """Return the inertia (3,) for the fitted `numbers` [kg m^2].
 
     If `inertia_z` is not among them, the inertia about z changes by the mean ratio of the other
-    two. The largest inertia is limited to the sum of the others, as in every rigid body.
+    two.
     """
-    inertia = np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers))
-    return np.minimum(inertia, inertia.sum() - inertia)
+    return possible_inertia(np.asarray(vehicle.inertia) * np.exp(log_inertia_ratio(numbers)))
 
 
 def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
@@ -62,16 +61,13 @@ def force_entries(driven: DrivenVehicle, fitted: Fitted) -> list[Number]:
     return [number_from(fitted, *row) for row in rows]
 
 
-def torque_entries(
-    driven: DrivenVehicle, fitted: Fitted, log_thrust: float, lag_s: float
-) -> list[Number]:
+def torque_entries(driven: DrivenVehicle, fitted: Fitted, log_thrust: float) -> list[Number]:
     """Return the entries that the torque fit estimates: inertia, yaw torque, lag and delay.
 
     Args:
         driven: vehicle from which the fit started, with the drive of its flights.
         fitted: result of the torque fit.
         log_thrust: logarithm of the scale of the thrust, from the force fit.
-        lag_s: lag (time constant) of the rotors, used if this fit has not estimated it [s].
     """
     entries, vehicle = list[Number](), driven.start
     if "inertia_x" in fitted.names:
@@ -90,24 +86,19 @@ def torque_entries(
 
         key, unit = "rotors.torque_coefficient", "N m/(rad/s)^2"
         entries.append(number_from(fitted, key, unit, torque_coefficient, ("yaw",)))
-    return [*entries, *loop_entries(vehicle, fitted, lag_s)]
+    return [*entries, *loop_entries(vehicle, fitted)]
 
 
-def loop_entries(vehicle: Vehicle, fitted: Fitted, lag_s: float) -> list[Number]:
-    """Return the entries of lag, delay and gains of the rate loop, as far as the fit has them.
-
-    `lag_s` is the rotors' lag, used if the fit has not estimated it [s].
-    """
+def loop_entries(vehicle: Vehicle, fitted: Fitted) -> list[Number]:
+    """Return the entries of lag, delay and gains of the rate loop, as far as the fit has them."""
     entries = []
-    if "lag" in fitted.names:
-        lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
-        entries.append(lag)
     if "late" in fitted.names:
+        lag = number_from(fitted, "rotors.time_constant", "s", lambda n: n["lag"], ("lag",))
         # `late` is the sum of lag and delay. The delay is at least as uncertain as the lag, however
         # exact the sum is. The delay in the file keeps the sum.
         widest = fitted.unknowns[fitted.index("late")].max_half_width
-        delay_s: Formula = lambda n: n["late"] - n.get("lag", lag_s)  # noqa: E731
-        entries.append(number_from(fitted, DELAY, "s", delay_s, ("late",), widest))
+        delay_s: Formula = lambda n: n["late"] - n["lag"]  # noqa: E731
+        entries += [lag, number_from(fitted, DELAY, "s", delay_s, ("late",), widest)]
     if "gain_x" in fitted.names:
         start, names = np.asarray(vehicle.controller.rate_gain), [f"gain_{a}" for a in "xyz"]
         gains: Formula = lambda n: start * np.exp([n[name] for name in names])  # noqa: E731
@@ -158,22 +149,19 @@ def _clipped(vehicle: Vehicle, entry: Number) -> Number:
 
 
 def with_entry(vehicle: Vehicle, entry: Number) -> Vehicle:
-    """Return the vehicle with the values of `entry`, if these flights determine them.
-
-    The inertia is not entered here, since `identify.py` sets all three components together.
-    """
+    """Return the vehicle with the values of `entry`, if these flights determine them."""
+    table, _, key = entry.key.rpartition(".")
+    value = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
+    if not table:  # the inertia, of which one component follows from the others
+        return replace(vehicle, **{key: value})
     if not entry.is_entered:
         return vehicle
-    value = tuple(entry.value) if len(entry.value) > 1 else entry.value[0]
-    table, _, key = entry.key.rpartition(".")
     if table.startswith(EFFECTS_TABLE):
         name = table.removeprefix(EFFECTS_TABLE)
         effects = {**vehicle.effects, name: EFFECTS[name].values(value)}
         if entry.key == DELAY and value == 0.0:
             del effects[name]
         return replace(vehicle, effects=MappingProxyType(effects))
-    if not table:  # the inertia
-        return vehicle
     return replace(vehicle, **{table: replace(getattr(vehicle, table), **{key: value})})
 
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import Block, Estimate, without_nuisance
 from suite.diagnose.estimate.gauss_newton import Z95, intervals95
 from suite.diagnose.estimate.gauss_newton import fit as fit_numbers
@@ -65,7 +66,7 @@ class Rows(NamedTuple):
     """Residuals of one flight in N windows and C channels."""
 
     value: np.ndarray
-    """(N, C) measured minus modelled value."""
+    """(N, C) measured minus modelled value; NaN where a channel was not measured."""
     block: np.ndarray
     """(N,) number of the window's block; errors of different blocks are independent."""
     offset: np.ndarray
@@ -124,6 +125,11 @@ class Fitted:
         """Return the position of the number `name` among the P numbers."""
         return self.names.index(name)
 
+    def interval(self, name: str) -> Interval:
+        """Return the value of the fitted number `name` with its 95 % interval."""
+        value, half = (float(array[self.index(name)]) for array in (self.value, self.half_width))
+        return Interval(value, value - half, value + half)
+
     def values(self) -> dict[str, float]:
         """Return the values of all numbers by name."""
         return dict(zip(self.names, self.value.tolist(), strict=True))
@@ -135,6 +141,8 @@ class ResidualEvidence:
 
     residuals: Residuals
     unknowns: tuple[Unknown, ...]
+    noise: np.ndarray | None
+    """(C,) standard deviation of the residuals, by channel; None to estimate it."""
     weights: tuple[np.ndarray, ...] = ()
     """Weights (N, C) of the residuals, one array for each flight."""
 
@@ -153,15 +161,18 @@ class ResidualEvidence:
     def weighed(self, at: Estimate) -> ResidualEvidence:
         """Return this evidence with weights of the residuals at the estimate `at`.
 
-        A weight is one over the variance of the channel's noise, and lower for an outlier (Huber
-        1964).
+        A weight is one over the variance of the channel's noise. If the noise is estimated, it is
+        lower for an outlier (Huber 1964).
         """
         errors = [np.abs(_without_median(row)) for row in self.residuals(at.theta)]
+        if self.noise is not None:
+            known = tuple(np.isfinite(error) / self.noise**2 for error in errors)
+            return replace(self, weights=known)
         # 1.4826 times the median absolute deviation is a normal variable's standard deviation.
-        sigma = np.maximum(1.4826 * np.median(np.concatenate(errors), axis=0), LEAST_SIGMA)
+        sigma = np.maximum(1.4826 * _median(np.concatenate(errors)), LEAST_SIGMA)
         scaled = (np.maximum(error / sigma, LEAST_ERROR) for error in errors)
-        weights = tuple(np.minimum(1.0, HUBER / one) / sigma**2 for one in scaled)
-        return replace(self, weights=weights)
+        weights = (np.minimum(1.0, HUBER / one) / sigma**2 for one in scaled)
+        return replace(self, weights=tuple(np.nan_to_num(weight) for weight in weights))
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> Block:
         """Return whitened residuals and slopes along the numbers at `indices`, or along all.
@@ -182,7 +193,8 @@ class ResidualEvidence:
         values, slopes, blocks = [], [], []
         for flight, (row, weight) in enumerate(zip(rows, self.weights, strict=True)):
             columns = [row.value, *(-difference[flight] for difference in differences)]
-            centred = _without_mean(np.stack(columns, axis=-1), weight, row.offset)
+            table = np.nan_to_num(np.stack(columns, axis=-1))
+            centred = _without_mean(table, weight, row.offset)
             if row.nuisance is not None:
                 slopes_of_it = _without_mean(row.nuisance, weight, row.offset)
                 centred = unexplained(slopes_of_it, centred, weight)
@@ -204,6 +216,7 @@ def fit(
     unknowns: Sequence[Unknown],
     held: Sequence[str] = (),
     known: KnownNumbers | None = None,
+    noise: np.ndarray | None = None,
 ) -> Fitted:
     """Return the numbers that minimise `residuals`, with intervals.
 
@@ -215,12 +228,13 @@ def fit(
         unknowns: the numbers.
         held: names of numbers that are not fitted and keep their start.
         known: those of `unknowns` that another fit has identified; they keep their start, too.
+        noise: (C,) standard deviation of the residuals, by channel; by default it is estimated.
 
     Raises:
         NoWholeWindow: if the residuals have no window.
     """
     not_identified, known = list(held), known or KnownNumbers()
-    evidence = ResidualEvidence(residuals, tuple(unknowns))
+    evidence = ResidualEvidence(residuals, tuple(unknowns), noise)
     at = evidence.at(np.array([unknown.start for unknown in unknowns]))
     if not sum(len(rows.value) for rows in residuals(at.theta)):
         raise NoWholeWindow("no window of these flights has all signals that this fit compares")
@@ -242,7 +256,7 @@ def fit(
         not_identified.append(unknowns[worst].name)
         at.theta[worst] = unknowns[worst].start
     misfit = np.concatenate([_without_median(row) for row in residuals(at.theta)])
-    rms = np.sqrt(np.mean(misfit**2, axis=0))
+    rms = np.sqrt(np.ma.mean(np.ma.masked_invalid(misfit**2), axis=0).filled(0.0))
     return Fitted(
         evidence.unknowns, at.theta, half, covariance, tuple(not_identified), rms, known.names
     )
@@ -252,7 +266,12 @@ def _without_median(rows: Rows) -> np.ndarray:
     """Return the residuals (N, C) minus their median in channels with a free constant."""
     if not len(rows.value):
         return rows.value
-    return rows.value - np.where(rows.offset, np.median(rows.value, axis=0), 0.0)
+    return rows.value - np.where(rows.offset, _median(rows.value), 0.0)
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Return the median (C,) of the measured ones of `values` (N, C); 0 where there are none."""
+    return np.ma.median(np.ma.masked_invalid(values), axis=0).filled(0.0)
 
 
 def _without_mean(values: np.ndarray, weight: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from eval.importers.rows import held
 from eval.importers.signals import Signal
@@ -19,16 +20,14 @@ from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import leaning, turning_of
 from suite.diagnose.data.inertial import InertialLog, specific_force_w
 from suite.diagnose.data.noise import noise_like
-from suite.diagnose.data.sampling import sign_continuous
+from suite.diagnose.data.sampling import HELD, MEASURED, attitude_at, in_hole, interpolate
 from suite.diagnose.data.view import FlightRows, WeakForm, weak_form
-from tracks.geometry.rotation import quat_to_rot, rot_to_quat
+from tracks.geometry.rotation import rot_to_quat
 
 STEP_S = 0.004
 """Step of the grid [s]."""
 MEMORY_S = 0.4
 """Commands older than this have no effect [s]."""
-HOLE_STEPS = 4.0
-"""Rows further apart than this many median steps are a hole; no window reaches across it."""
 ROTOR_NOISE = "rotor_noise"
 """Name of a signal: random noise as large as that of the measured rotor speeds. It is added to
 them, to see how such noise changes the model."""
@@ -40,12 +39,8 @@ POSE_SLOPE = "pose_slope_b"
 """Signal: change of the drag by each uncertainty of a pose by inertia, (G, 3 K): `InertialLog`."""
 VELOCITY_NOISE = "vel_noise_b"
 """Signal: draws of the error of a velocity by inertia, (G, 3 D): `InertialLog`."""
-PATH_VELOCITY = "path_velocity"
-"""Name of a signal: velocity by differences of the position, if none was measured."""
-PATH_SLOPE_S = 0.05
-"""For this velocity, positions this long before and after a time are compared [s]."""
-VOLTAGE_S = 0.04
-"""The voltage is averaged over about this time, to reduce its noise [s]."""
+VOLTAGE_STEPS = 11
+"""The voltage is averaged over this many steps of the grid, to reduce its noise."""
 
 
 class FlightGrid(NamedTuple):
@@ -89,7 +84,7 @@ class FlightGrid(NamedTuple):
         count = len(self.time_s)
         zeros = np.zeros((count, 3))
         volts = self.signals.get("voltage", np.zeros(count))
-        vel_w = self.signals.get("vel_w", self.signals.get(PATH_VELOCITY, zeros))
+        vel_w = self.signals.get("vel_w", zeros)
         if attitude is None:  # without an attitude the velocity in body axes is unknown
             attitude, vel_w = np.broadcast_to(np.eye(3), (count, 3, 3)), zeros
         measured = (self.signals.get("pos_w", zeros), attitude, vel_w)
@@ -106,46 +101,40 @@ def grid_of(log: FlightLog) -> FlightGrid:
     # Collect the signals that the log has.
     time_s = log.time_s - log.time_s[0]
     grid_s = np.arange(0.0, time_s[-1], STEP_S)
-    measured = {
-        "pos_w": log.pos_w,
-        "vel_w": None if log.velocity_derived else log.vel_w,
-        IMU_ACC: specific_force_w(log),
-        "rate_b": log.rate_b,
-        "rotor_speed": log.rotor_speed,
-    }
-    commanded = {
-        "pwm": log.pwm,
-        "thrust_cmd": log.thrust_cmd,
-        "rate_cmd_b": log.rate_cmd_b,
-        "torque_cmd_b": log.torque_cmd_b,
-        "rotor_speed_cmd": log.rotor_speed_cmd,
-    }
-    logged = {name: v for name, v in (measured | commanded).items() if v is not None and _enough(v)}
+    values = {name: getattr(log, name) for name in (*MEASURED, *HELD)}
+    values[IMU_ACC] = specific_force_w(log)
+    quat_wxyz = values.pop("quat_wxyz")
+    logged = {name: v for name, v in values.items() if v is not None and _enough(v)}
     in_turn = tuple(name for name, values in logged.items() if _complete_rows(values) < 2)
-    # Resample them, and derive those that were not measured.
     signals: dict[str, np.ndarray] = {}
+
+    def add_measured(name: str, values: np.ndarray) -> None:
+        signals[name] = interpolate(grid_s, time_s, values, holes=True)
+
+    # Resample them, and derive those that were not measured.
     for name, values in logged.items():
-        signals[name] = (interpolated if name in measured else _held)(time_s, values, grid_s)
+        if name in HELD:
+            signals[name] = _held(time_s, values, grid_s)
+        else:
+            add_measured(name, values)
     if isinstance(log, InertialLog):
         for name, of_pose in ((POSE_SLOPE, log.pose_slope_b), (VELOCITY_NOISE, log.vel_noise_b)):
             assert of_pose is not None
-            flat = of_pose.reshape(len(time_s), -1)
-            signals[name] = np.nan_to_num(interpolated(time_s, flat, grid_s))
+            add_measured(name, of_pose.reshape(len(time_s), -1))
+            signals[name] = np.nan_to_num(signals[name])
     if "rotor_speed" in logged:
-        signals[ROTOR_NOISE] = interpolated(time_s, noise_like(logged["rotor_speed"]), grid_s)
-    if "pos_w" in signals and "vel_w" not in signals:
-        signals[PATH_VELOCITY] = _path_velocity(signals["pos_w"])
-    if _complete_rows(log.quat_wxyz) > 1:
-        signals["rot_w"] = attitude_at(time_s, log.quat_wxyz, grid_s)
-        rate_b = turning_of(time_s, log.quat_wxyz)
+        add_measured(ROTOR_NOISE, noise_like(logged["rotor_speed"]))
+    if _complete_rows(quat_wxyz) > 1:
+        signals["rot_w"] = attitude_at(grid_s, time_s, quat_wxyz)
+        rate_b = turning_of(time_s, quat_wxyz)
         if "rate_b" not in signals and _enough(rate_b):
-            signals["rate_b"] = interpolated(time_s, rate_b, grid_s)
-    elif {"pos_w", "vel_w"} & {*signals}:
-        signals[LEANING] = attitude_at(time_s, np.asarray(rot_to_quat(leaning(log))), grid_s)
+            add_measured("rate_b", rate_b)
+    elif "vel_w" in signals:
+        lean = np.asarray(rot_to_quat(leaning(log)))
+        signals[LEANING] = attitude_at(grid_s, time_s, lean)
     if log.voltage is not None and _enough(log.voltage):
-        good = np.isfinite(log.voltage)
-        volts = np.interp(grid_s, time_s[good], log.voltage[good])
-        signals["voltage"] = _averaged(volts, round(VOLTAGE_S / STEP_S))
+        volts = interpolate(grid_s, time_s, log.voltage[:, None])[:, 0]
+        signals["voltage"] = uniform_filter1d(volts, VOLTAGE_STEPS, mode="nearest")
     return FlightGrid(log.name, grid_s, signals, in_turn)
 
 
@@ -157,34 +146,6 @@ def _enough(values: np.ndarray) -> bool:
 def _complete_rows(values: np.ndarray) -> int:
     """Return the number of rows in which all columns are present."""
     return int(np.isfinite(values.reshape(len(values), -1)).all(axis=1).sum())
-
-
-def interpolated(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return `values` (T, C) at times `time_s` (T,) interpolated linearly to `grid_s`, (G, C).
-
-    Each column is interpolated between the rows in which it is present. It is NaN in holes, and
-    before the first and after the last of these rows.
-    """
-    out = np.empty((len(grid_s), values.shape[1]))
-    for k, column in enumerate(values.T):
-        good = np.isfinite(column)
-        out[:, k] = np.interp(grid_s, time_s[good], column[good])
-        out[_in_hole(time_s[good], grid_s), k] = np.nan
-    return out
-
-
-def attitude_at(time_s: np.ndarray, quat_wxyz: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return the attitudes (G, 3, 3) of quaternions (T, 4) on the grid; NaN as `interpolated`."""
-    mixed = interpolated(time_s, sign_continuous(quat_wxyz), grid_s)
-    return quat_to_rot(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
-
-
-def _path_velocity(pos_w: np.ndarray) -> np.ndarray:
-    """Return the velocity (G, 3) by central differences of positions; NaN at both ends."""
-    reach = round(PATH_SLOPE_S / STEP_S)
-    out = np.full_like(pos_w, np.nan)
-    out[reach:-reach] = (pos_w[2 * reach :] - pos_w[: -2 * reach]) / (2 * reach * STEP_S)
-    return out
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
@@ -199,19 +160,5 @@ def _held(time_s: np.ndarray, values: np.ndarray, grid_s: np.ndarray) -> np.ndar
         good = np.isfinite(column)
         signal = Signal(time_s[good], column[good, None])
         out[:, k] = held(signal, ends_s)[:-1, 0]
-        out[_in_hole(signal.time_s, grid_s), k] = np.nan
+        out[in_hole(grid_s, signal.time_s), k] = np.nan
     return out.reshape(len(grid_s), *values.shape[1:])
-
-
-def _in_hole(time_s: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Return whether each grid point (G,) is in a hole between two rows, or outside all rows."""
-    is_hole = np.diff(time_s) > HOLE_STEPS * float(np.median(np.diff(time_s)))
-    row = np.clip(np.searchsorted(time_s, grid_s, side="right") - 1, 0, len(time_s) - 2)
-    return is_hole[row] | (grid_s < time_s[0]) | (grid_s > time_s[-1])
-
-
-def _averaged(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the moving average of `values` (G,) over about `count` points, an odd number."""
-    count = max(1, min(count, len(values) // 4)) | 1  # "| 1" makes an even number odd
-    padded = np.pad(values, count // 2, mode="edge")
-    return np.convolve(padded, np.full(count, 1.0 / count), mode="valid")

@@ -37,13 +37,12 @@ from suite.diagnose.identify.drive import (
 )
 from suite.diagnose.identify.entries import (
     force_entries,
-    inertia_from,
     loop_entries,
     torque_entries,
     with_entries,
     with_reachable_speed,
 )
-from suite.diagnose.identify.fit import Fitted, NoWholeWindow, Unknown
+from suite.diagnose.identify.fit import Fitted, KnownNumbers, NoWholeWindow, Unknown
 from suite.diagnose.identify.flapping import flapping_of, perturbed_vehicles
 from suite.diagnose.identify.grid import FlightGrid, grid_of
 from suite.diagnose.identify.loop import (
@@ -146,21 +145,26 @@ class _Fits:
         if drive == "pwm" and (vehicle.motors is None or "motors" not in leave):
             self.start = with_motor_map(flights, vehicle)
         self.driven = driven_vehicle(flights, self.start, drive)
-        self.lag_s: float = vehicle.rotors.time_constant
-        delay, scale = (vehicle.effects.get(name) for name in ("command_delay", "thrust_scale"))
-        self.delay_s: float = 0.0 if delay is None else delay.delay
         self.results: dict[str, Fitted] = {}
         """Results by the name of the fit: force, torque, rotors or loop."""
         self.broken: set[str] = set()
         """Names of fits without a complete window."""
         self.without_voltage: set[str] = set()
         """Names of flights without a voltage, if others have one."""
-        self.start_log_thrust = 0.0 if scale is None else float(np.log(scale.scale))
-        self.log_thrust = self.start_log_thrust
+        lag_s: float = vehicle.rotors.time_constant
+        delay, scale = (vehicle.effects.get(name) for name in ("command_delay", "thrust_scale"))
+        self.log_thrust = 0.0 if scale is None else float(np.log(scale.scale))
+        """Logarithm of the thrust's scale at the start."""
+        self.numbers = {
+            "thrust": self.log_thrust,
+            "lag": lag_s,
+            "late": lag_s + (0.0 if delay is None else delay.delay),
+        }
+        """Present values of the numbers on which several fits depend, by name."""
 
     def fit_force(self) -> None:
         """Fit thrust and drag to the translation."""
-        flights = [f for f in self.flights if f.has("vel_w") or f.has("pos_w")]
+        flights = [flight for flight in self.flights if flight.has("vel_w")]
         # If no flight has an attitude, it follows from how the vehicle must lean to fly its path.
         leaning = not any(flight.has("rot_w") for flight in flights)
         flights = [flight for flight in flights if leaning or flight.has("rot_w")]
@@ -169,16 +173,12 @@ class _Fits:
         flights = self.with_known_thrust(flights)
         voltage = all(flight.has("voltage") for flight in flights)
         unknowns = self.wanted(
-            force_unknowns(self.driven, voltage, leaning, self.start_log_thrust),
+            force_unknowns(self.driven, voltage, leaning, self.log_thrust),
             {"drag": ("drag_",), "motors": ("thrust", "curve", "battery")},
         )
-        if not unknowns:
-            return
-        fixed = {"thrust": self.start_log_thrust, **self.lags()}
-        result = self.attempt("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
-        if result is not None:
-            self.results["force"] = result
-            self.log_thrust = result.values().get("thrust", self.start_log_thrust)
+        if unknowns:
+            fixed = {**self.numbers, "thrust": self.log_thrust}
+            self.attempt("force", lambda: fit_force(flights, self.driven, unknowns, fixed))
 
     def fit_torque(self) -> None:
         """Fit inertia, yaw torque, lag and delay to the rotation."""
@@ -186,13 +186,13 @@ class _Fits:
         if self.drive in ("rates", "thrust") or not flights:  # these commands contain no torques
             return
         unknowns = self.wanted(
-            torque_unknowns(self.drive, self.lag_s, self.delay_s),
+            torque_unknowns(self.drive, self.numbers["lag"], self.numbers["late"]),
             {"inertia": ("inertia_", "yaw"), "lag": ("lag", "late")},
         )
         if not unknowns:
             return
         flights = self.with_known_thrust(flights)
-        fixed, known = self.lags(), None
+        fixed, known = dict(self.numbers), None
         if "force" in self.results and self.drive in KNOWN_MOTORS:
             fixed |= self.results["force"].values()
             known = self.results["force"].known_numbers(*FORCE_NUMBERS)
@@ -202,43 +202,33 @@ class _Fits:
             return fit_torque(flights, self.driven, unknowns, fixed, held, known)
 
         result = self.attempt("torque", lambda: fitted(unknowns))
-        if result is None:
-            return
         start_lag_s = self.start.rotors.time_constant
-        if result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
+        if result and result.identifies("lag") and result.values()["lag"] < NO_LAG_S < start_lag_s:
             # No rotor follows at once. Commands that are blurred in the log hide its lag, so the
             # start's lag is held and the other numbers are fitted again.
-            self.lag_s = start_lag_s
             unknowns = [u._replace(start=start_lag_s) if u.name == "lag" else u for u in unknowns]
-            result = fitted(unknowns, ("lag",))
-        self.keep("torque", result)
+            self.attempt("torque", lambda: fitted(unknowns, ("lag",)))
 
     def fit_loop(self) -> None:
         """Fit the rotors' lag behind commanded speeds, and the nominal rate loop."""
-        lags = lag_unknowns(self.lag_s, self.delay_s)
         speeds = ("rotor_speed", "rotor_speed_cmd")
         # Speeds of motors that are read one after another are blurred, which resembles a lag.
         commanded = [f for f in self.flights if f.has(*speeds) and not {*speeds} & {*f.in_turn}]
         if commanded and "lag" not in self.leave:
-            result = self.attempt("rotors", lambda: fit_rotor_lag(commanded, lags))
-            if result is not None:
-                self.keep("rotors", result)
+            starts = lag_unknowns(self.numbers["lag"], self.numbers["late"])
+            self.attempt("rotors", lambda: fit_rotor_lag(commanded, starts))
         flights = [f for f in self.flights if f.has("rate_b", "rate_cmd_b")]
         if not flights or self.start.controller.kind != "p" or "loop" in self.leave:
             return
         # If the motors are known, other fits identify lag and delay better: hold them fixed here.
-        separate = "rotors" in self.results or self.drive == "pwm" or "lag" in self.leave
-        source = self.results.get("rotors", self.results.get("torque"))
-        known = source.known_numbers("late", "lag") if separate and source is not None else None
-        if separate:
-            lags = [u for u in lags if known is not None and u.name in known.names]
+        lags, known = lag_unknowns(self.numbers["lag"], self.numbers["late"]), None
+        if "rotors" in self.results or self.drive == "pwm" or "lag" in self.leave:
+            source = self.results.get("rotors", self.results.get("torque"))
+            known = source.known_numbers("late", "lag") if source else KnownNumbers()
+            lags = [u for u in lags if u.name in known.names]
         nuisance = [*coupling_unknowns(self.start), *air_torque_unknowns(flights)]
         unknowns = [*gain_unknowns(), *nuisance, *lags]
-        result = self.attempt(
-            "loop", lambda: fit_loop(flights, self.start, unknowns, self.lags(), known)
-        )
-        if result is not None:
-            self.keep("loop", result)
+        self.attempt("loop", lambda: fit_loop(flights, self.start, unknowns, self.numbers, known))
 
     def wanted(
         self, unknowns: Sequence[Unknown], prefixes: Mapping[str, tuple[str, ...]]
@@ -258,25 +248,19 @@ class _Fits:
         return selected
 
     def attempt(self, name: str, fit: Callable[[], Fitted]) -> Fitted | None:
-        """Return the result of `fit`, or None if it has no complete window.
+        """Run `fit`, and keep its result for the following fits and under its name.
 
-        In that case its name is added to `broken`.
+        Without a complete window there is none, and the name is added to `broken`.
         """
         try:
-            return fit()
+            result = fit()
         except NoWholeWindow:
             self.broken.add(name)
             return None
-
-    def keep(self, name: str, result: Fitted) -> None:
-        """Store a result, and use its lag and delay in the following fits."""
         self.results[name] = result
-        self.lag_s = result.values().get("lag", self.lag_s)
-        self.delay_s = result.values().get("late", self.lag_s + self.delay_s) - self.lag_s
-
-    def lags(self) -> dict[str, float]:
-        """Return the current `lag`, and `late`, the sum of lag and delay [s]."""
-        return {"lag": self.lag_s, "late": self.lag_s + self.delay_s}
+        values = result.values()
+        self.numbers |= {number: values[number] for number in self.numbers if number in values}
+        return result
 
     def lacking(self) -> list[str]:
         """Return a line for people for each number that was not fitted."""
@@ -290,19 +274,16 @@ class _Fits:
         if "force" in results:
             entries += force_entries(self.driven, results["force"])
         if "torque" in results:
-            entries += torque_entries(self.driven, results["torque"], self.log_thrust, self.lag_s)
+            entries += torque_entries(self.driven, results["torque"], self.numbers["thrust"])
         for name in ("rotors", "loop"):
             if name in results:
-                entries += loop_entries(self.start, results[name], self.lag_s)
+                entries += loop_entries(self.start, results[name])
         by_key: dict[str, Number] = {}
         for entry in entries:
             # Several fits may estimate lag and delay. Later fits observe them more directly.
             if entry.key not in by_key or entry.is_identified:
                 by_key[entry.key] = entry
         vehicle, numbers, notes = with_entries(self.start, by_key.values())
-        if "torque" in results:
-            x, y, z = inertia_from(self.start, results["torque"].values()).tolist()
-            vehicle = replace(vehicle, inertia=(x, y, z))
         if self.drive == "rotors":
             speeds = [f.signals["rotor_speed"] for f in self.flights]
             vehicle = with_reachable_speed(vehicle, speeds)

@@ -15,14 +15,14 @@ Changes of rotor speed are assumed small.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.identify.body import block_of, stacked_residuals
+from suite.diagnose.identify.body import Windows, by_value
 from suite.diagnose.identify.drive import LEAST_LAG_S, after_delay_and_lag, delayed, filled, lagged
 from suite.diagnose.identify.fit import Fitted, KnownNumbers, Rows, Unknown, fit
 from suite.diagnose.identify.grid import STEP_S, FlightGrid
@@ -31,8 +31,6 @@ LOOP_WIDTH_S = 0.08
 """Width of the windows over which rates are averaged [s]."""
 SPEED_WIDTH_S = 0.16
 """Width of the windows over which rotor speeds are averaged [s]."""
-NumberResiduals = Callable[[Mapping[str, float]], Rows]
-"""Function from numbers (parameters by name) to the residuals of one flight."""
 
 
 def gain_unknowns() -> list[Unknown]:
@@ -85,16 +83,12 @@ def fit_loop(
     Raises:
         NoWholeWindow: if no window has all signals.
     """
+    windows = [_windows(flight, LOOP_WIDTH_S, "rate_b", "rate_cmd_b") for flight in flights]
 
-    def residuals_of(flight: FlightGrid) -> NumberResiduals:
-        """Return the function from the numbers to measured minus modelled rates of a flight."""
-        form = flight.form(LOOP_WIDTH_S, ("rate_b", "rate_cmd_b"))
-        rates = form.mean @ np.nan_to_num(flight.signals["rate_b"])
-        block, offset = block_of(form), np.ones(3, dtype=bool)
-        return lambda n: Rows(rates - form.mean @ loop_rates(flight, vehicle, n), block, offset)
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        return [one.residuals(loop_rates(one.flight, vehicle, numbers)) for one in windows]
 
-    residuals = [residuals_of(flight) for flight in flights]
-    return fit(stacked_residuals(residuals, unknowns, fixed, dict), unknowns, known=known)
+    return fit(by_value(residuals, unknowns, fixed), unknowns, known=known)
 
 
 def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) -> Fitted:
@@ -103,22 +97,23 @@ def fit_rotor_lag(flights: Sequence[FlightGrid], unknowns: Sequence[Unknown]) ->
     Raises:
         NoWholeWindow: if no window has both measured and commanded speeds.
     """
+    measured, commanded = "rotor_speed", "rotor_speed_cmd"
+    windows = [_windows(flight, SPEED_WIDTH_S, measured, commanded) for flight in flights]
 
-    def residuals_of(flight: FlightGrid) -> NumberResiduals:
-        """Return the function from the numbers to measured minus modelled speeds of a flight."""
-        form = flight.form(SPEED_WIDTH_S, ("rotor_speed", "rotor_speed_cmd"))
-        measured = form.mean @ np.nan_to_num(flight.signals["rotor_speed"])
-        commanded = flight.signals["rotor_speed_cmd"]
-        block, offset = block_of(form), np.ones(4, dtype=bool)
+    def residuals(numbers: Mapping[str, float]) -> list[Rows]:
+        return [
+            one.residuals(after_delay_and_lag(one.flight.signals[commanded], numbers))
+            for one in windows
+        ]
 
-        def residuals(numbers: Mapping[str, float]) -> Rows:
-            speed = np.nan_to_num(after_delay_and_lag(commanded, numbers))
-            return Rows(measured - form.mean @ speed, block, offset)
+    return fit(by_value(residuals, unknowns, {}), unknowns)
 
-        return residuals
 
-    residuals = [residuals_of(flight) for flight in flights]
-    return fit(stacked_residuals(residuals, unknowns, {}, dict), unknowns)
+def _windows(flight: FlightGrid, width_s: float, measured: str, commanded: str) -> Windows:
+    """Return the windows of `flight` with both signals; each channel has a free constant."""
+    form = flight.form(width_s, (measured, commanded))
+    values = np.nan_to_num(flight.signals[measured])
+    return Windows(flight, form, form.mean @ values, np.ones(values.shape[1], dtype=bool))
 
 
 def loop_rates(flight: FlightGrid, vehicle: Vehicle, numbers: Mapping[str, float]) -> np.ndarray:

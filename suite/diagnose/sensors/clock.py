@@ -15,9 +15,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.identify.grid import attitude_at, interpolated
+from suite.diagnose.data.sampling import attitude_at, interpolate
 from suite.diagnose.sensors.errors import rotation_between
 from tracks.geometry.rotation import rot_to_quat
 
@@ -99,18 +100,14 @@ def _misfits(
         times (M,) of each block that are compared.
     """
     half_s = SPAN_ROWS * STEP_S
-    rot_w = attitude_at(log.time_s, log.quat_wxyz, grid)
+    rot_w = attitude_at(grid, log.time_s, log.quat_wxyz)
     turn = rotation_between(rot_w[: -2 * SPAN_ROWS], rot_w[2 * SPAN_ROWS :])
     reference = np.full((len(grid), 3), np.nan)
     reference[SPAN_ROWS:-SPAN_ROWS] = turn / (2.0 * half_s)
-    # The mean rate of the gyro over the same span is a difference of its integral.
-    gyro = interpolated(log.time_s, log.rate_b, grid)
-    angle = np.cumsum(np.nan_to_num(gyro), axis=0) * STEP_S
-    # The trapezoidal rule; half of the first row, which is too much, cancels in differences.
-    angle = angle - 0.5 * STEP_S * np.nan_to_num(gyro)
-    mean = np.full_like(gyro, np.nan)
-    mean[SPAN_ROWS:-SPAN_ROWS] = (angle[2 * SPAN_ROWS :] - angle[: -2 * SPAN_ROWS]) / (2.0 * half_s)
-    mean[~np.isfinite(gyro)] = np.nan
+    # The mean rate of the gyro over the same span, by the trapezoidal rule.
+    gyro = interpolate(grid, log.time_s, log.rate_b, holes=True)
+    weight = np.append(0.5, np.append(np.ones(2 * SPAN_ROWS - 1), 0.5)) / (2 * SPAN_ROWS)
+    mean = convolve1d(gyro, weight, axis=0, mode="constant", cval=np.nan)
     known = np.isfinite(mean + reference).all(axis=1)
     if known.any():
         mean -= np.median((mean - reference)[known], axis=0)  # bias of the gyro
@@ -150,7 +147,7 @@ def on_gyro_clock(log: FlightLog, clock: Clock) -> FlightLog:
     reference_s = log.time_s - clock.at(log.time_s)
     return replace(
         log,
-        pos_w=interpolated(log.time_s, log.pos_w, reference_s),
-        quat_wxyz=rot_to_quat(attitude_at(log.time_s, log.quat_wxyz, reference_s)),
-        vel_w=interpolated(log.time_s, log.vel_w, reference_s),
+        pos_w=interpolate(reference_s, log.time_s, log.pos_w, holes=True),
+        quat_wxyz=rot_to_quat(attitude_at(reference_s, log.time_s, log.quat_wxyz)),
+        vel_w=interpolate(reference_s, log.time_s, log.vel_w, holes=True),
     )

@@ -27,7 +27,8 @@ from scipy.stats import chi2
 from eval.judging.statistics import Interval
 from suite.diagnose.estimate.block import NormalEquations, products
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.sensors.errors import DIFFER_P, STRETCH_S, significant
+from suite.diagnose.identify.fit import DIFFER_P
+from suite.diagnose.sensors.errors import STRETCH_S, significant
 
 SHORT_S = 1.0
 """The autocorrelation is fitted up to this lag [s]."""

@@ -1,11 +1,11 @@
 """Errors of an on-board state estimate relative to the log's reference pose, and their delay.
 
 To first order, an estimate that is late by d has the error -d times the derivative of the truth. A
-scale error k of the velocity v causes the error k v. Delay and scale are fitted by least squares to
-the errors of all flights, after subtracting the mean of each flight. Each axis is divided by the
-RMS of its errors. Errors are correlated in time, so intervals come from the disagreement between
-stretches of 5 s. Rows are not whitened (made uncorrelated in time): whitening would give a high
-weight to fast motion, in which the dynamics of the estimator dominate.
+scale error k of the velocity v causes the error k v. Delay and scale are fitted by least squares
+to the errors of all flights (`identify/fit.py`), with a free constant of each flight.
+Errors are correlated in time, so intervals come from the disagreement between stretches of 5 s.
+Rows are not whitened (made uncorrelated in time): whitening would give a high weight to fast
+motion, in which the dynamics of the estimator dominate.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from eval.effects.interface import GRAVITY
 from eval.judging.statistics import Interval
 from eval.logs.columns import ESTIMATE, GROUPS, FlightLogError
 from eval.logs.flight_log import FlightLog
-from suite.diagnose.estimate.block import NormalEquations, without_nuisance
-from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.identify.grid import attitude_at, interpolated
+from suite.diagnose.data.sampling import attitude_at, interpolate
+from suite.diagnose.identify.fit import Rows, Unknown, fit
 from tracks.geometry.rotation import cross, to_local
 
 PARTS = {"position": "pos", "velocity": "vel", "attitude": "quat"}
 """Parts of the state, three axes each, and the group of columns that has each part."""
+VELOCITY = slice(3, 6)
+"""Channels of the velocity among the errors."""
 SLOPE_ROWS = 15
 """Number of rows over which the reference is differentiated."""
 SETTLES_S = 2.0
@@ -39,8 +40,6 @@ LEAST_S = 8.0
 class Errors(NamedTuple):
     """Errors of the estimate in one flight at T evenly spaced times; NaN for missing signals."""
 
-    name: str
-    """Name of the flight."""
     step_s: float
     """Time between rows [s]."""
     value: np.ndarray
@@ -89,8 +88,8 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
             f"{log.duration_s:.1f} s of flight; allowed are {LEAST_S + 2 * SETTLES_S:g} s or more"
         )
         raise FlightLogError(log.name, None, None, reason)
-    vel_w = interpolated(log.time_s, log.vel_w, from_start - late_s)
-    rot_w = attitude_at(log.time_s, log.quat_wxyz, from_start - late_s)
+    vel_w = interpolate(from_start - late_s, log.time_s, log.vel_w, holes=True)
+    rot_w = attitude_at(from_start - late_s, log.time_s, log.quat_wxyz)
     lean_w = cross(vel_w, rot_w[..., 2]) / GRAVITY
     vel_w, rot_w = vel_w[-len(grid) :], rot_w[-len(grid) :]
     # Estimate minus reference, part by part.
@@ -100,18 +99,19 @@ def errors_of(log: FlightLog, late_s: float = 0.0) -> Errors:
         if estimate is None:
             continue
         if part == "attitude":
-            error = rotation_between(rot_w, attitude_at(log.time_s, estimate, grid))
+            error = rotation_between(rot_w, attitude_at(grid, log.time_s, estimate))
         else:
-            reference = interpolated(log.time_s, log.pos_w, then_s) if part == "position" else vel_w
-            error = interpolated(log.time_s, estimate, grid) - reference
+            pos_w = interpolate(then_s, log.time_s, log.pos_w, holes=True)
+            reference = pos_w if part == "position" else vel_w
+            error = interpolate(grid, log.time_s, estimate, holes=True) - reference
             error = to_local(rot_w, error) if part == "velocity" else error
         value[:, 3 * k : 3 * k + 3] = error
     # The time derivative of the reference is velocity, acceleration and body rates.
     acc_b = to_local(rot_w, _differentiated(vel_w, step_s))
     if np.isfinite(log.rate_b).any():
-        rate_b = interpolated(log.time_s, log.rate_b, then_s)
+        rate_b = interpolate(then_s, log.time_s, log.rate_b, holes=True)
     slope = np.concatenate([vel_w, acc_b, rate_b], axis=1)
-    return Errors(log.name, step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
+    return Errors(step_s, value, slope, to_local(rot_w, vel_w), rot_w, lean_w)
 
 
 def rotation_between(rot_w: np.ndarray, other_w: np.ndarray) -> np.ndarray:
@@ -149,13 +149,11 @@ def _differentiated(values: np.ndarray, step_s: float) -> np.ndarray:
 
 STRETCH_S = 5.0
 """Errors further apart than this count as independent [s]."""
-DIFFER_P = 0.05
-"""P-value below which flights differ more than their stretches explain. Intervals are then
-wider."""
 ROUNDS = 3
 """Number of rounds of the fit; each is linearised at the delay of the round before."""
-LEAST_INFORMATION = 1e-9
-"""A parameter (delay or scale) with less information in the errors is not fitted."""
+DELAY = Unknown("delay", 0.0, -1.0, 1.0, np.inf, 1e-3)
+SCALE = Unknown("scale", 0.0, -1.0, 1.0, np.inf, 1e-3)
+"""The fitted parameters: change of the delay [s], and relative scale error of the velocity."""
 
 
 class Lateness(NamedTuple):
@@ -165,8 +163,6 @@ class Lateness(NamedTuple):
     """Delay of the estimate [s]."""
     velocity_scale: Interval
     """Relative scale error of the velocity."""
-    by_part: dict[str, Interval]
-    """Delay that each part of the state alone gives, by the part's name [s]."""
 
 
 def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
@@ -185,22 +181,43 @@ def fit_lateness(logs: Sequence[FlightLog]) -> tuple[Lateness, list[Errors]]:
 
 def _fitted(flights: Sequence[Errors], delay_s: float) -> Lateness:
     """Return delay and scale, from errors that were computed with the delay `delay_s`."""
-    # Parameter 0 is the delay, parameter 1 the scale.
-    numbers, scale = (0, 1), Interval(0.0, 0.0, 0.0)
-    equations = _equations(flights, slice(0, 9))
-    value, half = _solved(equations, numbers)
-    if value[1]:
-        scale = _interval(value[1], half[1])
-        if not significant(scale):  # it would only widen the delay's interval
-            numbers = (0,)
-            value, half = _solved(equations, numbers)
-    by_part = {}
-    for k, part in enumerate(PARTS):
-        of_part = _equations(flights, slice(3 * k, 3 * k + 3))
-        if of_part.hessian[:, 0, 0].any():
-            part_value, part_half = _solved(of_part, numbers)
-            by_part[part] = _interval(delay_s + part_value[0], part_half[0])
-    return Lateness(_interval(delay_s + value[0], half[0]), scale, by_part)
+
+    def residuals(value: np.ndarray) -> list[Rows]:
+        """Return the errors that remain at a change of the delay, and at a scale if there is one.
+
+        To first order, a delay causes the error -delay * slope.
+        """
+        change_s, scale = value[0], value[1] if len(value) > 1 else 0.0
+        return [rows_of(one, without_scale(one, scale) + change_s * one.slope) for one in flights]
+
+    noise = size_of([one.value for one in flights])
+    fitted, scale = fit(residuals, [DELAY], noise=noise), Interval(0.0, 0.0, 0.0)
+    if any(np.isfinite(one.value[:, VELOCITY]).any() for one in flights):
+        both = fit(residuals, [DELAY, SCALE], noise=noise)
+        scale = both.interval("scale")
+        # A scale that is not significant would only widen the delay's interval.
+        fitted = both if significant(scale) else fitted
+    change_s = fitted.interval("delay")
+    return Lateness(Interval(*(delay_s + end for end in change_s)), scale)
+
+
+def size_of(values: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the RMS (C,) of errors (T, C) of each flight about the flight's mean.
+
+    It serves as noise of a fit, which explains a small part of the errors.
+    """
+    known = [np.ma.masked_invalid(one) for one in values]
+    squares = np.ma.concatenate([(one - one.mean(axis=0)) ** 2 for one in known])
+    return np.maximum(np.sqrt(squares.mean(axis=0)).filled(1.0), 1e-150)
+
+
+def rows_of(flight: Errors, values: np.ndarray) -> Rows:
+    """Return remaining errors `values` (T, C) of a flight for a fit.
+
+    Each channel has a free constant, and stretches of `STRETCH_S` are independent.
+    """
+    stretch = (np.arange(len(values)) * flight.step_s / STRETCH_S).astype(int)
+    return Rows(values, stretch, np.ones(values.shape[1], bool))
 
 
 def significant(interval: Interval) -> float:
@@ -208,69 +225,8 @@ def significant(interval: Interval) -> float:
     return 0.0 if interval.low <= 0.0 <= interval.high else interval.value
 
 
-def _interval(value: float, half: float) -> Interval:
-    """Return the interval of `value` with the half-width `half`."""
-    return Interval(float(value), float(value - half), float(value + half))
-
-
 def without_scale(flight: Errors, scale: float) -> np.ndarray:
     """Return the errors (T, 9) without those by a relative `scale` error of the velocity."""
-    return flight.value - scale * _scale_slope(flight)
-
-
-def _scale_slope(flight: Errors) -> np.ndarray:
-    """Return the errors (T, 9) that a relative scale error of 1 of the velocity causes."""
-    zeros = np.zeros_like(flight.vel_b)
-    return np.concatenate([zeros, flight.vel_b, zeros], axis=1)
-
-
-def _equations(flights: Sequence[Errors], channels: slice) -> NormalEquations:
-    """Return the normal equations of delay and scale for the errors of `channels`, by stretch."""
-    columns = [np.stack([one.value, -one.slope, _scale_slope(one)], axis=-1) for one in flights]
-    return equations_of(flights, [values[:, channels] for values in columns])
-
-
-def equations_of(flights: Sequence[Errors], columns: Sequence[np.ndarray]) -> NormalEquations:
-    """Return the normal equations of two parameters, by stretch.
-
-    Args:
-        flights: the flights.
-        columns: for each flight (T, C, 3): its errors in C channels, and their slopes along the two
-            parameters.
-    """
-    rows, stretch, flight_of = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for index, (flight, values) in enumerate(zip(flights, columns, strict=True)):
-        complete = np.isfinite(values).all(axis=-1, keepdims=True)
-        values = np.where(complete, values, 0.0)
-        mean = values.sum(axis=0) / np.maximum(complete.sum(axis=0), 1)
-        rows.append(np.where(complete, values - mean, 0.0))
-        stretch.append((np.arange(len(values)) * flight.step_s / STRETCH_S).astype(int))
-        flight_of.append(np.full(len(values), index))
-    # Give each stretch of each flight a number; `index` is then the stretch of each row.
-    flight_and_stretch, index = np.unique(
-        np.stack([np.concatenate(flight_of), np.concatenate(stretch)]), axis=1, return_inverse=True
-    )
-    table = np.concatenate(rows)
-    # The errors' RMS serves as noise: the fit explains a small part of them.
-    count = np.maximum(np.count_nonzero(table[..., 0], axis=0), 1)
-    noise = np.sqrt(np.maximum((table[..., 0] ** 2).sum(axis=0) / count, 1e-300))
-    white = table / noise[:, None]
-    start_s = flight_and_stretch[1] * STRETCH_S
-    return without_nuisance(
-        white[..., 0], white[..., 1:], (0, 1), index.ravel(), flight_and_stretch[0], start_s
-    ).equations
-
-
-def _solved(equations: NormalEquations, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return delay and scale (2,), and the half-widths (2,) of their intervals.
-
-    Only the parameters in `numbers` are fitted; 0 is the delay and 1 the scale. The others are 0.
-    """
-    hessian, gradient = equations.sums()
-    fitted = [k for k in numbers if hessian[k, k] > LEAST_INFORMATION]
-    value, half = np.zeros(2), np.zeros(2)
-    if fitted:
-        value[fitted] = np.linalg.solve(hessian[np.ix_(fitted, fitted)], gradient[fitted])
-        residual = equations._replace(gradient=equations.gradient - equations.hessian @ value)
-        half[fitted] = intervals95(residual.take(fitted), DIFFER_P, leave_out=True).half_width
-    return value, half
+    value = flight.value.copy()
+    value[:, VELOCITY] -= scale * flight.vel_b
+    return value

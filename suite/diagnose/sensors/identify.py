@@ -39,8 +39,6 @@ SCHEMA = 1
 WITHIN = 0.2
 """A model fits if its autocorrelation differs by at most this from the measured one, at every lag
 (time difference)."""
-LEAST_RELATIVE = 0.2
-"""Least measured autocorrelation at lags where the relative difference is computed as well."""
 ZERO = Interval(0.0, 0.0, 0.0)
 """A parameter that is not in the model."""
 
@@ -69,11 +67,6 @@ class HeldOut(NamedTuple):
     """Autocorrelation of the model at that lag."""
     largest: float
     """Largest difference; an autocorrelation is 1 at lag 0."""
-    relative: float
-    """Largest relative difference, among lags with a measured value of at least
-    `LEAST_RELATIVE`."""
-    size_ratio: float
-    """Standard deviation of the model divided by that of the held-out flights."""
 
     @property
     def fits(self) -> bool:
@@ -124,22 +117,16 @@ def _compare(fitted: Coloured, series: Sequence[Series]) -> HeldOut:
     step_s = max(flight.step_s for flight in series)
     lags = np.arange(round(SHORT_S / step_s) + 1)
     duration_s = float(np.mean([flight.duration_s for flight in series]))
-    variance, measured = _autocorrelation(series, lags)
+    measured = _autocorrelation(series, lags)
     model = fitted.correlation(lags * step_s, duration_s)
     difference = np.abs(model - measured)
-    worst, large = int(difference.argmax()), np.abs(measured) >= LEAST_RELATIVE
-    return HeldOut(
-        float(lags[worst] * step_s),
-        float(measured[worst]),
-        float(model[worst]),
-        float(difference[worst]),
-        float((difference[large] / np.abs(measured[large])).max()),
-        float(fitted.noise.value / np.sqrt(variance)),
-    )
+    worst = int(difference.argmax())
+    shown = (lags[worst] * step_s, measured[worst], model[worst], difference[worst])
+    return HeldOut(*map(float, shown))
 
 
-def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the variance of all flights, and the autocorrelation (L,) at `lags` (L,) in steps."""
+def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> np.ndarray:
+    """Return the autocorrelation (L,) of all flights at `lags` (L,) in steps."""
     total, pairs = np.zeros(len(lags)), np.zeros(len(lags))
     for flight in series:
         centred = flight.value - np.nanmean(flight.value)
@@ -148,7 +135,7 @@ def _autocorrelation(series: Sequence[Series], lags: np.ndarray) -> tuple[float,
             total[place] += np.nansum(product)
             pairs[place] += np.isfinite(product).sum()
     covariance = total / np.maximum(pairs, 1)
-    return float(covariance[0]), covariance / covariance[0]
+    return covariance / covariance[0]
 
 
 def _series(
@@ -245,7 +232,6 @@ def identify_sensors(flights: Sequence[Path], out: Path, console: Console) -> di
     return {
         "sensors": str(out),
         "parameters": numbers_json(numbers),
-        "delay_by_part": {part: list(delay) for part, delay in fitted.lateness.by_part.items()},
         "held_out": {
             axis: {**compared._asdict(), "fits": compared.fits, "within": WITHIN}
             for axis, compared in checked.items()

@@ -1,8 +1,8 @@
 """Tilt error of an estimator that neglects drag: the sensor model `drag_tilt`, fitted to errors.
 
 Such an estimator takes the deceleration by drag for a tilt of the vehicle. The tilt follows the
-velocity with a first-order lag, whose time constant is called correlation time. The drag is fitted
-to errors of the attitude by least squares for each correlation time, and the best time is searched.
+velocity with a first-order lag, whose time constant is called correlation time. Both are fitted to
+errors of the attitude by least squares (`identify/fit.py`).
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import fminbound
 from scipy.signal import lfilter
 
 from eval.judging.statistics import Interval
-from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.sensors.errors import DIFFER_P, Errors, equations_of, significant
+from suite.diagnose.identify.fit import Rows, Unknown, fit
+from suite.diagnose.sensors.errors import Errors, rows_of, significant, size_of
 from tracks.geometry.rotation import to_local
 
 TILT = slice(6, 9)
 """Channels of the attitude among the errors. All three axes are fitted: if a body leans, a tilt
 about a horizontal world axis has a part about the body's z axis."""
-LASTS_S = (0.05, 10.0)
-"""Smallest and largest correlation time that is tried [s]."""
-CHANGE = 0.01
-"""Relative change of the correlation time in the finite difference along it."""
+DRAG = Unknown("drag", 0.3, -2.0, 5.0, np.inf, 1e-2)
+LOG_LASTS = Unknown("log_lasts", 0.0, np.log(0.05), np.log(10.0), np.inf, 1e-2)
+"""The fitted parameters: the drag [1/s], and the logarithm of the correlation time in seconds. The
+drag does not start at 0, where the correlation time has no effect."""
+LOG_LIMITS = (-20.0, 20.0)
+"""Limits of the logarithm of the correlation time's interval."""
 
 
 class Tilt(NamedTuple):
@@ -64,35 +65,14 @@ def fit_tilt(flights: Sequence[Errors]) -> Tilt:
     if not any(np.isfinite(flight.value[:, TILT]).any() for flight in flights):
         return NO_TILT
 
-    def columns(log_s: float, drag: float = 0.0) -> list[np.ndarray]:
-        """Return for each flight the remaining errors and two slopes, (T, 3, 3).
+    def residuals(value: np.ndarray) -> list[Rows]:
+        """Return the errors that remain with a drag and the logarithm of a correlation time."""
+        drag, lasts_s = float(value[0]), float(np.exp(value[1]))
+        return [rows_of(one, one.value[:, TILT] - drag * lean(one, lasts_s)) for one in flights]
 
-        The slopes are along the drag and along the logarithm `log_s` of the correlation time.
-        """
-        result = []
-        for flight in flights:
-            tilt, later_tilt = (lean(flight, np.exp(log_s + change)) for change in (0.0, CHANGE))
-            slope = drag * (later_tilt - tilt) / CHANGE
-            residual = flight.value[:, TILT] - drag * tilt
-            result.append(np.stack([residual, tilt, slope], axis=-1))
-        return result
-
-    def drag_at(log_s: float) -> tuple[float, float]:
-        """Return the best drag at a correlation time, and by how much it lowers the squares."""
-        hessian, gradient = equations_of(flights, columns(log_s)).sums()
-        best_drag = float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
-        return best_drag, best_drag * float(gradient[0])
-
-    # Search the correlation time, then fit both parameters once more for the intervals.
-    log_s = float(np.squeeze(fminbound(lambda at: -drag_at(at)[1], *np.log(LASTS_S))))
-    drag = max(drag_at(log_s)[0], 0.0)
-    if not drag:
+    noise = size_of([one.value[:, TILT] for one in flights])
+    fitted = fit(residuals, [DRAG, LOG_LASTS], noise=noise)
+    drag, log_lasts = fitted.interval("drag"), fitted.interval("log_lasts")
+    if drag.value <= 0.0 or not significant(drag):
         return NO_TILT
-    equations = equations_of(flights, columns(log_s, drag))
-    half = intervals95(equations, DIFFER_P, leave_out=True).half_width
-    result = Interval(drag, drag - float(half[0]), drag + float(half[0]))
-    if not significant(result):
-        return NO_TILT
-    # The interval of a logarithm becomes a factor.
-    lasts_s, factor = float(np.exp(log_s)), float(np.exp(min(half[1], 20.0)))
-    return Tilt(result, Interval(lasts_s, lasts_s / factor, lasts_s * factor))
+    return Tilt(drag, Interval(*np.exp(np.clip(log_lasts, *LOG_LIMITS)).tolist()))

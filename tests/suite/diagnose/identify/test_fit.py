@@ -94,3 +94,16 @@ def test_intervals_of_few_blocks_are_as_much_wider_as_students_t():
 def test_a_fit_without_rows_is_refused():
     with pytest.raises(NoWholeWindow):
         fit(flights([2.0], count=0), [SLOPE])
+
+
+def test_missing_values_are_left_out():
+    residuals = flights([2.0] * 4)
+
+    def with_holes(value):
+        rows = residuals(value)
+        for one in rows:
+            one.value[::3] = np.nan
+        return rows
+
+    found = fit(with_holes, [SLOPE])
+    assert abs(found.value[0] - 2.0) < found.half_width[0] < 0.03
