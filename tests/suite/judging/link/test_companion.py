@@ -238,6 +238,14 @@ def test_half_of_the_messages_cut_off_is_flown_on_and_all_of_them_is_silence(ben
     assert one.companion.over == "no state for 0.1 s"
 
 
+def test_another_system_and_an_old_state_are_not_listened_to(bench):
+    one = bench().fly()
+    far = one.state(pos_w=np.array([0.0, 900.0, 1.0]))
+    assert one.companion.receive([Wire(9, 2).encode(far)]) == []
+    assert one.companion.flying and "foreign" in one.companion.events[-1]
+    assert one.tell(one.state(time_s=one.now - 0.04)) == [] and one.companion.flying
+
+
 def test_depth_images_of_another_size_are_said_once(bench):
     one = bench()
     one.image = np.full((48, 64), 5.0)
