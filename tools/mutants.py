@@ -29,7 +29,7 @@ from typing import NamedTuple
 from plant_faults import LONGEST_S, ROOT, copy_tree, run_tests
 
 IMPORTERS = (
-    "importers/test_frames importers/test_mapping importers/formats importers/test_importers"
+    "importers/test_frames importers/test_mapping importers/test_foreign importers/test_importers"
 )
 """Tests of the importers, as in `AREAS`."""
 AREAS = (
@@ -43,7 +43,7 @@ AREAS = (
     ("suite/delta/windows.py", "suite/delta/test_windows"),
     ("suite/delta/fit.py", "suite/delta/test_fit"),
     ("eval/effects/*.py", "effects/test_equations effects/test_effects quadrotor/test_rotors "
-     "effects/test_slung_load quadrotor/test_stepper"),
+     "quadrotor/test_stepper"),
     ("eval/importers/frames.py", IMPORTERS),
     ("eval/importers/mapping*.py", IMPORTERS),
     ("eval/importers/formats/*.py", f"{IMPORTERS} importers/test_damaged"),

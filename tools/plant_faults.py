@@ -91,7 +91,7 @@ FAULTS = (
           "xp.where(known, hy * gx - hx * gy, 0.0)", "test_attitude"),
     # eval: units of importers
     Fault("eval/importers", '0.01, "V": 1.0, "mV": 1e-3}', '0.01, "V": 1.0, "mV": 1e-2}',
-          "formats/test_foreign importers/test_frames"),
+          "importers/test_foreign importers/test_frames"),
     Fault("eval/importers", '"Hz": float(2.0 * np.pi)', '"Hz": float(np.pi)',
           "importers/test_mapping importers/test_frames"),
     Fault("eval/importers", '"mrad/s": 1e-3', '"mrad/s": 1e-2',

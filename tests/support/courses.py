@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from eval.judging.judge import JudgeOptions, fly
+from eval.worlds.trial import TrialSpec
 from tracks.geometry.scene import Boxes, Gates, Scene, Spheres, no_rods
 from tracks.track import Track
 
@@ -28,3 +30,14 @@ def straight(distances=(2.0, 4.0), wall_at=None, height=1.5, name="straight"):
     scene = Scene(gates, boxes, no_rods(), no_rods(), spheres, np.zeros((0, 3, 3)))
     names = ("the wall",) * len(walls)
     return Track(name, 0, 0, 0.0, scene, np.array([0.0, 0.0, height]), 0.0, names)
+
+
+def fly_on(policy, *tracks, vehicle, world="mujoco", seeds=(0,), record=None, **options):
+    """Return the results and flights of a policy on given tracks, in order."""
+    named, flights = {track.family: track for track in tracks}, {}
+    trials = [TrialSpec(name, 0, seed) for name in named for seed in seeds]
+    results = fly(
+        policy, trials, vehicle, world, JudgeOptions(**options),
+        lambda result, flight: flights.update({result.trial: flight}), record, named,
+    )  # fmt: skip
+    return results, [flights[trial] for trial in trials]

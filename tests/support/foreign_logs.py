@@ -72,7 +72,7 @@ def write_ulog(
     log = UlogWriter()
     log.nested("esc_report", [("int32_t", "esc_rpm"), ("uint8_t", "actuator_function")])
     # Hubs (x forward, y right) in PX4's usual order.
-    for k, (x, y) in enumerate([(0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1)]):
+    for k, (x, y) in enumerate([(0.03, 0.04), (-0.03, -0.04), (0.03, -0.04), (-0.03, 0.04)]):
         log.parameter(f"CA_ROTOR{k}_PX", x)
         log.parameter(f"CA_ROTOR{k}_PY", y)
     log.parameter("THR_MDL_FAC", 1.0)
@@ -252,8 +252,8 @@ def pack_quaternion(wxyz):
 
 
 def write_mcap(
-    path, span=(0.0, 6.0), imu=200.0, odometry=100.0, command=50.0, full_thrust=30.0, motion=True,
-    source=fly, mask=0,
+    path, span=(0.0, 6.0), imu=200.0, odometry=100.0, command=50.0, full_thrust=30.0, source=fly,
+    mask=0,
 ):  # fmt: skip
     """ROS 2: odometry (twist in the body), imu, mavros' attitude target and motors, in MCAP."""
     from mcap_ros2.writer import Writer
@@ -310,9 +310,8 @@ def write_mcap(
         def turning(truth, k):
             return {"velocity": [float(speed) for speed in truth.motor[k]]}
 
-        if motion:
-            topics = ["/odom", "/odom_slow"]
-            send(topics, "nav_msgs/msg/Odometry", ODOMETRY, odometry, moving)
+        topics = ["/odom", "/odom_slow"]
+        send(topics, "nav_msgs/msg/Odometry", ODOMETRY, odometry, moving)
         send(["/imu"], "sensor_msgs/msg/Imu", IMU, imu, measured)
         send(["/target"], "mavros_msgs/msg/AttitudeTarget", TARGET, command, wanted)
         send(["/motors"], "actuator_msgs/msg/Actuators", ACTUATORS, command, turning)

@@ -1,7 +1,7 @@
-"""What all effects have in common: neutral values, numpy and JAX alike, faults of logs undone."""
+"""What all effects have in common, faults of logs undone, and the physics of a load on a line."""
 
 from dataclasses import replace
-from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -9,65 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.effects import EFFECTS, all_values
+from eval.effects import EFFECTS, all_values, slung_load
 from eval.effects.body import MASS_OFFSET as MASS
-from eval.effects.interface import Effect, Parameter, Sample, along_z, as_arrays
-from eval.effects.log_faults import apply_log_faults, pose_delay, time_shifted, to_logged, to_true
-from eval.effects.slung_load import SlungLoad
+from eval.effects.interface import GRAVITY, Effect, Parameter, Sample, along_z, as_arrays
+from eval.effects.log_faults import pose_delay, time_shifted, to_logged, to_true
+from eval.effects.slung_load import LoadState, SlungLoad
 from eval.quadrotor.plant import Command, Motion, Wrench, make_plant
-from eval.quadrotor.stepper import Inputs, hover_state, plant_step
+from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from tests.support.faults import ImuFault, with_imu_fault
-from tests.support.flights import small_log
-from tests.support.vehicles import PLAIN, drawn_effects
-from tracks.geometry.rotation import exp_rot, quat_to_rot
+from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
+from tracks.geometry.rotation import exp_rot
 
 # All four rotors at 1000 rad/s push 1.6 N each; their torques about z cancel.
 SPEED = np.full(4, 1000.0)
-
 MOVING = Motion(np.zeros(3), np.eye(3), np.array([3.0, -2.0, 1.0]), np.array([1.0, 2.0, -0.5]))
-
-
-def test_neutral_values_change_nothing():
-    vehicle = replace(PLAIN, rotors=replace(PLAIN.rotors, time_constant=0.02))
-    plain, full = make_plant(vehicle, 0.002), make_plant(vehicle, 0.002, all_values(vehicle), 0.02)
-    states = [hover_state(plant, ()) for plant in (plain, full)]
-    for k in range(10):
-        command = Command(np.array(9.0 + k), np.array([1.0, 0.1 * k, -1.0]))
-        acting = []
-        for i, plant in enumerate((plain, full)):
-            states[i], one = plant_step(plant, states[i], MOVING, Inputs(command), 3.0)
-            acting.append(np.concatenate(one))
-        np.testing.assert_allclose(acting[1], acting[0], rtol=1e-12, atol=1e-15)
-
-
-def test_numpy_and_jax_agree_on_the_whole_catalogue():
-    rng = np.random.default_rng(5)
-    vehicle = drawn_effects(rng, replace(PLAIN, rotors=replace(PLAIN.rotors, time_constant=0.03)))
-    n = 7
-    rot = np.linalg.qr(rng.standard_normal((n, 3, 3)))[0]
-    rot *= np.sign(np.linalg.det(rot))[:, None, None]
-    motion = Motion(
-        rng.uniform(0.05, 2.0, (n, 3)), rot, 5 * rng.standard_normal((n, 3)),
-        2 * rng.standard_normal((n, 3)),
-    )  # fmt: skip
-    plant = make_plant(vehicle, 0.002)
-    commands = rng.uniform(0.0, 25.0, (12, n)), 4 * rng.standard_normal((12, n, 3))
-    noise = rng.standard_normal((12, n, 3))
-
-    def fly(xp):
-        now = Motion(*(xp.asarray(field) for field in motion))
-        state, acting = hover_state(plant, (n,), xp, xp.asarray(noise[0])), Wrench(now, now)
-        for k in range(12):
-            command = Command(xp.asarray(commands[0][k]), xp.asarray(commands[1][k]))
-            inputs = Inputs(command, noise=xp.asarray(noise[k]))
-            state, acting = plant_step(plant, state, now, inputs, 0.5 + 0.002 * k)
-        return acting, state
-
-    with jax.enable_x64(True):
-        ours, theirs = fly(np), jax.jit(lambda: fly(jnp))()
-        assert isinstance(ours[0].force_b, np.ndarray)
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
 
 
 def test_parameters_with_a_batch_axis_are_one_vehicle_each():
@@ -116,10 +71,8 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
     monkeypatch.setitem(EFFECTS._entries, WHEEL.name, WHEEL)
     monkeypatch.setitem(EFFECTS._values, WHEEL.name, WHEEL)
     plant = make_plant(PLAIN, 0.002, {"flywheel": Flywheel(0.5), "slung_load": SlungLoad(0.1, 0.5)})
-    state, motion = (
-        hover_state(plant, (2,), xp),
-        Motion(*(xp.stack([xp.asarray(f)] * 2) for f in MOVING)),
-    )
+    state = hover_state(plant, (2,), xp)
+    motion = Motion(*(xp.stack([xp.asarray(f)] * 2) for f in MOVING))
     inputs = Inputs(rotor_speed=xp.full((2, 4), 1000.0))
     step = plant_step if xp is np else jax.jit(plant_step)
     for _ in range(3):
@@ -133,31 +86,7 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
         plant_step(plant, state._replace(carried={}), motion, inputs, 0.0)
 
 
-@pytest.mark.parametrize("values", [NamedTuple("Other", [("shove", Any)]), tuple])
-def test_values_have_a_field_for_each_parameter(values):
-    with pytest.raises(ValueError, match=r"parameters the names \['push'\]; both must be the same"):
-        EFFECTS.register("flywheel", replace(WHEEL, values=values))
-
-
-def test_usual_directions_are_unit_vectors():
-    for effect in EFFECTS.values():
-        for parameter in effect.parameters:
-            assert np.linalg.norm(parameter.direction or (1.0,)) == pytest.approx(1.0)
-
-
-def test_a_memory_needs_both_of_its_hooks():
-    half = replace(WHEEL, carry=None)
-    with pytest.raises(ValueError, match="only one of `start` and `carry`"):
-        EFFECTS.register("flywheel", half)
-
-
 FAULT = ImuFault((0.0, 0.0, 0.2), 1.1, 0.01)
-
-
-def a_sample(rng, n=5):
-    rot_w = exp_rot(rng.standard_normal((n, 3)))
-    pos_w, vel_w, rate_b, acc_b = rng.standard_normal((4, n, 3))
-    return Sample(pos_w, rot_w, vel_w, rate_b, acc_b)
 
 
 def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():
@@ -166,51 +95,208 @@ def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():
         np.testing.assert_allclose(time_shifted(time_s, series, np.asarray(offset))[:, 0], wanted)
 
 
-def test_the_catalogue_undoes_its_own_faults_on_a_sample():
+def test_faults_of_a_log_are_undone_on_a_sample(monkeypatch):
     rng = np.random.default_rng(2)
     drawn = {n: as_arrays(v) for n, v in drawn_effects(rng, PLAIN).effects.items()}
-    sample = a_sample(rng)
+    pos_w, vel_w, rate_b, acc_b = rng.standard_normal((4, 5, 3))
+    sample = Sample(pos_w, exp_rot(rng.standard_normal((5, 3))), vel_w, rate_b, acc_b)
     seen = to_logged(drawn, sample)
     np.testing.assert_array_equal(seen.rate_b, sample.rate_b + drawn["gyro_bias"].bias)
     np.testing.assert_array_equal(seen.acc_b, sample.acc_b + drawn["accelerometer_bias"].bias)
     assert pose_delay(drawn) == drawn["clock_offset"].offset
     for one, other in zip(to_true(drawn, seen), sample, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    assert pose_delay({}) == 0.0 and to_logged({}, sample) is sample
-
-
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_a_fault_of_another_package_acts_on_a_log(monkeypatch, xp):
-    """It turns the frame, scales a channel and reads poses late, from one hook each."""
+    # A turn of the frame is undone to first order.
     with_imu_fault(monkeypatch)
-    log = {name: xp.asarray(values) for name, values in small_log().items()}
-    faulted = partial(apply_log_faults, {"imu_fault": FAULT})
-    faulty = (faulted if xp is np else jax.jit(faulted))(log)
-    np.testing.assert_allclose(faulty["rate_b"], 1.1 * log["rate_b"], rtol=1e-6)  # about z alone
-    np.testing.assert_allclose(faulty["pos_w"][:, 0], 3.0 * (log["time_s"] - 0.01), atol=1e-6)
-    heading = np.asarray(small_log()["time_s"]) - 0.01 + 0.2
-    rot_w = np.asarray(quat_to_rot(faulty["quat_wxyz"]))
-    np.testing.assert_allclose(np.arctan2(rot_w[:, 1, 0], rot_w[:, 0, 0]), heading, atol=1e-5)
-    np.testing.assert_array_equal(faulty["thrust_cmd"], log["thrust_cmd"])
-
-
-def test_a_small_fault_of_another_package_is_undone(monkeypatch):
-    with_imu_fault(monkeypatch)
-    sample = a_sample(np.random.default_rng(3))
     fault = {"imu_fault": as_arrays(ImuFault((1e-4, -2e-4, 3e-4), 1.0002, 0.0))}
     seen = to_logged(fault, sample)
     assert np.abs(seen.rate_b - sample.rate_b).max() > 1e-4
     for one, other in zip(to_true(fault, seen), sample, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
+    assert pose_delay({}) == 0.0 and to_logged({}, sample) is sample
 
 
-def test_what_is_added_must_be_an_effect_of_its_name():
-    with pytest.raises(ValueError, match="'heavier'.*'mass_offset'.*the same"):
-        EFFECTS.register("heavier", MASS)
-    with pytest.raises(ValueError, match="must be an eval.effects.interface.Effect"):
-        EFFECTS.register("heavier", cast(Effect, "heavier"))
-    by_vehicle = Parameter("x", "1", lambda vehicle: vehicle.mass, 0.0, 1.0, (0.1, 0.2))
-    fault = Effect("odd", "", "", "", tuple, (by_vehicle,), late=lambda values: values.x)
-    with pytest.raises(ValueError, match="must be numbers"):
-        EFFECTS.register("odd", fault)
-    assert "odd" not in EFFECTS
+BY_VEHICLE = Parameter("x", "1", lambda vehicle: vehicle.mass, 0.0, 1.0, (0.1, 0.2))
+LATE = Effect("odd", "", "", "", tuple, (BY_VEHICLE,), late=lambda values: values.x)
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "reason"),
+    [
+        ("flywheel", replace(WHEEL, carry=None), "only one of `start` and `carry`"),
+        ("flywheel", replace(WHEEL, values=tuple), r"names \['push'\]; both must be the same"),
+        ("heavier", MASS, "'heavier'.*'mass_offset'.*the same"),
+        ("heavier", cast(Effect, "heavier"), "must be an eval.effects.interface.Effect"),
+        ("odd", LATE, "must be numbers"),
+    ],
+)
+def test_what_is_no_effect_of_its_name_is_refused(name, effect, reason):
+    with pytest.raises(ValueError, match=reason):
+        EFFECTS.register(name, effect)
+    assert name not in EFFECTS
+
+
+LOAD, LENGTH = 0.05, 0.5
+LOADED = with_effects(slung_load=(LOAD, LENGTH))
+TOTAL = PLAIN.mass + LOAD
+
+# What carries both in hover, as the controller counts it: per mass of the vehicle alone.
+HOLDING = Inputs(Command(np.asarray(GRAVITY * TOTAL / PLAIN.mass), np.zeros(3)))
+FALLING = Inputs(rotor_speed=np.zeros(4))
+
+
+def hanging(plant, line_w=None, vel_w=(0.0, 0.0, 0.0)):
+    """Return the plant's state in hover, its load at `line_w` from the vehicle if that is given."""
+    state = hover_state(plant, ())
+    swing = state.carried["slung_load"]
+    line_w = swing.line_w if line_w is None else np.asarray(line_w)
+    return state._replace(carried={"slung_load": LoadState(line_w, np.asarray(vel_w))})
+
+
+def flown(plant, state, motion, inputs, duration_s):
+    """Yield state, motion and wrench after each step."""
+    for k in range(round(duration_s / float(plant.dt))):
+        now = inputs if isinstance(inputs, Inputs) else inputs(k * plant.dt)
+        state, motion, wrench = step(plant, state, motion, now, k * plant.dt)
+        yield state.carried["slung_load"], motion, wrench, state
+
+
+def lively(time_s):
+    """Return a command with hard turns; what it asks of the rotors is within their limits."""
+    rate_b = 3.0 * np.sin(np.array([5.0, 4.0, 3.0]) * time_s)
+    return Inputs(Command(np.asarray(12.0 + 4.0 * np.sin(7.0 * time_s)), rate_b))
+
+
+def test_a_step_of_the_line_is_backward_euler_of_a_damped_spring():
+    """The tension is that of the stretch and its speed at the end of the step, however long."""
+    at_m, speed, dt = 0.01, 0.3, 0.02
+    line = LoadState(np.array([0.0, 0.0, -LENGTH - at_m]), np.array([0.0, 0.0, -speed]))
+    flow: Any = SimpleNamespace(memory=line, dt=dt)
+    values = SlungLoad(np.asarray(LOAD), np.asarray(LENGTH))
+    parting = float(slung_load._tension(values, flow)[1][0])
+    after = speed - dt * parting
+    spring = slung_load.STIFFNESS**2 * (at_m + dt * after)
+    damper = 2.0 * slung_load.DAMPING * slung_load.STIFFNESS * after
+    assert parting == pytest.approx(spring + damper) and parting > 1.0
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.004, 0.02])
+def test_a_hanging_load_pulls_by_its_weight_and_both_hover(dt):
+    plant = make_plant(LOADED, dt)
+    for swing, motion, wrench, _ in flown(plant, hanging(plant), at_rest(), HOLDING, 0.6):
+        # The rotors hold both, and the line takes the load's weight of 0.4905 N off them again.
+        np.testing.assert_allclose(wrench.force_b, [0, 0, 0.75 * 9.81], atol=1e-9)
+        np.testing.assert_allclose(motion.pos_w, [0, 0, 1], atol=1e-9)
+        assert 0.0 < -swing.line_w[2] - LENGTH < (0.002 if dt < 0.005 else 0.01)
+
+
+def test_the_start_is_where_a_swing_comes_to_rest():
+    plant = make_plant(LOADED, 0.002)
+    start = hover_state(plant, (2,)).carried["slung_load"]
+    *_, (swing, *_) = flown(plant, hanging(plant, [0, 0, -0.49]), at_rest(), HOLDING, 1.0)
+    np.testing.assert_allclose(swing.line_w, start.line_w[0], atol=1e-6)
+    # Along gravity, where that leans.
+    leaning = with_effects(slung_load=(LOAD, LENGTH), frame_tilt=((0.0, 0.1),))
+    line_w = hover_state(make_plant(leaning, 0.002), ()).carried["slung_load"].line_w
+    assert line_w[0] / line_w[2] == pytest.approx(np.tan(0.1))
+
+
+def test_small_swings_have_the_period_of_both_masses():
+    """Level under (M + m) g the vehicle is free to give way: 2 pi sqrt(L / (g (1 + m / M)))."""
+    plant = make_plant(LOADED, 0.002)
+    hangs = hanging(plant).carried["slung_load"].line_w
+    state = hanging(plant, hangs + [0.01, 0.0, 0.0])
+    swings = flown(plant, state, at_rest(), HOLDING, 3.2)
+    offset = np.array([swing.line_w[0] for swing, *_ in swings])
+    down = np.flatnonzero((offset[:-1] > 0.0) & (offset[1:] <= 0.0))
+    crossed = down + offset[down] / (offset[down] - offset[down + 1])
+    period = 2 * np.pi * np.sqrt(-hangs[2] / (GRAVITY * (1 + LOAD / PLAIN.mass)))
+    np.testing.assert_allclose(np.diff(crossed) * 0.002, period, rtol=1e-3)
+
+
+def test_momentum_changes_by_gravity_and_rotors_alone():
+    vehicle = with_lag(LOADED, 0.03)
+    loaded, bare = make_plant(vehicle, 0.002), make_plant(with_lag(PLAIN, 0.03), 0.002)
+    state, motion = hanging(loaded, [0.3, 0.1, -0.4], [0.5, -1.0, 0.0]), at_rest()
+
+    def momentum(state, motion):
+        return TOTAL * motion.vel_w + LOAD * state.carried["slung_load"].vel_w
+
+    for k in range(250):
+        before, inputs = momentum(state, motion), lively(0.002 * k)
+        _, rotors = plant_step(bare, state._replace(carried={}), motion, inputs, 0.002 * k)
+        force_w = motion.rot_w @ rotors.force_b + [0.0, 0.0, -9.81 * TOTAL]
+        state, motion, _ = step(loaded, state, motion, inputs, 0.002 * k)
+        np.testing.assert_allclose(momentum(state, motion) - before, 0.002 * force_w, atol=1e-12)
+
+
+def test_a_wide_swing_keeps_its_energy_but_for_what_the_line_takes():
+    plant = make_plant(LOADED, 0.002)
+    angle = 1.0
+    start = (LENGTH + 0.001) * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    heights = []
+    for swing, *_ in flown(plant, hanging(plant, start), at_rest(), HOLDING, 4.0):
+        # Seen from the vehicle, whose weight the rotors' push makes up for, the load falls by it.
+        push = GRAVITY * TOTAL / PLAIN.mass
+        heights.append((0.5 * swing.vel_w @ swing.vel_w + push * swing.line_w[2]) / push)
+    heights = np.array(heights) - heights[0]
+    assert heights.max() < 0.001, "m, of 0.23 m"
+    assert -0.006 < heights[-1] < 0.0
+
+
+def test_a_slack_line_pulls_nothing():
+    plant = make_plant(LOADED, 0.002)
+    state = hanging(plant, [0.0, 0.0, -0.4])._replace(rotor_speed=np.zeros(4))
+    rows = list(flown(plant, state, at_rest(), FALLING, 0.5))
+    for swing, _, wrench, _ in rows:
+        assert not wrench.force_b.any(), "both fall freely"
+        np.testing.assert_allclose(swing.line_w, [0.0, 0.0, -0.4], atol=1e-12)
+    np.testing.assert_allclose(rows[-1][1].vel_w[2], -9.81 * 0.5)
+    # A load that is thrown up hangs loose until it has fallen back and 0.1 m below: 0.143 s.
+    hover = Inputs(Command(np.asarray(GRAVITY), np.zeros(3)))
+    rows = flown(plant, hanging(plant, [0, 0, -0.4]), at_rest(), hover, 0.2)
+    pulls = [wrench.force_b[2] - 0.75 * 9.81 for _, _, wrench, _ in rows]
+    first = np.flatnonzero(np.abs(pulls) > 1e-9)[0] * 0.002
+    assert first == pytest.approx(np.sqrt(2 * 0.1 / 9.81), abs=0.004)
+    assert min(pulls) < -0.5 and max(pulls) < 1e-9, "it pulls down and never pushes up"
+
+
+def test_gradients_are_finite_wherever_the_load_is():
+    steps = 20
+    inputs = Inputs(Command(jnp.full(steps, 12.0), jnp.full((steps, 3), 0.5)))
+    start = Motion(*map(jnp.asarray, at_rest()))
+
+    def end(values, line_w, vel_w):
+        plant = make_plant(PLAIN, 0.004, {"slung_load": values})
+        carried = {"slung_load": LoadState(line_w, vel_w)}
+        state = hover_state(plant, (), jnp)._replace(carried=carried)
+        return rollout(plant, start, inputs, state).motion.pos_w.sum()
+
+    slopes, vel_w = jax.jit(jax.grad(end, (0, 1, 2))), jnp.asarray([0.3, 0.2, -0.4])
+    for mass in (0.0, LOAD):
+        for line_w in ((0.0, 0.0, 0.0), (0.0, 0.0, -0.5), (0.1, 0.0, -0.2)):
+            values = SlungLoad(jnp.asarray(mass), jnp.asarray(LENGTH))
+            leaves = jax.tree.leaves(slopes(values, jnp.asarray(line_w), vel_w))
+            assert all(np.isfinite(leaf).all() for leaf in leaves), (mass, line_w)
+            if mass and line_w[2] < -0.4:
+                assert all(np.abs(leaf).max() > 1e-6 for leaf in leaves)
+
+
+def held(time_s):
+    """Return `lively` commands that hold for 20 ms, the same for steps of any length."""
+    return lively(0.02 * np.floor(time_s / 0.02 + 1e-6))
+
+
+def test_steps_converge_and_none_is_too_long():
+    def end(dt):
+        plant = make_plant(with_lag(LOADED, 0.03), dt)
+        state = hanging(plant, [0.2, 0.1, -0.45])
+        *_, (swing, motion, *_) = flown(plant, state, at_rest(), held, 0.6)
+        return np.concatenate([motion.pos_w, motion.pos_w + swing.line_w])
+
+    exact = end(0.00025)
+    errors = {dt: np.abs(end(dt) - exact).max() for dt in (0.001, 0.002, 0.004, 0.02)}
+    assert errors[0.001] < errors[0.002] < errors[0.004] < 0.05
+    # Of order 1, against a step of a quarter of the finest.
+    assert errors[0.001] < 0.35 * errors[0.004]
+    assert errors[0.02] < 0.5, errors

@@ -135,8 +135,7 @@ def test_gusts_have_their_intensity_colour_and_mean():
     state = hover_state(plant, (n,), noise=rng.standard_normal((n, 3)))
     winds = []
     for _ in range(steps):
-        noise = rng.standard_normal((n, 3))
-        inputs = Inputs(rotor_speed=np.tile(SPEED, (n, 1)), noise=noise)
+        inputs = Inputs(rotor_speed=np.tile(SPEED, (n, 1)), noise=rng.standard_normal((n, 3)))
         state, _ = plant_step(plant, state, motion, inputs, 0.0)
         winds.append(state.wind["gusts"])
     winds = np.array(winds)
@@ -161,29 +160,23 @@ def test_motor_lag_replaces_the_time_constant():
     near(state.rotor_speed, 1000.0 + 1000.0 * (1.0 - np.exp(-1.0)))
 
 
-@pytest.mark.parametrize(("delay", "acts_at"), [(0.0, 0), (0.004, 2), (0.03, 15)])
-def test_command_delay(delay, acts_at):
+@pytest.mark.parametrize(
+    ("delay", "thrusts", "acting"),
+    [
+        (0.0, [15.0] * 3, [15.0] * 3),
+        (0.03, [15.0] * 18, [9.81] * 15 + [15.0] * 3),
+        # Between two steps: the mean over the step.
+        (0.005, [10.0, 20.0, 12.0, 12.0, 12.0], [9.81, 9.81, (9.81 + 10.0) / 2, 15.0, 16.0]),
+    ],
+)
+def test_command_delay(delay, thrusts, acting):
     plant = make_plant(with_effects(command_delay=(delay,)), 0.002)
-    state = hover_state(plant, ())
-    pushes = []
-    for _ in range(20):
-        command = Command(np.array(15.0), np.zeros(3))
-        state, acting = plant_step(plant, state, at_rest(), Inputs(command), 0.0)
-        pushes.append(acting.force_b[2])
-    expected = np.where(np.arange(20) < acts_at, 9.81 * 0.75, 15.0 * 0.75)
-    near(pushes, expected)
-
-
-def test_command_delay_between_steps_gives_the_mean_of_the_step():
-    plant = make_plant(with_effects(command_delay=(0.005,)), 0.002)
-    state = hover_state(plant, ())
-    thrusts = [10.0, 20.0, 12.0, 12.0, 12.0]
-    pushes = []
+    state, pushes = hover_state(plant, ()), []
     for thrust in thrusts:
-        command = Command(np.array(thrust), np.zeros(3))
-        state, acting = plant_step(plant, state, at_rest(), Inputs(command), 0.0)
-        pushes.append(acting.force_b[2] / 0.75)
-    near(pushes, [9.81, 9.81, (9.81 + 10.0) / 2, 15.0, 16.0])
+        inputs = Inputs(Command(np.array(thrust), np.zeros(3)))
+        state, wrench = plant_step(plant, state, at_rest(), inputs, 0.0)
+        pushes.append(wrench.force_b[2] / 0.75)
+    near(pushes, acting)
 
 
 def test_thrust_scale_leaves_yaw_torque():
@@ -297,9 +290,8 @@ def test_clock_offset_logs_an_older_pose(xp):
     np.testing.assert_allclose(faulty["vel_w"][4, 0], 3.05, rtol=1e-6)
     quat = np.asarray(faulty["quat_wxyz"])
     np.testing.assert_allclose(np.linalg.norm(quat, axis=-1), 1.0, rtol=1e-6)
-    np.testing.assert_allclose(
-        quat[:, 3] / quat[:, 0], np.tan(0.5 * (small_log()["time_s"] - 0.015)), atol=1e-5
-    )
+    turned = np.tan(0.5 * (small_log()["time_s"] - 0.015))
+    np.testing.assert_allclose(quat[:, 3] / quat[:, 0], turned, atol=1e-5)
     for name in ("rate_b", "acc_b", "thrust_cmd", "time_s"):
         assert faulty[name] is log[name]
 

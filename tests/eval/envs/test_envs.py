@@ -1,7 +1,11 @@
-"""The environments by their libraries' own checkers, and against the judge."""
+"""The environments by the conventions and checkers of libraries, and against the judge."""
 
+import copy
+import importlib.util
 import os
+import pickle
 import warnings
+from dataclasses import replace
 
 os.environ.setdefault("MUJOCO_GL", "disable")
 
@@ -11,20 +15,25 @@ import pytest
 from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
+from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.race import ACTION_LIMIT
+from eval.envs.races import REWARDS
 from eval.judging.judge import JudgeOptions, fly
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.vehicles.vehicle import with_effects
+from eval.view import colours
 from eval.worlds.trial import Rules, TrialSpec
+from policies.contract import read_contract
 from policies.spec import PolicySpec
 from tests.support.pilots import Pursuit
-from tracks.families import make_track
+from tests.support.pixels import share
+from tracks.geometry.camera import Camera
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of the renderers that dm_control looks for
     from eval.envs.dm_control_env import load
-
-from eval.envs.gymnasium_env import ID, RaceEnv
 
 EVEN = PolicySpec(rate_hz=50.0)  # a whole number of physics steps, so that the judge flies alike
 
@@ -68,13 +77,6 @@ def pursue(policy, observation):
     return action[0]
 
 
-def judged(policy, trial, rules):
-    (result,) = fly(
-        policy, [trial], load_vehicle("reference"), options=JudgeOptions(slots=1, rules=rules)
-    )
-    return result
-
-
 @pytest.mark.parametrize(
     ("trial", "spec"),
     [
@@ -85,8 +87,8 @@ def judged(policy, trial, rules):
 )
 def test_environments_fly_what_the_judge_flies(trial, spec):
     rules, policy = Rules(time_limit_s=1.6), Pursuit(spec=spec)
-    expected = judged(policy, trial, rules)
-
+    options = JudgeOptions(slots=1, rules=rules)
+    (expected,) = fly(policy, [trial], load_vehicle("reference"), options=options)
     env = RaceEnv(
         track=trial.track, level=trial.difficulty, track_seed=trial.seed, spec=spec, rules=rules,
         vehicle="reference",
@@ -94,13 +96,12 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
     observation, _ = env.reset()
     over, terminated, info, total = False, False, {}, 0.0
     while not over:
-        observation, reward, terminated, truncated, info = env.step(
-            pursue(policy, observation) / ACTION_LIMIT
-        )
+        action = pursue(policy, observation) / ACTION_LIMIT
+        observation, reward, terminated, truncated, info = env.step(action)
         over, total = terminated or truncated, total + reward
     assert (info["gates"], info["ended_by"]) == (expected.gates_passed, expected.ended_by)
     assert terminated == (expected.ended_by != "timeout")
-    end = np.array([expected.pos_x, expected.pos_y, expected.pos_z])
+    end = np.array(expected[10:13])
     # The action was divided and multiplied on its way.
     assert env._races._world.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
 
@@ -167,7 +168,167 @@ def test_the_second_gate_and_the_direction_are_shown_where_asked_for():
     assert env.observation_space.contains(seen) and state.shape == (21,)
     assert np.linalg.norm(state[12:15] - state[6:9]) > 3.0
     np.testing.assert_allclose(state[15:18], [1, 0, 0], atol=0.3)  # at rest before the first gate
-    track = make_track("zigzag", 0, 1)
-    assert state[18:] @ state[15:18] == pytest.approx(
-        track.scene.gates.rot_w[1, :, 0] @ track.scene.gates.rot_w[0, :, 0], abs=1e-6
-    )
+
+
+SHORT = Rules(time_limit_s=0.3)
+
+
+def test_n_at_once_give_the_bits_of_n_single_ones_through_resets():
+    settings = {"track": "circular", "level": (0, 9), "rules": SHORT, "action": "ctbr"}
+    many = RaceVectorEnv(3, **settings)
+    singles = [RaceEnv(**settings) for _ in range(3)]
+    seen, _ = many.reset(seed=5)
+    alone = [env.reset(seed=5 + k)[0] for k, env in enumerate(singles)]
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(14):
+        for k in range(3):
+            assert all(np.array_equal(seen[key][k], alone[k][key]) for key in seen)
+        actions = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+        seen, reward, terminated, truncated, info = many.step(actions)
+        for k, env in enumerate(singles):
+            alone[k], one, term, trunc, told = env.step(actions[k])
+            assert (one, term, trunc) == (reward[k], terminated[k], truncated[k])
+            if term or trunc:
+                ended += 1
+                last = info["final_obs"][k]
+                assert all(np.array_equal(last[key], alone[k][key]) for key in last)
+                assert info["final_info"]["ended_by"][k] == told["ended_by"]
+                alone[k], _ = env.reset()
+    assert ended >= 3 and many.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+def test_it_is_made_by_its_id_alone_and_many_at_once():
+    env = gymnasium.make(ID, track="zigzag", rules=SHORT)
+    assert isinstance(env.unwrapped, RaceEnv)
+    many = gymnasium.make_vec(ID, num_envs=2, rules=SHORT)
+    assert isinstance(many, RaceVectorEnv)
+    assert many.observation_space["state"].shape == (2, 12)
+
+
+def test_images_on_request_are_uint8_with_a_channel_axis():
+    env = RaceEnv(track="circular", track_seed=1, uint8=True, channel_axis=True)
+    seen, _ = env.reset(seed=0)
+    assert env.observation_space.contains(seen)
+    image = seen["image"]
+    assert (image.shape, image.dtype) == ((1, 24, 32), np.uint8) and image.max() > image.min()
+    plain, _ = RaceEnv(track="circular", track_seed=1).reset(seed=0)
+    low, high = -0.3, 9.4
+    np.testing.assert_allclose(image[0] / 255 * (high - low) + low, plain["image"], atol=0.02)
+    assert read_contract(env.contract.text, "env") == env.contract
+
+
+def test_rewards_are_terms_by_name():
+    settings = {"track": "circular", "track_seed": 1, "rules": SHORT}
+    nothing = dict.fromkeys(REWARDS, 0.0)
+    for weights, expected in ((nothing, 0.0), ({**nothing, "time": -2.0}, -2 * 17 * 0.002)):
+        env = RaceEnv(**settings, rewards=weights)
+        env.reset(seed=0)
+        assert env.step(np.zeros(3, np.float32))[1] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"rewards": {"gates": 1.0}}, "unknown reward term 'gates'. Did you mean 'gate'"),
+        ({"level": (3, 0)}, r"level is \(3, 0\), allowed is 0 to 9"),
+        ({"level": 10}, "level is 10, allowed is 0 to 9"),
+        ({"spec": "raec"}, "unknown policy .* 'raec'. Did you mean 'race'"),
+        ({"num_envs": 0}, "num_envs is 0, allowed is 1 or more"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_when_it_is_made(settings, said):
+    with pytest.raises(ValueError, match=said):
+        RaceVectorEnv(**settings)
+
+
+def test_each_episode_may_draw_its_vehicle_and_its_level():
+    drawn = []
+
+    def vehicle(rng):
+        drawn.append(rng.uniform())
+        return with_effects(load_vehicle("racer5"), {})
+
+    env = RaceVectorEnv(2, vehicle=vehicle, level=(2, 4), rules=SHORT)
+    _, info = env.reset(seed=0)
+    assert len(set(drawn)) >= 2 and set(info["level"]) <= {2, 3, 4}
+    env.step(np.zeros((2, 3), np.float32))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_environments_and_vehicles_travel(copied):
+    vehicle = load_vehicle("reference")
+    assert copied(vehicle) == vehicle
+    env = RaceEnv(track="circular", vehicle=vehicle, rules=SHORT, render_mode="rgb_array")
+    first, _ = env.reset(seed=3)
+    again = copied(env)
+    second, _ = again.reset(seed=3)
+    assert np.array_equal(first["image"], second["image"])
+    assert again.render().shape == (360, 640, 3) and again.render().max() > 0
+    assert copied(RaceVectorEnv(2, rules=SHORT)).num_envs == 2
+
+
+sb3 = pytest.mark.skipif(
+    importlib.util.find_spec("stable_baselines3") is None,
+    reason="pip install 'diffracing-suite[sb3]'",
+)
+
+
+def test_a_picture_shows_the_track_from_behind_the_drone_and_what_it_sees():
+    with pytest.raises(RuntimeError, match=r"reset\(\) before render"):
+        RaceEnv(render_mode="rgb_array").render()
+    env = RaceEnv(track="circular", track_seed=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture is not None and (picture.shape, picture.dtype) == ((360, 640, 3), np.uint8)
+    assert share(picture, colours.AHEAD, 50) > 3e-3 and share(picture, colours.DRONE, 12) > 5e-4
+    depth_m = env._races.view().depth_m[0]
+    want = colours.depth_colours(depth_m, env.spec_of_policy.camera.range_m)
+    np.testing.assert_array_equal(picture[-120:, -160:][2::5, 2::5], want)
+    env.reset(options={"track_seed": 2})
+    fresh = RaceEnv(track="circular", track_seed=2, render_mode="rgb_array")
+    fresh.reset(seed=0)
+    assert np.array_equal(env.render(), fresh.render())  # pyright: ignore[reportArgumentType]
+    assert RaceEnv().render() is None and env.metadata["render_fps"] == 30
+
+
+@sb3
+@pytest.mark.parametrize("how", ["vector", "pixels"])
+def test_the_checker_of_stable_baselines3_finds_nothing(how):
+    from stable_baselines3.common.env_checker import check_env  # pyright: ignore
+
+    from eval.envs.sb3_env import race_env
+
+    settings = {"rules": SHORT, "render_mode": "rgb_array"}
+    if how == "pixels":  # its networks for images ask for 36 pixels and more
+        spec = replace(PolicySpec(), camera=Camera(width=48, height=36))
+        settings |= {"spec": spec, "uint8": True, "channel_axis": True}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(race_env(**settings))
+
+
+@sb3
+def test_its_vector_environment_is_ours():
+    from eval.envs.sb3_env import RaceVecEnv, race_env
+
+    many = RaceVecEnv(2, track="circular", rules=SHORT)
+    singles = [race_env(track="circular", rules=SHORT) for _ in range(2)]
+    assert many.observation_space == singles[0].observation_space
+    assert many.observation_space["image"].shape == (24 * 32,)
+    many.seed(7)
+    seen = many.reset()
+    alone = [env.reset(seed=7 + k)[0] for k, env in enumerate(singles)]
+    over = np.zeros(2, bool)
+    while not over.any():
+        for k in range(2):
+            assert all(np.array_equal(seen[key][k], alone[k][key]) for key in seen)
+        actions = np.full((2, 3), 0.05, np.float32)
+        seen, reward, over, infos = many.step(actions)
+        steps = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        alone = [each[0] for each in steps]
+        assert reward.tolist() == pytest.approx([each[1] for each in steps])
+    for k in np.flatnonzero(over):
+        last = infos[k]["terminal_observation"]
+        assert all(np.array_equal(last[key], alone[k][key]) for key in last)
+        assert infos[k]["TimeLimit.truncated"] and infos[k]["ended_by"] == "timeout"
+    assert many.get_attr("contract")[0] == singles[0].unwrapped.contract

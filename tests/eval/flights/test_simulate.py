@@ -1,12 +1,12 @@
-"""Trajectories flown in MuJoCo: what is recorded, what is logged of it, and what fails."""
+"""Trajectories, the loop of a pilot, and flights in MuJoCo: what is recorded, logged and fails."""
 
 import numpy as np
 import pytest
 
-from eval.flights.follow import FlightFailed
+from eval.flights.follow import FlightFailed, Step, follow, reference_of
 from eval.flights.simulate import FULL_V, SENSORS, fly, log_of
-from eval.flights.trajectory import Trajectory
-from eval.quadrotor.plant import Wrench, accelerations, make_plant
+from eval.flights.trajectory import KINDS, Trajectory
+from eval.quadrotor.plant import Command, Motion, Wrench, accelerations, make_plant
 from eval.quadrotor.stepper import Inputs, PlantState, plant_step
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 from tests.support.ways import BARE, CIRCLE, EIGHT, bare_flights, having
@@ -64,17 +64,6 @@ def test_flights_side_by_side_are_those_flown_alone(flights):
     np.testing.assert_array_equal(alone.motion.pos_w, flights[1].motion.pos_w)
 
 
-def test_drag_is_in_the_flight_as_worked_by_hand():
-    """Decelerations: two flights under the same command differ by D v in the first moments."""
-    truth = having(linear_drag=((0.5, 0.5, 0.0),))
-    with_it, without = fly(BARE, truth, [CIRCLE])[0], fly(BARE, BARE, [CIRCLE])[0]
-    row = 500
-    drag = with_it.acc_b[row, :2]
-    vel_b = with_it.motion.rot_w[row - 1].T @ with_it.motion.vel_w[row - 1]
-    np.testing.assert_allclose(drag, -0.5 * vel_b[:2], rtol=1e-6)
-    np.testing.assert_allclose(without.acc_b[row, :2], 0.0, atol=1e-12)
-
-
 def test_noise_is_as_stated(flights):
     flight, sensors = flights[0], SENSORS["full"]
     twin = log_of(flight, BARE, sensors, None)
@@ -84,13 +73,9 @@ def test_noise_is_as_stated(flights):
         return np.std([getattr(draw, name) - getattr(twin, name) for draw in draws])
 
     for name, stated in (
-        ("pos_w", sensors.pos),
-        ("vel_w", sensors.vel),
-        ("rate_b", sensors.gyro),
-        ("acc_b", sensors.acc),
-        ("rotor_speed", sensors.rotor),
-        ("voltage", sensors.voltage),
-    ):
+        ("pos_w", sensors.pos), ("vel_w", sensors.vel), ("rate_b", sensors.gyro),
+        ("acc_b", sensors.acc), ("rotor_speed", sensors.rotor), ("voltage", sensors.voltage),
+    ):  # fmt: skip
         assert spread(name) == pytest.approx(stated, rel=0.06), name
     inner = np.abs([(draw.quat_wxyz * twin.quat_wxyz).sum(1) for draw in draws])
     angle = 2.0 * np.sqrt(np.maximum(2.0 * (1.0 - inner), 0.0))
@@ -98,13 +83,10 @@ def test_noise_is_as_stated(flights):
     np.testing.assert_array_equal(twin.thrust_cmd, draws[0].thrust_cmd)
 
 
-def test_a_log_without_velocity_does_not_carry_it(flights):
-    log = log_of(flights[0], BARE, SENSORS["capture"], np.random.default_rng(0))
+def test_a_log_says_how_its_simulator_stepped_and_holds_what_its_sensors_measure(flights):
+    log = log_of(flights[0], BARE, SENSORS["capture"], None)
     assert log.velocity_derived and log.acc_b is None and log.rotor_speed is None
-
-
-def test_a_log_says_how_its_simulator_stepped_where_the_step_shows(flights):
-    assert log_of(flights[0], BARE, SENSORS["capture"], None).integrator == "euler"
+    assert log.integrator == "euler"
     continuous = flights[0]._replace(integrator=None)
     assert set(log_of(continuous, BARE, SENSORS["capture"], None).about) == {"source"}
 
@@ -118,3 +100,90 @@ def test_faults_of_the_log_are_in_the_log():
     np.testing.assert_allclose(bias, np.tile([0.1, -0.2, 0.3], (len(bias), 1)), atol=1e-12)
     # 0.02 s are two rows of 0.01 s.
     np.testing.assert_allclose(log.pos_w[2:], flight.motion.pos_w[rows][:-2], atol=1e-9)
+
+
+DT = 0.002
+BOTH_WAYS = [Trajectory("circle", 0.4, speed=1.0), Trajectory("hover", 0.2)]
+
+
+class Points:
+    """Bodies that stay level and fall off their trajectories by `off_m` a second."""
+
+    integrator: str | None = "none"
+
+    def __init__(self, wanted, off_m=0.0):
+        self.off_m, self.steps, self.commands = off_m, 0, []
+        self.start_w = wanted.pos_w[0]
+
+    def motion(self):
+        count = len(self.start_w)
+        pos_w = self.start_w + np.array([self.off_m * self.steps * DT, 0.0, 0.0])
+        quat = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        still = np.zeros((count, 3))
+        return Motion(pos_w, np.tile(np.eye(3), (count, 1, 1)), still, still), quat
+
+    def step(self, motion, command, time_s):
+        assert time_s == pytest.approx(self.steps * DT)
+        self.steps += 1
+        self.commands.append(command)
+        count = len(self.start_w)
+        still, felt = np.zeros((count, 3)), np.full((count, 3), float(self.steps))
+        speed = np.full((count, 4), 10.0 * self.steps)
+        return Step(speed, np.full(count, 16.0), command, Wrench(still, still), felt)
+
+
+def flown(off_m=0.0):
+    wanted = reference_of(BOTH_WAYS, 5, DT)
+    bodies = Points(wanted, off_m)
+    return bodies, follow(bodies, PLAIN, BOTH_WAYS, wanted, 5, DT)
+
+
+def test_each_flight_has_its_length_and_commands_are_held_for_a_period():
+    bodies, (circle, hover) = flown()
+    assert (len(circle.time_s), len(hover.time_s)) == (200, 100)
+    assert circle.period == 5 and circle.integrator == "none"
+    assert all(bodies.commands[k] is bodies.commands[5 * (k // 5)] for k in range(200))
+    given = Command(*(np.array(part)[:100, 1] for part in zip(*bodies.commands, strict=True)))
+    np.testing.assert_array_equal(hover.command.thrust, given.thrust)
+
+
+def test_a_specific_force_stands_with_the_step_after_the_one_that_had_it():
+    _, (circle, _) = flown()
+    np.testing.assert_array_equal(circle.acc_b[0], [0.0, 0.0, 9.81])
+    np.testing.assert_array_equal(circle.acc_b[1:, 0], np.arange(1.0, 200.0))
+    np.testing.assert_array_equal(circle.rotor_speed[:, 0], 10.0 * np.arange(1.0, 201.0))
+
+
+def test_a_flight_away_from_its_trajectory_fails_with_its_number():
+    with pytest.raises(FlightFailed, match=r"flight [12] failed at 0\.\d\d s, 4\.\d m off"):
+        flown(off_m=20.0)
+
+
+def test_the_pilot_stays_on_the_trajectory():
+    for way, flight in zip((EIGHT, CIRCLE), bare_flights(), strict=True):
+        off = np.linalg.norm(way.reference(flight.time_s).pos_w - flight.motion.pos_w, axis=1)
+        assert off.max() < 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_trajectory_starts_at_rest_and_its_velocity_is_its_slope(kind):
+    way = Trajectory(kind, duration_s=4.0, speed=2.0, size=2.0, direction=0.7)
+    time_s = np.linspace(0.0, 4.0, 2001)
+    now = way.reference(time_s)
+    np.testing.assert_allclose(now.vel_w[0], 0.0, atol=0.01)
+    slope = np.gradient(now.pos_w, time_s, axis=0)[1:-1]
+    np.testing.assert_allclose(now.vel_w[1:-1], slope, atol=2e-3)
+    assert np.isfinite(now.acc_w).all()
+
+
+def test_a_constant_circle_is_one():
+    now = CIRCLE.reference(np.array([20.0]))
+    assert np.linalg.norm(now.vel_w) == pytest.approx(3.0, rel=1e-3)
+    assert np.linalg.norm(now.acc_w) == pytest.approx(3.0, rel=1e-3)  # v^2 / r
+
+
+def test_unknown_words_are_refused():
+    with pytest.raises(ValueError, match="cirkle"):
+        Trajectory("cirkle").reference(np.zeros(1))
+    with pytest.raises(ValueError, match="turn"):
+        Trajectory("hover", turn="swep").reference(np.zeros(1))

@@ -1,52 +1,25 @@
-"""Logs that are damaged, or of other definitions than their format's: one line, no traceback."""
+"""Faults of public logs, damaged files and other definitions: named or refused in one line."""
 
-import io
 import os
 import struct
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from eval.importers import import_log
-from eval.importers.formats import px4
+from eval.importers.formats import mcap, px4
 from eval.importers.options import ImportOptions
 from eval.importers.signals import make_signal
 from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
-from tests.support import known_flight, raw_logs, ros_messages
-from tests.support.imported import flight, text, write
-
-
-@pytest.fixture
-def ulog(tmp_path, monkeypatch):
-    """Return a function that imports a ULog file after `damage` was done to what pyulog read."""
-    path, load = made.write_ulog(tmp_path / "log.ulg", span=(0, 3)), px4._load
-
-    def imported(damage):
-        def damaged(path):
-            log = load(path)
-            damage(log)
-            return log
-
-        monkeypatch.setattr(px4, "_load", damaged)
-        return import_log(path, None, ImportOptions(full_thrust=30.0))
-
-    return imported
-
-
-def test_a_topic_without_a_timestamp_is_left_out(ulog):
-    def damage(log):
-        (topic,) = (each for each in log.data_list if each.name == "esc_status")
-        topic.data["timestamq"] = topic.data.pop("timestamp")
-
-    log, findings = ulog(damage)
-    assert log.rotor_speed is None and "esc_status has no timestamp" in text(findings, "file")
+from tests.support import known_flight, raw_logs
+from tests.support.imported import flight, near, text, write
+from tests.support.vehicles import PLAIN
 
 
 def test_a_size_beyond_the_end_is_no_circle(tmp_path):
@@ -86,15 +59,6 @@ def test_dropouts_are_counted_and_their_time_is_in_seconds():
     assert "2 dropouts, 0.5 s in all" in text(px4._check_file(log), "file")
 
 
-def test_only_a_step_back_over_a_cut_body_is_shortened():
-    file = px4._TruncationSafeReader(io.BytesIO(bytes(10)))  # type: ignore[arg-type]
-    file.read(20)
-    assert file.seek(-20, 1) == 0
-    file.seek(8)
-    file.read(4)
-    assert file.seek(0, 1) == 10 and file.seek(-1, 1) == 9
-
-
 @pytest.mark.parametrize("ending", ["ulg", "mcap", "bin"])
 def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatch, ending):
     import mcap.reader
@@ -120,34 +84,9 @@ def test_what_a_reader_quotes_of_a_damaged_file_is_one_line(tmp_path, monkeypatc
     assert str(met.value).isprintable() and len(os.listdir("/proc/self/fd")) == len(held)
 
 
-@pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])
-def test_a_parameter_that_is_no_number_is_as_one_that_is_missing(ulog, value):
-    odd = {"THR_MDL_FAC": value, "CA_ROTOR0_PX": value, "CA_ROTOR0_PY": value}
-    _, findings = ulog(lambda log: log.initial_parameters.update(odd))
-    assert "quadrotor X" in text(findings, "motors")
-    assert "THR_MDL_FAC is 0" in text(findings, "thrust")
-
-
-def test_motors_of_a_small_quadrotor_are_where_its_log_says():
-    """PX4's y is to the right."""
-    places = ((0.03, -0.04), (-0.03, 0.04), (0.03, 0.04), (-0.03, -0.04))
-    said = {
-        f"CA_ROTOR{k}_P{a}": v for k, at in enumerate(places) for a, v in zip("XY", at, strict=True)
-    }
-    assert px4._motor_side(said) == (tuple((x, -y) for x, y in places), [])
-
-
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("geometry_msgs/Vector3 angular_velocity\n", "geometry_msgs/Vector3 angular_speed\n"),
-        ("geometry_msgs/Vector3 angular_velocity\n", "float64[3] angular_velocity\n"),
-        ("geometry_msgs/Vector3 angular_velocity\n", "std_msgs/Header angular_velocity\n"),
-    ],
-)
-def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, before, after):
+@pytest.mark.parametrize("rate", ["missing", "three numbers", "a header"])
+def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, rate):
     """What was written under the true definition is read under the other one."""
-    assert before in ros_messages.IMU
     path = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
     from mcap_ros2.decoder import DecoderFactory
 
@@ -156,8 +95,8 @@ def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, befor
     class Odd:
         def __init__(self, message):
             self.header = message.header
-            if "speed" not in after:
-                self.angular_velocity = [0.0] * 3 if "float64" in after else message.header
+            if rate != "missing":
+                self.angular_velocity = [0.0] * 3 if rate == "three numbers" else message.header
 
     def other(self, encoding, schema):
         decode: Any = decoder_for(self, encoding, schema)
@@ -166,13 +105,6 @@ def test_messages_of_another_definition_are_refused(tmp_path, monkeypatch, befor
     monkeypatch.setattr(DecoderFactory, "decoder_for", other)
     with pytest.raises(FlightLogError, match="differ from the definition of sensor_msgs/Imu"):
         import_log(path)
-
-
-def test_a_table_without_rows_is_refused(tmp_path):
-    columns = {name: pa.array([], pa.float64()) for name in flight(end=2.0)}
-    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
-    with pytest.raises(FlightLogError, match="holds no position"):
-        import_log(tmp_path / "log.parquet")
 
 
 @pytest.mark.parametrize(
@@ -191,12 +123,202 @@ def test_steps_of_time_that_nothing_can_be_divided_by_are_no_steps():
     assert found is not None and len(found.time_s) == len(time) - 1 and finding is not None
 
 
-@pytest.mark.parametrize("name", [b"", b"timestamp", b"gyro.y"])
-def test_a_variable_without_a_name_of_its_own_is_a_broken_header(tmp_path, name):
-    path = made.write_usd(tmp_path / "log.usd", (0.0, 1.2))
+FULL = ImportOptions(full_thrust=30.0)
+
+
+def faults(findings, *statuses):
+    return {
+        f.fault for f in findings if f.fault and f.status in (statuses or ("corrected", "doubt"))
+    }
+
+
+@pytest.fixture
+def px4_log(tmp_path, monkeypatch):
+    """Import a ULog file after `damage` was done to its topics by name and to its parameters."""
+    path, load = made.write_ulog(tmp_path / "log.ulg", span=(0, 6)), px4._load
+
+    def imported(damage, options=FULL):
+        def damaged(path):
+            log = load(path)
+            damage({d.name: d for d in log.data_list}, log)
+            return log
+
+        monkeypatch.setattr(px4, "_load", damaged)
+        return import_log(path, None, options)
+
+    return imported
+
+
+def test_a_battery_without_stamps_is_left_out_and_the_flight_is_read(px4_log):
+    """PX4 wrote battery_status with time 0 for years."""
+    log, findings = px4_log(lambda topics, _: topics["battery_status"].data["timestamp"].fill(0))
+    assert log.voltage is None and log.rotor_speed is not None
+    (finding,) = (f for f in findings if f.fault == "time_stamps")
+    assert (finding.signal, finding.status) == ("voltage", "corrected")
+    with pytest.raises(FlightLogError, match="'rate'"):  # nothing flies without a gyro
+        px4_log(lambda topics, _: topics["vehicle_angular_velocity"].data.update(
+            timestamp_sample=np.zeros(1200), timestamp=np.zeros(1200)))  # fmt: skip
+
+
+def test_a_topic_without_a_timestamp_is_left_out(px4_log):
+    log, findings = px4_log(lambda topics, _: topics["esc_status"].data.pop("timestamp"))
+    assert log.rotor_speed is None and "esc_status has no timestamp" in text(findings, "file")
+
+
+@pytest.mark.parametrize("value", ["0.1", b"\xff", None, float("nan")])
+def test_a_parameter_that_is_no_number_is_as_one_that_is_missing(px4_log, value):
+    odd = {"THR_MDL_FAC": value, "CA_ROTOR0_PX": value, "CA_ROTOR0_PY": value}
+    _, findings = px4_log(lambda _, log: log.initial_parameters.update(odd))
+    assert "quadrotor X" in text(findings, "motors")
+    assert "THR_MDL_FAC is 0" in text(findings, "thrust")
+
+
+def test_headers_without_a_stamp_do_not_mix_clocks(tmp_path, monkeypatch):
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 4))
+    stamp = mcap._stamp
+    monkeypatch.setattr(
+        mcap, "_stamp", lambda m: 0 if hasattr(m, "angular_velocity") else stamp(m) - 10**15
+    )
+    log, findings = import_log(path, None, FULL)
+    assert "time_stamps" in faults(findings, "corrected")
+    near(log.rate_b, known_flight.fly(log.time_s).rate, 1e-6)
+
+
+@pytest.mark.parametrize("how", ["parameter", "type", "motors"])
+def test_what_is_no_quadrotor_is_not_read_as_one(px4_log, how):
+    def damage(topics, log):
+        if how == "parameter":
+            log.initial_parameters["CA_ROTOR_COUNT"] = 6
+        elif how == "type":
+            log.initial_parameters["MAV_TYPE"] = 22  # a VTOL with four rotors
+        else:
+            topics["esc_status"].data |= {
+                f"esc[{k}].esc_rpm": topics["esc_status"].data["esc[0].esc_rpm"] for k in (4, 5)
+            }
+
+    _, findings = px4_log(damage)
+    (finding,) = (f for f in findings if f.fault == "motor_count")
+    assert finding.is_open
+
+
+@pytest.mark.parametrize("second", ["whole", "without stamps", None])
+def test_an_impossible_battery_is_not_believed(px4_log, second):
+    def damage(topics, log):
+        first = topics["battery_status"]
+        if second:
+            other = type("Topic", (), {"name": first.name, "multi_id": 1})()
+            other.data = {name: value.copy() for name, value in first.data.items()}
+            if second == "without stamps":
+                del other.data["timestamp"]
+            log.data_list.append(other)
+        first.data["voltage_v"][:] = 0.1
+
+    log, findings = px4_log(damage, ImportOptions(vehicle=PLAIN))
+    assert "voltage" in faults(findings, "corrected")
+    if second == "whole":
+        near(log.voltage[:-25], 16.0 - 0.05 * log.time_s[:-25], 0.01)
+    else:
+        assert log.voltage is None
+    assert not any(f.status == "doubt" for f in findings if f.signal == "thrust")
+
+
+def test_blackbox_in_physical_units_under_bare_names(tmp_path):
+    """Volts and m/s^2 that look like the firmware's counts, and nothing scaled by them."""
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 10), rate=500.0)
+    header, *lines = path.read_text().splitlines()
+    names = [name.strip() for name in header.split(",")]
+    rows = [line.split(",") for line in lines]
+    for row in rows:
+        for k in range(3):
+            at = names.index(f"accSmooth[{k}]")
+            row[at] = f"{float(row[at]) / 2048 * 9.81:.4f}"
+        at = names.index("vbatLatest (V)")
+        row[at] = f"{float(row[at]) + 0.013:.3f}"
+    header = header.replace("vbatLatest (V)", "vbatLatest")
+    path.write_text("\n".join([header, *(",".join(row) for row in rows)]) + "\n")
+    pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 10))
+    log, findings = import_log(path, None, ImportOptions(pose=pose))
+    truth = known_flight.fly(log.time_s)
+    assert {"accelerometer_unit", "voltage"} <= faults(findings, "corrected")
+    near(log.acc_b, truth.acc, 0.02)
+    near(log.voltage, truth.voltage, 0.1)
+    near(log.thrust_cmd, truth.thrust, 0.2)
+
+
+def test_lines_before_a_csvs_header_are_left_out(tmp_path):
+    """Blackbox Explorer writes the firmware's settings first."""
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 8), rate=500.0)
+    pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
+    options = ImportOptions(pose=pose, full_thrust=30.0)
+    wanted, _ = import_log(path, None, options)
+    before = '"Product","Blackbox flight data recorder by Nicholas Sherlock"\n"minthrottle",1070\n'
+    path.write_text(before + path.read_text())
+    log, findings = import_log(path, None, options)
+    np.testing.assert_array_equal(log.rate_b, wanted.rate_b)
+    assert any("2 lines before the header" in f.evidence for f in findings)
+
+
+def test_tables_of_other_programs_are_named(tmp_path):
+    path = tmp_path / "log.csv"
+    for first, advice in (
+        ("FMT, 128, 89, FMT, BBnNZ, Type,Length,Name\nATT, 100, 1, 2, 3\n", "an ArduPilot text"),
+        ("Format Version,1.23,Take Name,fly\n,,Quad,Quad\nFrame,Time,X,Y\n0,0,1,2\n", "Motive"),
+        ("t,x,y\n0,1,2\n1,2,3\n", "describe the columns with --map. There are: t, x, y"),
+    ):
+        path.write_text(first)
+        with pytest.raises(FlightLogError, match=advice):
+            import_log(path)
+
+
+def test_a_cut_usd_log_keeps_no_garbage_and_thrust_is_no_tiny_number(tmp_path):
+    path = made.write_usd(tmp_path / "log00", crc=False)
     whole = path.read_bytes()
-    for old in (b"gyro.x(", b"stateEstimateZ.rateRoll("):
-        whole = whole.replace(old, name + b"(")
-    path.write_bytes(whole)
-    with pytest.raises(FlightLogError, match="header is broken .*with no name or a repeated one"):
-        import_log(path, "crazyflie", ImportOptions(partial=True))
+    event = len(made.write_usd(tmp_path / "one", span=(0, 0.02), crc=False).read_bytes())
+    event -= len(made.write_usd(tmp_path / "two", span=(0, 0.01), crc=False).read_bytes())
+    old = bytearray(whole[-3 * event :])
+    old[2:10] = b"\x11\x22\x33\x44\x55\x66\x07\x00"  # the card's old content: another day
+    for k in range(12, event, 4):
+        old[k : k + 4] = b"\x7a\x99\x99\x7f"
+    path.write_bytes(whole[: -event // 2] + bytes(old[: event // 2]) + bytes(old))
+    log, findings = import_log(path, None, ImportOptions())
+    truth = known_flight.fly(log.time_s)
+    near(log.pos_w, truth.pos, 1e-5)
+    near(log.thrust_cmd, truth.thrust, 0.2)
+    assert any("checksum" in f.evidence for f in findings)
+
+
+def test_a_full_throttle_that_none_gives_is_refused(tmp_path):
+    path = made.write_usd(tmp_path / "log00", full_thrust=400.0)
+    _, findings = import_log(path, None, ImportOptions(partial=True))
+    (finding,) = (f for f in findings if f.signal == "thrust" and f.status == "doubt")
+    assert "full throttle would be 400 m/s^2" in finding.evidence and finding.is_open
+
+
+def test_an_odometrys_twist_in_world_axes_is_found(tmp_path):
+    def world(time):
+        truth = known_flight.fly(time)
+        # The writer turns it into the body; turned on by that, it is in the world there.
+        return truth._replace(vel=np.einsum("tij,tj->ti", truth.rot, truth.vel))
+
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 8), source=world)
+    log, findings = import_log(path, None, FULL)
+    assert "velocity_frame" in faults(findings, "corrected")
+    near(log.vel_w, known_flight.fly(log.time_s).vel, 0.02)
+
+
+def test_a_height_alone_says_why_there_is_no_position(px4_log):
+    with pytest.raises(FlightLogError, match="no position .xy_valid of vehicle_local_position"):
+        px4_log(lambda topics, _: topics["vehicle_local_position"].data["xy_valid"].fill(0))
+
+
+def test_the_crazyflie_clients_csv_has_a_time(tmp_path):
+    truth, rpm = known_flight.fly(np.arange(0, 6, 0.01)), 60 / (2 * np.pi)
+    names = [f"stateEstimate.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    names += ["gyro.x", "gyro.y", "gyro.z", "rpm.m1", "rpm.m2", "rpm.m3", "rpm.m4"]
+    parts = (truth.pos, truth.quat, np.rad2deg(truth.rate), truth.motor * rpm)
+    table = np.column_stack([5000 + 1000 * truth.time, *parts])
+    header = ",".join(["Timestamp", *names])
+    path = tmp_path / "client.csv"
+    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.9g")
+    log, _ = import_log(path, None, ImportOptions(map=Path("crazyflie")))
+    near(log.rate_b, truth.rate, 1e-5)

@@ -1,8 +1,11 @@
-"""Frames of logs against turns worked by hand, and every unit against what one of it is."""
+"""Frames and units against what they are; thrust, motors and set points become commands."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from eval.importers.commands import SHIPPED_ORDER, order_motors, rates_wanted, thrust_command
 from eval.importers.formats import betaflight
 from eval.importers.frames import (
     attitude,
@@ -15,27 +18,22 @@ from eval.importers.frames import (
     world_vector,
 )
 from eval.importers.mapping_file import UNITS
+from eval.importers.options import ImportOptions
 from eval.logs.faults.reading import TIMES
+from eval.vehicles.vehicle import MotorMap
+from tests.support.vehicles import PLAIN
 
 ROOT_HALF = np.sqrt(0.5)
-
 LEFT_TURN = np.array([ROOT_HALF, 0.0, 0.0, ROOT_HALF])
 """A quarter turn about z: forward becomes left."""
-
 NOSE_UP = np.array([ROOT_HALF, 0.0, -ROOT_HALF, 0.0])
 """A quarter turn about -y: forward becomes up."""
 
 
-@pytest.mark.parametrize(
-    ("world", "expected"), [("z-up", [1, 2, 3]), ("ned", [1, -2, -3]), ("y-up", [1, -3, 2])]
-)
-def test_world_axes(world, expected):
-    found = world_vector(np.array([[1.0, 2.0, 3.0]]), world)
-    np.testing.assert_allclose(found, [expected], atol=1e-15)
-
-
-def test_body_axes():
+def test_axes_of_worlds_and_bodies():
     vector = np.array([1.0, 2.0, 3.0])
+    for world, wanted in (("z-up", [1, 2, 3]), ("ned", [1, -2, -3]), ("y-up", [1, -3, 2])):
+        np.testing.assert_allclose(world_vector(vector[None], world), [wanted], atol=1e-15)
     np.testing.assert_array_equal(body_vector(vector, "frd"), [1, -2, -3])
     np.testing.assert_array_equal(body_vector(vector, "flu"), vector)
 
@@ -68,7 +66,6 @@ def test_euler_angles_and_rotation_vectors():
 
 
 TURN, G = 6.283185307179586, 9.81
-
 ONE = {
     "s": 1.0, "ms": 0.001, "us": 0.000001, "ns": 0.000000001,
     "m": 1.0, "cm": 0.01, "mm": 0.001, "m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001,
@@ -79,25 +76,15 @@ ONE = {
 """One of each unit in SI; `65535` is the full scale of a motor command."""
 
 
-def test_every_unit_of_a_mapping_is_what_it_says():
-    for signal, units in UNITS.items():
-        assert units == pytest.approx({name: ONE[name] for name in units}, rel=1e-12), signal
-
-
-def test_every_unit_that_a_check_tries_is_what_it_says():
-    assert TIMES == pytest.approx({name: ONE[name] for name in TIMES}, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("table", "raw"),
-    [
+def test_every_unit_is_what_it_says():
+    """Of mappings, of checks, and of Betaflight, where no unit in a header is a raw one."""
+    raw = [
         (betaflight._TIME, 1e-6), (betaflight._ROTATION, TURN / 360),
         (betaflight._ACCELERATION, G / 2048), (betaflight._VOLT, 0.01),
-    ],
-)  # fmt: skip
-def test_every_unit_of_betaflight_is_what_it_says(table, raw):
-    """Where the header says no unit it is `raw`."""
-    assert table == pytest.approx({"": raw, **{n: ONE[n] for n in table if n}}, rel=1e-12)
+    ]  # fmt: skip
+    for units, bare in [*((units, None) for units in (*UNITS.values(), TIMES)), *raw]:
+        wanted = {name: ONE[name] if name else bare for name in units}
+        assert units == pytest.approx(wanted, rel=1e-12)
 
 
 def test_a_column_is_in_the_unit_of_its_header(tmp_path):
@@ -106,3 +93,96 @@ def test_a_column_is_in_the_unit_of_its_header(tmp_path):
     box = betaflight.Blackbox(path)
     np.testing.assert_allclose(box.values(["vbatLatest"], betaflight._VOLT)[:, 0], [16.1, 16.0])
     np.testing.assert_allclose(box.values(["time"], betaflight._TIME)[:, 0], [0.0, 5e-4])
+
+
+def thrust_rows(felt=None, count=200):
+    """Rows with a throttle from 0.2 to 0.8, and where `felt` is given an accelerometer."""
+    throttle = np.linspace(0.2, 0.8, count)
+    found = {"throttle": throttle[:, None]}
+    if felt is not None:
+        found["acc"] = felt * throttle[:, None] * np.array([0.0, 0.0, 1.0])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("felt", "options", "full", "by"),
+    [
+        (25.0, ImportOptions(full_thrust=20.0, vehicle=PLAIN), 20.0, "as given"),
+        # Four rotors of 1.6e-6 N s^2 at 2100 rad/s on 0.75 kg.
+        (37.632, ImportOptions(vehicle=PLAIN), 37.632, "by the vehicle file"),
+        (25.0, ImportOptions(), 25.0, "by the accelerometer"),
+    ],
+)
+def test_full_throttle_is_what_is_told_or_built_or_felt(felt, options, full, by):
+    found = thrust_rows(felt)
+    (finding,) = thrust_command(found, options)
+    np.testing.assert_allclose(found["cmd_thrust"], full * found["throttle"], rtol=1e-12)
+    assert finding.status == "note" and by in finding.evidence
+
+
+@pytest.mark.parametrize("found", [thrust_rows(), thrust_rows(25.0, count=50)])
+def test_where_nothing_tells_the_scale_thrust_is_left_out(found):
+    (finding,) = thrust_command(found, ImportOptions())
+    assert "cmd_thrust" not in found and finding.status == "doubt"
+    assert "give --vehicle FILE or --full-thrust" in finding.evidence
+
+
+def test_a_thrust_that_is_there_stays():
+    found = thrust_rows() | {"cmd_thrust": np.ones((200, 1))}
+    assert thrust_command(found, ImportOptions(full_thrust=20.0)) == []
+    assert (found["cmd_thrust"] == 1.0).all()
+
+
+def test_a_throttle_goes_through_the_vehicles_motors_with_the_battery():
+    """u = 0.5 x 3/4: 4 x 0.159375 N over the mass; see test_motors.py."""
+    vehicle = replace(PLAIN, motors=MotorMap((0.2, 0.6), 4.0))
+    rows = {"throttle": np.full((3, 1), 0.5), "voltage": np.full((3, 1), 3.0)}
+    findings = thrust_command(rows, ImportOptions(vehicle=vehicle))
+    np.testing.assert_allclose(rows["cmd_thrust"], 4 * 0.159375 / vehicle.mass)
+    assert "with the battery's voltage" in findings[0].evidence
+
+
+def motor_rows():
+    return {"motor": np.array([[10.0, 20.0, 30.0, 40.0]]), "motor_cmd": np.array([[1.0, 2, 3, 4]])}
+
+
+def test_without_places_the_order_stays():
+    found = motor_rows()
+    assert order_motors(found, None, None) == [] == order_motors({}, SHIPPED_ORDER, None)
+    np.testing.assert_array_equal(found["motor"], [[10, 20, 30, 40]])
+
+
+def test_places_in_any_unit_set_the_order_the_vehicles_own_before_the_shipped_ones():
+    backwards = tuple((90.0 * x, 70.0 * y) for x, y in reversed(SHIPPED_ORDER))
+    hubs = PLAIN.rotors.position
+    turned = replace(PLAIN.rotors, position=(hubs[1], hubs[2], hubs[3], hubs[0]))
+    for places, vehicle, order, words in (
+        (backwards, None, [4, 3, 2, 1], "shipped vehicles: the file's 4, 3, 2, 1"),
+        (SHIPPED_ORDER, replace(PLAIN, rotors=turned), [2, 3, 4, 1], "vehicle 'plain'"),
+    ):
+        found = motor_rows()
+        (finding,) = order_motors(found, places, vehicle)
+        np.testing.assert_array_equal(found["motor_cmd"], [order])
+        np.testing.assert_array_equal(found["motor"], 10 * found["motor_cmd"])
+        assert words in finding.evidence
+
+
+def set_points(angle):
+    half = 0.5 * angle
+    return {
+        "quat": np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        "cmd_quat": np.tile([np.cos(half), 0.0, np.sin(half), 0.0], (2, 1)),
+    }
+
+
+def test_set_points_are_the_error_times_the_gain_within_the_limit_where_a_vehicle_says_it():
+    for angle, wanted in (
+        (0.1, 0.1 * PLAIN.controller.attitude_gain[1]),
+        (3.0, PLAIN.controller.rate_max[1]),
+    ):
+        given = set_points(angle)
+        rates_wanted(given, PLAIN)
+        np.testing.assert_allclose(given["cmd_rate"], [[0.0, wanted, 0.0]] * 2, atol=1e-12)
+    given = set_points(0.1)
+    assert rates_wanted(given, None)[0].status == "doubt"
+    assert set(given) == {"quat"}

@@ -1,4 +1,4 @@
-"""An import as a whole: formats are detected, what is read can be written, cut and refused."""
+"""An import as a whole: formats are detected, recordings become checked logs or are refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,40 +7,30 @@ import numpy as np
 import pytest
 
 from eval.importers import import_log
+from eval.importers.assemble import assemble, usable_for
 from eval.importers.formats import FORMATS, detect
 from eval.importers.options import ImportOptions
+from eval.importers.signals import Recording, Signal
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
-from tests.support import known_flight
-from tests.support.imported import flight, levels, near, write
+from tests.support.imported import flight, write
+from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
 
 
-def test_an_import_can_be_written_and_read_back(tmp_path):
+def test_an_import_is_written_read_back_and_keeps_what_it_says_of_itself(tmp_path):
     log, _ = import_log(made.write_usd(tmp_path / "log00"), None, FULL)
     again = read_flight(write_flight(tmp_path / "flight.parquet", log))
     np.testing.assert_array_equal(again.pos_w, log.pos_w)
     assert again.about["imported_from"] == "log00" and again.about["findings"]
-
-
-def test_a_log_of_ours_keeps_what_it_says_of_itself(tmp_path):
-    log, _ = import_log(made.write_usd(tmp_path / "log00"), None, FULL)
     told = {"integrator": "euler", "step_s": 0.002, "seed": 7, "partial": ["motor"]}
     path = write_flight(tmp_path / "ours.parquet", replace(log, about={**log.about, **told}))
     again, _ = import_log(path)
     assert (again.integrator, again.step_s, again.about["seed"]) == ("euler", 0.002, 7)
     assert again.partial == () and again.about["source"] == log.about["source"]
-
-
-def test_start_and_end_cut_the_flight(tmp_path):
-    path = made.write_usd(tmp_path / "log00")
-    log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, start_s=2.0, end_s=5.0))
-    assert log.duration_s == pytest.approx(3.0, abs=0.02)
-    near(log.pos_w, known_flight.fly(log.time_s + 2.0).pos, 1e-5)
-    with pytest.raises(FlightLogError, match="no row between --start and --end; .* first sample"):
-        import_log(path, None, ImportOptions(start_s=50.0))
 
 
 def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
@@ -54,106 +44,36 @@ def test_a_source_is_asked_of_what_knows_of_sources(tmp_path):
 
 LOGS = Path(__file__).resolve().parents[4] / "shared" / "real_logs"
 
-real = pytest.mark.skipif(not LOGS.is_dir(), reason="the logs are not on this machine")
 
-
-def read(path, name, **options):
-    return import_log(LOGS / path, None, ImportOptions(map=Path(name), **options))
-
-
-@real
-def test_nanobench_has_motor_commands_battery_and_only_the_flight():
-    log, findings = read("nanobench/B3_figure8_fast_rep1.csv", "nanobench")
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the logs are not on this machine")
+@pytest.mark.parametrize(
+    ("path", "lacks", "length_s"),
+    [
+        ("nanobench/B8_star_fast_rep2.csv", (), (28.0, 40.0)),
+        ("crazypad/motor/add_weight_W3_near_M3__E9_log00", ("quat", "rate"), (20.0, 24.0)),
+        ("crazypad/controller/add_weight_W3_near_M3__E9_log01", ("quat",), (20.0, 24.0)),
+        ("crazyswarm2/log10", (), (2.0, 60.0)),
+    ],
+)
+def test_published_logs_are_read_by_their_shipped_mappings(path, lacks, length_s):
+    name = path.split("/")[0]
+    log, _ = import_log(LOGS / path, None, ImportOptions(map=Path(name), partial=bool(lacks)))
+    assert log.partial == lacks and length_s[0] < log.duration_s < length_s[1]
+    if name == "crazyswarm2":  # thrust in newtons, by the mass in the file beside it
+        assert log.thrust_cmd is not None and log.torque_cmd_b is not None
+        np.testing.assert_allclose(log.thrust_cmd, log.extra["cmd_force"] / 0.0333)
+        return
     assert log.pwm is not None
-    assert log.voltage is not None
-    assert log.acc_b is not None
-    assert 19.0 < log.duration_s < 21.0  # of 26.8 s
-    assert np.nanmin(log.pwm) > 0.3
-    assert abs(np.nanmean(log.acc_b[:, 2]) - 9.9) < 0.3
-    assert log.about["beside"]["crazyflie_id"] == "CF_01"
-    assert levels(findings)["gyro"] == "ok"
-
-
-@real
-def test_nanobench_motors_turn_the_body_as_the_shipped_order_says():
-    """M1 and M3 turn counter-clockwise: more of them yaws the body clockwise."""
-    log, _ = read("nanobench/B8_star_fast_rep2.csv", "nanobench")
+    if name == "crazypad":  # the weight hangs near rotor 3
+        assert np.argmax(np.nanmean(log.pwm, axis=0)) == 2
+        return
+    # M1 and M3 turn counter-clockwise: more of them yaws the body clockwise.
     change = np.gradient(log.rate_b, log.time_s, axis=0)
-    assert log.pwm is not None
     one, two, three, four = log.pwm.T
     drives = (three + four - one - two, two + three - one - four, two + four - one - three)
     for axis, drive in enumerate(drives):
         both = np.isfinite(drive[:-3]) & np.isfinite(change[3:, axis])
         assert np.corrcoef(drive[:-3][both], change[3:, axis][both])[0, 1] > 0.15
-
-
-@real
-def test_nanobench_by_the_estimate_is_late_and_moved():
-    log, findings = read("nanobench/B8_star_fast_rep2.csv", "nanobench", source="estimate")
-    assert levels(findings)["pose delay"] == "corrected"
-    assert log.duration_s > 30
-
-
-@pytest.mark.parametrize("source", ["", "estimate"])
-def test_an_estimate_next_to_motion_capture_is_kept(tmp_path, source):
-    columns = {"t": np.arange(0.0, 4.0, 0.01)}
-    half = 0.1 * np.sin(columns["t"])
-    quat = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
-    parts = {"x": columns["t"] ** 2, "y": 0.0 * half, "z": 1.0 + half}
-    for k, (name, value) in enumerate(parts.items()):
-        columns |= {name: value, f"e{name}": 1e3 * (value + 0.01 * (k + 1))}
-    columns |= {f"{p}q{a}": v for p in ("", "e") for a, v in zip("wxyz", quat, strict=True)}
-    columns |= {"gx": np.gradient(2.0 * half, 0.01), "gy": 0.0 * half, "gz": 0.0 * half}
-    np.savetxt(
-        tmp_path / "log.csv", np.stack([*columns.values()], 1), "%.9g", ",",
-        header=",".join(columns), comments="",
-    )  # fmt: skip
-    text = '[time]\ncolumn = "t"\n[rate]\ncolumns = ["gx", "gy", "gz"]\n'
-    for start, where, unit in (("", "mocap", "m"), ("e", "estimate", "mm")):
-        names = [f"{start}{axis}" for axis in "xyz"]
-        text += f'[[pos]]\ncolumns = {names}\nunit = "{unit}"\nsource = "{where}"\n'
-        names = [f"{start}q{part}" for part in "wxyz"]
-        text += f'[[quat]]\ncolumns = {names}\nsource = "{where}"\n'
-    (tmp_path / "map.toml").write_text(text)
-    options = ImportOptions(
-        map=tmp_path / "map.toml", source=source, partial=True, trim=False, fix=False
-    )
-    log, _ = import_log(tmp_path / "log.csv", None, options)
-    kept = {name for name in log.extra if name.startswith("est_")}
-    if source:
-        assert not kept
-        return
-    assert kept == {f"est_pos_{a}" for a in "xyz"} | {f"est_quat_{a}" for a in "wxyz"}
-    for k, axis in enumerate("xyz"):
-        near(log.extra[f"est_pos_{axis}"] - log.pos_w[:, k], 0.01 * (k + 1), 1e-6)
-
-
-@real
-@pytest.mark.parametrize(
-    ("path", "lacks"),
-    [
-        ("motor/add_weight_W3_near_M3__E9_log00", ("quat", "rate")),
-        ("controller/add_weight_W3_near_M3__E9_log01", ("quat",)),
-    ],
-)
-def test_crazypad_is_partial_and_shows_the_weight_near_rotor_3(path, lacks):
-    log, findings = read(f"crazypad/{path}", "crazypad", partial=True)
-    assert log.partial == lacks
-    assert levels(findings)["partial"] == "note"
-    assert log.pwm is not None
-    mean = np.nanmean(log.pwm, axis=0)
-    assert np.argmax(mean) == 2
-    assert 20.0 < log.duration_s < 24.0
-
-
-@real
-def test_crazyswarm2_has_thrust_by_the_mass_beside_it_and_torque():
-    log, _ = read("crazyswarm2/log10", "crazyswarm2")
-    assert log.torque_cmd_b is not None and log.thrust_cmd is not None
-    assert log.about["mass"] == 0.0333
-    np.testing.assert_allclose(log.thrust_cmd, log.extra["cmd_force"] / 0.0333)
-    assert 6.0 < np.nanmean(log.thrust_cmd) < 10.0
-    assert log.rate_cmd_b is None
 
 
 def test_unknown_formats_and_files(tmp_path):
@@ -182,3 +102,95 @@ def test_each_format_is_told_by_its_first_bytes(tmp_path):
     for name, path in files.items():  # by what is in it, whatever it is called
         assert detect(path.rename(tmp_path / "renamed"), ImportOptions()) == name
     assert files.keys() == set(FORMATS)
+
+
+def recording(**left_out):
+    parts = flight(end=2.0)
+    signals = {
+        name: Signal(parts["time"], value)
+        for name, value in parts.items()
+        if name != "time" and name not in left_out
+    }
+    return Recording("log.bin", signals, about={"firmware": "made up"})
+
+
+def test_a_recording_becomes_a_log_that_says_where_it_is_from():
+    log, findings = assemble(recording(), "made", ImportOptions(vehicle=PLAIN))
+    parts = flight(end=2.0)
+    np.testing.assert_allclose(log.pos_w, parts["pos"], atol=1e-12)
+    assert log.thrust_cmd is not None
+    np.testing.assert_allclose(log.thrust_cmd, parts["cmd_thrust"][:, 0], atol=1e-12)
+    known = [log.about[key] for key in ("firmware", "source", "imported_from", "vehicle")]
+    assert known == ["made up", "made", "log.bin", "plain"]
+    assert log.about["findings"] == [finding._asdict() for finding in findings]
+
+
+def test_start_and_end_cut_more_than_the_time_on_the_ground():
+    parts = dict(recording().signals)
+    del parts["cmd_thrust"], parts["cmd_rate"]
+    time_s = parts["pos"].time_s
+    flying = (time_s > 0.4) & (time_s < 1.7)
+    height = np.where(flying, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    parts["pos"] = Signal(time_s, height)
+    parts["motor"] = Signal(time_s, np.where(flying, 800.0, 50.0)[:, None] * np.ones(4))
+    asked = ImportOptions(fix=False, start_s=0.1, end_s=1.6)
+    log, findings = assemble(Recording("log", parts), "made", asked)
+    assert any("before take-off and the" in f.evidence for f in findings)
+    assert log.rotor_speed is not None and log.rotor_speed.min() > 400.0
+    assert log.duration_s == pytest.approx(1.2, abs=0.05)
+    with pytest.raises(FlightLogError, match="no row between --start and --end; .* first sample"):
+        assemble(Recording("log", parts), "made", replace(asked, start_s=50.0, end_s=60.0))
+    kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
+    assert kept.duration_s == pytest.approx(1.5, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("missing", "reason"),
+    [
+        (["rate"], r"log\.bin: holds no gyro; --partial keeps"),
+        (["pos", "quat"], "holds no position and no attitude; --pose FILE adds"),
+        (["cmd_thrust"], "neither a thrust and rate command nor motor"),
+    ],
+)
+def test_what_a_log_needs_is_asked_for(missing, reason):
+    with pytest.raises(FlightLogError, match=reason):
+        assemble(recording(**dict.fromkeys(missing)), "made", ImportOptions())
+
+
+def test_a_partial_log_keeps_what_is_there_and_says_what_can_be_asked(tmp_path):
+    parts = flight(end=2.0)
+    lone = recording(quat=None, cmd_rate=None)
+    with pytest.raises(FlightLogError, match="no attitude"):
+        assemble(lone, "made", ImportOptions())
+    log, findings = assemble(lone, "made", ImportOptions(partial=True))
+    assert log.partial == ("quat", "command")
+    assert np.isnan(log.quat_wxyz).all()
+    np.testing.assert_allclose(log.rate_b, parts["rate"], atol=1e-12)
+    said = [finding for finding in findings if finding.signal == "partial"]
+    assert "the vertical force" in said[0].evidence
+    write_flight(tmp_path / "log.parquet", log)
+    with pytest.raises(FlightLogError, match="a partial log, without quat, command"):
+        read_flight(tmp_path / "log.parquet")
+    back = read_flight(tmp_path / "log.parquet", partial=True)
+    np.testing.assert_array_equal(back.thrust_cmd, log.thrust_cmd)
+    assert back.partial == log.partial
+
+
+def test_the_serious_come_first_and_the_rest_in_order():
+    findings = (
+        Finding("ok", "units", "as they should be"),
+        Finding("note", "rows", "at 100 Hz"),
+        Finding("doubt", "velocity", "is off"),
+        Finding("note", "motors", "put in order"),
+        Finding("corrected", "attitude", "is xyzw"),
+    )
+    signals = [line.split()[1] for line in finding_lines(findings)]
+    assert signals == ["attitude:", "velocity:", "rows:", "motors:", "units:"]
+
+
+def test_motor_commands_and_positions_tell_weight_and_balance():
+    rows = {"pos": np.zeros((3, 3)), "pwm": np.zeros((3, 4))}
+    text = usable_for(rows, ["quat", "rate"]).evidence
+    assert "balance of the rotors in hover" in text and "its torque" not in text
+    alone = usable_for({"pos": rows["pos"]}, ["quat", "rate", "command"])
+    assert alone.evidence.endswith("only its path")

@@ -1,14 +1,19 @@
-"""Signals are known and in order of time, and come onto the rows of one log."""
+"""Signals and poses come onto one clock and the rows of one log; bad samples and ground time go."""
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from eval.importers import import_log
+from eval.importers.checks.airborne import airborne
+from eval.importers.checks.glitches import clean
 from eval.importers.options import ImportOptions
-from eval.importers.pose import grid
+from eval.importers.pose import align, grid
 from eval.importers.rows import averaged, row_times, smoothed
-from eval.importers.signals import Recording, make_signal, median_step
+from eval.importers.signals import Recording, Signal, make_signal, median_step
 from eval.logs.columns import FlightLogError
+from eval.logs.faults.reading import read_as
+from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import flight, of, write
 
@@ -125,10 +130,216 @@ def test_a_time_that_goes_back_often_is_refused_with_its_first_row():
         make_signal(np.arange(10.0)[::-1], np.zeros((10, 3)), "log", "gyro")
 
 
-def test_nothing_known_is_no_signal():
+def test_few_known_samples_have_no_signal_and_no_step():
     assert make_signal(np.full(3, np.nan), np.zeros(3), "log", "gyro") == (None, None)
+    assert median_step(np.array([0.0, 0.5, 1.0, 9.0])) == 0.5 and median_step(np.zeros(1)) == np.inf
 
 
-def test_the_median_step_is_that_of_most_samples():
-    assert median_step(np.array([0.0, 0.5, 1.0, 9.0])) == 0.5
-    assert median_step(np.zeros(1)) == np.inf
+@pytest.fixture
+def signals():
+    truth = known_flight.fly(np.arange(0, 6, 0.01))
+    rng = np.random.default_rng(3)
+    quat = truth.quat + 2e-4 * rng.normal(size=truth.quat.shape)
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return {
+        "pos": Signal(truth.time, truth.pos + 2e-4 * rng.normal(size=truth.pos.shape)),
+        "vel": Signal(truth.time, truth.vel + 0.01 * rng.normal(size=truth.vel.shape)),
+        "quat": Signal(truth.time, quat),
+    }
+
+
+def test_a_good_flight_is_left_as_it_is(signals):
+    cleaned, findings = clean(Recording("log", signals))
+    assert findings == []
+    for name, samples in signals.items():
+        np.testing.assert_array_equal(cleaned.signals[name].value, samples.value)
+
+
+def test_a_jump_of_position_and_one_of_speed_are_left_out(signals):
+    signals["pos"].value[200] += [0.0, 0.5, 0.0]
+    signals["vel"].value[320] += [1.0, 0.0, 0.0]
+    cleaned, findings = clean(Recording("log", signals))
+    assert 2.0 not in cleaned.signals["pos"].time_s
+    assert len(cleaned.signals["pos"].time_s) == 599
+    assert np.abs(cleaned.signals["vel"].time_s - 3.2).min() > 0.005
+    assert {finding.signal for finding in findings} == {"position", "velocity"}
+
+
+def test_repeated_poses_are_left_out_with_what_is_logged_with_them(signals):
+    for name in ("pos", "quat", "vel"):
+        signals[name].value[1::3] = signals[name].value[0::3]
+    cleaned, findings = clean(Recording("log", signals))
+    for name in ("pos", "quat", "vel"):
+        assert len(cleaned.signals[name].time_s) == 400
+    assert "33 % of the poses repeat" in findings[0].evidence
+
+
+def test_whole_millimetres_are_not_repeats(signals):
+    coarse = np.round(0.02 * signals["pos"].value, 3)
+    cleaned, findings = clean(Recording("log", {"pos": Signal(signals["pos"].time_s, coarse)}))
+    assert len(cleaned.signals["pos"].time_s) == 600
+    assert not [finding for finding in findings if "repeat" in finding.evidence]
+
+
+def test_attitudes_drawn_between_their_neighbours_are_left_out(signals):
+    quat = signals["quat"].value
+    middle = quat[0:-2:2] + quat[2::2]
+    quat[1:-1:2] = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    cleaned, findings = clean(Recording("log", {"quat": signals["quat"]}))
+    assert len(cleaned.signals["quat"].time_s) < 340
+    assert "are interpolated" in findings[0].evidence
+
+
+TIME = np.arange(0, 10, 0.01)
+
+
+def recording(lift=2.0, land=8.0, ground=0.3):
+    height = np.interp(TIME, [0, lift, lift + 1, land - 1, land, 10], [0, 0, 1, 1, 0, 0]) + ground
+    # The motors run up half a second before they lift, and stop a while after touching down.
+    pwm = np.interp(TIME, [0, lift - 0.5, lift, land, land + 0.3], [0, 0, 0.6, 0.6, 0])
+    pos = np.stack([0 * TIME, 0 * TIME, height], axis=1)
+    return Recording(
+        "log", {"pos": Signal(TIME, pos), "pwm": Signal(TIME, np.repeat(pwm[:, None], 4, 1))}
+    )
+
+
+def test_the_flight_is_found_between_take_off_and_landing():
+    (start, stop), findings = airborne(recording())
+    # It rises by 1 m in the second after lifting: 5 cm after 0.05 s.
+    np.testing.assert_allclose([start, stop], [2.06, 7.94], atol=0.02)
+    assert "2.1 s before take-off" in findings[0].evidence
+
+
+def test_without_motors_or_without_a_take_off_nothing_is_cut():
+    signals = recording().signals
+    inside = (TIME > 3) & (TIME < 6)
+    flying = {n: Signal(s.time_s[inside], s.value[inside]) for n, s in signals.items()}
+    span, (finding,) = airborne(Recording("log", flying))
+    assert span == (-np.inf, np.inf) and finding.status == "ok"
+    span, (finding,) = airborne(Recording("log", {"pos": signals["pos"]}))
+    assert span == (-np.inf, np.inf) and "no signal shows when the motors" in finding.evidence
+
+
+def _gyro(span, rate=500.0, bias=0.0, noise=0.0):
+    truth = known_flight.fly(np.arange(span[0], span[1], 1 / rate))
+    rng = np.random.default_rng(2)
+    return Signal(truth.time, truth.rate + bias + noise * rng.normal(size=truth.rate.shape))
+
+
+def _poses(span, rate, offset, drift, noise=0.0, turn=None):
+    time = np.arange(span[0], span[1], 1 / rate)
+    rot = Rotation.from_matrix(known_flight.fly(time).rot)
+    rot = rot if turn is None else rot * turn
+    rng = np.random.default_rng(3)
+    rot = rot * Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
+    return Signal((time - offset) / (1 + drift), rot.as_quat(scalar_first=True))
+
+
+@pytest.mark.parametrize(
+    ("offset", "drift", "rate"),
+    [(0.0, 0.0, 240.0), (-7.77, -400e-6, 120.0), (1.7e6, 30e-6, 60.0)],
+)
+def test_offset_and_drift_come_back(offset, drift, rate):
+    found = align(_poses((5, 45), rate, offset, drift), _gyro((0, 60), bias=0.02), "pose")
+    at = (np.array([5.0, 25.0, 45.0]) - offset) / (1 + drift)
+    log_time = found.offset_s + (1 + found.drift) * at
+    np.testing.assert_allclose(log_time, [5.0, 25.0, 45.0], atol=2e-4)
+    assert found.correlation > 0.999
+
+
+def test_noise_widens_the_reported_error():
+    calm = align(_poses((1, 19), 120.0, 2.0, 0.0), _gyro((0, 20)), "pose")
+    poses = _poses((1, 19), 120.0, 2.0, 0.0, noise=0.002)
+    shaken = align(poses, _gyro((0, 20), noise=0.1), "pose")
+    middle = 10.0 - 2.0
+    error = abs(shaken.offset_s + (1 + shaken.drift) * middle - 10.0)
+    assert calm.offset_sd_s < shaken.offset_sd_s < 5e-3
+    assert error < 4 * shaken.offset_sd_s
+
+
+def test_a_turn_between_the_bodies_is_found():
+    turn = Rotation.from_rotvec([0.4, -0.8, 1.9])
+    found = align(_poses((1, 19), 120.0, 2.0, 0.0, turn=turn), _gyro((0, 20)), "pose")
+    np.testing.assert_allclose(found.rotation, turn.as_matrix(), atol=1e-3)
+
+
+def _import(tmp_path, text=None, **options):
+    log = made.write_blackbox(tmp_path / "log.csv", span=(0, 12), rate=250.0)
+    pose = tmp_path / "pose.csv"
+    if text is not None:
+        pose.write_text(text)
+    told = {"pose": pose, "full_thrust": 30.0, **options}
+    return import_log(log, None, ImportOptions(**told))
+
+
+def test_faults_of_the_poses_are_corrected(tmp_path):
+    made.write_mocap(tmp_path / "pose.csv", span=(1.0003, 11), offset=4.0)
+    lines = (tmp_path / "pose.csv").read_text().splitlines()
+    # Time in us, the quaternion xyzw under the names of wxyz.
+    rows = [lines[0]]
+    for line in lines[1:]:
+        t, x, y, z, qw, qx, qy, qz = line.split(",")
+        rows.append(",".join([f"{float(t) * 1e6:.1f}", x, y, z, qx, qy, qz, qw]))
+    log, findings = _import(tmp_path, "\n".join(rows))
+    assert {"pose time", "pose attitude"} == {f.signal for f in findings if f.status == "corrected"}
+    truth = known_flight.fly(log.time_s + 1.0003)
+    np.testing.assert_allclose(log.pos_w, truth.pos, atol=2e-3)
+    np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
+
+
+def test_a_turned_marker_body_is_corrected(tmp_path):
+    turn = Rotation.from_euler("z", 90, degrees=True)
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 11), turn=turn)
+    log, findings = _import(tmp_path)
+    truth = known_flight.fly(log.time_s + 1.0)
+    assert "pose axes" in {f.signal for f in findings if f.status == "corrected"}
+    np.testing.assert_allclose(np.abs(np.sum(log.quat_wxyz * truth.quat, 1)), 1.0, atol=1e-5)
+
+
+def test_an_angle_of_the_wrong_sign_is_no_turned_body(tmp_path):
+    def source(time):
+        truth = known_flight.fly(time)
+        wrong = Rotation.from_quat(read_as("quat", truth.quat, "-pitch"), scalar_first=True)
+        return truth._replace(rot=wrong.as_matrix())
+
+    made.write_mocap(tmp_path / "pose.csv", span=(1.0003, 11), offset=4.0, source=source)
+    _, findings = _import(tmp_path)
+    assert {f.fault for f in findings if f.status == "corrected"} == {"attitude_sign"}
+
+
+def test_a_mirrored_gyro_is_no_turned_body(tmp_path):
+    def source(time):
+        truth = known_flight.fly(time)
+        return truth._replace(rate=truth.rate * [1.0, -1.0, 1.0])
+
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 11), offset=4.0)
+    log = made.write_blackbox(tmp_path / "log.csv", span=(0, 12), rate=500.0, source=source)
+    options = ImportOptions(pose=tmp_path / "pose.csv", full_thrust=30.0)
+    _, findings = import_log(log, None, options)
+    assert {"gyro_axes"} == {f.fault for f in findings if f.status == "corrected"}
+
+
+def test_a_pose_clock_that_no_crystal_keeps_is_named(tmp_path):
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 11), offset=4.0, drift=1e-3)
+    _, findings = _import(tmp_path)
+    (drift,) = [f for f in findings if f.fault == "clock_drift"]
+    assert drift.size == pytest.approx(1e-3, rel=0.05)
+
+
+def test_poses_of_another_flight_are_refused(tmp_path):
+    def source(time):
+        rng, truth = np.random.default_rng(0), known_flight.fly(time)
+        smooth = np.cumsum(np.cumsum(rng.normal(size=(len(time), 3)), 0), 0)
+        return truth._replace(rot=Rotation.from_rotvec(3 * smooth / smooth.max()).as_matrix())
+
+    made.write_mocap(tmp_path / "pose.csv", span=(0, 10), source=source)
+    with pytest.raises(FlightLogError, match=r"pose\.csv.*cannot be aligned"):
+        _import(tmp_path)
+
+
+def test_poses_without_an_attitude_or_too_short_are_refused(tmp_path):
+    with pytest.raises(FlightLogError, match="holds no attitude; name its columns"):
+        _import(tmp_path, "time,pos_x,pos_y,pos_z\n0,1,2,3\n1,2,3,4\n")
+    made.write_mocap(tmp_path / "pose.csv", span=(1, 2))
+    with pytest.raises(FlightLogError, match="less than 3 s"):
+        _import(tmp_path)

@@ -5,6 +5,7 @@ with and without rotor speeds and a pose, where the mistake can then be made at 
 """
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -13,14 +14,14 @@ from eval.importers import import_log
 from eval.logs.faults.check import CheckContext, check_before_diagnosis
 from eval.logs.flight_log import FlightLog
 from suite.experiments.injected.flights import flight_signals
-from suite.experiments.injected.kinds import KINDS
+from suite.experiments.injected.kinds import KINDS, inject
 from suite.experiments.injected.writers import write_table
 from tests.support import known_flight
 from tests.support.vehicles import PLAIN
 
 pytestmark = pytest.mark.slow
-DEG = 180.0 / np.pi
 ROTORS, POSE = ("motor", "pwm"), ("pos", "quat", "vel")
+ALL = (*POSE, *ROTORS, "rate", "acc", "cmd_rate", "throttle")
 LACKS = {
     "whole": (),
     "no rotor speeds": ROTORS,
@@ -29,34 +30,16 @@ LACKS = {
 }
 COMPARED = ("pos_w", "vel_w", "quat_wxyz", "rate_b", "acc_b", "rotor_speed", "thrust_cmd",
             "rate_cmd_b")  # fmt: skip
-
-
-def scaled(name, factor):
-    return lambda parts: {**parts, name: parts[name] * factor}
-
-
-def ordered(*order):
-    return lambda parts: {**parts, "motor": parts["motor"][:, list(order)]}
-
-
-SIGNALS = {
-    "gyro in counts, declared deg/s": (scaled("rate", 16.384), "rate", "gyro_scale"),
-    "gyro in rad/s, declared deg/s": (scaled("rate", 1.0 / DEG), "rate", "gyro_scale"),
-    "gyro 20 % too large": (scaled("rate", 1.2), "rate", "gyro_scale rate_curve"),
-    "motors 2, 1, 4, 3": (ordered(1, 0, 3, 2), "motor", "motor_order"),
-    "motors 4, 1, 2, 3": (ordered(3, 0, 1, 2), "motor", "motor_order"),
-    "motors 1, 2, 4, 3": (ordered(0, 1, 3, 2), "motor", "motor_order"),
-    "motors 3, 4, 1, 2": (ordered(2, 3, 0, 1), "motor", "motor_order"),
-    "12 poles declared, 14 true": (scaled("motor", 14 / 12), "motor", "motor_poles"),
-    "sign of the yaw command": (scaled("cmd_rate", [1.0, 1.0, -1.0]), "", "rate_command_sign"),
-    "throttle from 0 to 1000": (scaled("throttle", 1000.0), "", "throttle_range"),
-    "all lengths in cm": (
-        lambda parts: {**parts, "pos": 100 * parts["pos"], "vel": 100 * parts["vel"]},
-        "pos", "position_unit velocity_unit",
-    ),
-    "positions in cm": (scaled("pos", 100.0), "pos", "position_unit"),
-}  # fmt: skip
-"""Mistake -> change of the flight, the signal without which there is none, and names of it."""
+SIGNALS = (
+    ("gyro in raw counts (x16.384)",), ("gyro in rad/s, taken for deg/s",),
+    ("gyro 20 % too large",), ("motors in the order 2, 1, 4, 3",),
+    ("motors in the order 4, 1, 2, 3",), ("motors 3 and 4 swapped",),
+    ("12 poles declared of 14",), ("sign of the yaw command",), ("throttle from 0 to 1000",),
+    ("position in cm", "velocity in cm/s"), ("position in cm",),
+)  # fmt: skip
+"""Kinds of faults that are injected at once."""
+ALSO = {"gyro 20 % too large": "rate_curve"}
+"""Kind -> another name that is right for it."""
 MAPPINGS = {
     "z-up declared, north-east-down": ('world = "ned"', 'world = "z-up"', "pos", "world_frame"),
     "FLU declared, forward-right-down": (
@@ -64,7 +47,8 @@ MAPPINGS = {
     ),
     "xyzw declared, wxyz": ("[quat]\n", '[quat]\norder = "xyzw"\n', "pos", "quaternion_order"),
 }  # fmt: skip
-"""Mistake -> text of the mapping, what stands there instead, and the same as in `SIGNALS`."""
+"""Mistake -> text of the mapping, what stands there instead, the signal without which there is
+none, and names of it."""
 VEHICLES = {
     "arms in mm": "vehicle_arms",
     "speed_max in rpm": "vehicle_thrust",
@@ -111,19 +95,20 @@ def refused_by(log, vehicle=PLAIN):
 @pytest.mark.parametrize("mistake", [*SIGNALS, *MAPPINGS])
 def test_a_mistake_is_corrected_exactly_or_stops_a_diagnosis_by_its_name(tmp_path, mistake, lacks):
     if mistake in SIGNALS:
-        change, signal, names = SIGNALS[mistake]
-        wrong = {"change": change}
+        kinds = [KINDS[name] for name in mistake]
+        names = {name for kind in kinds for name in kind.names} | {ALSO.get(mistake[0], "")}
+        there = all(kind.fits({*ALL} - {*LACKS[lacks]}) for kind in kinds)
+        wrong = {"change": lambda parts: reduce(lambda p, k: inject(k, p, PLAIN), kinds, parts)}
     else:
-        *mapping, signal, names = MAPPINGS[mistake]
-        wrong = {"mapping": mapping}
-    if signal in LACKS[lacks]:
+        *mapping, signal, text = MAPPINGS[mistake]
+        there, names, wrong = signal not in LACKS[lacks], {*text.split()}, {"mapping": mapping}
+    if not there:
         pytest.skip("such a log does not hold the signal")
     log, findings = imported(tmp_path, LACKS[lacks], **wrong)
     good, _ = imported(tmp_path, LACKS[lacks])
-    told = {f.fault for f in findings if f.status in ("corrected", "doubt")}
     stops = refused_by(log)
-    assert told & set(names.split())
-    assert stops <= set(names.split()), "no wrong name"
+    assert names & {f.fault for f in findings if f.status in ("corrected", "doubt")}
+    assert stops <= names, "no wrong name"
     assert stops or same(log, good)
 
 

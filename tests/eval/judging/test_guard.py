@@ -1,4 +1,4 @@
-"""A policy's output checked and limited."""
+"""A policy's output checked and limited; the monitor around a policy and its way out."""
 
 import time
 
@@ -8,12 +8,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eval.judging.guard import ActionLimits, guard_action
-from eval.judging.judge import JudgeOptions, Record, fly
+from eval.judging.judge import Record
+from eval.judging.monitor import (
+    Monitored,
+    MonitorLimits,
+    clearance,
+    last_moment,
+    limited,
+    seen_of,
+    ways_out,
+)
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds.trial import Rules, TrialSpec
-from policies.spec import NoAnswer
-from tests.support.courses import straight
-from tests.support.pilots import Pursuit
+from eval.worlds.trial import Rules
+from policies.observation import encode_depth
+from policies.spec import NoAnswer, PolicySpec
+from tests.support.courses import fly_on, straight
+from tests.support.pilots import Pursuit, Steady
+from tracks.geometry.camera import pixel_rays_b
 
 VEHICLE = load_vehicle("reference")
 LIMITS = ActionLimits(size=10.0)
@@ -67,9 +78,8 @@ class Faulty(Pursuit):
 
 @pytest.mark.parametrize("world", ["mujoco", "reference"])
 def test_the_trial_says_so(world):
-    options = JudgeOptions(slots=3, rules=Rules(time_limit_s=0.99))
-    trials = [TrialSpec("straight", 0, seed) for seed in range(4)]
-    found = fly(Faulty(1.0), trials, VEHICLE, world, options, tracks={"straight": straight()})
+    how = {"seeds": range(4), "slots": 3, "rules": Rules(time_limit_s=0.99)}
+    found, _ = fly_on(Faulty(1.0), straight(), vehicle=VEHICLE, world=world, **how)
     # 30 decisions: 10 thirds of which 2 are fifths too, 6 fifths.
     assert {(r.bad_actions, r.limited_actions, r.late_actions) for r in found} == {(8, 6, 0)}
 
@@ -90,38 +100,117 @@ class Slow(Pursuit):
         return super().act(hidden, state, image, fresh)
 
 
-@pytest.mark.parametrize("world", ["mujoco", "reference"])
+@pytest.mark.parametrize(("world", "concerned"), [("mujoco", 2), ("reference", 1)])
 @pytest.mark.parametrize(
     ("slow", "deadline_s"),
     [(Slow(3.0, 0.3), 0.2), (Slow(3.0, 0.0, NoAnswer("it.onnx: does not come to an end")), None)],
     ids=["late", "none"],
 )
-def test_a_late_answer_ends_the_trials_that_it_was_for_and_the_run_goes_on(slow, deadline_s, world):
-    """The third of an answer for two trials; in the reference world, which has one trial, one."""
-    options = JudgeOptions(
-        slots=2, rules=Rules(time_limit_s=0.3), limits=ActionLimits(deadline_s=deadline_s)
-    )
-    slow.asked = 0
-    trials = [TrialSpec("straight", 0, seed) for seed in range(5)]
-    found = fly(slow, trials, VEHICLE, world, options, tracks={"straight": straight()})
-    assert [result.seed for result in found] == [0, 1, 2, 3, 4]
-    concerned = 2 if world == "mujoco" else 1
-    late = [(r.late_actions, r.ended_by, r.success) for r in found]
-    assert late == [(1, "timeout", False)] * concerned + [(0, "timeout", False)] * (5 - concerned)
-    ended_s = [r.time_s for r in found]
+def test_a_late_answer_ends_its_trials_and_the_run_goes_on(slow, deadline_s, world, concerned):
+    """An answer is for two trials; in the reference world, which has one slot, for one."""
+    limits, slow.asked = ActionLimits(deadline_s=deadline_s), 0
+    how = {"seeds": range(4), "slots": 2, "rules": Rules(time_limit_s=0.3), "limits": limits}
+    found, _ = fly_on(slow, straight(), vehicle=VEHICLE, world=world, **how)
+    assert [r.seed for r in found] == [0, 1, 2, 3]
+    assert {(r.ended_by, r.success) for r in found} == {("timeout", False)}
+    assert [r.late_actions for r in found] == [1] * concerned + [0] * (4 - concerned)
     # Asked at 0, 1/30 and 2/30 s: there the trial ends, and the answer is not flown.
-    assert ended_s[:concerned] == pytest.approx([2 / 30] * concerned, abs=0.002)
-    assert ended_s[concerned:] == pytest.approx([0.3] * (5 - concerned))
+    wanted_s = [2 / 30] * concerned + [0.3] * (4 - concerned)
+    assert [r.time_s for r in found] == pytest.approx(wanted_s, abs=0.002)
 
 
 def test_a_trial_whose_first_answer_is_late_ends_where_it_started():
-    options = JudgeOptions(slots=2, limits=ActionLimits(deadline_s=0.0))
-    trials = [TrialSpec("straight", 0, seed) for seed in range(5)]
-    flights = []
-    found = fly(
-        Pursuit(3.0), trials, VEHICLE, "mujoco", options,
-        lambda result, flight: flights.append(flight),
-        Record(), tracks={"straight": straight()},
-    )  # fmt: skip
+    how = {"seeds": range(5), "slots": 2, "limits": ActionLimits(deadline_s=0.0)}
+    found, flights = fly_on(Pursuit(3.0), straight(), vehicle=VEHICLE, record=Record(), **how)
     assert {(r.late_actions, r.ended_by, r.time_s) for r in found} == {(1, "timeout", 0.0)}
     assert [len(flight.time_s) for flight in flights] == [0] * 5
+
+
+SPEC = PolicySpec(rate_hz=15.0)
+BOUNDS = MonitorLimits()
+PERIOD_S = 1.0 / SPEC.rate_hz
+
+
+def observation(vel_b=(5.0, 0.0, 0.0), depth_m=10.0, last_b=(0.0, 0.0, 0.0), up_b=(0.0, 0.0, 1.0)):
+    """One level observation before a wall that fills the image at a planar depth."""
+    state = np.array([[*vel_b, *up_b, 5.0, 0.0, 0.0, *last_b]], np.float32)
+    depth = np.broadcast_to(depth_m, (SPEC.camera.height, SPEC.camera.width))
+    image = encode_depth(SPEC.depth, np.array(depth, float), SPEC.camera.range_m)
+    return state, image[None].astype(np.float32)
+
+
+def seen(**changed):
+    return seen_of(SPEC, *observation(**changed))
+
+
+def test_depths_come_back_as_points_along_the_rays():
+    found = seen(depth_m=2.0)
+    rays = pixel_rays_b(SPEC.camera)
+    np.testing.assert_allclose(found.points_b[0], 2.0 * rays, atol=1e-5)
+    assert found.hit.all() and not seen().hit.any()
+
+
+def test_tilt_and_speed_bend_an_action_and_small_ones_pass():
+    gentle = np.array([[2.0, 1.0, 0.5]])
+    np.testing.assert_allclose(limited(BOUNDS, gentle, seen()), gentle, atol=1e-12)
+    wild = limited(BOUNDS, np.array([[200.0, 0.0, 0.0]]), seen(vel_b=(1.0, 0.0, 0.0)))[0]
+    tilt = np.degrees(np.arctan2(wild[0], wild[2] + 9.81))
+    assert tilt == pytest.approx(BOUNDS.tilt_deg)
+    fast = limited(BOUNDS, np.array([[5.0, 1.0, 0.0]]), seen(vel_b=(15.0, 0.0, 0.0)))[0]
+    np.testing.assert_allclose(fast, [0.0, 1.0, 0.0], atol=1e-12)
+    braking = np.array([[-5.0, 0.0, 0.0]])
+    assert (limited(BOUNDS, braking, seen(vel_b=(15.0, 0.0, 0.0))) == braking).all()
+
+
+def test_how_near_a_path_comes_is_worked_out():
+    times = np.array([0.0, 0.2, 0.4])
+    ahead = seen(vel_b=(5.0, 0.0, 0.0), depth_m=3.0)
+    coast = clearance(BOUNDS, ahead, np.zeros((1, 3)), None, times, PERIOD_S)
+    points = ahead.points_b[0]
+    path = np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
+    expected = np.linalg.norm(points[None] - path[:, None], axis=-1).min()
+    assert coast == pytest.approx(expected)
+    stop = clearance(BOUNDS, ahead, np.array([[-20.0, 0, 0]]), None, times, PERIOD_S)
+    assert stop > coast
+    assert clearance(BOUNDS, seen(), np.zeros((1, 3)), None, times, PERIOD_S) == np.inf
+
+
+def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
+    """Towards a wall as wide as the image: from afar the policy has its will, near it has not."""
+    will = np.zeros((1, 3))
+    taken_at, action, view, blocked = None, will, seen(), 0
+    times = np.linspace(0.025, BOUNDS.horizon_s, 24)
+    for depth_m in np.arange(6.0, 0.3, -0.1):
+        view = seen(vel_b=(4.0, 0.0, 0.0), depth_m=depth_m)
+        action, taken = last_moment(BOUNDS, will, view, PERIOD_S)
+        if taken[0]:
+            taken_at = depth_m
+            break
+        assert (action == will).all()
+        ahead = clearance(BOUNDS, view, will, None, times, PERIOD_S)
+        blocked += bool(ahead[0] < BOUNDS.clearance_m)
+    assert blocked >= 3  # its path is blocked and there is time yet
+    assert taken_at is not None and 0.6 < taken_at < 2.5
+    assert any((action == way).all() for way in ways_out(BOUNDS, view))
+    assert action[0, 0] < 0 or action[0, 2] > 0
+    # The same wall, flown away from, is left alone.
+    away = seen(vel_b=(-4.0, 0.0, 0.0), depth_m=taken_at)
+    assert not last_moment(BOUNDS, will, away, PERIOD_S)[1][0]
+
+
+def test_every_row_is_judged_by_itself():
+    parts = [observation(depth_m=d) for d in (9.0, 1.2, 0.8)]
+    state, image = (np.concatenate(each) for each in zip(*parts, strict=True))
+    policy = Monitored(Steady(spec=SPEC))
+    fresh = np.ones(3, bool)
+    together, _ = policy.act(policy.start(3), state, image, fresh)
+    assert policy.interventions > 0 and policy.name == "steady+monitor"
+    for k, part in enumerate(parts):
+        alone, _ = Monitored(Steady(spec=SPEC)).act(policy.start(1), *part, fresh[:1])
+        np.testing.assert_array_equal(together[k], alone[0])
+
+
+def test_an_answer_that_is_no_number_stays_one():
+    nothing = Monitored(Steady((np.nan, 0.0, 0.0), spec=SPEC))
+    action, _ = nothing.act(nothing.start(1), *observation(depth_m=1.0), np.ones(1, bool))
+    assert np.isnan(action).any()

@@ -1,21 +1,23 @@
-"""The judge: wrong input, interrupts, and outcomes that are the trial's alone, to the bit."""
+"""The judge: wrong input, interrupts, recordings, and outcomes that are the trial's alone."""
 
 import multiprocessing
+from functools import cache
 
 import numpy as np
 import pytest
 
 from eval.judging.judge import JudgeOptions, Record, fly
+from eval.judging.recorder import Recorder
 from eval.judging.results import Journal
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.worlds import Rows
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
-from tests.support.courses import straight
+from tests.support.courses import fly_on, straight
 from tests.support.pilots import Pursuit, RandomNetwork, Steady
 from tracks.formats.custom import load_track
 
 VEHICLE = load_vehicle("reference")
-
 SHORT = Rules(time_limit_s=0.3)
 
 
@@ -26,34 +28,18 @@ def test_unknown_names_are_refused_before_anything_flies():
         fly(Pursuit(), [TrialSpec("zigzac", 0, 0)], VEHICLE)
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -5.0, 501.0])
-def test_a_policy_that_cannot_keep_time_is_refused(rate_hz):
+@pytest.mark.parametrize("rate_hz", [0.0, 501.0])
+@pytest.mark.parametrize("world", ["mujoco", "reference"])
+def test_a_policy_that_cannot_keep_time_is_refused(rate_hz, world):
     policy = Steady(spec=PolicySpec(rate_hz=rate_hz))
-    for world in ("mujoco", "reference"):
-        with pytest.raises(ValueError, match="decides at"):
-            fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE, world)
+    with pytest.raises(ValueError, match="decides at"):
+        fly(policy, [TrialSpec("zigzag", 0, 0)], VEHICLE, world)
 
 
-def test_the_reference_world_records_nothing():
+def test_the_reference_world_records_nothing_and_without_trials_nothing_flies():
     with pytest.raises(ValueError, match="records no flights"):
         fly(Pursuit(), [TrialSpec("zigzag", 0, 0)], VEHICLE, "reference", record=Record())
-
-
-def test_no_trials():
     assert fly(Pursuit(), [], VEHICLE) == []
-
-
-def test_a_policy_is_asked_for_no_more_rows_than_there_are_trials():
-    asked = []
-
-    class Counted(Steady):
-        def act(self, hidden, state, image, fresh):
-            asked.append(len(state))
-            return super().act(hidden, state, image, fresh)
-
-    trials = [TrialSpec("zigzag", 0, seed) for seed in range(3)]
-    fly(Counted(), trials, VEHICLE, options=JudgeOptions(rules=SHORT))
-    assert set(asked) == {3}
 
 
 def test_tracks_with_meshes_are_flown_beside_others(root):
@@ -68,17 +54,12 @@ def test_tracks_with_meshes_are_flown_beside_others(root):
 
 @pytest.mark.parametrize("rate_hz", [7.0, 30.0, 100.0, 500.0])
 def test_decisions_come_at_the_policys_rate(rate_hz):
-    flights = []
-    options = JudgeOptions(slots=2, rules=Rules(time_limit_s=1.0))
-    trials = [TrialSpec("straight", 0, 0)]
-    fly(
-        Steady(spec=PolicySpec(rate_hz=rate_hz)), trials, VEHICLE, "mujoco", options,
-        lambda result, flight: flights.append(flight), Record(), {"straight": straight()},
-    )  # fmt: skip
+    policy, rules = Steady(spec=PolicySpec(rate_hz=rate_hz)), Rules(time_limit_s=1.0)
+    _, (flight,) = fly_on(policy, straight(), vehicle=VEHICLE, record=Record(), rules=rules)
     # A decision shows in the first row that flies it; rows are 100 a second.
     expected = {round(k * 500 / rate_hz) for k in range(int(rate_hz) + 1)}
     rows = {-(-step // 5) for step in expected if step < 500}
-    found = {round(t * 100) for t in flights[0].time_s[flights[0].policy_step]}
+    found = {round(t * 100) for t in flight.time_s[flight.policy_step]}
     assert found | {100} == rows | {100}
 
 
@@ -115,20 +96,17 @@ def test_interrupt_keeps_what_was_finished_and_the_rest_is_flown_later(tmp_path,
 TRIALS = [
     TrialSpec(track, level, 0) for track in ("zigzag", "circular", "ellipse") for level in (1, 6)
 ]
-
 RULES = Rules(time_limit_s=0.5)
 
 
-def results(trials, slots=64, threads=1):
-    options = JudgeOptions(slots, threads, rules=RULES)
-    return fly(network(), trials, VEHICLE, "mujoco", options)
-
-
-_made = {}
-
-
+@cache
 def network():
-    return _made.setdefault("network", RandomNetwork())
+    return RandomNetwork()
+
+
+def results(trials, slots=64, threads=1, world="mujoco"):
+    options = JudgeOptions(slots, threads, rules=RULES)
+    return fly(network(), trials, VEHICLE, world, options)
 
 
 @pytest.fixture(scope="module")
@@ -144,21 +122,100 @@ def same(trials, found, expected):
     assert found == [expected[trial] for trial in trials]
 
 
-def test_repetition_order_subset_and_threads(expected):
-    order = [TRIALS[i] for i in np.random.default_rng(1).permutation(len(TRIALS))][:4]
-    same(order, results(order), expected)
-    same(TRIALS[5:6], results(TRIALS[5:6]), expected)
-    same(TRIALS, results(TRIALS, slots=5, threads=2), expected)
-
-
-@pytest.mark.parametrize("slots", [3, 20])
-def test_number_of_slots(expected, slots):
+def test_outcomes_are_the_same_at_any_order_number_of_slots_and_threads(expected):
+    same(TRIALS[5:1:-2], results(TRIALS[5:1:-2]), expected)
     # With 3 slots trials start in the middle of others, each in any slot.
-    same(TRIALS, results(TRIALS, slots), expected)
+    same(TRIALS, results(TRIALS, slots=3, threads=2), expected)
 
 
 def test_reference_world_flies_the_same(expected):
     trials = TRIALS[1::2]
-    options = JudgeOptions(rules=RULES)
-    found = fly(network(), trials, VEHICLE, "reference", options)
+    found = results(trials, world="reference")
     assert [r._replace(world="mujoco") for r in found] == [expected[t] for t in trials]
+
+
+def rows(due, time_s):
+    """Rows of two slots: the numbers of slot 1 are those of slot 0 and ten more."""
+    add = np.array([0.0, 10.0])
+    three, four = (np.arange(size) + add[:, None] for size in (3, 4))
+    return Rows(
+        due=np.asarray(due),
+        time_s=np.asarray(time_s, dtype=float),
+        pos_w=three,
+        quat_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        vel_w=three,
+        rate_b=three,
+        thrust_cmd=9.81 + add,
+        rate_cmd_b=three,
+        rotor_speed=four,
+        gate=(add + 2).astype(int),
+    )
+
+
+def test_slots_do_not_mix_and_a_decision_is_flagged_once():
+    recorder = Recorder(2, depth=True)
+    action_b = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    depth_m = np.stack([np.full((2, 2), 7.0), np.full((2, 2), 8.0)])
+    recorder.add(rows([True, True], [0.0, 0.5]))
+    recorder.decided(np.array([1]), action_b, depth_m)
+    recorder.add(rows([False, True], [0.1, 0.6]))
+    recorder.add(rows([True, True], [0.2, 0.7]))
+    first, second = recorder.finish(0, {"seed": 3}), recorder.finish(1, {"seed": 4})
+    assert first.about == {"seed": 3} and second.about == {"seed": 4}
+    np.testing.assert_array_equal(first.time_s, [0.0, 0.2])
+    np.testing.assert_array_equal(second.time_s, [0.5, 0.6, 0.7])
+    np.testing.assert_array_equal(second.pos_w, np.tile([10.0, 11.0, 12.0], (3, 1)))
+    np.testing.assert_array_equal(second.rotor_speed, np.tile([10.0, 11.0, 12.0, 13.0], (3, 1)))
+    np.testing.assert_array_equal(second.gate, [12, 12, 12])
+    assert second.policy_step.tolist() == [False, True, False] and not first.policy_step.any()
+    np.testing.assert_array_equal(second.action_b, [[0, 0, 0], [4, 5, 6], [4, 5, 6]])
+    assert second.depth_m is not None and first.depth_m is not None
+    assert second.depth_m.dtype == np.float32 and len(first.depth_m) == 0
+    np.testing.assert_array_equal(second.depth_m, depth_m[1:])
+
+
+def test_the_next_trial_of_a_slot_begins_with_nothing():
+    recorder = Recorder(2, depth=False)
+    recorder.decided(np.array([0]), np.ones((2, 3)), np.zeros((2, 2, 2)))
+    recorder.add(rows([True, True], [0.0, 0.0]))
+    recorder.start(0)
+    empty = recorder.finish(0, {})
+    assert (empty.time_s.shape, empty.quat_wxyz.shape, empty.depth_m) == ((0,), (0, 4), None)
+    recorder.add(rows([True, False], [0.0, 0.0]))
+    (action,) = recorder.finish(0, {}).action_b
+    np.testing.assert_array_equal(action, np.zeros(3))
+
+
+def test_recording_changes_nothing():
+    levels = ((track, level) for track in ("zigzag", "circular") for level in (1, 6))
+    trials = [TrialSpec(track, level, 0) for track, level in levels]
+    options, flights = JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)), {}
+    policy = RandomNetwork()
+    found = fly(
+        policy, trials, VEHICLE, "mujoco", options,
+        on_result=lambda result, flight: flights.update({result.trial: flight}),
+        record=Record(depth=True),
+    )  # fmt: skip
+    assert found == fly(policy, trials, VEHICLE, "mujoco", options)
+    for result in found:
+        check_flight(flights[result.trial], result)
+
+
+def check_flight(flight, result):
+    rows = len(flight.time_s)
+    assert np.diff(flight.time_s).min() > 0 and flight.time_s[0] == 0.0
+    assert np.allclose(np.diff(flight.time_s)[:-1], 0.01)
+    assert flight.time_s[-1] == pytest.approx(result.time_s)
+    assert np.array_equal(flight.pos_w[-1], [result.pos_x, result.pos_y, result.pos_z])
+    assert (flight.gate[-1], flight.about["ended_by"]) == (result.gates_passed, result.ended_by)
+    assert {len(part) for part in flight[:-2]} == {rows}
+    # 30 decisions a second, the first at once; each has its image.
+    assert flight.policy_step[0] and flight.policy_step.sum() == len(flight.depth_m)
+    assert abs(flight.policy_step.sum() - 30 * result.time_s) <= 1.5
+    # The action in use changes where a decision is flagged and nowhere else.
+    changed = (np.diff(flight.action_b, axis=0) != 0).any(-1)
+    assert not changed[~flight.policy_step[1:]].any()
+    # Velocity is the position's slope, and hovering rotors carry the weight at the start.
+    slope = np.gradient(flight.pos_w, flight.time_s, axis=0)
+    assert np.abs(slope - flight.vel_w)[2:-2].max() < 0.1
+    assert 4 * 1.6e-6 * (flight.rotor_speed[0] ** 2).mean() > 0

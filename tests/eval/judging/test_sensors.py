@@ -1,20 +1,26 @@
-"""Sensor models in the judge: a trial's own errors whatever flies beside it, and none where off."""
+"""Sensor models and the estimator in the judge: errors and outcomes are the trial's own."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+from eval.judging import filtered, judge
 from eval.judging import judge as module
+from eval.judging.filtered import Filtered, inertial
 from eval.judging.judge import JudgeOptions, fly
 from eval.judging.sensors import Sensors
 from eval.quadrotor.vehicle_file import load_vehicle
+from eval.sensors.filter.kalman import error_of, update_gate
 from eval.sensors.sensors_file import PERFECT, load_sensors, scale_sensors, sensor_set
-from eval.worlds import View
 from eval.worlds.trial import Rules, TrialSpec
-from tests.support.pilots import RandomNetwork
+from policies.observation import View
+from policies.spec import PolicySpec
+from tests.support.pilots import Pursuit, RandomNetwork
 from tracks.geometry.camera import Camera
+from tracks.geometry.rotation import exp_rot
 
 VEHICLE = load_vehicle("reference")
 RULES = Rules(time_limit_s=0.3)
@@ -89,7 +95,7 @@ def flown():
 
 
 def test_every_model_reaches_the_policy():
-    few = TRIALS[:3]
+    few = TRIALS[:2]
     true = results(few, PERFECT)
     flying = {}
     for name in ("all", "tof-depth", "nanobench"):
@@ -115,3 +121,84 @@ def test_the_reference_simulator_shows_the_same():
     assert [row._replace(world="mujoco") for row in two] == one
     with pytest.raises(ValueError, match="has no delay of observations"):
         results(TRIALS[:1], sensor_set({"delay": {"state": 0.1}}), world="reference")
+
+
+SPEC = PolicySpec(rate_hz=31.25, camera=Camera(width=4, height=4))
+DELAY_S = 1.0 / SPEC.rate_hz
+"""One period: the truth at the filter's horizon is what was seen at the decision before."""
+TWO_TRACKS = [TrialSpec(track, 0, seed) for track in ("circular", "zigzag") for seed in range(20)]
+
+
+def filtering(**changed):
+    """Return the shipped sensors, with what is changed of the filter."""
+    shipped = {k: values._asdict() for k, values in load_sensors("imu+gates").models.items()}
+    return sensor_set({**shipped, "gate_filter": shipped["gate_filter"] | changed})
+
+
+def filtered_flights(wanted, trials, monkeypatch, slots=40, seconds=1.6):
+    """Return the results, and the NEES (T, N) of position, velocity and attitude."""
+    found = []
+
+    class Watched(Filtered):
+        def see(self, view, truth, fresh, flying):
+            seen = super().see(view, truth, fresh, flying)
+            assert self.filters is not None and self._truth is not None
+            past.append(View(*self._truth))
+            if len(past) > 1:
+                state, (pos_w, rot_w, vel_w, *_) = self.filters.state, past[-2]
+                true = state._replace(pos_w=pos_w, rot_w=rot_w, vel_w=vel_w)
+                error = error_of(state, true)[:, :9, None]
+                covariance = state.covariance[:, :9, :9]
+                value = (error * np.linalg.solve(covariance, error)).sum((1, 2))
+                found.append(np.where(flying, value, np.nan))
+            return seen
+
+    past = []
+    monkeypatch.setattr(judge, "Filtered", Watched)
+    options = JudgeOptions(slots=slots, sensors=wanted, rules=Rules(time_limit_s=seconds))
+    results = fly(Pursuit(spec=SPEC), trials, VEHICLE, options=options)
+    return results, np.array(found)
+
+
+@pytest.mark.parametrize(("believed", "least", "most"), [(1.0, 0.9, 1.0), (0.25, 0.0, 0.5)])
+def test_nees_is_within_its_bounds_if_the_corners_variance_is_right(
+    monkeypatch, believed, least, most
+):
+    def sure(state, corners, variance, camera_b):
+        return update_gate(state, corners, believed * variance, camera_b)
+
+    monkeypatch.setattr(filtered, "update_gate", sure)
+    # From a second after the start on.
+    late = filtered_flights(filtering(delay=DELAY_S), TWO_TRACKS, monkeypatch)[1][30:]
+    flying = np.isfinite(late).sum(axis=1)
+    low, high = (chi2.ppf(share, 9 * flying) / flying for share in (0.025, 0.975))
+    mean = np.nanmean(late, axis=1)
+    assert least <= np.mean((low < mean) & (mean < high)) <= most
+
+
+def test_an_ideal_imu_reads_nothing_in_free_fall_and_the_turn():
+    rng = np.random.default_rng(0)
+    rot_w, turn_b = exp_rot(rng.normal(size=(5, 3))), 0.04 * rng.normal(size=(5, 3))
+    none = (np.zeros((5, 3)),) * 4
+    before = View(np.zeros((5, 3)), rot_w, np.ones((5, 3)), *none)
+    fallen = np.ones((5, 3)) - [0.0, 0.0, 9.81 * 0.002]
+    after = View(np.zeros((5, 3)), rot_w @ exp_rot(turn_b), fallen, *none)
+    found = inertial(before, after, 0.002)
+    np.testing.assert_allclose(found.acc_b, 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.rate_b, turn_b / 0.002, atol=1e-6)
+
+
+def test_a_trials_outcome_is_the_same_at_any_batch(monkeypatch):
+    together, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 2, 0.6)
+    alone, _ = filtered_flights(filtering(), TWO_TRACKS[:2], monkeypatch, 1, 0.6)
+    assert together == alone
+
+
+def test_what_has_no_estimator_refuses_it(monkeypatch):
+    wanted = load_sensors("imu+gates")
+    with pytest.raises(ValueError, match="world 'reference' has no state estimator"):
+        fly(Pursuit(spec=SPEC), TWO_TRACKS[:1], VEHICLE, "reference", JudgeOptions(sensors=wanted))
+    models = {name: values._asdict() for name, values in wanted.models.items()}
+    late = sensor_set({**models, "delay": {"state": 0.02}})
+    with pytest.raises(ValueError, match=r"delay.state is 0.02 s, but the estimator"):
+        filtered_flights(late, TWO_TRACKS[:1], monkeypatch)

@@ -17,17 +17,6 @@ from eval.judging.statistics import (
 )
 
 
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    # Newcombe 1998, Statistics in Medicine 17, 857-872, Table I, method 3.
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611),
-     (1, 29, 0.0061, 0.1718)],
-)  # fmt: skip
-def test_wilson_published(successes, trials, low, high):
-    found = wilson(successes, trials)
-    assert found == pytest.approx((successes / trials, low, high), abs=5e-5)
-
-
 @given(st.integers(1, 200), st.data())
 def test_wilson_is_where_the_score_test_rejects(trials, data):
     successes = data.draw(st.integers(0, trials))

@@ -1,4 +1,4 @@
-"""Columns come back from Parquet and CSV as they were written; damaged files are named."""
+"""Columns come back as they were written; a broken rule or file is refused by name."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from eval.logs import files
-from eval.logs.files import first_line, read_head
+from eval.logs.columns import GROUPS
 from eval.logs.flight_log import (
     FlightLog,
     FlightLogError,
@@ -22,7 +22,7 @@ from eval.logs.flight_log import (
     read_flight,
     write_flight,
 )
-from tests.support.log_tables import KINDS, assert_same, columns, write_table
+from tests.support.log_tables import KINDS, STATE, assert_same, columns, write_table
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -83,6 +83,7 @@ def test_files_that_are_no_logs_are_refused(tmp_path):
         "word.csv": (text.replace(lines[5].split(",")[0], "oops", 1).encode(), "oops"),
         "short.csv": ("\n".join([*lines[:3], "1,2", *lines[3:]]).encode(), "row 3: 2 values"),
         "twice.csv": (text.replace('"pos_y"', '"pos_x"').encode(), "twice"),
+        "letters.csv": (text.encode().replace(b"1", b"\xe9", 99), "nor CSV in UTF-8"),
     }
     for name, (content, reason) in cases.items():
         path = tmp_path / name
@@ -115,35 +116,20 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_row_that_is_no_text_is_refused(tmp_path):
-    path = write_table(tmp_path / "good.csv", columns())
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join([*lines[:5], lines[5][:60] + b"\xf0\x9f\n", *lines[6:]]))
-    with pytest.raises(FlightLogError, match="nor CSV in UTF-8"):
-        read_flight(path)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_log_of_too_many_rows_is_refused_unread(tmp_path, kind, monkeypatch):
     monkeypatch.setattr(files, "MOST_ROWS", 149)
-    path = tmp_path / f"long.{kind}"
-    write_table(path, columns(150))
+    path = write_table(tmp_path / f"long.{kind}", columns(150))
     read = pyarrow.csv if kind == "csv" else pyarrow.parquet.ParquetFile
     monkeypatch.setattr(read, "read_csv" if kind == "csv" else "read", None)
     with pytest.raises(FlightLogError, match="rows; at most 149"):
         read_flight(path)
 
 
-def wide(path, rows=4_000_000, more=26):
-    """Write a Parquet file of few bytes and of more cells than a log may have."""
-    zeros = pa.array(np.zeros(rows, np.int8))
-    table = pa.table({"time": zeros} | {f"u{k}": zeros for k in range(more)})
-    pyarrow.parquet.write_table(table, path)
-    return path
-
-
-def test_of_more_cells_than_fit_only_known_columns_are_read(tmp_path):
-    read, _, warnings = files.read_columns(wide(tmp_path / "wide.parquet"))
+def test_of_more_cells_than_fit_only_known_columns_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_CELLS", 1000)
+    table = {"time": np.zeros(400)} | {f"u{k}": np.zeros(400) for k in range(26)}
+    read, _, warnings = files.read_columns(write_table(tmp_path / "wide.parquet", table))
     assert list(read) == ["time"] and "26 of 27 columns are left out" in warnings[0]
 
 
@@ -179,18 +165,85 @@ def test_texts_stay_coded_and_lists_are_left_out(tmp_path):
         read_flight(write_table(tmp_path / "in.parquet", table | {"pos_x": table["list"]}))
 
 
-def test_a_head_is_the_first_bytes_only(tmp_path):
-    path = tmp_path / "log"
-    path.write_bytes(b"time,x\n" + bytes(20000))
-    head = read_head(path)
-    assert head == path.read_bytes()[: len(head)] and 1000 < len(head) < 20000
-    assert first_line(head) == b"time,x"
-    assert first_line(b"no end") == b"no end"
+@pytest.mark.parametrize("groups", [("motor",), ("cmd_thrust", "cmd_rate"), ("motor", "acc")])
+def test_motors_or_commands_alone_are_enough(groups):
+    log = log_from_columns(columns(groups=(*STATE, "vel", *groups)), {}, "a")
+    assert (log.rotor_speed is not None) == ("motor" in groups)
+    assert (log.thrust_cmd is not None) == (log.rate_cmd_b is not None) == ("motor" not in groups)
+    assert (log.acc_b is not None) == ("acc" in groups)
+    assert log.whole.all()
 
 
-def test_no_file_and_an_empty_one_are_refused_by_name(tmp_path):
-    with pytest.raises(FlightLogError, match=r"none\.ulg: .*cannot be read: No such file"):
-        read_head(tmp_path / "none.ulg")
-    (tmp_path / "empty.ulg").touch()
-    with pytest.raises(FlightLogError, match=r"empty\.ulg: .*the file is empty"):
-        read_head(tmp_path / "empty.ulg")
+def spoil(name, row, value):
+    return lambda table: table[name].__setitem__(row, value)
+
+
+def drop(name, other="unknown"):
+    return lambda table: table.update({other: table.pop(name)})
+
+
+BAD = [
+    (spoil("time", 7, 0.06), "time", 8, "does not come after"),
+    (spoil("time", 7, 0.01), "time", 8, "must increase"),
+    (spoil("pos_y", 3, np.inf), "pos_y", 4, "infinite"),
+    (spoil("vel_x", 0, -np.inf), "vel_x", 1, "infinite"),
+    (spoil("cmd_rate_z", 149, np.inf), "cmd_rate_z", 150, "infinite"),
+    (spoil("pos_z", 9, -100_001.0), "pos_z", 10, "100 km"),
+    (spoil("rate_x", 2, 201.0), "rate_x", 3, "200 rad/s"),
+    (spoil("vel_x", 3, 1e300), "vel_x", 4, "too large for any unit"),
+    (spoil("quat_w", 5, 3.0), "quat_w", 6, "norm"),
+    (drop("pos_x"), "pos_x", None, "missing"),
+    (drop("pos_x", "x"), "pos_x", None, "did you mean 'x'"),
+    (drop("rate_y", "Rate_Y"), "rate_y", None, "did you mean 'Rate_Y'"),
+    (drop("time", "timestamp"), "time", None, "did you mean 'timestamp'"),
+    (drop("vel_y"), "vel_y", None, "missing"),
+    (drop("cmd_thrust"), "cmd_thrust", None, "cmd_rate_x needs it"),
+    (drop("cmd_rate_y"), "cmd_rate_y", None, "missing"),
+]
+
+
+@pytest.mark.parametrize(("change", "column", "row", "reason"), BAD)
+def test_a_broken_rule_is_refused_with_file_column_row_and_reason(
+    tmp_path, change, column, row, reason
+):
+    table = columns()
+    change(table)
+    for kind in KINDS:
+        path = write_table(tmp_path / f"bad.{kind}", table)
+        with pytest.raises(FlightLogError) as caught:
+            read_flight(path)
+        error = caught.value
+        assert (error.name, error.column, error.row) == (str(path), column, row)
+        assert reason in error.reason and str(path) in str(error) and column in str(error)
+        assert row is None or f"row {row}" in str(error)
+
+
+def test_values_at_the_limits_are_taken():
+    table = columns()
+    table["pos_z"][0], table["rate_x"][0] = 100e3, -200.0
+    for part in GROUPS["quat"]:
+        table[part][4] *= 1.049
+        table[part][5] *= 0.951
+    log = log_from_columns(table, {}, "a")
+    np.testing.assert_allclose(np.linalg.norm(log.quat_wxyz, axis=1), 1, atol=1e-12)
+    assert log.pos_w[0, 2] == 100e3
+
+
+def test_rows_are_counted_as_in_the_file_where_some_have_no_time():
+    table = columns()
+    table["time"][:3] = np.nan
+    table["rate_z"][10] = 500
+    with pytest.raises(FlightLogError, match="row 11"):
+        log_from_columns(table, {}, "a")
+
+
+def test_less_than_a_second_no_rows_and_no_command_are_refused():
+    with pytest.raises(FlightLogError, match="0.99 s of flight; at least 1 s"):
+        log_from_columns(columns(rows=100), {}, "a")
+    with pytest.raises(FlightLogError, match="no rows"):
+        log_from_columns(columns(rows=0), {}, "a")
+    with pytest.raises(FlightLogError, match="neither cmd_thrust .* motor_4"):
+        log_from_columns(columns(groups=STATE), {}, "a")
+    for name in ("quat_y", "cmd_thrust"):
+        with pytest.raises(FlightLogError, match=name):
+            log_from_columns(columns() | {name: np.full(150, np.nan)}, {}, "a")

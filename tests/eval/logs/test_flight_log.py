@@ -29,26 +29,23 @@ from tests.support.log_tables import KINDS, assert_same, columns, write_table
 def test_our_flight_round_trips_bit_for_bit_with_its_extras(tmp_path, kind):
     flight = smooth_flight(small_track())
     log = log_from_flight(flight)
-    for name in ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b"):
-        np.testing.assert_array_equal(getattr(log, name), getattr(flight, name), err_msg=name)
     path = write_flight(tmp_path / f"a.{kind}", log)
     back = read_flight(path)
     assert_same(log, back)
     assert back.name == str(path) and not back.warnings and not back.velocity_derived
-    np.testing.assert_array_equal(back.action_b, flight.action_b)
-    np.testing.assert_array_equal(back.policy_step, flight.policy_step)
-    np.testing.assert_array_equal(back.gate, flight.gate)
+    state = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b")
+    for name in (*state, "action_b", "policy_step", "gate"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(flight, name), err_msg=name)
     assert back.about["track"] == "zigzag" and back.about["seed"] == 5
     assert {"schema", "suite_version", "git_commit"} <= set(back.about)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_how_a_simulator_stepped_comes_back_and_nothing_is_made_up(tmp_path, kind):
+def test_how_a_simulator_stepped_comes_back_and_nothing_is_made_up(tmp_path):
     log = log_from_flight(smooth_flight(small_track()))
     assert log.integrator is None and log.step_s is None
     said = replace(log, about={**log.about, "integrator": "euler", "step_s": 0.002})
-    back = read_flight(write_flight(tmp_path / f"a.{kind}", said))
+    back = read_flight(write_flight(tmp_path / "a.parquet", said))
     assert (back.integrator, back.step_s) == ("euler", 0.002)
     for odd in ({"integrator": 4, "step_s": "fine"}, {"step_s": 0.0}, {"step_s": True}):
         assert (replace(log, about=odd).integrator, replace(log, about=odd).step_s) == (None, None)
@@ -99,14 +96,11 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
     flights, warnings = read_flights([good, bad, good])
     assert [flight.name for flight in flights] == [str(good)] * 2
     assert len(warnings) == 1 and str(bad) in warnings[0] and "pos_x" in warnings[0]
-    with pytest.raises(FlightLogError, match="none can be used") as caught:
-        read_flights([bad])
-    assert str(bad) in str(caught.value)
     worse = bad.with_name("worse.csv")
     worse.write_bytes(bad.read_bytes())
-    with pytest.raises(FlightLogError) as caught:
+    with pytest.raises(FlightLogError, match="none can be used") as caught:
         read_flights([bad, worse])
-    assert len(str(caught.value).splitlines()) == 3, "a line each"
+    assert str(bad) in str(caught.value) and len(str(caught.value).splitlines()) == 3, "a line each"
     with pytest.raises(FlightLogError, match="no file"):
         read_flights([])
 
@@ -114,16 +108,8 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
 def test_a_row_that_lacks_a_torque_is_not_whole():
     still, up = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     torque = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, 0.0]])
-    log = FlightLog(
-        "made",
-        np.arange(3.0),
-        still,
-        up,
-        still,
-        still,
-        thrust_cmd=np.array([9.0, 9.0, np.nan]),
-        torque_cmd_b=torque,
-    )
+    log = FlightLog("made", np.arange(3.0), still, up, still, still,
+                    thrust_cmd=np.array([9.0, 9.0, np.nan]), torque_cmd_b=torque)  # fmt: skip
     np.testing.assert_array_equal(log.whole, [True, False, False])
 
 
@@ -145,7 +131,7 @@ def test_derived_velocity_follows_a_racing_flight_over_jitter_and_holes(tmp_path
     np.testing.assert_array_equal(back.vel_w, log.vel_w)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), rate=st.sampled_from([20, 100, 500]))
 def test_derived_velocity_of_a_cubic_is_exact_at_any_sampling(seed, rate):
     rng = np.random.default_rng(seed)

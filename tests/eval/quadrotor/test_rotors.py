@@ -1,7 +1,6 @@
 """Rotors' lag against an independent integration, late commands, and the mixer by hand."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +13,6 @@ from eval.quadrotor.rotors import (
     delay_weight,
     delayed,
     follow,
-    speed_command,
     whole_steps,
 )
 from tests.support.vehicles import PLAIN
@@ -45,10 +43,6 @@ def test_lag_can_be_fitted_from_none():
     # Thrust comes late: dt mean(Omega^2) loses (Omega_c^2 - Omega^2) tau - (...)^2 tau / 2.
     expected = 4 * (2 * 1500.0 * -500.0 + 0.5 * 500.0**2) / 0.002
     assert slope == pytest.approx(expected, rel=1e-5)
-
-
-def test_speed_command_inverts_the_thrust_curve():
-    np.testing.assert_allclose(speed_command(np.array([1.6, 0.0]), 1.6e-6), [1000.0, 0.0])
 
 
 def test_the_mean_acceleration_is_what_the_speed_changed_by():
@@ -89,24 +83,8 @@ def test_what_acts_is_the_line_through_what_was_given(delay):
             np.testing.assert_allclose(now, (1 - part) * before[0] + part * before[1], atol=1e-7)
 
 
-def test_no_delay_needs_no_memory():
-    assert delay_weight(np.asarray(0.0), DT, 0.0).shape == (0,)
-
-
-def test_a_delay_has_a_slope():
-    past = jnp.arange(4.0)[::-1][None] ** 2  # newest first: 9, 4, 1, 0
-
-    def acting(delay):
-        return delayed(delay_weight(delay, DT, 0.006), past, jnp.full(1, 16.0))[1][0]
-
-    # Between 1 and 2 steps late: from 3^2 to 2^2 in one step.
-    np.testing.assert_allclose(jax.grad(acting)(0.003), (4.0 - 9.0) / DT, rtol=1e-5)
-
-
 MATRIX = mixer_matrix(PLAIN.rotors.position, PLAIN.rotors.spin, 2.2e-8 / 1.6e-6)
-
 UNMIXER = np.linalg.inv(MATRIX)
-
 LIMIT = 7.056
 
 
@@ -140,7 +118,6 @@ def test_mix_by_hand(force, torque, expected):
 
 
 NEWTONS = st.floats(-10.0, 60.0)
-
 TORQUES = st.lists(st.floats(-5.0, 5.0), min_size=3, max_size=3)
 
 

@@ -1,4 +1,4 @@
-"""The stepper: physics, parity with MuJoCo and numpy, and gradients of every effect."""
+"""The steppers: physics, parity with MuJoCo and numpy, order, and gradients of every effect."""
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +9,11 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from eval.effects import EFFECTS, all_values
+from eval.quadrotor import continuous
+from eval.quadrotor import plant as plants
+from eval.quadrotor.continuous import Steps
 from eval.quadrotor.model import compile_quadrotor
-from eval.quadrotor.plant import (
-    Command,
-    Motion,
-    Wrench,
-    accelerations,
-    euler_step,
-    fit_plant,
-    make_plant,
-)
+from eval.quadrotor.plant import Command, Motion, Wrench, accelerations, fit_plant, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, plant_step, rollout, step
 from eval.quadrotor.vehicle_file import load_vehicle
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
@@ -37,7 +32,6 @@ def aggressive_commands(steps, seed=0):
 
 
 PART = 50
-
 ROLLOUT = jax.jit(rollout)
 
 
@@ -113,7 +107,6 @@ def test_the_whole_catalogue_at_once_flies_like_mujoco():
 
 
 BASE = with_lag(PLAIN, 0.03)
-
 TRIMMED = {
     # Away from every kink: a delay between steps, wind and sag that act, rotors near the ground.
     "command_delay": (0.0113,),
@@ -178,15 +171,6 @@ def test_gradient_of_every_parameter_is_that_of_finite_differences(slopes, name)
         np.testing.assert_allclose(ours, expected, rtol=2e-4, atol=1e-7)
 
 
-def test_rollouts_map_over_flights():
-    plant = fit_plant(load_vehicle("reference"), {})
-    flights = [aggressive_commands(PART, seed) for seed in range(3)]
-    commands = Command(*(jnp.stack(parts) for parts in zip(*flights, strict=True)))
-    together = jax.jit(jax.vmap(lambda c: rollout(plant, FAST, Inputs(c)).motion.pos_w))(commands)
-    alone, _ = fly(plant, FAST, flights[1])
-    np.testing.assert_allclose(together[1], alone.pos_w, atol=1e-12)
-
-
 def test_measured_rotor_speeds_stand_for_the_command():
     plant, speed = make_plant(PLAIN, 0.002), jnp.full((40, 4), 1200.0)
     held = rollout(plant, FAST, Inputs(aggressive_commands(40), rotor_speed=speed))
@@ -212,20 +196,6 @@ def test_a_push_is_an_acceleration_in_body_axes():
     assert given.motion.vel_w[-1, 0] > 0.09
 
 
-def test_numpy_steps_as_a_rollout_does():
-    plant, commands = make_plant(load_vehicle("reference"), 0.002), aggressive_commands(50)
-    state, motion, wrench = hover_state(plant, ()), FAST, None
-    for k in range(50):
-        inputs = Inputs(Command(*(np.asarray(field[k]) for field in commands)))
-        state, motion, wrench = step(plant, state, motion, inputs, 0.002 * k)
-    flown = rollout(plant, FAST, Inputs(commands))
-    for ours, theirs in zip(motion, flown.motion, strict=True):
-        np.testing.assert_allclose(ours, theirs[-1], atol=1e-12)
-    np.testing.assert_allclose(state.rotor_speed, flown.rotor_speed[-1], rtol=1e-12)
-    assert wrench is not None
-    np.testing.assert_allclose(wrench.force_b / plant.constants.mass, flown.acc_b[-1], atol=1e-12)
-
-
 def test_rate_loop_cancels_the_gyroscopic_torque():
     plant = make_plant(PLAIN, 0.002)
     rate = np.array([2.0, -1.0, 1.5])
@@ -244,33 +214,22 @@ def reference_flight(vehicle, command_of, duration, start):
     hubs, spin = np.array(vehicle.rotors.position), np.array(vehicle.rotors.spin)
     k_t, k_q = vehicle.rotors.thrust_coefficient, vehicle.rotors.torque_coefficient
     inertia, gain = np.diag(vehicle.inertia), np.diag(vehicle.controller.rate_gain)
-    allocation = np.array(
-        [[1, y, -x, -s * k_q / k_t] for (x, y, _), s in zip(hubs, spin, strict=True)]
-    ).T
+    x, y, _ = hubs.T
+    allocation = np.array([np.ones(4), y, -x, -spin * k_q / k_t])
 
-    def slopes(t, y):
-        attitude = Rotation.from_quat(y[3:7])
-        velocity, rate, speed = y[7:10], y[10:13], y[13:]
+    def slopes(t, state):
+        attitude, vector, scalar = Rotation.from_quat(state[3:7]), state[3:6], state[6]
+        velocity, rate, speed = state[7:10], state[10:13], state[13:]
         thrust, wanted_rate = command_of(t)
         torque = inertia @ gain @ (wanted_rate - rate) + np.cross(rate, inertia @ rate)
         asked = np.linalg.solve(allocation, [vehicle.mass * thrust, *torque])
         assert np.all((asked > 0) & (asked < vehicle.rotors.thrust_max))
         push = k_t * speed**2
-        twist = np.sum(
-            [np.cross(hub, [0, 0, f]) for hub, f in zip(hubs, push, strict=True)], axis=0
-        )
+        twist = np.cross(hubs, push[:, None] * [0, 0, 1]).sum(axis=0)
         twist = twist + [0, 0, -(spin * k_q * speed**2).sum()]
         turn = np.linalg.solve(inertia, twist - np.cross(rate, inertia @ rate))
         acc = attitude.apply([0, 0, push.sum() / vehicle.mass]) + [0, 0, -9.81]
-        x, yq, z, _ = y[3:7]
-        spun = 0.5 * np.array(
-            [
-                y[6] * rate[0] + yq * rate[2] - z * rate[1],
-                y[6] * rate[1] + z * rate[0] - x * rate[2],
-                y[6] * rate[2] + x * rate[1] - yq * rate[0],
-                -x * rate[0] - yq * rate[1] - z * rate[2],
-            ]
-        )
+        spun = 0.5 * np.append(scalar * rate + np.cross(vector, rate), -vector @ rate)
         follow_up = (np.sqrt(asked / k_t) - speed) / vehicle.rotors.time_constant
         return np.concatenate([velocity, spun, acc, turn, follow_up])
 
@@ -278,9 +237,8 @@ def reference_flight(vehicle, command_of, duration, start):
 
 
 def smooth_command(t):
-    return 11.0 + 3.0 * np.sin(9.0 * t), np.array(
-        [1.5 * np.sin(7.0 * t), 1.2 * np.cos(6.0 * t) - 1.2, 0.5 * np.sin(4.0 * t)]
-    )
+    rate = [1.5 * np.sin(7.0 * t), 1.2 * np.cos(6.0 * t) - 1.2, 0.5 * np.sin(4.0 * t)]
+    return 11.0 + 3.0 * np.sin(9.0 * t), np.array(rate)
 
 
 def test_flight_converges_to_an_independent_integration_with_order_one():
@@ -315,19 +273,65 @@ def test_tumbling_keeps_angular_momentum_and_energy_to_first_order():
     for dt in (0.002, 0.001):
         plant, motion = make_plant(PLAIN, dt), start
         for _ in range(round(0.4 / dt)):
-            motion = euler_step(plant, motion, Wrench(np.zeros(3), np.zeros(3)))
-        momentum_w = motion.rot_w @ (inertia * motion.rate_b)
-        energy = 0.5 * (inertia * motion.rate_b**2).sum()
-        momentum_start, energy_start = (
-            inertia * start.rate_b,
-            0.5 * (inertia * start.rate_b**2).sum(),
-        )
-        drifts.append(
-            [
-                np.linalg.norm(momentum_w - momentum_start) / np.linalg.norm(momentum_start),
-                abs(energy - energy_start) / energy_start,
-            ]
-        )
+            motion = plants.euler_step(plant, motion, Wrench(np.zeros(3), np.zeros(3)))
+        before, after_w = inertia * start.rate_b, motion.rot_w @ (inertia * motion.rate_b)
+        energy = (inertia * motion.rate_b**2).sum() / (inertia * start.rate_b**2).sum()
+        turned = np.linalg.norm(after_w - before) / np.linalg.norm(before)
+        drifts.append([turned, abs(energy - 1.0)])
     assert np.max(drifts) < 0.02
     ratio = np.array(drifts[0]) / drifts[1]
     assert np.all((ratio > 1.7) & (ratio < 2.3)), ratio
+
+
+TRUTH = with_effects(with_lag(PLAIN, 0.03), linear_drag=((0.4, 0.5, 0.2),),
+                     angular_damping=((0.5, 0.4, 0.3),))  # fmt: skip
+DT = 0.002
+ONES = np.ones((1, 3))
+MOVING = Motion(0.0 * ONES, np.eye(3)[None], ONES, 0.0 * ONES)
+by_jax = jax.jit(continuous.fly, static_argnums=6)
+
+
+def flown(length_s, integrator="continuous", duration_s=0.6):
+    """Fly a turn with commands that change every 0.02 s, the loop looking as often."""
+    plant, count = make_plant(TRUTH, DT), round(duration_s / length_s)
+    time = np.arange(count) * length_s
+    held = np.floor(time / 0.02 + 1e-9) * 0.02
+    rate_b = np.stack([3 * np.sin(9 * held), 2 * np.cos(7 * held), 0.5 + 0 * held], axis=-1)
+    command = Command((11 + 3 * np.sin(5 * held))[:, None], rate_b[:, None])
+    looks = np.abs(time / 0.02 - np.rint(time / 0.02)) < 1e-9
+    steps = Steps(*(x[:, None] for x in (0 * time + length_s, looks, 0 * time)))
+    speed = hover_state(plant, (1,)).rotor_speed
+    return by_jax(plant, MOVING, steps, Inputs(command), speed, np.zeros(1), integrator)
+
+
+def end_of(flight):
+    return np.concatenate([np.ravel(field[-1]) for field in flight.motion])
+
+
+def test_half_the_step_is_a_quarter_of_the_error():
+    fine = end_of(flown(0.000125))
+    coarse, half = (np.abs(end_of(flown(h)) - fine).max() for h in (0.004, 0.002))
+    assert coarse < 2e-3 and 3.0 < coarse / half < 5.0
+
+
+def test_euler_steps_are_the_steppers():
+    plant = make_plant(TRUTH, DT)
+    rng = np.random.default_rng(0)
+    thrust, rates = rng.uniform(8, 14, (200, 1)), rng.uniform(-3, 3, (200, 1, 3))
+    inputs, state = Inputs(Command(thrust, rates)), hover_state(plant, (1,))
+    ones = np.ones((200, 1))
+    steps = Steps(DT * ones, ones > 0, 0.0 * ones)
+    theirs = jax.jit(rollout)(plant, MOVING, inputs, state)
+    ours = by_jax(plant, MOVING, steps, inputs, state.rotor_speed, np.zeros(1), "euler")
+    np.testing.assert_allclose(end_of(ours), end_of(theirs), atol=1e-11)
+    np.testing.assert_allclose(ours.acc_b, theirs.acc_b, atol=1e-10)
+
+
+def test_a_step_of_no_length_moves_nothing():
+    plant, zero = make_plant(TRUTH, DT), np.zeros((3, 1))
+    inputs, start = Inputs(Command(zero + 20.0, np.ones((3, 1, 3)))), MOVING._replace(rate_b=ONES)
+    speed, steps = hover_state(plant, (1,)).rotor_speed, Steps(zero, zero > 0, zero)
+    flight = by_jax(plant, start, steps, inputs, speed, np.zeros(1), "continuous")
+    for field, first in zip(flight.motion, start, strict=True):
+        np.testing.assert_array_equal(field[-1], first)
+    np.testing.assert_allclose(flight.rotor_speed[-1], speed, rtol=1e-6)

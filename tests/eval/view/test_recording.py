@@ -1,8 +1,5 @@
 """Recordings of flights and of comparisons hold what was given; they are read back to see that."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import rerun.chunk
@@ -13,6 +10,15 @@ from eval.view.recording import write_recording
 from tests.support.flights import rollout
 from tests.support.recordings import columns
 from tracks.geometry.camera import Camera, pixel_rays_b
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A recording of a flight that finished and of one that collided, and its columns."""
+    path = tmp_path_factory.mktemp("rrd") / "two.rrd"
+    assert write_recording(path, [rollout(), rollout("collision", 1.5, False)]) == path
+    assert [p.name for p in path.parent.iterdir()] == ["two.rrd"]
+    return path, columns(path)
 
 
 def nanoseconds(time_s):
@@ -112,20 +118,12 @@ def test_obstacles_path_end_and_events_are_there(recorded):
     assert {"schema", "suite_version"} <= {name.split(":")[-1] for name in about}
 
 
-def test_the_rerun_command_finds_the_recording_sound(recorded):
-    path, _ = recorded
-    command = [sys.executable, "-m", "rerun", "rrd", "verify", path]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_recordings_of_nothing_and_of_a_folder_are_refused(tmp_path):
+def test_recordings_of_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match="at least one rollout"):
         write_recording(tmp_path / "a.rrd", [])
+    with pytest.raises(ValueError, match="at least one flight"):
+        write_comparison(tmp_path / "a.rrd", [])
     assert not list(tmp_path.iterdir())
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError):
-        write_recording(tmp_path / "file" / "a.rrd", [rollout()])
 
 
 def test_a_recording_opens_laid_out(recorded):
@@ -146,15 +144,12 @@ def test_a_recording_opens_laid_out(recorded):
     assert {"/trial_0/world", "/trial_0/world/drone/camera", "/trial_1/speed"} <= origins
     shown = {entity for entity, _ in columns(path)}
     assert all(any(entity.startswith(origin) for entity in shown) for origin in origins)
-    # It plays from just before the first gate, with the time in sight.
+    # It plays from just before the first gate.
     flight = rollout()[1]
     gate_s = flight.time_s[flight.gate > 0][0]
     (shown,) = by_name["TimePanelBlueprint:time_selection"]
-    begin, end = shown["min"] / 1e9, shown["max"] / 1e9
-    assert max(0.0, gate_s - 1.0) <= begin < gate_s < end
-    assert by_name["PanelBlueprint:state"] or by_name["TimePanelBlueprint:state"]
-    titles = by_name["ContainerBlueprint:display_name"]
-    assert "zigzag level 3 seed 5: collision" in titles
+    assert max(0.0, gate_s - 1.0) <= shown["min"] / 1e9 < gate_s < shown["max"] / 1e9
+    assert "zigzag level 3 seed 5: collision" in by_name["ContainerBlueprint:display_name"]
 
 
 def track(first_s, last_s, shift=0.0):
@@ -171,36 +166,16 @@ def flight(name="first", simulations=2):
     return ComparedFlight(name, track(0.0, 2.0), [Simulation(k, rollouts, errors) for k in labels])
 
 
-def test_all_that_was_given_is_in_the_recording(tmp_path):
-    path = write_comparison(tmp_path / "two.rrd", [flight(), flight("second", 1)])
-    assert [p.name for p in tmp_path.iterdir()] == ["two.rrd"]
-    found = columns(path)
-    times, poses = found["/flight_0/world/measured/drone", "Transform3D:translation"]
-    np.testing.assert_allclose(np.array(poses)[:, 0], track(0.0, 2.0).pos_w, atol=1e-6)
-    np.testing.assert_allclose(times, 1e9 * track(0.0, 2.0).time_s, atol=1.0)
-    strips = found["/flight_0/world/as\\ given/path", "LineStrips3D:strips"][1][0]
-    assert len(strips) == 2
-    np.testing.assert_allclose(strips[1], track(1.0, 2.0, 0.2).pos_w, atol=1e-6)
-    # A break between the rollouts, so that the line does not jump.
-    values = np.array(found["/flight_1/error_position/as\\ given", "Scalars:scalars"][1])[:, 0]
-    assert len(values) == 201 and np.isnan(values[100])
-    np.testing.assert_allclose(values[[0, 99, 101, 200]], [0.1, 0.1, 0.2, 0.2])
-    entities = {entity for entity, _ in found}
-    assert "/flight_0/rates_z/as\\ named" in entities
-    assert "/flight_1/rates_z/as\\ named" not in entities
-
-
 def test_what_is_missing_is_left_out(tmp_path):
     lost = flight()
     lost.measured.pos_w[20:30] = np.nan
     lost.measured.vel_w[:] = np.nan
     bare = lost._replace(simulations=[Simulation("as given", [], [])])
     path = write_comparison(tmp_path / "lost.rrd", [lost, bare])
-    _, poses = columns(path)["/flight_0/world/measured/drone", "Transform3D:translation"]
-    assert len(poses) == 190
-
-
-def test_no_flight_is_refused_and_nothing_half_written_stays(tmp_path):
-    with pytest.raises(ValueError, match="at least one flight"):
-        write_comparison(tmp_path / "a.rrd", [])
-    assert list(tmp_path.iterdir()) == []
+    assert [p.name for p in tmp_path.iterdir()] == ["lost.rrd"]
+    found = columns(path)
+    assert len(found["/flight_0/world/measured/drone", "Transform3D:translation"][1]) == 190
+    # A break between the rollouts, so that the line does not jump.
+    values = np.array(found["/flight_0/error_position/as\\ given", "Scalars:scalars"][1])[:, 0]
+    assert len(values) == 201 and np.isnan(values[100])
+    np.testing.assert_allclose(values[[0, 99, 101, 200]], [0.1, 0.1, 0.2, 0.2])

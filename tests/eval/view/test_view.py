@@ -1,30 +1,25 @@
-"""Pictures show track, path, gates and end; solids are as a pinhole camera sees them."""
+"""Pictures and videos show track, path, gates and end; solids are as a pinhole camera sees them."""
 
+import subprocess
 from dataclasses import replace
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from PIL import Image, ImageSequence
 from scipy.spatial import ConvexHull
 
-from eval.view import colours
+from eval.view import colours, scene3d
+from eval.view.chase import _not_between
 from eval.view.picture import write_grid, write_picture
 from eval.view.recording import Drone, write_recording
-from eval.view.scene3d import (
-    LONGEST_M,
-    MOST_FACES,
-    Faces,
-    Lines,
-    divide_faces,
-    look_at,
-    paint,
-    to_camera,
-    to_pixels,
-)
+from eval.view.scene3d import Faces, Lines, divide_faces, look_at, paint
 from eval.view.solids import flat_normals, join_solids, outline, track_solids
-from eval.view.video import VideoOptions, write_video
+from eval.view.video import DEPTH_RANGE_M, VideoOptions, frame_times, video_frames, write_video
+from eval.view.video_file import write_gif
 from tests.support.flights import rollout, small_track
 from tests.support.pixels import opened, share
 from tests.support.recordings import columns
@@ -35,10 +30,8 @@ SMALL = VideoOptions(size=(160, 96), fps=10, hold_s=0.3)
 
 def test_a_diverged_flight_can_still_be_seen(tmp_path):
     track, flight, result = rollout()
-    pos = flight.pos_w.copy()
-    pos[-3:] = np.nan
-    vel = flight.vel_w.copy()
-    vel[-2:] = np.nan
+    pos, vel = flight.pos_w.copy(), flight.vel_w.copy()
+    pos[-3:], vel[-2:] = np.nan, np.nan
     lost = flight._replace(pos_w=pos, vel_w=vel)
     result = result._replace(ended_by="diverged")
     write_recording(tmp_path / "a.rrd", [(track, lost, result)], Drone(camera=Camera(pitch_deg=0)))
@@ -51,9 +44,10 @@ def test_a_diverged_flight_can_still_be_seen(tmp_path):
 def test_a_trial_without_a_row_can_still_be_seen(tmp_path):
     track, flight, result = rollout()
     arrays = {name: getattr(flight, name)[:0] for name in type(flight)._fields[:-2]}
-    write_picture(tmp_path / "a.png", track, flight._replace(**arrays), result)
-    write_grid(tmp_path / "b.png", [(track, flight._replace(**arrays), result)])
-    write_recording(tmp_path / "a.rrd", [(track, flight._replace(**arrays), result)])
+    none = track, flight._replace(**arrays), result
+    write_picture(tmp_path / "a.png", *none)
+    write_grid(tmp_path / "b.png", [none])
+    write_recording(tmp_path / "a.rrd", [none])
     assert ("/trial_0/world/end", "Points3D:positions") in columns(tmp_path / "a.rrd")
     assert share(opened(tmp_path / "a.png"), colours.PASSED) > 1e-3
 
@@ -109,7 +103,9 @@ NO_LINES = Lines(np.zeros((0, 2, 3)), np.zeros((0, 3)), 0.01)
 
 def test_painted_solids_stand_where_a_pinhole_puts_them_and_the_near_hides_the_far():
     view = look_at(np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.0]), 90.0, (200, 100))
-    ahead = to_pixels(view, to_camera(view, np.array([[2.0, 0, 1], [2, 1, 1], [2, 0, 1.5]])))
+    ahead = scene3d.to_pixels(
+        view, scene3d.to_camera(view, np.array([[2.0, 0, 1], [2, 1, 1], [2, 0, 1.5]]))
+    )
     # Left (y > 0) is left of the middle and up is above it; at 90 deg, 2 m to 2 m is the edge.
     np.testing.assert_allclose(ahead, [[100, 50], [50, 50], [100, 25]], atol=1e-9)
     # A sheet of 2 m by 2 m that faces the eye, which is at smaller x.
@@ -121,9 +117,8 @@ def test_painted_solids_stand_where_a_pinhole_puts_them_and_the_near_hides_the_f
     pixels = np.asarray(paint(view, both, NO_LINES)).astype(int)
     red_there = pixels[..., 0] > 1.5 * pixels[..., 2]
     blue_there = pixels[..., 2] > 1.5 * pixels[..., 0]
-    assert blue_there[50, 100] and blue_there.sum() == pytest.approx(
-        50 * 50, rel=0.07
-    )  # edges are drawn, too
+    # Edges are drawn, too.
+    assert blue_there[50, 100] and blue_there.sum() == pytest.approx(50 * 50, rel=0.07)
     assert red_there.sum() < 60  # the far sheet is exactly as large to the eye, and hidden
     behind = Faces(far[:, ::-1], red)
     assert not (np.asarray(paint(view, behind, NO_LINES)).astype(int)[..., 0] > 250).any()
@@ -139,26 +134,12 @@ def sheet_and_box():
     return np.array(floor, float), np.array(front, float)
 
 
-def test_a_large_floor_does_not_hide_what_stands_on_it():
-    floor, front = sheet_and_box()
-    view = look_at(np.array([-1.0, 0.0, 1.8]), np.array([8.0, 0.0, 0.5]), 60.0, (200, 100))
-    red, blue = [255.0, 0.0, 0.0], [0.0, 0.0, 255.0]
-    seen = []
-    for cut in (False, True):
-        parts = divide_faces(floor)[0] if cut else floor
-        colour = np.array([blue] * len(parts) + [red] * 2)
-        painted = paint(view, Faces(np.concatenate([parts, front]), colour), NO_LINES)
-        pixels = np.asarray(painted).astype(int)
-        seen.append(int((pixels[..., 0] > 1.5 * pixels[..., 2]).sum()))
-    assert seen[1] > 500 and seen[1] > 1.5 * seen[0]
-
-
 def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
     floor, front = sheet_and_box()
     corners = np.concatenate([front, floor])
     parts, whose = divide_faces(corners)
     side = np.linalg.norm(parts - np.roll(parts, -1, axis=1), axis=-1)
-    assert side.max() <= LONGEST_M and (whose == 0).sum() >= 1
+    assert side.max() <= scene3d.LONGEST_M and (whose == 0).sum() >= 1
 
     def areas(triangles):
         cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -166,7 +147,7 @@ def test_what_is_cut_up_covers_the_same_and_knows_whose_it_was():
 
     for number, whole in enumerate(areas(corners)):
         np.testing.assert_allclose(areas(parts[whose == number]).sum(0), whole, atol=1e-9)
-    assert len(divide_faces(1e4 * floor)[0]) <= MOST_FACES
+    assert len(divide_faces(1e4 * floor)[0]) <= scene3d.MOST_FACES
 
 
 def test_solids_are_the_gates_bars_first_and_their_normals_point_out():
@@ -193,3 +174,93 @@ def test_outlines_are_the_convex_hulls(points):
     x, y = corners.T
     area = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
     assert area == pytest.approx(hull.volume)
+
+
+def test_the_video_shows_drone_depth_and_gates():
+    track, flight, result = rollout()
+    frames = list(video_frames(track, flight, result, VideoOptions((480, 270), 4, hold_s=0.2)))
+    assert share(frames[0], colours.AHEAD, 50) > 3e-3
+    assert share(frames[0], colours.DRONE, 12) > 5e-4
+    assert share(frames[-1], colours.PASSED, 2) > 5e-4  # the word at the end
+    greens = []
+    for frame in frames[:-1]:
+        red, green, blue = np.moveaxis(np.asarray(frame, dtype=int)[100:, :320], -1, 0)
+        greens.append(((green > 1.5 * red) & (green > 1.2 * blue)).mean())
+    # No gate is green before it was passed; just behind it the eye sees it green.
+    assert greens[0] == 0 < max(greens[2:])
+    # Beside it, in the right third and at its middle: what it saw, pixel for pixel.
+    seen = np.asarray(frames[0])[75:195, 320:480]
+    assert flight.depth_m is not None
+    want = colours.depth_colours(flight.depth_m[0], DEPTH_RANGE_M)
+    np.testing.assert_array_equal(seen[2::5, 2::5], want)
+    without = next(video_frames(*rollout("finished", None, False), VideoOptions((480, 270), 5)))
+    assert share(without.crop((320, 0, 480, 270)), colours.DRONE, 2) < 0.01  # the scene goes on
+
+
+def test_what_stands_before_the_drone_is_not_painted():
+    eye, drone = np.zeros(3), np.array([2.0, 0.0, 0.0])
+    before = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0]])
+    faces = np.stack([before, before + [2.0, 0.0, 0.0], before * [3.0, 1.0, 1.0] - [1.5, 0, 0]])
+    faces[2, 0, 0] = 2.5  # one corner beyond is enough
+    assert _not_between(faces, eye, drone).tolist() == [False, True, True]
+
+
+def test_bad_video_requests_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"\.avi.*\.mp4 or \.gif"):
+        write_video(tmp_path / "a.avi", *rollout())
+    with pytest.raises(ValueError, match="even"):
+        write_video(tmp_path / "a.mp4", *rollout(), VideoOptions(size=(161, 96)))
+    track, flight, result = rollout()
+    alone = flight._replace(time_s=np.zeros(1))
+    with pytest.raises(ValueError, match="1 usable rows"):
+        write_video(tmp_path / "a.mp4", track, alone, result)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_a_video_plays_the_whole_flight(tmp_path, kind):
+    done = []
+    path = tmp_path / f"a.{kind}"
+    track, flight, result = rollout()
+    write_video(path, track, flight, result, SMALL, done.append)
+    expected = len(frame_times(flight, SMALL))
+    assert done == list(range(1, expected + 1))
+    assert abs(expected / SMALL.fps - flight.time_s[-1] - SMALL.hold_s) < 0.11
+    if kind == "gif":
+        with Image.open(path) as video:
+            assert video.size == SMALL.size
+            # Frames that are alike are one that stays longer.
+            lasting = sum(frame.info["duration"] for frame in ImageSequence.Iterator(video))
+        assert lasting == expected * 1000 / SMALL.fps
+        return
+    decoder = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, *"-f rawvideo -pix_fmt rgb24 -".split()]
+    done = subprocess.run(decoder, capture_output=True, check=True)
+    stream = done.stderr.decode().split("Output #0")[0]
+    assert "h264" in stream and "yuv420p" in stream and "160x96" in stream and "10 fps" in stream
+    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, 96, 160, 3)
+    assert len(frames) == expected
+    painted = list(video_frames(track, flight, result, SMALL))
+    for number in (0, expected // 2, expected - 1):
+        error = np.abs(frames[number].astype(int) - np.asarray(painted[number]).astype(int))
+        assert error.mean() < 6
+
+
+def test_a_gif_is_as_long_as_its_frames_at_any_rate(tmp_path):
+    frames = [Image.new("RGB", (8, 8), (20 * k, 0, 0)) for k in range(12)]
+    write_gif(tmp_path / "a.gif", frames, 12)
+    with Image.open(tmp_path / "a.gif") as video:
+        lasting = [frame.info["duration"] for frame in ImageSequence.Iterator(video)]
+    assert sum(lasting) == 1000
+
+
+def test_a_video_that_fails_or_is_interrupted_leaves_nothing(tmp_path, monkeypatch):
+    def interrupt(number):
+        raise KeyboardInterrupt
+
+    for kind in ("mp4", "gif"):
+        with pytest.raises(KeyboardInterrupt):
+            write_video(tmp_path / f"a.{kind}", *rollout(), SMALL, interrupt)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: "false")
+    with pytest.raises(OSError, match=r"a\.mp4: the video encoder failed"):
+        write_video(tmp_path / "a.mp4", *rollout(), SMALL)
+    assert not list(tmp_path.iterdir())

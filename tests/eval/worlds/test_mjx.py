@@ -1,7 +1,7 @@
 """The simulator mjx agrees with the simulator mujoco within stated tolerances."""
 
-from collections import Counter
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from eval.vehicles.vehicle import with_effects
 from eval.worlds.collision import NEAR
 from eval.worlds.trial import Rules, TrialSpec
 from policies.spec import PolicySpec
-from tests.support.courses import straight
+from tests.support.courses import fly_on, straight
 from tests.support.pilots import Pursuit, Steady
 from tracks.geometry.scene import Boxes
 
@@ -24,20 +24,14 @@ step, 1e-7, and this policy does not use its image."""
 
 
 def both(trials, rules=None, record=None, vehicle=VEHICLE):
-    options = JudgeOptions(slots=6, workers=1, rules=rules or Rules())
-    found = []
+    options, found = JudgeOptions(slots=6, workers=1, rules=rules or Rules()), []
     for world in ("mujoco", "mjx"):
-        flights = []
-        results = fly(
-            Pursuit(),
-            trials,
-            vehicle,
-            world,
-            options,
-            lambda *ended, flights=flights: flights.append(ended),
-            record,
-        )
-        found.append((results, {result.trial: flight for result, flight in flights}))
+        flights = {}
+
+        def keep(result, flight, flights=flights):
+            flights[result.trial] = flight
+
+        found.append((fly(Pursuit(), trials, vehicle, world, options, keep, record), flights))
     return found
 
 
@@ -64,10 +58,8 @@ def test_states_and_images_agree(few):
 
 def test_ends_agree_on_a_few(few):
     (ours, _), (theirs, _) = few
-    assert len(Counter(r.ended_by for r in ours)) >= 2
-    assert [r.ended_by for r in ours] == [r.ended_by for r in theirs]
-    assert [r.collided_with for r in ours] == [r.collided_with for r in theirs]
-    assert [r.gates_passed for r in ours] == [r.gates_passed for r in theirs]
+    assert len({r.ended_by for r in ours}) >= 2
+    assert [r[7:10] for r in ours] == [r[7:10] for r in theirs]  # gates, end and what was hit
 
 
 def small_boxes(track, count):
@@ -88,11 +80,8 @@ def small_boxes(track, count):
 def test_who_decides_rarely_meets_what_was_not_near_when_it_decided():
     track = small_boxes(straight((20.0, 30.0), wall_at=6.0), 2 * NEAR.boxes)
     pilot = Steady((4.0, 0.0, 1.6), PolicySpec(rate_hz=1.0))
-    tracks, rules = {"t.toml": track}, Rules(time_limit_s=2.5)
-    trial, options = TrialSpec("t.toml", 0, 0), JudgeOptions(slots=1, workers=1, rules=rules)
-    (ours,), (theirs,) = (
-        fly(pilot, [trial], VEHICLE, world, options, tracks=tracks) for world in ("mujoco", "mjx")
-    )
+    how = {"vehicle": VEHICLE, "slots": 1, "workers": 1, "rules": Rules(time_limit_s=2.5)}
+    ours, theirs = (fly_on(pilot, track, world=w, **how)[0][0] for w in ("mujoco", "mjx"))
     assert ours.collided_with == theirs.collided_with == "the wall"
     assert ours.pos_x == pytest.approx(theirs.pos_x, abs=0.01)
 
@@ -100,7 +89,7 @@ def test_who_decides_rarely_meets_what_was_not_near_when_it_decided():
 def test_a_track_beyond_single_precision_is_refused():
     track = straight((2.0, 4.0, 1500.0))
     with pytest.raises(ValueError, match="'straight' reaches 1500 m .* single precision"):
-        fly(Steady(), [TrialSpec("t.toml", 0, 0)], VEHICLE, "mjx", tracks={"t.toml": track})
+        fly_on(Steady(), track, vehicle=VEHICLE, world="mjx")
 
 
 @pytest.mark.slow
@@ -117,12 +106,8 @@ def test_a_load_on_a_line_swings_alike():
 
 @pytest.mark.slow
 def test_ends_agree_on_many():
-    trials = [
-        TrialSpec(t, level, seed)
-        for t in ("zigzag", "circular", "ellipse")
-        for level in (0, 3, 6, 9)
-        for seed in range(25)
-    ]
+    kinds = product(("zigzag", "circular", "ellipse"), (0, 3, 6, 9), range(25))
+    trials = [TrialSpec(*kind) for kind in kinds]
     (ours, _), (theirs, _) = both(trials)
     agree = np.mean([a.ended_by == b.ended_by for a, b in zip(ours, theirs, strict=True)])
     assert agree >= 0.99

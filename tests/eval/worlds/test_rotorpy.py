@@ -1,43 +1,35 @@
-"""The world rotorpy: what of it stands without RotorPy, and trials in it where it is installed."""
+"""The simulator rotorpy: without RotorPy, what it is told of a vehicle, and trials in it."""
 
 import builtins
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from eval.judging.judge import JudgeOptions, Record, fly
+from eval.effects import EFFECTS
+from eval.judging.judge import Record
+from eval.quadrotor.forces import wind_and_flow, wrench_on
+from eval.quadrotor.plant import Motion, make_plant
+from eval.quadrotor.rotors import steady
 from eval.quadrotor.vehicle_file import load_vehicle
-from eval.worlds import differences, world_class
+from eval.worlds import differences as differences_of
 from eval.worlds import rotorpy as rotorpy_world
+from eval.worlds import world_class
 from eval.worlds.rotorpy import Multirotor, StepInput
-from eval.worlds.trial import Rules, TrialSpec
+from eval.worlds.rotorpy_vehicle import AIR, differences, rotorpy_parameters
+from eval.worlds.trial import Rules
 from suite.cli import main
-from tests.support.courses import straight
+from tests.support.courses import fly_on, straight
 from tests.support.engines import STAND_IN
-from tests.support.pilots import Pursuit, RandomNetwork, Steady
-from tests.support.vehicles import PLAIN, with_effects, with_lag
+from tests.support.pilots import Pursuit, Steady
+from tests.support.vehicles import PLAIN, drawn_effects, with_effects, with_lag
 
 VEHICLE = load_vehicle("reference")
-TRACK = straight()
-RULES = Rules(time_limit_s=4.0)
-
-
-def one(policy, track=TRACK, vehicle=VEHICLE, record=None, rules=RULES):
-    flights = []
-    (result,) = fly(
-        policy,
-        [TrialSpec(track.family, 0, 0)],
-        vehicle,
-        "rotorpy",
-        JudgeOptions(slots=3, rules=rules),
-        lambda _, flight: flights.append(flight),
-        record,
-        {track.family: track},
-    )
-    return result, flights[0]
+flown = partial(fly_on, vehicle=VEHICLE, world="rotorpy", slots=3)
+TRACK, RULES = straight(), Rules(time_limit_s=4.0)
 
 
 @pytest.fixture
@@ -62,16 +54,14 @@ def test_without_rotorpy_the_install_line_is_said(missing, monkeypatch, tmp_path
 
 
 def test_the_body_falls_as_the_simulator_says_and_touches_our_ground(stand_in):
-    result, _ = one(Steady())
-    assert (result.ended_by, result.collided_with, result.world) == (
-        "collision", "ground", "rotorpy",
-    )  # fmt: skip
+    (result,), _ = flown(Steady(), TRACK, rules=RULES)
+    assert result[8:10] == ("collision", "ground") and result.world == "rotorpy"
     assert result.time_s == pytest.approx(np.sqrt(2 * 1.475 / 9.81), abs=0.003)
     assert torch.get_default_dtype() is torch.float32, "left as it was"
 
 
 def test_rows_are_the_simulators_states_and_count_as_continuous(stand_in):
-    _, flight = one(Steady(), record=Record())
+    _, (flight,) = flown(Steady(), TRACK, record=Record(), rules=RULES)
     t = flight.time_s
     np.testing.assert_allclose(flight.pos_w[:, 2], 1.5 - 0.5 * 9.81 * t**2, atol=1e-9)
     np.testing.assert_allclose(flight.vel_w[:, 2], -9.81 * t, atol=1e-9)
@@ -88,19 +78,16 @@ def test_a_state_that_is_none_ends_that_trial_only(stand_in, monkeypatch, tmp_pa
 
     monkeypatch.setattr(Multirotor, "step", broken)
     high, low = straight(height=30.0, name="high"), straight(height=5.5, name="low")
-    trials = [TrialSpec("high", 0, 0), TrialSpec("low", 0, 0)]
-    ends = fly(
-        Steady(), trials, VEHICLE, "rotorpy", JudgeOptions(slots=3, rules=Rules(time_limit_s=1.0)),
-        tracks={"high": high, "low": low},
-    )  # fmt: skip
+    ends, _ = flown(Steady(), high, low, rules=Rules(time_limit_s=1.0))
     assert [end.ended_by for end in ends] == ["timeout", "diverged"]
     assert 4.9 < ends[1].pos_z < 5.1 and list(tmp_path.iterdir()) == []
 
 
 def test_what_the_vehicle_loses_is_said(stand_in):
     lame = with_effects(with_lag(PLAIN, 0.03), weak_motor=((0.8, 1.0, 1.0, 1.0),))
-    assert differences("rotorpy", lame) == ["weak_motor: RotorPy does not have it; flown without"]
-    assert differences("mujoco", lame) == []
+    (said,) = differences_of("rotorpy", lame)
+    assert said == "weak_motor: RotorPy does not have it; flown without"
+    assert differences_of("mujoco", lame) == []
 
 
 # From here on RotorPy itself flies.
@@ -114,18 +101,8 @@ def installed():
 
 def test_one_trial_is_finished_and_another_ends_at_a_wall(installed):
     clear, walled = straight((1.0, 2.0), name="clear"), straight((4.0, 5.0), 1.2, name="walled")
-    flights = {}
-    result, hit = fly(
-        Pursuit(3.0),
-        [TrialSpec("clear", 0, 0), TrialSpec("walled", 0, 0)],
-        VEHICLE,
-        "rotorpy",
-        JudgeOptions(slots=2, rules=RULES),
-        lambda found, flight: flights.update({found.trial.track: flight}),
-        Record(depth=True),
-        {"clear": clear, "walled": walled},
-    )
-    flight = flights["clear"]
+    record = Record(depth=True)
+    (result, hit), (flight, _) = flown(Pursuit(3.0), clear, walled, rules=RULES, record=record)
     assert (hit.ended_by, hit.collided_with) == ("collision", "the wall")
     assert (result.ended_by, result.gates_passed, result.gates_035) == ("finished", 2, 2)
     assert 1.0 < result.v_mean < result.v_max < 3.5
@@ -136,40 +113,83 @@ def test_one_trial_is_finished_and_another_ends_at_a_wall(installed):
 @pytest.mark.slow
 def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
     rules = Rules(time_limit_s=0.4)
-    still, _ = one(Steady(), rules=rules)
+    (still,), _ = flown(Steady(), TRACK, rules=rules)
     wind = with_effects(constant_wind=((0.0, 4.0, 0.0),)).effects
     blown = replace(VEHICLE, effects={**VEHICLE.effects, **wind})
-    carried, _ = one(Steady(), vehicle=blown, rules=rules)
+    (carried,), _ = flown(Steady(), TRACK, vehicle=blown, rules=rules)
     assert abs(still.pos_y) < 1e-6 and carried.pos_y > 0.02
 
 
-@pytest.mark.slow
-def test_outcomes_are_the_same_bits_at_any_place_in_any_batch(installed):
-    policy, rules = RandomNetwork(), Rules(time_limit_s=0.6)
-    wind = with_effects(gusts=(2.0, 5.0)).effects
-    gusty = replace(VEHICLE, effects={**VEHICLE.effects, **wind})
-    trials = [TrialSpec(t, 9, seed) for t in ("zigzag", "ellipse") for seed in range(3)]
-
-    def flown(order, slots):
-        options = JudgeOptions(slots=slots, workers=1, rules=rules)
-        results = fly(policy, order, gusty, "rotorpy", options)
-        return {result.trial: result for result in results}
-
-    first = flown(trials, 6)
-    assert flown(trials[::-1], 6) == first
-    assert flown(trials, 4) == first
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_a_row_is_stepped_by_itself(installed, count):
-    rng = np.random.default_rng(0)
+def test_a_row_is_stepped_by_itself(installed):
+    """So a trial's outcome does not depend on the others of its batch."""
+    rng, count = np.random.default_rng(0), 3
     qpos = rng.normal(size=(64, 7))
     qpos[:, 3:] /= np.linalg.norm(qpos[:, 3:], axis=1, keepdims=True)
     qvel, speed = rng.normal(0, 4, (64, 6)), rng.uniform(300, 1800, (64, 4))
     push = StepInput(rng.uniform(300, 1800, (64, 4)), rng.normal(size=(64, 3)))
     whole = Multirotor(VEHICLE, 0.002, 64).step(qpos, qvel, speed, push)
-    few = Multirotor(VEHICLE, 0.002, count).step(
-        qpos[:count], qvel[:count], speed[:count], StepInput(*(part[:count] for part in push))
-    )
+    parts = qpos[:count], qvel[:count], speed[:count], StepInput(*(p[:count] for p in push))
+    few = Multirotor(VEHICLE, 0.002, count).step(*parts)
     for part, of_few in zip(whole, few, strict=True):
         np.testing.assert_array_equal(part[:count], of_few)
+
+
+def test_motors_behind_a_firmwares_loop_may_turn_as_fast_as_their_curve_says():
+    crazyflie = load_vehicle("crazyflie21")
+    assert crazyflie.motors is not None
+    full = np.sqrt(sum(crazyflie.motors.thrust) / crazyflie.rotors.thrust_coefficient)
+    assert full > crazyflie.rotors.speed_max
+    assert rotorpy_parameters(crazyflie)["rotor_speed_max"] == pytest.approx(full)
+    plain = replace(crazyflie, controller=PLAIN.controller)
+    assert rotorpy_parameters(plain)["rotor_speed_max"] == crazyflie.rotors.speed_max
+
+
+def test_linear_drag_becomes_drag_of_rotors_that_is_the_same_at_hover():
+    told = rotorpy_parameters(with_effects(linear_drag=((0.2, 0.4, 0.8),), rotor_drag=(1e-5,)))
+    hover = np.sqrt(0.75 * 9.81 / (4 * 1.6e-6))
+    assert 4 * hover * (told["k_d"] - 1e-5) == pytest.approx(0.75 * 0.3)
+    assert 4 * hover * told["k_z"] == pytest.approx(0.75 * 0.8)
+
+
+def test_the_mass_is_the_true_one_and_rotors_lag_at_least_as_long_as_asked():
+    assert rotorpy_parameters(with_effects(mass_offset=(0.05,)))["mass"] == pytest.approx(0.8)
+    assert rotorpy_parameters(PLAIN)["tau_m"] == 0.0
+    assert rotorpy_parameters(PLAIN, 0.002)["tau_m"] == 0.002
+    assert rotorpy_parameters(with_lag(PLAIN, 0.03), 0.002)["tau_m"] == 0.03
+
+
+def test_every_difference_is_said_and_nothing_else():
+    assert differences(with_lag(PLAIN, 0.03), 0.002) == []
+    assert "flown with 0.002 s" in differences(PLAIN, 0.002)[0]
+    said = " ".join(differences(drawn_effects(np.random.default_rng(0), PLAIN), 0.002))
+    without = [name for name in EFFECTS if f"{name}: RotorPy does not have it" in said]
+    assert set(without) == {
+        "rotor_gyroscopic", "ground_effect", "battery_sag", "angular_damping", "thrust_tilt",
+        "torque_trim", "frame_tilt", "weak_motor", "rotor_spin_up", "slung_load",
+    }  # fmt: skip
+    assert "linear_drag: RotorPy's drag is proportional to the rotors' speed" in said
+    assert "gusts" not in said and "gyro_bias" not in said
+
+
+@pytest.mark.parametrize("name", [*AIR, "com_offset", "thrust_scale", None])
+def test_forces_and_torques_are_ours_where_the_body_does_not_turn(name):
+    """To rounding: RotorPy's equations in other words. Turning, its hubs have airspeeds of their
+    own, which ours have not (`differences` says so)."""
+    rotorpy = pytest.importorskip("rotorpy.vehicles.multirotor")
+    rng = np.random.default_rng(3)
+    drawn = drawn_effects(rng).effects
+    vehicle = replace(with_lag(PLAIN, 0.03), effects={name: drawn[name]} if name else {})
+    plant = make_plant(vehicle, 0.002)
+    theirs = rotorpy.Multirotor(rotorpy_parameters(vehicle))
+    for _ in range(5):
+        vel_b, speed = rng.normal(0, 6, 3), rng.uniform(300, 2000, 4)
+        motion = Motion(np.zeros(3), np.eye(3), vel_b, np.zeros(3))
+        _, flow = wind_and_flow(plant, {}, motion, steady(speed), 0.0)
+        ours = wrench_on(plant, steady(speed), flow)
+        force_b, torque_b = theirs.compute_body_wrench(np.zeros(3), speed, vel_b)
+        np.testing.assert_allclose(force_b, ours.force_b, rtol=1e-9, atol=1e-9)
+        if name == "rotor_drag":  # at its hubs: no torque of theirs where all turn alike
+            alike = np.full(4, speed[0])
+            torque_b = theirs.compute_body_wrench(np.zeros(3), alike, vel_b)[1]
+            ours = wrench_on(plant, steady(alike), flow._replace(rotor_speed=alike))
+        np.testing.assert_allclose(torque_b, ours.torque_b, rtol=1e-9, atol=1e-9)

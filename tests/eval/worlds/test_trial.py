@@ -5,51 +5,25 @@ from dataclasses import replace
 import numpy as np
 
 from eval.quadrotor.plant import Motion, Wrench
-from eval.worlds import slots
-from eval.worlds.slots import (
-    GUSTS_AT_ONCE,
-    GustDraws,
-    empty_course,
-    generator_of,
-    gust_draws,
-    layout_of,
-    pad_gates,
-    slot_groups,
-)
-from eval.worlds.trial import (
-    COLLISION,
-    DIVERGED,
-    FINISHED,
-    FLYING,
-    TIMEOUT,
-    TIPPED,
-    Course,
-    Rules,
-    TrialSpec,
-    has_diverged,
-    is_wrench,
-    judge_state,
-    next_gate,
-    start_progress,
-)
+from eval.worlds import slots, trial
+from eval.worlds.slots import GUSTS_AT_ONCE, GustDraws, gust_draws, layout_of
 from tests.support.courses import straight
 from tracks.geometry.scene import Gates
 
 DT = 0.002
-
 GATES = straight((1.0, 2.0)).scene.gates
 
 
 def judged(pos_w, before_w=None, passed=0, step=1, contact=False, diverged=False, rot_w=None):
     """Return the progress of a trial that moved from `before_w` to `pos_w` after `passed` gates."""
     pos_w = np.array([pos_w], float)
-    course = Course(Gates(*(field[None] for field in GATES)), np.array([2]))
-    progress = start_progress(pos_w if before_w is None else np.array([before_w], float))
+    course = trial.Course(Gates(*(field[None] for field in GATES)), np.array([2]))
+    progress = trial.start_progress(pos_w if before_w is None else np.array([before_w], float))
     progress = progress._replace(gates=np.array([passed]), step=np.array([step]))
     rot_w = np.eye(3)[None] if rot_w is None else rot_w
     motion = Motion(pos_w, rot_w, np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)))
     flags = np.array([contact]), np.array([diverged])
-    return judge_state(Rules(), progress, course, DT, motion, *flags)
+    return trial.judge_state(trial.Rules(), progress, course, DT, motion, *flags)
 
 
 BEFORE, AFTER = (1.9, 0.0, 1.5), (2.1, 0.0, 1.5)
@@ -57,9 +31,9 @@ BEFORE, AFTER = (1.9, 0.0, 1.5), (2.1, 0.0, 1.5)
 
 def test_the_last_gate_finishes_unless_something_is_hit_in_the_same_step():
     through = judged(AFTER, BEFORE, passed=1)
-    assert (through.ended[0], through.gates[0], through.v_max[0]) == (FINISHED, 2, 5.0)
+    assert (through.ended[0], through.gates[0], through.v_max[0]) == (trial.FINISHED, 2, 5.0)
     hit = judged(AFTER, BEFORE, passed=1, contact=True)
-    assert (hit.ended[0], hit.gates[0], hit.v_max[0]) == (COLLISION, 1, 0.0)
+    assert (hit.ended[0], hit.gates[0], hit.v_max[0]) == (trial.COLLISION, 1, 0.0)
 
 
 def test_a_gate_out_of_its_turn_does_not_count():
@@ -67,11 +41,11 @@ def test_a_gate_out_of_its_turn_does_not_count():
 
 
 def test_upside_down_late_and_lost():
-    assert judged((0, 0, 1), rot_w=np.diag([1.0, -1.0, -1.0])[None]).ended[0] == TIPPED
-    assert judged((0, 0, 1), step=9999).ended[0] == FLYING
-    assert judged((0, 0, 1), step=10000).ended[0] == TIMEOUT
+    assert judged((0, 0, 1), rot_w=np.diag([1.0, -1.0, -1.0])[None]).ended[0] == trial.TIPPED
+    assert judged((0, 0, 1), step=9999).ended[0] == trial.FLYING
+    assert judged((0, 0, 1), step=10000).ended[0] == trial.TIMEOUT
     lost = judged((np.nan, 0, 1), (0, 0, 1), diverged=True)
-    assert lost.ended[0] == DIVERGED and np.isfinite(lost.pos_w).all()
+    assert lost.ended[0] == trial.DIVERGED and np.isfinite(lost.pos_w).all()
 
 
 def leaning(angle_deg):
@@ -81,10 +55,10 @@ def leaning(angle_deg):
 
 
 def test_a_trial_ends_as_tipped_from_90_degrees_on_and_not_before():
-    assert judged((0, 0, 1), rot_w=leaning(89.9)).ended[0] == FLYING
-    assert judged((0, 0, 1), rot_w=leaning(90.1)).ended[0] == TIPPED
+    assert judged((0, 0, 1), rot_w=leaning(89.9)).ended[0] == trial.FLYING
+    assert judged((0, 0, 1), rot_w=leaning(90.1)).ended[0] == trial.TIPPED
     on_its_side = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
-    assert judged((0, 0, 1), rot_w=on_its_side).ended[0] == FLYING
+    assert judged((0, 0, 1), rot_w=on_its_side).ended[0] == trial.FLYING
 
 
 def test_gates_of_the_first_8_s_count_up_to_that_very_step():
@@ -97,17 +71,19 @@ def test_what_is_no_state_and_no_wrench():
     fine = np.zeros((3, 3))
     vel_w = np.array([[0.0, 1000.0, 0.0], [1001.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
     motion = Motion(fine, np.tile(np.eye(3), (3, 1, 1)), vel_w, fine)
-    np.testing.assert_array_equal(has_diverged(Rules(), motion), [False, True, True])
+    np.testing.assert_array_equal(trial.has_diverged(trial.Rules(), motion), [False, True, True])
     torque_b = np.array([[0.0, 1e6, 0.0], [2e6, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-    np.testing.assert_array_equal(is_wrench(Rules(), Wrench(fine, torque_b)), [True, False, False])
+    np.testing.assert_array_equal(
+        trial.is_wrench(trial.Rules(), Wrench(fine, torque_b)), [True, False, False]
+    )
 
 
 def test_past_the_last_gate_the_last_is_next():
-    course = Course(Gates(*(np.stack([field] * 3) for field in GATES)), np.full(3, 2))
-    assert next_gate(course, np.array([0, 1, 5])).center_w[:, 0].tolist() == [1.0, 2.0, 2.0]
+    course = trial.Course(Gates(*(np.stack([field] * 3) for field in GATES)), np.full(3, 2))
+    assert trial.next_gate(course, np.array([0, 1, 5])).center_w[:, 0].tolist() == [1.0, 2.0, 2.0]
 
 
-TRIAL = TrialSpec("zigzag", 3, 7)
+TRIAL = trial.TrialSpec("zigzag", 3, 7)
 
 
 def test_a_layout_holds_every_track():
@@ -120,21 +96,15 @@ def test_a_track_with_meshes_is_a_group_of_its_own():
     plain = straight((1.0, 2.0))
     tracks = {"a.toml": plain, "m.toml": replace(plain, mesh_sizes=(12,))}
     trials = [TRIAL._replace(track=name) for name in ("zigzag", "m.toml", "a.toml", "m.toml")]
-    assert slot_groups(trials, tracks) == [[0, 2], [1, 3]]
-    assert slot_groups([], {}) == []
+    assert slots.slot_groups(trials, tracks) == [[0, 2], [1, 3]]
+    assert slots.slot_groups([], {}) == []
 
 
 def test_padding_repeats_the_last_gate():
     gates = straight((1.0, 2.0)).scene.gates
-    padded = pad_gates(gates, 4, 6)
+    padded = slots.pad_gates(gates, 4, 6)
     np.testing.assert_array_equal(padded.center_w[:, 0], [1.0, 2.0, 2.0, 2.0])
     np.testing.assert_array_equal(padded.opening_g[:, 3:], padded.opening_g[:, 3:4].repeat(3, 1))
-
-
-def test_an_empty_course_has_room_for_every_gate():
-    course, layout = empty_course(3, layout_of([])), layout_of([])
-    assert course.gates.opening_g.shape == (3, layout.gates, layout.corners, 2)
-    assert np.isfinite(course.gates.rot_w).all() and course.count.tolist() == [1, 1, 1]
 
 
 def test_a_trials_random_numbers_are_its_own_for_each_use():
@@ -144,7 +114,7 @@ def test_a_trials_random_numbers_are_its_own_for_each_use():
         assert (gust_draws(other, 5) != gust_draws(TRIAL, 5)).all()
     here, there = (TRIAL._replace(track=f"{way}own.toml") for way in ("", "./courses/"))
     np.testing.assert_array_equal(gust_draws(here, 5), gust_draws(there, 5))
-    assert generator_of(TRIAL, slots.SENSED).standard_normal() != gust_draws(TRIAL, 1)[0, 0]
+    assert slots.generator_of(TRIAL, slots.SENSED).standard_normal() != gust_draws(TRIAL, 1)[0, 0]
 
 
 def test_gusts_are_drawn_as_the_flight_goes_on():

@@ -21,7 +21,7 @@ HZ, POLICY_HZ = 100.0, 30.0
 NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "motor": 3.0}
 
 
-def good(seed=0, end=16.0):
+def good(seed=0, end=10.0):
     """A flight as a logger has it: noise, commands that hold, and a body that follows in 50 ms."""
     return {name: part.copy() for name, part in logged(seed, end).items()}
 
@@ -47,9 +47,8 @@ def logged(seed, end):
 
 
 def checked(parts, vehicle=VEHICLE, fov=1.0):
-    against = CheckContext(
-        vehicle, POLICY_HZ, tuple(fov * angle for angle in vehicle.camera.fov_deg)
-    )
+    seen_deg = tuple(fov * angle for angle in vehicle.camera.fov_deg)
+    against = CheckContext(vehicle, POLICY_HZ, seen_deg)
     checks = (*CLOCK, *POSE, lambda rows, _: check_clock(rows), *DRIVE)
     findings, readings, _ = run_checks(parts, checks, against, fix=True)
     commands = {name: value for name, value in parts.items() if name != "throttle"}
@@ -79,7 +78,7 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
                 np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_good_flight_has_no_fault(seed):
     findings, readings = checked(good(seed))
     assert not named(findings) and not readings
@@ -94,7 +93,6 @@ def test_a_good_flight_has_no_fault(seed):
         (("rate=x,-y,-z", "acc=x,-y,-z", "cmd_rate=x,-y,-z"), {"body_frame", "accelerometer_axes"}),
         (("acc=-x,-y,-z",), {"accelerometer_axes"}),
         (("acc=z,y,-x",), {"accelerometer_axes"}),
-        (("rate=938.7",), {"gyro_scale"}),
         (("rate=57.3",), {"gyro_scale"}),
         (("rate=0.01745329252",), {"gyro_scale"}),
         (("motor=1,2,4,3",), {"motor_order"}),
@@ -131,10 +129,9 @@ def test_without_a_pose_a_rate_loops_gain_shows_a_wrong_scale(wrong, lost, name,
 
 def test_a_calm_flight_says_what_it_does_not_show():
     still = good(end=4.0)
+    hover = {"quat": [1.0, 0.0, 0.0, 0.0], "rate": [0.0, 0.0, 0.0], "acc": [0.0, 0.0, 9.81]}
     for name in ("pos", "quat", "vel", "rate", "acc", "cmd_rate"):
-        still[name] = np.repeat(still[name][:1] * (name != "rate"), len(still["time"]), axis=0)
-    still["quat"] = np.tile([1.0, 0.0, 0.0, 0.0], (len(still["time"]), 1))
-    still["acc"] = np.tile([0.0, 0.0, 9.81], (len(still["time"]), 1))
+        still[name][:] = hover.get(name, still[name][0])
     findings, _ = checked(still)
     unseen = {f.fault for f in findings if f.status == "not identifiable"}
     assert unseen >= {"attitude", "gyro_scale", "velocity_frame", "motor_order"}

@@ -1,4 +1,8 @@
-"""Logs of PX4, Betaflight, Crazyflie and ROS 2: true formats, made from a flight that is known."""
+"""Logs of PX4, Betaflight, ArduPilot, Crazyflie and ROS 2, made from a flight that is known."""
+
+import sys
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from eval.logs.columns import FlightLogError
 from tests.support import foreign_logs as made
 from tests.support import known_flight
 from tests.support.imported import TRUE, levels, near, same_flight, text
+from tests.support.raw_logs import write_bin, write_raw
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -30,18 +35,6 @@ def test_px4_equals_the_flight(tmp_path):
     assert log.about["source"] == "px4" and not log.velocity_derived
 
 
-def test_px4_without_escs_or_a_thrust_scale_takes_the_accelerometer(tmp_path):
-    path = made.write_ulog(tmp_path / "log.ulg", esc=False)
-    log, findings = import_log(path)
-    truth = known_flight.fly(log.time_s)
-    assert log.rotor_speed is None
-    near(log.thrust_cmd, truth.thrust, 0.05)
-    assert "accelerometer" in text(findings, "thrust")
-    of_vehicle = import_log(path, "px4", ImportOptions(vehicle=PLAIN))
-    full = 4 * PLAIN.rotors.thrust_coefficient * PLAIN.rotors.speed_max**2 / PLAIN.mass
-    near(of_vehicle.log.thrust_cmd, truth.thrust / 30.0 * full, 1e-5)
-
-
 def test_px4_at_the_loggers_default_rates(tmp_path):
     """Position at 10 Hz, attitude at 20, gyro and commands at 50: rows at 20, nothing made up."""
     path = tmp_path / "log.ulg"
@@ -55,29 +48,18 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
     assert "doubt" not in levels(findings).values()
 
 
-@pytest.mark.parametrize("frame", [(True, 1), (True, 3), (False, 0), (False, 3)])
-def test_px4_odometry_in_each_frame_of_its_velocity(tmp_path, frame):
-    log, findings = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
+@pytest.mark.parametrize(
+    ("new", "frame", "known"),
+    [*((True, k, k in (1, 3)) for k in range(4)), *((False, k, k != 2) for k in (0, 2, 3))],
+)
+def test_px4_odometry_has_a_velocity_in_frames_that_are_known(tmp_path, new, frame, known):
+    path = made.write_ulog(tmp_path / "log.ulg", odometry=(new, frame))
+    log, findings = import_log(path, None, FULL)
     truth = known_flight.fly(log.time_s)
-    assert not log.velocity_derived
+    assert log.velocity_derived is not known
     near(log.pos_w, truth.pos, 2e-6)
-    near(log.vel_w, truth.vel, 2e-6)
+    near(log.vel_w, truth.vel, 2e-6 if known else 0.1)
     assert {"corrected", "doubt"}.isdisjoint(levels(findings).values())
-
-
-@pytest.mark.parametrize("frame", [(True, 2), (True, 0), (False, 2)])
-def test_px4_odometry_in_another_frame_leaves_the_velocity_out(tmp_path, frame):
-    log, _ = import_log(made.write_ulog(tmp_path / "log.ulg", odometry=frame), None, FULL)
-    assert log.velocity_derived
-    near(log.vel_w, known_flight.fly(log.time_s).vel, 0.1)
-
-
-@pytest.mark.parametrize("cut", [20, 400, 3000])
-def test_a_cut_ulog_is_refused_or_read_as_far_as_it_goes(tmp_path, cut):
-    path = made.write_ulog(tmp_path / "log.ulg", span=(0, 3))
-    path.write_bytes(path.read_bytes()[:cut])
-    with pytest.raises(FlightLogError, match=r"log\.ulg"):
-        import_log(path)
 
 
 def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
@@ -96,22 +78,20 @@ def test_betaflight_with_motion_capture_equals_the_flight(tmp_path):
     assert any(f"+{ppm} ppm" in text(findings, "pose clock") for ppm in range(57, 64))
 
 
-@pytest.mark.parametrize("fix", [True, False])
-def test_betaflights_tenfold_values_are_found(tmp_path, fix):
+def test_betaflights_tenfold_values_are_found(tmp_path):
     """blackbox_high_resolution multiplies rates by ten, blackbox_decode the voltage."""
-    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 10), gain=10, tenfold=10)
+    path = made.write_blackbox(tmp_path / "log.csv", (0, 10), gain=10, tenfold=10)
     pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 10), offset=0.4)
-    options = ImportOptions(pose=pose, full_thrust=30.0, fix=fix)
-    log, findings = import_log(path, None, options)
-    level = {f.signal for f in findings if f.status == ("corrected" if fix else "doubt")}
-    assert {"gyro", "voltage"} <= level
-    assert "blackbox_high_resolution" in text(findings, "gyro")
-    truth, tenfold = known_flight.fly(log.time_s), 1 if fix else 10
-    near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
-    near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
-    near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
-    if fix:
-        assert level == {"gyro", "rate command", "voltage"}
+    for status, tenfold in (("corrected", 1), ("doubt", 10)):
+        options = ImportOptions(pose=pose, full_thrust=30.0, fix=tenfold == 1)
+        log, findings = import_log(path, None, options)
+        level = {f.signal for f in findings if f.status == status}
+        assert level >= {"gyro", "voltage"} and "high_resolution" in text(findings, "gyro")
+        truth = known_flight.fly(log.time_s)
+        near(log.rate_b, tenfold * truth.rate, 0.02 * tenfold)
+        near(log.rate_cmd_b, tenfold * truth.cmd_rate, 0.04 * tenfold)
+        near(log.voltage, tenfold * truth.voltage, 0.1 * tenfold)
+        assert tenfold == 10 or level == {"gyro", "rate command", "voltage"}
 
 
 def test_motors_are_where_each_firmware_has_them():
@@ -123,38 +103,24 @@ def test_motors_are_where_each_firmware_has_them():
     assert ardupilot.QUAD_PLUS == ((0, right), (0, left), (front, 0), (rear, 0))
 
 
-def test_betaflight_counts_the_motors_poles(tmp_path):
-    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 8), poles=12)
-    pose = made.write_mocap(tmp_path / "pose.csv", span=(0, 8))
-    log, _ = import_log(path, None, ImportOptions(pose=pose, motor_poles=12, full_thrust=30.0))
-    near(log.rotor_speed, known_flight.fly(log.time_s).motor, 2.0)
+def test_a_map_of_columns_and_an_odd_number_of_poles_are_not_for_betaflight(tmp_path):
+    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2), rate=500.0)
     with pytest.raises(FlightLogError, match="motor_poles is 7"):
-        import_log(path, None, ImportOptions(pose=pose, motor_poles=7))
-
-
-def test_betaflight_alone_asks_for_a_pose(tmp_path):
-    path = made.write_blackbox(tmp_path / "log.csv", span=(0, 2))
-    with pytest.raises(FlightLogError, match="no position and no attitude; --pose"):
-        import_log(path)
+        import_log(path, None, ImportOptions(partial=True, motor_poles=7))
     with pytest.raises(ValueError, match="read as 'betaflight', .* leave --map out, or give"):
         import_log(path, None, ImportOptions(map=tmp_path / "mine.toml", partial=True))
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_crazyflie_equals_the_flight(tmp_path, version):
-    path = made.write_usd(tmp_path / "log00", version=version)
-    log, findings = import_log(path, None, FULL)
+@pytest.mark.parametrize("how", [{"version": 1}, {"version": 2}, {"compressed": True, "crc": 0}])
+def test_crazyflie_equals_the_flight(tmp_path, how):
+    log, findings = import_log(made.write_usd(tmp_path / "log00", **how), None, FULL)
     truth = known_flight.fly(log.time_s)
-    same_flight(log, truth, 1e-6, **{**dict.fromkeys(TRUE, 1e-5), "rotor_speed": 0.1})
-    assert "doubt" not in levels(findings).values()
-
-
-def test_crazyflie_compressed_and_without_checksum(tmp_path):
-    path = made.write_usd(tmp_path / "log00", compressed=True, crc=False)
-    log, findings = import_log(path, "crazyflie", FULL)
-    truth = known_flight.fly(log.time_s)
-    same_flight(log, truth, 1.5e-3, pos_w=6e-4, rate_b=6e-4)
-    assert levels(findings)["file"] == "doubt"
+    if "compressed" in how:
+        same_flight(log, truth, 1.5e-3, pos_w=6e-4, rate_b=6e-4)
+        assert levels(findings)["file"] == "doubt"
+    else:
+        same_flight(log, truth, 1e-6, **{**dict.fromkeys(TRUE, 1e-5), "rotor_speed": 0.1})
+        assert "doubt" not in levels(findings).values()
 
 
 def test_quaternions_unpack_whichever_part_is_largest():
@@ -170,8 +136,10 @@ def test_quaternions_unpack_whichever_part_is_largest():
     ("change", "reason"),
     [
         (lambda data: data[:3], "header is broken"),
-        (lambda data: data[:60], "header is broken"),
         (lambda data: data.replace(b"stateEstimate.x(f)", b"stateEstimate.x(?)"), "header is"),
+        (lambda data: data.replace(b"gyro.x(", b"("), "header is broken .*no name or a repeated"),
+        (lambda data: data.replace(b"gyro.x(", b"gyro.y("), "header is broken .*or a repeated one"),
+        (lambda data: data.replace(b"gyro.x(", b"timestamp("), "header is broken .*or a repeated"),
         (lambda data: data[:1] + b"\3" + data[2:], "version 3"),
         (lambda data: data[: data.index(b"pm.vbat(f)\0") + 11], "nothing was logged"),
         (lambda data: b"\0" + data[1:], "of no known format"),
@@ -249,12 +217,107 @@ def test_mcap_motors_are_put_in_order_by_a_map(tmp_path):
         import_log(path, None, ImportOptions(map=chosen))
 
 
-def test_mcap_that_is_cut_or_lacks_motion(tmp_path):
-    whole = made.write_mcap(tmp_path / "log.mcap", span=(0, 2))
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole.read_bytes()[:3000])
-    with pytest.raises(FlightLogError, match=r"cut\.mcap"):
-        import_log(cut)
-    still = made.write_mcap(tmp_path / "imu.mcap", span=(0, 2), motion=False)
-    with pytest.raises(FlightLogError, match="no position and no attitude"):
-        import_log(still)
+PARTIAL = ImportOptions(partial=True, full_thrust=30.0)
+
+
+def test_a_raw_blackbox_log_equals_the_flight(tmp_path):
+    pytest.importorskip("betaflight_chirp_core")
+    path = write_raw(tmp_path / "LOG00001.BFL", known_flight.fly(np.arange(0.0, 6.0, 0.002)))
+    log, findings = import_log(path, None, PARTIAL)
+    truth = known_flight.fly(log.time_s)
+    assert log.partial == ("pos", "quat")
+    np.testing.assert_allclose(log.rate_b, truth.rate, atol=0.02)
+    np.testing.assert_allclose(log.acc_b, truth.acc, atol=0.2)
+    np.testing.assert_allclose(log.rotor_speed, truth.motor, atol=4.0)
+    np.testing.assert_allclose(log.voltage, truth.voltage, atol=0.01)
+    np.testing.assert_allclose(log.pwm, truth.motor / 2100.0, atol=0.01)
+    np.testing.assert_allclose(log.thrust_cmd, truth.thrust, atol=0.1)
+    (asked,) = [f for f in findings if f.signal == "partial"]
+    for words in ("this log has no pose", "inertia", "battery sag", "not identifiable", "wind"):
+        assert words in asked.evidence
+    assert log.about["firmware"].startswith("Betaflight 4.5")
+
+
+def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
+    pytest.importorskip("betaflight_chirp_core")
+    short, long = (
+        write_raw(tmp_path / f"{end}", known_flight.fly(np.arange(0.0, end, 0.004)))
+        for end in (2.0, 4.0)
+    )
+    both = tmp_path / "both.bbl"
+    both.write_bytes(short.read_bytes() + long.read_bytes())
+    log, findings = import_log(both, None, PARTIAL)
+    assert log.duration_s == pytest.approx(4.0, abs=0.1)
+    assert any("holds 2 logs; the longest, number 2" in f.evidence for f in findings)
+    monkeypatch.setitem(sys.modules, "betaflight_chirp_core", None)
+    with pytest.raises(FlightLogError, match="pip install .*blackbox.*or decode it with black"):
+        import_log(both, None, PARTIAL)
+    monkeypatch.undo()
+    both.write_bytes(short.read_bytes()[:600])
+    with pytest.raises(FlightLogError, match="cannot be decoded"):
+        import_log(both, None, PARTIAL)
+
+
+@pytest.mark.parametrize("pose", [False, True])
+def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
+    pytest.importorskip("pymavlink")
+    truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
+    log, _ = import_log(write_bin(tmp_path / "00000001.BIN", truth, pose), None, PARTIAL)
+    assert log.partial == (() if pose else ("pos", "quat"))
+    truth = known_flight.fly(log.time_s)
+    np.testing.assert_allclose(log.rate_b, truth.rate, atol=0.01)
+    np.testing.assert_allclose(log.acc_b, truth.acc, atol=0.02)
+    np.testing.assert_allclose(log.rate_cmd_b[:-1], truth.cmd_rate[:-1], atol=0.05)
+    np.testing.assert_allclose(log.rotor_speed, truth.motor, atol=2.0)
+    np.testing.assert_allclose(log.pwm[:-1], truth.motor[:-1] / 2100.0, atol=0.01)
+    np.testing.assert_allclose(log.voltage, truth.voltage, atol=0.01)
+    if pose:
+        np.testing.assert_allclose(log.pos_w, truth.pos, atol=0.01)
+        np.testing.assert_allclose(log.rot_w, truth.rot, atol=1e-3)
+
+
+def test_px4_and_crazyflie_without_a_position_are_read(tmp_path):
+    ulog = made.write_ulog(tmp_path / "log.ulg", span=(0, 6))
+    usd = made.write_usd(tmp_path / "log00", span=(0, 6), crc=False)
+    for path, known, lacks in (
+        (ulog, b"vehicle_local_position", ("pos",)),
+        (usd, b"stateEstimate.", ("pos", "quat")),
+    ):
+        path.write_bytes(path.read_bytes().replace(known, known[::-1]))
+        with pytest.raises(FlightLogError, match="no position"):
+            import_log(path)
+        log, _ = import_log(path, None, PARTIAL)
+        assert log.partial == lacks
+        np.testing.assert_allclose(log.rate_b, known_flight.fly(log.time_s).rate, atol=0.1)
+
+
+def test_rotors_without_a_turn_are_not_counted_and_speeds_are_of_the_poles():
+    """Logs may have columns for eight rotors; 700 eRPM of 14 poles are 100 turns a minute."""
+    columns = {f"eRPM[{k}]": np.full(3, 7.0 if k < 4 else 0.0) for k in range(8)}
+    box: Any = SimpleNamespace(columns=columns, name="log")
+    findings: list[Any] = []
+    found = betaflight._motors(box, 14, findings)
+    assert [finding.status for finding in findings] == ["note"]
+    np.testing.assert_allclose(found["motor"], np.full((3, 4), 100.0 / 60.0 * 2.0 * np.pi))
+    slower = betaflight._motors(box, 28, findings)
+    np.testing.assert_allclose(slower["motor"], 0.5 * found["motor"])
+    columns["eRPM[4]"][1] = 1.0
+    betaflight._motors(box, 14, findings)
+    assert "motor_count" in {finding.fault for finding in findings}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "unit", "volts"),
+    [
+        ([16.13, 16.02], "", [16.13, 16.02]),
+        ([1613.0, 1602.0], "", [16.13, 16.02]),
+        ([16.13, 16.02], "V", [16.13, 16.02]),
+        ([0.21, 0.22], "V", [0.21, 0.22]),
+        ([161.3, 160.2], "V", [16.13, 16.02]),
+        ([5.0, 4.0], "", [0.05, 0.04]),
+    ],
+)
+def test_a_voltage_is_in_volts_whatever_wrote_it(numbers, unit, volts):
+    """Whole numbers without a unit are in hundredths; others are volts, or ten times too much."""
+    read = np.array(numbers) * betaflight._VOLT[unit]
+    np.testing.assert_allclose(betaflight._volts(read, unit, True, []), volts)

@@ -1,0 +1,216 @@
+"""Factors, axes and motor maps: corrected where they have a name."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eval.logs.faults.drive.commands import check_thrust_command
+from eval.logs.faults.drive.motor_map import check_motor_map
+from eval.logs.faults.drive.motors import check_lift, check_motors
+from eval.logs.faults.relation import match
+from eval.logs.faults.vectors import check_gyro, check_velocity
+from eval.vehicles.vehicle import MotorMap, command_of_thrust
+from tests.support.vehicles import PLAIN
+
+HOVER = np.sqrt(PLAIN.mass * 9.81 / (4 * PLAIN.rotors.thrust_coefficient))
+
+
+def lift(factor, vehicle=PLAIN):
+    rows = {"motor": np.full((50, 4), HOVER * factor), "time": np.arange(50.0)}
+    (finding,) = check_lift(rows, vehicle)
+    return finding
+
+
+def test_speeds_that_carry_the_weight_or_what_an_effect_can_do_are_no_fault():
+    assert lift(0.98).status == lift(1.03).status == "ok"
+    assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
+
+
+@pytest.mark.parametrize("factor", [6.5, 11.0, 11.5, 10.2])
+def test_a_factor_between_two_names_is_left_to_its_owner(factor):
+    """By either the speeds would look well; the wrong one would be off by a sixth or less."""
+    finding = lift(factor)
+    assert finding.is_open and " or " in finding.evidence
+
+
+def test_a_factor_without_a_name_is_a_doubt():
+    assert lift(2.5).is_open
+    assert lift(1.0, None).status == "note"
+    assert lift(14 / 12).fault == "motor_poles" and "14" in lift(14 / 12).fix
+    assert lift(5**-0.5).fault == "vehicle_mass"
+
+
+def test_without_a_gyro_order_and_spin_are_not_identifiable():
+    found = check_motors({"motor": np.full((50, 4), HOVER), "time": np.arange(50.0)}, PLAIN)
+    assert [(one.fault, one.status) for one in found] == [
+        (fault, "not identifiable") for fault in ("motor_order", "motor_spin")
+    ]
+
+
+def thrust(factor, vehicle=PLAIN):
+    time_s = np.arange(0.0, 4.0, 0.01)
+    force = 9.81 + 2.0 * np.sin(3.0 * time_s)
+    acc = np.column_stack([np.zeros_like(force), np.zeros_like(force), force])
+    rows = {"time": time_s, "acc": acc, "cmd_thrust": factor * force[:, None]}
+    return check_thrust_command(rows, vehicle)
+
+
+def test_a_command_near_the_force_is_fine():
+    for factor in (1.0, 0.88, 1.3):
+        (finding,) = thrust(factor)
+        assert finding.status == "ok", factor
+
+
+def test_newtons_need_the_mass_and_a_share_of_full_thrust_has_no_unit():
+    heavy = replace(PLAIN, mass=4.0)
+    (finding,) = thrust(4.0, heavy)
+    assert "newtons" in finding.evidence and finding.fix == "--read cmd_thrust=0.25"
+    light = replace(PLAIN, mass=0.78)
+    for factor in (0.78, 0.84):
+        (finding,) = thrust(factor, light)
+        assert finding.fault == "thrust_command_unit" and not finding.is_open, "or thrust is lower"
+    (finding,) = thrust(4.0, None)
+    assert finding.is_open and finding.fault == "thrust_command_unit"
+    (finding,) = thrust(0.67)
+    assert (finding.status, finding.fault) == ("note", "thrust_scale"), "the mass may be 0.5 kg"
+    (finding,) = thrust(0.03)
+    assert finding.is_open and "share of full thrust" in finding.evidence
+
+
+def findings(vel_of, seed=0):
+    """Return findings on a flight to and fro along a straight line, with noise."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, 10.0, 0.01)
+    along = np.array([0.7, -1.65, 0.05])
+    pos = np.sin(0.8 * time_s)[:, None] * along
+    vel = vel_of(0.8 * np.cos(0.8 * time_s)[:, None] * along)
+    noise = rng.standard_normal((2, len(time_s), 3))
+    rows = {"time": time_s, "pos": pos + 0.003 * noise[0], "vel": vel + 0.03 * noise[1]}
+    return {one.fault: one for one in check_velocity(rows) if one.fault}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_straight_line_no_axis_is_taken_for_another(seed):
+    """There x and y are proportional, and y over x is no unit."""
+    assert "velocity_unit" not in findings(lambda vel: vel, seed)
+
+
+def test_another_unit_on_a_straight_line_is_found():
+    found = findings(lambda vel: 100.0 * vel)["velocity_unit"]
+    assert found.status == "corrected" and "cm/s" in found.evidence
+
+
+def test_axes_that_move_in_proportion_are_no_evidence_of_their_order():
+    found = findings(lambda vel: vel)
+    assert found["velocity_frame"].status == "not identifiable"
+    assert "y,x,z" in found["velocity_frame"].evidence
+
+
+def test_swapped_axes_are_found_though_they_resemble_each_other():
+    rng = np.random.default_rng(5)
+    first, other, weak = rng.standard_normal((3, 500))
+    wanted = np.column_stack([first, 0.6 * first + 0.8 * other, 0.02 * weak])
+    given = wanted[:, [1, 0, 2]] + 0.015 * rng.standard_normal(wanted.shape)
+    found = match(wanted, given)
+    assert (found.axes, found.rival) == ("y,x,z", "") and found.is_turned
+    assert not match(wanted, wanted).is_turned
+
+
+@pytest.mark.parametrize(("factor", "status"), [(57.3, "doubt"), (1.0, "not identifiable")])
+def test_rates_that_no_gyro_measures_are_a_fault_without_an_attitude(factor, status):
+    time_s = np.arange(0.0, 10.0, 0.01)
+    rate = factor * np.column_stack([3.0 * np.sin(time_s), np.cos(2.0 * time_s), 0.1 * time_s])
+    found = {one.fault: one.status for one in check_gyro({"time": time_s, "rate": rate})}
+    assert found["gyro_scale"] == status
+
+
+TRUE = MotorMap((1.5, 4.0), 15.0, 1.0)
+
+
+def flown(depth=0.4, drained=True, seed=0, seconds=40.0):
+    """Rows of a vehicle whose motors are `TRUE`: rotors 30 ms behind their commands."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 0.01)
+    waves = np.array([[0.9, 0.0], [1.7, 1.0], [2.9, 2.0], [0.35, 3.0]])
+    each = [np.sin(w * time_s + p + k) for k in range(4) for w, p in waves]
+    swing = np.reshape(each, (4, 4, -1)).mean(axis=1).T
+    thrust = 9.81 * PLAIN.mass / 4.0 * (1.0 + depth * swing)
+    volts = np.interp(time_s, (0.0, seconds), (16.5, 13.5)) if drained else 15.0 + 0.0 * time_s
+    pwm = command_of_thrust(TRUE.thrust, thrust) * (TRUE.voltage / volts)[:, None]
+    late = np.concatenate([np.repeat(thrust[:1], 3, axis=0), thrust])[: len(time_s)]
+    force = late.sum(axis=1) / PLAIN.mass + 0.3 * rng.normal(size=len(time_s))
+    acc = np.column_stack([0.0 * force, 0.0 * force, force])
+    return {"time": time_s, "acc": acc, "pwm": pwm, "voltage": volts[:, None],
+            "motor": np.sqrt(late / PLAIN.rotors.thrust_coefficient)}  # fmt: skip
+
+
+def with_motors(**changes):
+    return replace(PLAIN, motors=replace(TRUE, **changes))
+
+
+def found(rows, vehicle):
+    return [f for f in check_motor_map(rows, vehicle) if f.status == "doubt"]
+
+
+@pytest.mark.parametrize("by", ["motor", "acc"])
+@pytest.mark.parametrize(
+    ("changes", "faults"),
+    [
+        ({}, []),
+        ({"thrust": (0.0, 9.5)}, ["motor_map"]),
+        ({"thrust": (6.0, 0.0)}, ["motor_map"]),
+        ({"thrust": (3.0, 8.0)}, ["motor_map"]),
+        ({"thrust": (0.6, 1.6)}, ["motor_map"]),
+        ({"voltage_exponent": 0.0}, ["battery_scaling"]),
+        ({"voltage_exponent": 2.5}, ["battery_scaling"]),
+    ],
+)
+def test_the_fault_is_named_and_the_fix_is_the_map_that_was_flown(by, changes, faults):
+    rows = flown()
+    del rows["acc" if by == "motor" else "motor"]
+    findings = found(rows, with_motors(**changes))
+    assert [f.fault for f in findings] == faults
+    for finding in findings:
+        first, second, voltage, exponent = map(float, re.findall(r"\d[\d.e-]*", finding.fix))
+        fixed = MotorMap((first, second), voltage, exponent)
+        assert exponent == pytest.approx(1.0, abs=0.1)
+        assert not found(rows, replace(PLAIN, motors=fixed)), "the fix is right"
+        gives = [first * u + second * u**2 for u in (u0 * 15.0 / voltage for u0 in (0.4, 0.55))]
+        assert gives == pytest.approx([1.5 * u + 4.0 * u**2 for u in (0.4, 0.55)], rel=0.06)
+
+
+def test_what_a_flight_does_not_show_is_reported_as_not_identifiable():
+    def unseen(rows, vehicle):
+        findings = check_motor_map(rows, vehicle)
+        assert not [f for f in findings if f.status == "doubt"]
+        return {f.fault for f in findings if f.status == "not identifiable"}
+
+    hover = flown(depth=0.02, drained=False)
+    assert unseen(hover, with_motors(thrust=(0.0, 6.9))) == {"motor_map", "battery_scaling"}
+    rows = flown()
+    del rows["acc"], rows["motor"]
+    assert unseen(rows, with_motors()) == {"motor_map", "battery_scaling"}
+    assert unseen(flown(drained=False), with_motors(voltage_exponent=0.0)) == {"battery_scaling"}
+
+
+@pytest.mark.parametrize(
+    ("power", "factor", "vehicle", "faults"),
+    [
+        (1.0, 1.0, PLAIN, []),
+        (1.0, 1.0, None, []),
+        (0.5, 1.0, PLAIN, ["throttle_curve"]),
+        (0.5, 1.0, None, ["throttle_curve"]),
+        (1.0, 2.0, PLAIN, ["throttle_curve"]),
+        (1.0, 2.0, None, []),  # no file says what full throttle gives
+    ],
+)
+def test_a_throttle_that_is_not_linear_or_of_another_full_thrust_is_named(
+    power, factor, vehicle, faults
+):
+    rows = flown(depth=1.0)
+    total = rows["motor"] ** 2 @ np.full(4, PLAIN.rotors.thrust_coefficient)
+    share = total / (PLAIN.full_thrust * PLAIN.mass)
+    rows = {"time": rows["time"], "acc": rows["acc"], "throttle": factor * share[:, None] ** power}
+    assert [f.fault for f in found(rows, vehicle)] == faults
