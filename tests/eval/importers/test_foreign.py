@@ -221,7 +221,6 @@ PARTIAL = ImportOptions(partial=True, full_thrust=30.0)
 
 
 def test_a_raw_blackbox_log_equals_the_flight(tmp_path):
-    pytest.importorskip("betaflight_chirp_core")
     path = write_raw(tmp_path / "LOG00001.BFL", known_flight.fly(np.arange(0.0, 6.0, 0.002)))
     log, findings = import_log(path, None, PARTIAL)
     truth = known_flight.fly(log.time_s)
@@ -239,7 +238,6 @@ def test_a_raw_blackbox_log_equals_the_flight(tmp_path):
 
 
 def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
-    pytest.importorskip("betaflight_chirp_core")
     short, long = (
         write_raw(tmp_path / f"{end}", known_flight.fly(np.arange(0.0, end, 0.004)))
         for end in (2.0, 4.0)
@@ -260,7 +258,6 @@ def test_the_longest_log_of_a_raw_file_is_read(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("pose", [False, True])
 def test_an_ardupilot_log_equals_the_flight(tmp_path, pose):
-    pytest.importorskip("pymavlink")
     truth = known_flight.fly(np.arange(0.0, 8.0, 0.01))
     log, _ = import_log(write_bin(tmp_path / "00000001.BIN", truth, pose), None, PARTIAL)
     assert log.partial == (() if pose else ("pos", "quat"))

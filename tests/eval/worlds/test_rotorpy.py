@@ -93,13 +93,7 @@ def test_what_the_vehicle_loses_is_said(stand_in):
 # From here on RotorPy itself flies.
 
 
-@pytest.fixture
-def installed():
-    pytest.importorskip("rotorpy")
-    pytest.importorskip("torchdiffeq")
-
-
-def test_one_trial_is_finished_and_another_ends_at_a_wall(installed):
+def test_one_trial_is_finished_and_another_ends_at_a_wall():
     clear, walled = straight((1.0, 2.0), name="clear"), straight((4.0, 5.0), 1.2, name="walled")
     record = Record(depth=True)
     (result, hit), (flight, _) = flown(Pursuit(3.0), clear, walled, rules=RULES, record=record)
@@ -111,7 +105,7 @@ def test_one_trial_is_finished_and_another_ends_at_a_wall(installed):
 
 
 @pytest.mark.slow
-def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
+def test_wind_carries_the_vehicle_by_rotorpys_drag():
     rules = Rules(time_limit_s=0.4)
     (still,), _ = flown(Steady(), TRACK, rules=rules)
     wind = with_effects(constant_wind=((0.0, 4.0, 0.0),)).effects
@@ -120,7 +114,7 @@ def test_wind_carries_the_vehicle_by_rotorpys_drag(installed):
     assert abs(still.pos_y) < 1e-6 and carried.pos_y > 0.02
 
 
-def test_a_row_is_stepped_by_itself(installed):
+def test_a_row_is_stepped_by_itself():
     """So a trial's outcome does not depend on the others of its batch."""
     rng, count = np.random.default_rng(0), 3
     qpos = rng.normal(size=(64, 7))
@@ -175,12 +169,13 @@ def test_every_difference_is_said_and_nothing_else():
 def test_forces_and_torques_are_ours_where_the_body_does_not_turn(name):
     """To rounding: RotorPy's equations in other words. Turning, its hubs have airspeeds of their
     own, which ours have not (`differences` says so)."""
-    rotorpy = pytest.importorskip("rotorpy.vehicles.multirotor")
+    from rotorpy.vehicles import multirotor
+
     rng = np.random.default_rng(3)
     drawn = drawn_effects(rng).effects
     vehicle = replace(with_lag(PLAIN, 0.03), effects={name: drawn[name]} if name else {})
     plant = make_plant(vehicle, 0.002)
-    theirs = rotorpy.Multirotor(rotorpy_parameters(vehicle))
+    theirs = multirotor.Multirotor(rotorpy_parameters(vehicle))
     for _ in range(5):
         vel_b, speed = rng.normal(0, 6, 3), rng.uniform(300, 2000, 4)
         motion = Motion(np.zeros(3), np.eye(3), vel_b, np.zeros(3))

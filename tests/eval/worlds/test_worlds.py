@@ -251,14 +251,8 @@ def test_mjx_steps_as_mujoco_does(motion):
     assert np.abs(single.quat_wxyz - flight.quat_wxyz).max() < 1e-5
 
 
-@pytest.fixture
-def rotorpy():
-    pytest.importorskip("rotorpy")
-    pytest.importorskip("torchdiffeq")
-
-
 @each_motion
-def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion, rotorpy):
+def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion):
     (_, ours), (_, theirs) = by_mujoco(motion), moved("rotorpy", motion)
     assert np.abs(ours.pos_w - theirs.pos_w).max() < EULER_M
     assert np.abs(ours.vel_w - theirs.vel_w).max() < EULER_SPEED
@@ -267,7 +261,7 @@ def test_rotorpy_steps_as_mujoco_does_but_for_the_length_of_mujocos_steps(motion
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["fall", "spin", "manoeuvre"])
-def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
+def test_what_differs_from_rotorpy_halves_with_the_step(motion):
     """Nothing else does: a difference of models would stay."""
 
     def apart(frequency):
@@ -284,7 +278,7 @@ def test_what_differs_from_rotorpy_halves_with_the_step(motion, rotorpy):
     assert 1.8 < attitude < 2.3 or motion == "fall"
 
 
-def test_rotorpy_falls_as_continuous_equations_say(rotorpy):
+def test_rotorpy_falls_as_continuous_equations_say():
     """Rotors that run down from a hover with lag tau push with g exp(-2 t / tau)."""
     tau, end = 0.03, 0.5
     _, flight = moved("rotorpy", "fall", vehicle=with_lag(PLAIN, tau), seconds=end)
