@@ -43,55 +43,52 @@ def test_rotors_alone():
     near(force, [0.0, 0.0, 6.4])
     near(torque, [0.0, 0.0, 0.0])
     # Rotor 1 alone, front right, counter-clockwise: rolls left, pitches up, yaws clockwise.
-    force, torque = wrench(PLAIN, speed=np.array([1000.0, 0.0, 0.0, 0.0]))
+    force, torque = wrench(PLAIN, speed=FIRST)
     near(force, [0.0, 0.0, 1.6])
     near(torque, [-0.16, -0.12, -0.022])
 
 
-UNEVEN = np.array([1200.0, 1000.0, 1200.0, 1000.0])
-FORCE = {
-    "linear_drag": (((0.3, 0.2, 0.1),), [-0.675, 0.3, -0.075]),
+UNEVEN, FIRST = np.array([1200.0, 1000.0, 1200.0, 1000.0]), np.array([1000.0, 0.0, 0.0, 0.0])
+THIRD, NONE = np.array([1000.0, 1000.0, 1500.0, 1000.0]), [0.0, 0.0, 0.0]
+ADDED = [
+    ("linear_drag", ((0.3, 0.2, 0.1),), SPEED, [-0.675, 0.3, -0.075], NONE),
     # |v| = sqrt(14) = 3.7416574
-    "quadratic_drag": (((0.01, 0.02, 0.04),), [-0.084187291, 0.112249722, -0.112249722]),
-    "rotor_drag": ((2e-5,), [-0.24, 0.16, 0.0]),
-    "translational_lift": ((0.01,), [0.0, 0.0, 0.0975]),
-}
-"""Parameters, and the force [N] on the moving body; none has a torque."""
-TORQUE = [
-    ("blade_flapping", (1e-6,), SPEED, [-0.008, -0.012, 0.0]),
-    ("torque_trim", ((0.01, -0.02, 0.003),), SPEED, [0.01, -0.02, 0.003]),
-    ("angular_damping", ((1.0, 2.0, 0.5),), SPEED, [-0.0025, -0.0084, 0.001075]),
-    ("rotor_gyroscopic", (2e-5,), UNEVEN, [-0.016, 0.008, 0.0]),
+    ("quadratic_drag", ((0.01, 0.02, 0.04),), SPEED, [-0.084187291, 0.112249722, -0.112249722],
+     NONE),
+    ("rotor_drag", (2e-5,), SPEED, [-0.24, 0.16, 0.0], NONE),
+    ("translational_lift", (0.01,), SPEED, [0.0, 0.0, 0.0975], NONE),
+    ("inflow", (1e-4,), SPEED, [0.0, 0.0, -0.4], NONE),
+    # One rotor faster than the others loses more: rotor 3, rear left.
+    ("inflow", (1e-4,), THIRD, [0.0, 0.0, -0.45], [-0.05 * 0.1, -0.05 * 0.075, 0.0]),
+    # Rotor 1, front right, pushes a tenth less of its 1.6 N; its torque about z stays.
+    ("thrust_scale", (0.9,), FIRST, [0.0, 0.0, -0.16], [0.016, 0.012, 0.0]),
+    # Rotor 2 is rear right, clockwise: without its tenth the body rolls right and pitches up.
+    ("weak_motor", ((1.0, 0.9, 1.0, 1.0),), SPEED, [0.0, 0.0, -0.16], [0.016, -0.012, -0.0022]),
+    ("blade_flapping", (1e-6,), SPEED, NONE, [-0.008, -0.012, 0.0]),
+    ("torque_trim", ((0.01, -0.02, 0.003),), SPEED, NONE, [0.01, -0.02, 0.003]),
+    ("angular_damping", ((1.0, 2.0, 0.5),), SPEED, NONE, [-0.0025, -0.0084, 0.001075]),
+    ("rotor_gyroscopic", (2e-5,), UNEVEN, NONE, [-0.016, 0.008, 0.0]),
     # Ahead of the rotors' centre the weight pitches the nose down (+y), on the left it rolls left.
-    ("com_offset", ((0.01, 0.0, 0.0),), SPEED, [0.0, 0.064, 0.0]),
-    ("com_offset", ((0.0, 0.01, 0.0),), SPEED, [-0.064, 0.0, 0.0]),
-    ("com_offset", ((0.0, 0.0, 0.01),), SPEED, [0.0, 0.0, 0.0]),
-]
-"""Parameters, rotor speeds, and the torque [N m] on the moving body; none has a force."""
+    ("com_offset", ((0.01, 0.0, 0.0),), SPEED, NONE, [0.0, 0.064, 0.0]),
+    ("com_offset", ((0.0, 0.01, 0.0),), SPEED, NONE, [-0.064, 0.0, 0.0]),
+    ("com_offset", ((0.0, 0.0, 0.01),), SPEED, NONE, NONE),
+    # From a hover to 1200 and 1000 rad/s in 2 ms the rotors turn by 400 rad/s more to the left than
+    # to the right: against 400 / 0.002 x 1e-5 = 2 N m the body turns to the right.
+    ("rotor_spin_up", (1e-5,), UNEVEN, NONE, [0.0, 0.0, -2.0]),
+]  # fmt: skip
+"""Effect, parameters, rotor speeds [rad/s], and force [N] and torque [N m] that are added."""
 
 
-def test_forces_and_torques_by_hand():
-    for name, (parameters, expected) in FORCE.items():
-        force, torque = added(**{name: parameters})
-        near(force, expected)
-        near(torque, 0.0)
-    for name, parameters, speed, expected in TORQUE:
-        force, torque = added(speed=speed, **{name: parameters})
-        near(force, 0.0)
-        near(torque, expected)
+@pytest.mark.parametrize(("name", "parameters", "speed", "force_b", "torque_b"), ADDED)
+def test_forces_and_torques_by_hand(name, parameters, speed, force_b, torque_b):
+    found = added(speed=speed, **{name: parameters})
+    near(found[0], force_b)
+    near(found[1], torque_b)
 
 
 def test_drags_take_the_true_mass():
     force = wrench(with_effects(linear_drag=((0.3, 0.2, 0.1),), mass_offset=(0.25,))).force_b
     near(force, [-0.9, 0.4, 6.3])
-
-
-def test_inflow():
-    force, _ = added(inflow=(1e-4,))
-    near(force, [0.0, 0.0, -0.4])
-    # One rotor faster than the others loses more: rotor 3, rear left.
-    _, torque = added(speed=np.array([1000.0, 1000.0, 1500.0, 1000.0]), inflow=(1e-4,))
-    near(torque, [-0.05 * 0.1, -0.05 * 0.075, 0.0])
 
 
 def test_ground_effect():
@@ -179,12 +176,6 @@ def test_command_delay(delay, thrusts, acting):
     near(pushes, acting)
 
 
-def test_thrust_scale_leaves_yaw_torque():
-    force, torque = wrench(with_effects(thrust_scale=(0.9,)), speed=np.array([1000.0, 0, 0, 0]))
-    near(force, [0.0, 0.0, 1.44])
-    near(torque, [-0.144, -0.108, -0.022])
-
-
 def test_battery_sag():
     near(wrench(with_effects(battery_sag=(0.001, 0.0)), time_s=50.0).force_b[2], 6.4 * 0.95)
     by_voltage = with_effects(battery_sag=(0.001, 0.05))
@@ -221,26 +212,14 @@ def test_gyroscopic_terms_of_the_true_inertia():
     near(accelerations(plant, MOVING, none)[1], [0.0022 / 0.005, 0.00035 / 0.0021, 0.0058 / 0.0043])
 
 
-def test_rotor_spin_up():
-    """From a hover to 1200 and 1000 rad/s in 2 ms: 400 rad/s more counter-clockwise than clockwise.
-
-    Against 400 / 0.002 x 1e-5 = 2 N m the body turns clockwise.
-    """
-    force, torque = added(speed=UNEVEN, rotor_spin_up=(1e-5,))
-    near(force, 0.0)
-    near(torque, [0.0, 0.0, -2.0])
-    # Rotors that are told by a command to turn as they do push nothing.
+def test_rotors_that_turn_as_their_command_says_push_nothing_by_spinning_up():
     plant = make_plant(with_effects(rotor_spin_up=(1e-5,)), 0.002)
     still = Motion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
     inputs = Inputs(command=Command(np.asarray(9.81), np.zeros(3)))
     near(plant_step(plant, hover_state(plant, ()), still, inputs, 0.0)[1].torque_b, 0.0)
 
 
-def test_weak_motor():
-    # Rotor 2 is rear right, clockwise: without its tenth the body rolls right and pitches up.
-    vehicle = with_effects(weak_motor=((1.0, 0.9, 1.0, 1.0),))
-    near(wrench(vehicle).force_b, [0.0, 0.0, 6.24])
-    near(wrench(vehicle).torque_b, [0.016, -0.012, -0.0022])
+def test_weak_motors_are_written_by_their_numbers():
     for scale, table in (
         ((1.0, 1.0, 0.9, 1.0), {"index": 3, "scale": 0.9}),
         ((0.8, 1.0, 1.0, 0.9), {"index": [1, 4], "scale": [0.8, 0.9]}),

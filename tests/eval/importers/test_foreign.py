@@ -53,7 +53,7 @@ def test_px4_at_the_loggers_default_rates(tmp_path):
     [*((True, k, k in (1, 3)) for k in range(4)), *((False, k, k != 2) for k in (0, 2, 3))],
 )
 def test_px4_odometry_has_a_velocity_in_frames_that_are_known(tmp_path, new, frame, known):
-    path = made.write_ulog(tmp_path / "log.ulg", odometry=(new, frame))
+    path = made.write_ulog(tmp_path / "log.ulg", (0, 4), odometry=(new, frame))
     log, findings = import_log(path, None, FULL)
     truth = known_flight.fly(log.time_s)
     assert log.velocity_derived is not known
@@ -175,12 +175,12 @@ def test_mcap_equals_the_flight(tmp_path):
 
 
 def test_what_an_attitude_target_says_to_ignore_is_no_command(tmp_path):
-    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 4), mask=7)
+    path = made.write_mcap(tmp_path / "log.mcap", span=(0, 2.5), mask=7)
     log, _ = import_log(path, None, FULL)
     assert log.rate_cmd_b is None and log.rotor_speed is not None
     log, _ = import_log(path, None, ImportOptions(full_thrust=30.0, vehicle=PLAIN))
     assert log.rate_cmd_b is not None and log.thrust_cmd is not None
-    whole = made.write_mcap(tmp_path / "none.mcap", span=(0, 4), mask=7 + 64 + 128)
+    whole = made.write_mcap(tmp_path / "none.mcap", span=(0, 2.5), mask=7 + 64 + 128)
     log, _ = import_log(whole, None, FULL)
     assert log.rate_cmd_b is None and log.thrust_cmd is None
 
