@@ -15,7 +15,8 @@ from eval.logs.columns import FlightLogError
 from eval.logs.faults.finding import Finding, finding_lines
 from eval.logs.flight_log import read_flight, write_flight
 from tests.support import foreign_logs as made
-from tests.support.imported import flight, write
+from tests.support import known_flight
+from tests.support.imported import flight, near, write
 from tests.support.vehicles import PLAIN
 
 FULL = ImportOptions(full_thrust=30.0)
@@ -142,6 +143,7 @@ def test_start_and_end_cut_more_than_the_time_on_the_ground():
         assemble(Recording("log", parts), "made", replace(asked, start_s=50.0, end_s=60.0))
     kept, _ = assemble(Recording("log", parts), "made", replace(asked, trim=False))
     assert kept.duration_s == pytest.approx(1.5, abs=0.02)
+    near(kept.rate_b, known_flight.fly(kept.time_s + 0.1).rate, 1e-6)
 
 
 @pytest.mark.parametrize(

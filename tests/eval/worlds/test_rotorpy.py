@@ -146,7 +146,9 @@ def test_linear_drag_becomes_drag_of_rotors_that_is_the_same_at_hover():
 
 
 def test_the_mass_is_the_true_one_and_rotors_lag_at_least_as_long_as_asked():
-    assert rotorpy_parameters(with_effects(mass_offset=(0.05,)))["mass"] == pytest.approx(0.8)
+    heavy = with_effects(mass_offset=(0.05,), quadratic_drag=((0.1, 0.2, 0.3),))
+    told = [rotorpy_parameters(heavy)[name] for name in ("mass", "c_Dx", "c_Dy", "c_Dz")]
+    assert told == pytest.approx([0.8, 0.08, 0.16, 0.24])
     assert rotorpy_parameters(PLAIN)["tau_m"] == 0.0
     assert rotorpy_parameters(PLAIN, 0.002)["tau_m"] == 0.002
     assert rotorpy_parameters(with_lag(PLAIN, 0.03), 0.002)["tau_m"] == 0.03

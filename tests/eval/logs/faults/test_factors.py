@@ -28,6 +28,14 @@ def test_speeds_that_carry_the_weight_or_what_an_effect_can_do_are_no_fault():
     assert (lift(1.1).status, lift(1.1).fault) == ("note", "thrust_scale")
 
 
+def test_a_factor_with_a_name_is_put_right():
+    rpm = 60 / (2 * np.pi)
+    for factor, words, scale in ((6.0, "6 pole", 6.0), (rpm, "rpm", rpm), (7.1, "7 pole", 7.0)):
+        finding = lift(factor)
+        assert finding.status == "corrected" and words in finding.evidence
+        assert finding.fix == f"--read motor={1 / scale:.10g}"
+
+
 @pytest.mark.parametrize("factor", [6.5, 11.0, 11.5, 10.2])
 def test_a_factor_between_two_names_is_left_to_its_owner(factor):
     """By either the speeds would look well; the wrong one would be off by a sixth or less."""
@@ -61,6 +69,12 @@ def test_a_command_near_the_force_is_fine():
     for factor in (1.0, 0.88, 1.3):
         (finding,) = thrust(factor)
         assert finding.status == "ok", factor
+
+
+def test_a_unit_or_a_sign_of_the_thrust_is_corrected():
+    for factor, fix in ((1 / 9.81, 9.81), (0.92 / 9.81, 9.81), (-1.0, -1), (-1 / 9.81, -9.81)):
+        (finding,) = thrust(factor)
+        assert (finding.status, finding.fix) == ("corrected", f"--read cmd_thrust={fix}")
 
 
 def test_newtons_need_the_mass_and_a_share_of_full_thrust_has_no_unit():
