@@ -135,41 +135,31 @@ def test_reference_world_flies_the_same(expected):
 
 
 def rows(due, time_s):
-    """Rows of two slots: the numbers of slot 1 are those of slot 0 and ten more."""
-    add = np.array([0.0, 10.0])
-    three, four = (np.arange(size) + add[:, None] for size in (3, 4))
-    return Rows(
-        due=np.asarray(due),
-        time_s=np.asarray(time_s, dtype=float),
-        pos_w=three,
-        quat_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
-        vel_w=three,
-        rate_b=three,
-        thrust_cmd=9.81 + add,
-        rate_cmd_b=three,
-        rotor_speed=four,
-        gate=(add + 2).astype(int),
-    )
+    """Rows of two slots without a number twice: 100 a field, 10 a slot, 1 a component."""
+    starts = [100.0 * k + np.array([[0.0], [10.0]]) for k in range(8)]
+    sizes = (3, 4, 3, 3, 1, 3, 4, 1)
+    parts = [start + np.arange(size) for start, size in zip(starts, sizes, strict=True)]
+    return Rows(np.asarray(due), np.asarray(time_s), *(np.squeeze(part) for part in parts))
 
 
-def test_slots_do_not_mix_and_a_decision_is_flagged_once():
+def test_slots_and_fields_do_not_mix_and_a_decision_is_flagged_once():
     recorder = Recorder(2, depth=True)
-    action_b = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    depth_m = np.stack([np.full((2, 2), 7.0), np.full((2, 2), 8.0)])
+    action_b, depth_m = np.arange(6.0).reshape(2, 3), np.arange(8.0).reshape(2, 2, 2)
     recorder.add(rows([True, True], [0.0, 0.5]))
     recorder.decided(np.array([1]), action_b, depth_m)
     recorder.add(rows([False, True], [0.1, 0.6]))
     recorder.add(rows([True, True], [0.2, 0.7]))
     first, second = recorder.finish(0, {"seed": 3}), recorder.finish(1, {"seed": 4})
-    assert first.about == {"seed": 3} and second.about == {"seed": 4}
+    assert (first.about, second.about) == ({"seed": 3}, {"seed": 4})
     np.testing.assert_array_equal(first.time_s, [0.0, 0.2])
     np.testing.assert_array_equal(second.time_s, [0.5, 0.6, 0.7])
-    np.testing.assert_array_equal(second.pos_w, np.tile([10.0, 11.0, 12.0], (3, 1)))
-    np.testing.assert_array_equal(second.rotor_speed, np.tile([10.0, 11.0, 12.0, 13.0], (3, 1)))
-    np.testing.assert_array_equal(second.gate, [12, 12, 12])
+    for slot, flight in enumerate((first, second)):
+        for name, value in rows([True, True], [0.0, 0.0])._asdict().items():
+            if name not in ("due", "time_s"):
+                wanted = np.stack([value[slot]] * len(flight.time_s))
+                np.testing.assert_array_equal(getattr(flight, name), wanted, err_msg=name)
     assert second.policy_step.tolist() == [False, True, False] and not first.policy_step.any()
-    np.testing.assert_array_equal(second.action_b, [[0, 0, 0], [4, 5, 6], [4, 5, 6]])
-    assert second.depth_m is not None and first.depth_m is not None
+    np.testing.assert_array_equal(second.action_b, [0 * action_b[1], action_b[1], action_b[1]])
     assert second.depth_m.dtype == np.float32 and len(first.depth_m) == 0
     np.testing.assert_array_equal(second.depth_m, depth_m[1:])
 
@@ -218,4 +208,5 @@ def check_flight(flight, result):
     # Velocity is the position's slope, and hovering rotors carry the weight at the start.
     slope = np.gradient(flight.pos_w, flight.time_s, axis=0)
     assert np.abs(slope - flight.vel_w)[2:-2].max() < 0.1
-    assert 4 * 1.6e-6 * (flight.rotor_speed[0] ** 2).mean() > 0
+    thrust = VEHICLE.rotors.thrust_coefficient * (flight.rotor_speed[0] ** 2).sum()
+    assert thrust == pytest.approx(VEHICLE.mass * 9.81, rel=1e-6)
