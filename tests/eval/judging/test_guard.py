@@ -7,17 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eval.judging import monitor
 from eval.judging.guard import ActionLimits, guard_action
 from eval.judging.judge import Record
-from eval.judging.monitor import (
-    Monitored,
-    MonitorLimits,
-    clearance,
-    last_moment,
-    limited,
-    seen_of,
-    ways_out,
-)
 from eval.quadrotor.vehicle_file import load_vehicle
 from eval.worlds.trial import Rules
 from policies.observation import encode_depth
@@ -127,7 +119,7 @@ def test_a_trial_whose_first_answer_is_late_ends_where_it_started():
 
 
 SPEC = PolicySpec(rate_hz=15.0)
-BOUNDS = MonitorLimits()
+BOUNDS = monitor.MonitorLimits()
 PERIOD_S = 1.0 / SPEC.rate_hz
 
 
@@ -140,7 +132,7 @@ def observation(vel_b=(5.0, 0.0, 0.0), depth_m=10.0, last_b=(0.0, 0.0, 0.0), up_
 
 
 def seen(**changed):
-    return seen_of(SPEC, *observation(**changed))
+    return monitor.seen_of(SPEC, *observation(**changed))
 
 
 def test_depths_come_back_as_points_along_the_rays():
@@ -152,27 +144,27 @@ def test_depths_come_back_as_points_along_the_rays():
 
 def test_tilt_and_speed_bend_an_action_and_small_ones_pass():
     gentle = np.array([[2.0, 1.0, 0.5]])
-    np.testing.assert_allclose(limited(BOUNDS, gentle, seen()), gentle, atol=1e-12)
-    wild = limited(BOUNDS, np.array([[200.0, 0.0, 0.0]]), seen(vel_b=(1.0, 0.0, 0.0)))[0]
+    np.testing.assert_allclose(monitor.limited(BOUNDS, gentle, seen()), gentle, atol=1e-12)
+    wild = monitor.limited(BOUNDS, np.array([[200.0, 0.0, 0.0]]), seen(vel_b=(1.0, 0.0, 0.0)))[0]
     tilt = np.degrees(np.arctan2(wild[0], wild[2] + 9.81))
     assert tilt == pytest.approx(BOUNDS.tilt_deg)
-    fast = limited(BOUNDS, np.array([[5.0, 1.0, 0.0]]), seen(vel_b=(15.0, 0.0, 0.0)))[0]
+    fast = monitor.limited(BOUNDS, np.array([[5.0, 1.0, 0.0]]), seen(vel_b=(15.0, 0.0, 0.0)))[0]
     np.testing.assert_allclose(fast, [0.0, 1.0, 0.0], atol=1e-12)
     braking = np.array([[-5.0, 0.0, 0.0]])
-    assert (limited(BOUNDS, braking, seen(vel_b=(15.0, 0.0, 0.0))) == braking).all()
+    assert (monitor.limited(BOUNDS, braking, seen(vel_b=(15.0, 0.0, 0.0))) == braking).all()
 
 
 def test_how_near_a_path_comes_is_worked_out():
     times = np.array([0.0, 0.2, 0.4])
     ahead = seen(vel_b=(5.0, 0.0, 0.0), depth_m=3.0)
-    coast = clearance(BOUNDS, ahead, np.zeros((1, 3)), None, times, PERIOD_S)
+    coast = monitor.clearance(BOUNDS, ahead, np.zeros((1, 3)), None, times, PERIOD_S)
     points = ahead.points_b[0]
     path = np.array([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
     expected = np.linalg.norm(points[None] - path[:, None], axis=-1).min()
     assert coast == pytest.approx(expected)
-    stop = clearance(BOUNDS, ahead, np.array([[-20.0, 0, 0]]), None, times, PERIOD_S)
+    stop = monitor.clearance(BOUNDS, ahead, np.array([[-20.0, 0, 0]]), None, times, PERIOD_S)
     assert stop > coast
-    assert clearance(BOUNDS, seen(), np.zeros((1, 3)), None, times, PERIOD_S) == np.inf
+    assert monitor.clearance(BOUNDS, seen(), np.zeros((1, 3)), None, times, PERIOD_S) == np.inf
 
 
 def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
@@ -182,35 +174,35 @@ def test_a_way_out_is_taken_at_the_last_moment_and_not_before():
     times = np.linspace(0.025, BOUNDS.horizon_s, 24)
     for depth_m in np.arange(6.0, 0.3, -0.1):
         view = seen(vel_b=(4.0, 0.0, 0.0), depth_m=depth_m)
-        action, taken = last_moment(BOUNDS, will, view, PERIOD_S)
+        action, taken = monitor.last_moment(BOUNDS, will, view, PERIOD_S)
         if taken[0]:
             taken_at = depth_m
             break
         assert (action == will).all()
-        ahead = clearance(BOUNDS, view, will, None, times, PERIOD_S)
+        ahead = monitor.clearance(BOUNDS, view, will, None, times, PERIOD_S)
         blocked += bool(ahead[0] < BOUNDS.clearance_m)
     assert blocked >= 3  # its path is blocked and there is time yet
     assert taken_at is not None and 0.6 < taken_at < 2.5
-    assert any((action == way).all() for way in ways_out(BOUNDS, view))
+    assert any((action == way).all() for way in monitor.ways_out(BOUNDS, view))
     assert action[0, 0] < 0 or action[0, 2] > 0
     # The same wall, flown away from, is left alone.
     away = seen(vel_b=(-4.0, 0.0, 0.0), depth_m=taken_at)
-    assert not last_moment(BOUNDS, will, away, PERIOD_S)[1][0]
+    assert not monitor.last_moment(BOUNDS, will, away, PERIOD_S)[1][0]
 
 
 def test_every_row_is_judged_by_itself():
     parts = [observation(depth_m=d) for d in (9.0, 1.2, 0.8)]
     state, image = (np.concatenate(each) for each in zip(*parts, strict=True))
-    policy = Monitored(Steady(spec=SPEC))
+    policy = monitor.Monitored(Steady(spec=SPEC))
     fresh = np.ones(3, bool)
     together, _ = policy.act(policy.start(3), state, image, fresh)
     assert policy.interventions > 0 and policy.name == "steady+monitor"
     for k, part in enumerate(parts):
-        alone, _ = Monitored(Steady(spec=SPEC)).act(policy.start(1), *part, fresh[:1])
+        alone, _ = monitor.Monitored(Steady(spec=SPEC)).act(policy.start(1), *part, fresh[:1])
         np.testing.assert_array_equal(together[k], alone[0])
 
 
 def test_an_answer_that_is_no_number_stays_one():
-    nothing = Monitored(Steady((np.nan, 0.0, 0.0), spec=SPEC))
+    nothing = monitor.Monitored(Steady((np.nan, 0.0, 0.0), spec=SPEC))
     action, _ = nothing.act(nothing.start(1), *observation(depth_m=1.0), np.ones(1, bool))
     assert np.isnan(action).any()

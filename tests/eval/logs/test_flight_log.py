@@ -10,16 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from eval.logs.flight_log import (
-    FlightLog,
-    FlightLogError,
-    columns_from_log,
-    log_from_columns,
-    log_from_flight,
-    read_flight,
-    read_flights,
-    write_flight,
-)
+from eval.logs import flight_log
 from eval.logs.velocity import velocity_from_position
 from tests.support.flights import small_track, smooth_flight
 from tests.support.log_tables import KINDS, assert_same, columns, write_table
@@ -28,9 +19,9 @@ from tests.support.log_tables import KINDS, assert_same, columns, write_table
 @pytest.mark.parametrize("kind", KINDS)
 def test_our_flight_round_trips_bit_for_bit_with_its_extras(tmp_path, kind):
     flight = smooth_flight(small_track())
-    log = log_from_flight(flight)
-    path = write_flight(tmp_path / f"a.{kind}", log)
-    back = read_flight(path)
+    log = flight_log.log_from_flight(flight)
+    path = flight_log.write_flight(tmp_path / f"a.{kind}", log)
+    back = flight_log.read_flight(path)
     assert_same(log, back)
     assert back.name == str(path) and not back.warnings and not back.velocity_derived
     state = ("time_s", "pos_w", "quat_wxyz", "vel_w", "rate_b")
@@ -42,10 +33,10 @@ def test_our_flight_round_trips_bit_for_bit_with_its_extras(tmp_path, kind):
 
 
 def test_how_a_simulator_stepped_comes_back_and_nothing_is_made_up(tmp_path):
-    log = log_from_flight(smooth_flight(small_track()))
+    log = flight_log.log_from_flight(smooth_flight(small_track()))
     assert log.integrator is None and log.step_s is None
     said = replace(log, about={**log.about, "integrator": "euler", "step_s": 0.002})
-    back = read_flight(write_flight(tmp_path / "a.parquet", said))
+    back = flight_log.read_flight(flight_log.write_flight(tmp_path / "a.parquet", said))
     assert (back.integrator, back.step_s) == ("euler", 0.002)
     for odd in ({"integrator": 4, "step_s": "fine"}, {"step_s": 0.0}, {"step_s": True}):
         assert (replace(log, about=odd).integrator, replace(log, about=odd).step_s) == (None, None)
@@ -68,7 +59,7 @@ def test_a_golden_file_written_by_hand_reads_as_it_says(tmp_path, kind):
         table = table.rename_columns([name.strip() for name in table.column_names])
         path = tmp_path / "golden.parquet"
         pyarrow.parquet.write_table(table, path)
-    log = read_flight(path)
+    log = flight_log.read_flight(path)
     np.testing.assert_array_equal(log.time_s, [10, 10.5, 11.25])
     np.testing.assert_array_equal(log.pos_w, [[0, 1, 2], [0.5, 1, 2], [1.25, 1, 2]])
     np.testing.assert_allclose(log.quat_wxyz[2], np.sqrt([0.5, 0.5, 0, 0]), rtol=1e-12)
@@ -84,7 +75,7 @@ def test_a_golden_file_written_by_hand_reads_as_it_says(tmp_path, kind):
 
 
 def test_rot_w_is_body_to_world():
-    log = log_from_columns(columns(), {}, "a")
+    log = flight_log.log_from_columns(columns(), {}, "a")
     expected = Rotation.from_quat(log.quat_wxyz, scalar_first=True).as_matrix()
     np.testing.assert_allclose(log.rot_w, expected, atol=1e-12)
 
@@ -93,22 +84,22 @@ def test_one_bad_flight_among_many_is_named_and_all_bad_is_an_error(tmp_path):
     good = write_table(tmp_path / "good.csv", columns())
     bad = tmp_path / "bad.csv"
     bad.write_text("time\n1\n")
-    flights, warnings = read_flights([good, bad, good])
+    flights, warnings = flight_log.read_flights([good, bad, good])
     assert [flight.name for flight in flights] == [str(good)] * 2
     assert len(warnings) == 1 and str(bad) in warnings[0] and "pos_x" in warnings[0]
     worse = bad.with_name("worse.csv")
     worse.write_bytes(bad.read_bytes())
-    with pytest.raises(FlightLogError, match="none can be used") as caught:
-        read_flights([bad, worse])
+    with pytest.raises(flight_log.FlightLogError, match="none can be used") as caught:
+        flight_log.read_flights([bad, worse])
     assert str(bad) in str(caught.value) and len(str(caught.value).splitlines()) == 3, "a line each"
-    with pytest.raises(FlightLogError, match="no file"):
-        read_flights([])
+    with pytest.raises(flight_log.FlightLogError, match="no file"):
+        flight_log.read_flights([])
 
 
 def test_a_row_that_lacks_a_torque_is_not_whole():
     still, up = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     torque = np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, 0.0]])
-    log = FlightLog("made", np.arange(3.0), still, up, still, still,
+    log = flight_log.FlightLog("made", np.arange(3.0), still, up, still, still,
                     thrust_cmd=np.array([9.0, 9.0, np.nan]), torque_cmd_b=torque)  # fmt: skip
     np.testing.assert_array_equal(log.whole, [True, False, False])
 
@@ -118,15 +109,15 @@ def test_derived_velocity_follows_a_racing_flight_over_jitter_and_holes(tmp_path
     flight = smooth_flight(small_track(8), speed=6.0)
     keep = rng.random(len(flight.time_s)) > 0.1
     keep[100:112] = False
-    table = columns_from_log(replace(log_from_flight(flight), extra={}))
+    table = flight_log.columns_from_log(replace(flight_log.log_from_flight(flight), extra={}))
     table = {name: values[keep] for name, values in table.items() if not name.startswith("vel")}
     table["pos_x"][20] = np.nan
-    log = log_from_columns(table, {}, "a")
+    log = flight_log.log_from_columns(table, {}, "a")
     assert log.velocity_derived
     error = np.linalg.norm(log.vel_w - flight.vel_w[keep], axis=1)
     # A spline's jerk steps at its knots, up to 400 m/s^3 here, which a cubic cannot follow.
     assert np.median(error) < 0.02 and error.max() < 0.5
-    back = read_flight(write_flight(tmp_path / "a.parquet", log))
+    back = flight_log.read_flight(flight_log.write_flight(tmp_path / "a.parquet", log))
     assert back.velocity_derived
     np.testing.assert_array_equal(back.vel_w, log.vel_w)
 

@@ -8,33 +8,25 @@ import mujoco
 import numpy as np
 import pytest
 
+from eval.quadrotor import vehicle_file
 from eval.quadrotor.model import BODY, CAMERA, COLLIDES, compile_quadrotor, rotor_name
-from eval.quadrotor.vehicle_file import (
-    SHIPPED,
-    VehicleFileError,
-    load_vehicle,
-    parse_vehicle,
-    save_vehicle,
-    shipped_vehicles,
-    vehicle_table,
-)
 from eval.vehicles.vehicle import MotorMap, command_of_thrust, motor_speed, motor_thrust
 from eval.vehicles.vehicle_check import check_vehicle
 from tests.support.vehicles import PLAIN, drawn_effects, with_effects
 from tracks.common.toml_table import to_toml
 from tracks.geometry.camera import optical_axis_b
 
-TABLE = tomllib.loads((SHIPPED / "racer5.toml").read_text())
+TABLE = tomllib.loads((vehicle_file.SHIPPED / "racer5.toml").read_text())
 
 
 def test_shipped_vehicles_load():
-    assert {"reference", "racer5"} <= set(shipped_vehicles())
-    for name in shipped_vehicles():
-        assert load_vehicle(name).name == name
+    assert {"reference", "racer5"} <= set(vehicle_file.shipped_vehicles())
+    for name in vehicle_file.shipped_vehicles():
+        assert vehicle_file.load_vehicle(name).name == name
 
 
 def test_reference_is_what_the_tables_fly():
-    vehicle = load_vehicle("reference")
+    vehicle = vehicle_file.load_vehicle("reference")
     weight = vehicle.mass * 9.81
     assert 4 * vehicle.rotors.thrust_max / weight == pytest.approx(3.0, rel=1e-6)
     assert vehicle.rotors.time_constant == 0.03
@@ -48,30 +40,32 @@ def test_reference_is_what_the_tables_fly():
 def test_every_effect_survives_a_round_trip(tmp_path):
     for seed in range(5):
         vehicle = drawn_effects(np.random.default_rng(seed))
-        save_vehicle(vehicle, tmp_path / "v.toml", comment="first line\nsecond line")
-        assert load_vehicle(tmp_path / "v.toml") == vehicle
+        vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml", comment="first line\nsecond line")
+        assert vehicle_file.load_vehicle(tmp_path / "v.toml") == vehicle
 
 
 def test_arrays_are_written_as_numbers(tmp_path):
     vehicle = with_effects(linear_drag=(np.array([0.1, 0.2, 0.3]),), mass_offset=(np.array(0.1),))
-    save_vehicle(vehicle, tmp_path / "v.toml")
-    loaded = load_vehicle(tmp_path / "v.toml")
+    vehicle_file.save_vehicle(vehicle, tmp_path / "v.toml")
+    loaded = vehicle_file.load_vehicle(tmp_path / "v.toml")
     assert loaded == with_effects(linear_drag=((0.1, 0.2, 0.3),), mass_offset=(0.1,))
-    save_vehicle(replace(PLAIN, mass=np.float64(0.7)), tmp_path / "v.toml")
-    assert load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=0.7)
+    vehicle_file.save_vehicle(replace(PLAIN, mass=np.float64(0.7)), tmp_path / "v.toml")
+    assert vehicle_file.load_vehicle(tmp_path / "v.toml") == replace(PLAIN, mass=0.7)
 
 
 def test_an_impossible_vehicle_is_not_written(tmp_path):
     with pytest.raises(ValueError, match=r"linear_drag\.coefficient"):
-        save_vehicle(with_effects(linear_drag=((-1.0, 0.0, 0.0),)), tmp_path / "v.toml")
+        vehicle_file.save_vehicle(
+            with_effects(linear_drag=((-1.0, 0.0, 0.0),)), tmp_path / "v.toml"
+        )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_motors_that_cannot_hover_are_refused_where_a_firmware_drives_them():
-    table = vehicle_table(load_vehicle("crazyflie21"))
+    table = vehicle_file.vehicle_table(vehicle_file.load_vehicle("crazyflie21"))
     table["motors"]["thrust"] = [0.0, 0.05]
     with pytest.raises(ValueError, match=r"motors.thrust = .*too weak to hover; .* gives 0.05"):
-        parse_vehicle(table)
+        vehicle_file.parse_vehicle(table)
 
 
 REFUSED = [
@@ -117,18 +111,18 @@ def test_a_bad_file_is_refused_by_key_and_value(tmp_path, key, value, message):
     inner[last] = value
     path = tmp_path / "bad.toml"
     path.write_text(to_toml(table))
-    with pytest.raises(VehicleFileError, match=message) as refusal:
-        load_vehicle(path)
+    with pytest.raises(vehicle_file.VehicleFileError, match=message) as refusal:
+        vehicle_file.load_vehicle(path)
     assert str(path) in str(refusal.value)
 
 
 def test_unreadable_files_are_refused(tmp_path):
-    with pytest.raises(VehicleFileError, match="no such file"):
-        load_vehicle(tmp_path / "none.toml")
-    with pytest.raises(VehicleFileError, match="cannot be read"):
-        load_vehicle(tmp_path)
+    with pytest.raises(vehicle_file.VehicleFileError, match="no such file"):
+        vehicle_file.load_vehicle(tmp_path / "none.toml")
+    with pytest.raises(vehicle_file.VehicleFileError, match="cannot be read"):
+        vehicle_file.load_vehicle(tmp_path)
     with pytest.raises(ValueError, match="Did you mean 'racer5'"):
-        load_vehicle("racer")
+        vehicle_file.load_vehicle("racer")
 
 
 def test_a_vehicle_that_flies_passes_and_is_a_key():
@@ -168,16 +162,16 @@ def test_speed_is_that_of_the_thrust():
 
 
 def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
-    crazyflie = load_vehicle("crazyflie21")
-    table = vehicle_table(crazyflie)
-    assert parse_vehicle(table) == crazyflie
+    crazyflie = vehicle_file.load_vehicle("crazyflie21")
+    table = vehicle_file.vehicle_table(crazyflie)
+    assert vehicle_file.parse_vehicle(table) == crazyflie
     for motors, reason in (
         ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
         ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "Did you mean 'voltage'"),
     ):
         with pytest.raises(ValueError, match=reason):
-            parse_vehicle({**table, "motors": motors})
+            vehicle_file.parse_vehicle({**table, "motors": motors})
 
 
 def compiled(vehicle, ground=False):

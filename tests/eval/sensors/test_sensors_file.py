@@ -2,28 +2,19 @@
 
 import pytest
 
-from eval.sensors import SENSORS
-from eval.sensors.sensors_file import (
-    PERFECT,
-    SensorsFileError,
-    load_sensors,
-    save_sensors,
-    scale_sensors,
-    sensor_set,
-    shipped_sensors,
-)
+from eval.sensors import SENSORS, sensors_file
 
 STEREO = '[[depth]]\nkind = "stereo"\n'
 
 
-@pytest.mark.parametrize("name", shipped_sensors())
+@pytest.mark.parametrize("name", sensors_file.shipped_sensors())
 def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_path):
-    sensors = load_sensors(name)
+    sensors = sensors_file.load_sensors(name)
     assert sensors.name == name
-    save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
-    assert load_sensors(tmp_path / "again.toml") == sensors
-    assert scale_sensors(sensors, 0.0) == PERFECT
-    for model, values in scale_sensors(sensors, 1e6).models.items():
+    sensors_file.save_sensors(sensors, tmp_path / "again.toml", "a comment\x1b")
+    assert sensors_file.load_sensors(tmp_path / "again.toml") == sensors
+    assert sensors_file.scale_sensors(sensors, 0.0) == sensors_file.PERFECT
+    for model, values in sensors_file.scale_sensors(sensors, 1e6).models.items():
         sensor, own = SENSORS[model], sensors.models[model]
         for parameter, value in zip(sensor.parameters, values, strict=True):
             usual = getattr(own, parameter.name)
@@ -49,15 +40,15 @@ def test_a_shipped_file_reads_back_equal_and_grows_within_its_limits(name, tmp_p
 def test_what_cannot_be_is_refused_by_name(text, words, tmp_path):
     path = tmp_path / "odd.toml"
     path.write_text('name = "odd"\n' + text)
-    with pytest.raises(SensorsFileError, match=words) as error:
-        load_sensors(path)
+    with pytest.raises(sensors_file.SensorsFileError, match=words) as error:
+        sensors_file.load_sensors(path)
     assert str(path) in str(error.value)
 
 
 def test_unknown_names_say_what_there_is():
     with pytest.raises(ValueError, match="unknown sensors .or file. 'vioo'. Did you mean 'vio'"):
-        load_sensors("vioo")
-    with pytest.raises(SensorsFileError, match="no such file; shipped by name: all, "):
-        load_sensors("none/there.toml")
+        sensors_file.load_sensors("vioo")
+    with pytest.raises(sensors_file.SensorsFileError, match="no such file; shipped by name: all, "):
+        sensors_file.load_sensors("none/there.toml")
     with pytest.raises(ValueError, match="state.0..jitter is 1.5, allowed is a number from 0 to 1"):
-        sensor_set({"delay": {"jitter": 1.5}})
+        sensors_file.sensor_set({"delay": {"jitter": 1.5}})
