@@ -21,7 +21,7 @@ HZ, POLICY_HZ = 100.0, 30.0
 NOISE = {"pos": 0.002, "vel": 0.02, "rate": 0.03, "quat": 0.001, "acc": 0.3, "motor": 3.0}
 
 
-def good(seed=0, end=12.0):
+def good(seed=0, end=16.0):
     """A flight as a logger has it: noise, commands that hold, and a body that follows in 50 ms."""
     return {name: part.copy() for name, part in logged(seed, end).items()}
 
