@@ -104,7 +104,7 @@ def test_sections_show_the_numbers(drag, found):
     held = evidence_section(drag, found).parts[-1]
     assert isinstance(held, Grid) and texts(held)[-1][0] == "with the named effects"
     tried = candidates_section(drag).parts[0]
-    assert isinstance(tried, Grid) and texts(tried)[0][0] == "linear_drag"
+    assert isinstance(tried, Grid) and len(tried.rows) > 10
     assert [row[0] for row in texts(tried) if row[3] == "named"] == ["linear_drag"]
     # A channel that no log measured is not in the table.
     none = {"before": 0.0, "after": 0.0, "noise_floor": 1e-12}
