@@ -4,8 +4,7 @@ import pytest
 
 from policies.formats import onnx_file, torch_file
 from policies.formats.export import export_policy
-from policies.formats.policy_file import save_policy
-from tests.support.policy_files import SPEC, InProcess, lively
+from tests.support.policy_files import SPEC, InProcess, lively, small_checkpoint
 
 
 @pytest.fixture(scope="session")
@@ -14,8 +13,8 @@ def params():
 
 
 @pytest.fixture(scope="session")
-def checkpoint(tmp_path_factory, params):
-    return save_policy(tmp_path_factory.mktemp("policy") / "tiny", params, SPEC, seed=1)
+def checkpoint(tmp_path_factory):
+    return small_checkpoint(tmp_path_factory.mktemp("policy"))
 
 
 @pytest.fixture(scope="session")

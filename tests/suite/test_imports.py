@@ -10,7 +10,7 @@ from pathlib import Path
 
 from suite.cli import COMMANDS
 from suite.experiments import EXPERIMENTS
-from tests.support.small_policy import small_checkpoint
+from tests.support.policy_files import small_checkpoint
 
 ROOMS = ("tracks", "policies", "eval", "suite")
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,6 +8,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from policies.formats.model_process import REMEDIES, Port
 from policies.formats.model_server import KINDS
+from policies.formats.policy_file import save_policy
 from policies.networks import network
 from policies.spec import NoAnswer, PolicyError, PolicySpec
 from tracks.geometry.camera import Camera
@@ -20,6 +21,11 @@ def lively(spec, seed):
     scale = {"action.weight": 20.0, "state.bias": 5.0}
     made = network.init(jax.random.key(seed), spec)
     return {name: np.asarray(value) * scale.get(name, 1.0) for name, value in made.items()}
+
+
+def small_checkpoint(folder):
+    """Write the checkpoint of a small policy into `folder`/tiny and return its path."""
+    return save_policy(folder / "tiny", lively(SPEC, 2), SPEC, seed=1)
 
 
 def action_of(policy, state):

@@ -20,7 +20,7 @@ from suite.experiments.bench.compare import Comparison, Figure, compare_times, i
 from suite.experiments.bench.rigid_body import make_task
 from suite.experiments.bench.torch_baseline import Baseline, to_torch
 from suite.train.gradient import make_gradient
-from tests.support.small_policy import small_checkpoint
+from tests.support.policy_files import small_checkpoint
 from tests.support.training import fresh_params
 from tracks.geometry.scene import PARKED_Z
 

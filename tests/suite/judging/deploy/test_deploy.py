@@ -18,8 +18,7 @@ from policies.spec import PolicySpec
 from suite.judging.deploy import exporting, latency, parity
 from tests.support.commands import answer, refused, run
 from tests.support.pilots import Steady
-from tests.support.policy_files import SPEC, lively
-from tests.support.small_policy import small_checkpoint
+from tests.support.policy_files import SPEC, lively, small_checkpoint
 
 needs_cc = pytest.mark.skipif(find_compiler() is None, reason="no C compiler: cc, or what CC names")
 
