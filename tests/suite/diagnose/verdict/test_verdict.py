@@ -1,4 +1,4 @@
-"""What the numbers allow to be said: gaps, structure in what is left, wind, and the verdict."""
+"""The verdict and its reasons: gaps, structure in the remaining error, and wind."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from suite.diagnose.verdict.residual_structure import (
     disturbance_equations,
     residual_structure,
 )
-from suite.diagnose.verdict.rollout_gap import measure
+from suite.diagnose.verdict.rollout_gap import measure, noise_floor
 
 
 def slow_errors(size=1.0):
@@ -94,6 +94,12 @@ def test_a_gaps_interval_holds_it_and_a_rise_is_seen():
     assert not before.exceeds(after, 0.25, 0, THRESHOLDS)
     assert not before.exceeds(before, 0.25, 0, THRESHOLDS)
     assert not after.exceeds(before, 0.25, 0, Thresholds(refuting_chi2=1e6))
+
+
+def test_the_noise_floor_is_that_of_start_and_row():
+    slope, noise = np.zeros((1, STATE, STATE)), np.zeros(STATE)
+    slope[0, 0, 6], noise[[0, 6]] = 0.5, (0.3, 0.8)
+    np.testing.assert_allclose(noise_floor(slope, noise)[0, [0, 6]], [0.5, 0.8])
 
 
 def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):

@@ -121,7 +121,7 @@ def test_a_wind_at_one_heading_is_one_of_a_set_and_with_two_or_a_known_drag_alon
 
 
 @pytest.mark.slow
-def test_flights_that_hardly_move_leave_wind_and_drag_beside_a_leaning_frame():
+def test_flights_that_hardly_move_leave_wind_and_drag_and_a_leaning_frame():
     faint = {**SLOW, "speed": 0.2, "noise": 2.0, "constant_wind": ((0.4, -0.5, 0.0),)}
     found, _ = names(flights(4, headings=(0.3,), **faint))
     (effect,) = found

@@ -60,6 +60,12 @@ def test_motors_begin_with_those_of_the_file_or_at_full_speed(begun, with_volts,
         assert bare == MotorMap(*without)
 
 
+def test_motors_without_a_fit_are_those_of_the_file():
+    begun = replace(PLAIN, motors=MotorMap((1.0, 6.0), 6.0, 1.3))
+    found = DrivenVehicle(begun, "pwm", 0.5, 8.0).motor_map({})
+    np.testing.assert_allclose((*found.thrust, found.voltage_exponent), (1.0, 6.0, 1.3))
+
+
 def test_flights_that_share_no_drive_are_refused():
     one = FlightGrid("one", TIME, {"pwm": np.zeros((400, 4))})
     other = FlightGrid("other", TIME, {"rotor_speed": np.zeros((400, 4))})
@@ -102,8 +108,8 @@ def test_a_scale_with_which_it_could_not_hover_is_refused_before_the_work():
 
 def test_the_result_does_not_depend_on_how_the_start_gives_a_number():
     plain = known.start()
-    said = with_effects(plain, inertia_scale=((0.9, 1.1, 1.0),))
-    said = replace(said, inertia=tuple(np.divide(plain.inertia, (0.9, 1.1, 1.0)).tolist()))
-    one, other = known.found("rotors").vehicle, identify(known.logs("rotors", 0), said).vehicle
+    same = with_effects(plain, inertia_scale=((0.9, 1.1, 1.0),))
+    same = replace(same, inertia=tuple(np.divide(plain.inertia, (0.9, 1.1, 1.0)).tolist()))
+    one, other = known.found("rotors").vehicle, identify(known.logs("rotors", 0), same).vehicle
     assert set(one.effects) == set(other.effects)
     np.testing.assert_allclose(other.inertia, one.inertia, rtol=1e-6)

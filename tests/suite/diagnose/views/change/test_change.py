@@ -65,7 +65,7 @@ def test_a_change_stands_out_of_how_flights_differ_though_the_file_is_wrong(befo
     assert share == 1.0 or "weak_motor 3" in found["torque"]
 
 
-def test_an_axis_along_which_flights_are_alike_counts_for_itself_beside_the_others():
+def test_an_axis_along_which_flights_are_alike_has_a_spread_of_its_own():
     logs = flights(3, seed=5, trim=0.0)
     force, torque = task_of(logs), task_of(logs, TORQUE)
     apart = [
@@ -91,7 +91,7 @@ def test_sizes_are_drawn_as_the_spread_is_estimated():
         for view in ("force", "torque")
     }
     assert sizes["force"].mean(axis=0) == pytest.approx(np.ones(3), rel=0.02)
-    # Axes that nothing is told of have the spread of all: a chi-square of 8 degrees over 8.
+    # Axes without an estimate have the spread of all: a chi-square of 8 degrees over 8.
     assert sizes["force"][:, 0].var() == pytest.approx(2.0 / 8.0, rel=0.05)
     own, shared = 2.0 * 2.0, 2.0 * 8.0  # variances of the sums of squares
     both = (4.0 / 8.0) ** 2 * shared + own + 2.0 * (4.0 / 8.0) * own

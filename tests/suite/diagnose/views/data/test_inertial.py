@@ -76,8 +76,8 @@ def test_a_flight_may_begin_on_its_side():
 def test_thrust_and_drag_are_identified_without_a_pose():
     found = identify([flown(seed)[0] for seed in range(3)], VEHICLE)
     numbers = {number.key: number for number in found.numbers}
-    told = numbers["rotors.thrust_coefficient"].value[0]
-    assert told == pytest.approx(VEHICLE.rotors.thrust_coefficient, rel=0.01)
+    thrust = numbers["rotors.thrust_coefficient"].value[0]
+    assert thrust == pytest.approx(VEHICLE.rotors.thrust_coefficient, rel=0.01)
     drag = numbers["effects.linear_drag.coefficient"].value
     assert drag == pytest.approx([DRAG] * 3, abs=0.05)
     assert any("heading" in line for line in found.not_identified)

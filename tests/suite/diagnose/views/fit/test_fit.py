@@ -95,7 +95,7 @@ def test_sizes_beyond_three_times_the_usual_are_implausible():
     assert usual_first(SPACE, start, tilt) < usual_first(SPACE, start, whole)
     assert usual_first(SPACE, start, whole) < usual_first(SPACE, theta, tilt)
     start[list(whole.indices)] = 20.0
-    assert any("constant_wind velocity" in told for told in implausible(SPACE, start, whole))
+    assert any("constant_wind velocity" in line for line in implausible(SPACE, start, whole))
     drag = [i for i, entry in enumerate(SPACE.entries) if entry.effect == "linear_drag"]
     assert not at_bound(SPACE, theta, Candidate("linear_drag", tuple(drag), "linear_drag"))
 
