@@ -17,14 +17,8 @@ from tests.support.real_flights import VEHICLE, flights
 from tests.support.recordings import columns
 from tests.support.vehicles import PLAIN, REMEMBERING, with_effects
 
-STEPS = (
-    "The logs",
-    "The measurement noise",
-    "The candidates",
-    "Alternatives to the named effects",
-    "Remaining error",
-    "The evidence",
-)
+STEPS = ["The logs", "The measurement noise", "The candidates",
+         "Alternatives to the named effects", "Remaining error", "The evidence"]  # fmt: skip
 
 
 @pytest.fixture
@@ -49,7 +43,7 @@ def test_every_step_is_in_the_report(written):
     shown = re.findall(r"<h2>(.*?)</h2>", text)
     assert shown[:2] == ["What to do next", "Measured and simulated"]
     folded = re.findall(r'class="section"><summary>(.*?)</summary>', text)
-    assert [head for head in folded if head in STEPS] == list(STEPS)
+    assert [head for head in folded if head in STEPS] == STEPS
     assert "Actuators, apart from the air" in folded
     assert text.count("data:image/png;base64,") == 1
     assert "<script" not in text and not re.search(r'(src|href)="https?:', text)

@@ -43,10 +43,9 @@ def test_chance_names_as_often_as_it_is_allowed_however_alike_candidates_are():
 def test_candidates_that_are_one_cost_as_much_as_one_and_others_more():
     slope = np.random.default_rng(6).standard_normal((6, 3, 10))
     one, gains = searched(slope, [(0,)], truth=0.8)
-    twins, _ = searched(
-        np.repeat(slope[..., :1], 10, axis=-1), [(k,) for k in range(10)], truth=0.8
-    )
-    others, others_gains = searched(slope, [(k,) for k in range(10)], truth=0.8)
+    ten = [(k,) for k in range(10)]
+    twins, _ = searched(np.repeat(slope[..., :1], 10, axis=-1), ten, truth=0.8)
+    others, others_gains = searched(slope, ten, truth=0.8)
     assert others_gains[0] == pytest.approx(gains[0])
     assert twins == pytest.approx(one * 10)
     assert 3.0 * one[0] < others[0] < 15.0 * one[0]
