@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -50,11 +51,15 @@ class Scripted:
         return self.actions_b[which].astype(np.float32), done + np.float32(1)
 
 
+@dataclass
 class Steady(Scripted):
     """Always gives the same action."""
 
-    def __init__(self, action_b=(0.0, 0.0, 0.0), spec=None, name="steady"):
-        super().__init__(np.array([action_b]), spec or PolicySpec(), name)
+    actions_b: Any = (0.0, 0.0, 0.0)
+    name: str = "steady"
+
+    def __post_init__(self):
+        self.actions_b = np.atleast_2d(self.actions_b)
 
 
 class RandomNetwork:
