@@ -62,7 +62,7 @@ def named(findings):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
-    kind, right = KINDS[name], good()
+    kind, right = KINDS[name], good(end=10.0)
     wrong = inject(kind, right, VEHICLE)
     vehicle = VEHICLE if kind.vehicle is None else kind.vehicle(VEHICLE)
     findings, readings = checked(wrong, vehicle, kind.fov)
