@@ -34,7 +34,7 @@ from suite.diagnose.diagnose import diagnose
 from suite.diagnose.estimate.parameters import make_space
 from suite.diagnose.evidence.rollouts import RolloutModel, start_estimate
 from suite.diagnose.report.diagnosis_json import diagnosis_json
-from suite.diagnose.verdict.rollout_gap import gap_of
+from suite.diagnose.verdict.gap import gap_of
 from tracks.common.work import run_pieces, usable_cores
 from tracks.common.work.threads import one_thread_a_product
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
-from suite.diagnose.estimate.parameters import ParameterSpace, implausible, with_fitted
+from suite.diagnose.estimate.parameters import implausible, with_fitted
 from suite.diagnose.search.evaluation import NamedEffect
 from suite.diagnose.sources.examine import examine, one_cause, without_names
-from suite.diagnose.sources.rollout_source import pose_delays
+from suite.diagnose.sources.rollout_source import pose_delays, rollouts_of
 from suite.diagnose.sources.rollouts import by_rollouts
 from suite.diagnose.sources.source import DiagnosisInput, Finding, Source, SourceSet
 from suite.diagnose.sources.views import by_views
@@ -72,7 +72,8 @@ def diagnose(
     # A delay of half a step between pose and rates is how MuJoCo integrates, not a fault. If that
     # explains the named effects, repeat the diagnosis with its integrator.
     is_continuous = integrator == "auto" and integrator_of(logs, "auto") == "continuous"
-    if main.source.rollouts and is_continuous and main.source.explained_by_steps(main.search):
+    rollouts = rollouts_of(main)
+    if rollouts and is_continuous and rollouts.explained_by_steps(main.search):
         say("pose and rates differ by half a step: repeating with MuJoCo's Euler steps")
         euler = _diagnose(replace(given, integrator="euler", chosen=True), makers[:1], seed)
         if not pose_delays(euler.main.search):
@@ -179,11 +180,6 @@ class Diagnosis:
     def tested(self) -> tuple[TestedEffect, ...]:
         """The effects that separate tests named."""
         return tested_in(self.findings, self.flights)
-
-    @property
-    def space(self) -> ParameterSpace:
-        """The catalogue's parameters."""
-        return self.main.source.space
 
     @property
     def limits(self) -> Thresholds:

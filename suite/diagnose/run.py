@@ -20,6 +20,7 @@ from suite.diagnose.plan import trajectories_for, write_plan
 from suite.diagnose.report.charts import write_rollouts
 from suite.diagnose.report.diagnosis_json import actuators_json, diagnosis_json
 from suite.diagnose.report.page import page
+from suite.diagnose.sources.rollout_source import rollouts_of
 from suite.diagnose.thresholds import THRESHOLDS
 from suite.diagnose.verdict.actuators import actuator_mismatches
 from tracks.common.files import check_no_input, plain, write_json
@@ -66,7 +67,7 @@ def diagnose_files(config: Config, console: Console) -> dict[str, Any]:
     )
     result: dict[str, Any] = diagnosis_json(diagnosis)
     # Some options need rollouts. `flown` has them, and is None if only force and torque were used.
-    flown, files = diagnosis.main.source.rollouts, {"vehicle.toml", "diagnosis.json"}
+    flown, files = rollouts_of(diagnosis.main), {"vehicle.toml", "diagnosis.json"}
     if flown is None:
         wanted = {
             "--drive": config.drive != "auto",

@@ -32,10 +32,8 @@ from suite.diagnose.data.view import (
     LEAST_ROWS,
     SPECIFIC,
     TORQUE,
-    FlightRows,
     SmoothedFlight,
     View,
-    calibrated,
     rows_of,
     smoothed,
 )
@@ -86,15 +84,9 @@ def ready(
     """
     logs, notes = with_fewer_rows(logs, limits)
     rotors = [acting_rotors(log, vehicle, limits) for log in logs]
-    for log, one in zip(logs, rotors, strict=True):
-        if one is None:
-            needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
-            raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
-    known_rotors = [one for one in rotors if one is not None]
     filled = [on_every_row(completed(log), limits) for log in posed(logs)]
     rows = [
-        rows_of(log, vehicle, one.speed, limits)
-        for log, one in zip(filled, known_rotors, strict=True)
+        rows_of(log, vehicle, one.speed, limits) for log, one in zip(filled, rotors, strict=True)
     ]
     # Choose the views, with the axes and widths that the available signals allow.
     inertial = [is_inertial(log) for log in logs]
@@ -103,7 +95,7 @@ def ready(
         views = []
     elif any("quat" in log.partial and not is_inertial(log) for log in (*logs, *others)):
         views = [replace(views[0], axes=(2,))]
-    if all(one.each for one in known_rotors):
+    if all(one.each for one in rotors):
         slow = any({"quat", "rate"} <= set(log.partial) for log in (*logs, *others))
         views.append(replace(TORQUE, width_s=SLOW_WIDTH_S) if slow else TORQUE)
     if not views:
@@ -111,54 +103,64 @@ def ready(
             f"{', '.join(log.name for log in logs)}: no position, and no accelerometer or no motor "
             "of its own next to the gyro: nothing shows what moved"
         )
-    parts = {view.name: [smoothed(view, one, limits) for one in rows] for view in views}
-    main = views[0]
-    if TORQUE.name in parts:
-        parts[TORQUE.name] = [
-            _calibrated(flight, one, vehicle)
-            for flight, one in zip(parts[TORQUE.name], known_rotors, strict=True)
+    parts = {
+        view.name: [
+            _calibrated(view, smoothed(view, row, limits), one, vehicle)
+            for row, one in zip(rows, rotors, strict=True)
         ]
+        for view in views
+    }
     # Leave out flights without a usable stretch, and a second view that some flight does not allow.
+    main, *second = views
     kept = [k for k, flight in enumerate(parts[main.name]) if len(flight.form.middle_s)]
     without = f"no stretch of {main.width_s:g} s in flight without a hole"
     if not kept:
         raise ValueError(f"{', '.join(log.name for log in logs)}: {without}")
     notes += [f"{log.name}: {without}" for k, log in enumerate(logs) if k not in kept]
     parts = {name: [flights[k] for k in kept] for name, flights in parts.items()}
-    for view in views[1:]:
-        empty = [
-            logs[k].name
-            for k, flight in zip(kept, parts[view.name], strict=True)
-            if not len(flight.form.middle_s)
-        ]
+    names = tuple(logs[k].name for k in kept)
+    for view in second:
+        lengths = [len(flight.form.middle_s) for flight in parts[view.name]]
+        empty = [name for name, length in zip(names, lengths, strict=True) if not length]
         if empty:
             notes.append(
                 f"{view.name}: not examined, as {', '.join(empty)} has no {view.width_s:g} s "
                 f"with {LEAST_ROWS} rows; log faster"
             )
-            views, parts = views[:1], {main.name: parts[main.name]}
+            views.remove(view)
+            del parts[view.name]
     return ViewFlights(
         tuple(views),
-        tuple(logs[k].name for k in kept),
+        names,
         parts,
         {view.name: _floor(view, parts[view.name]) for view in views},
-        known_rotors[0].source,
+        rotors[0].source,
         tuple(kept),
         tuple(notes),
     )
 
 
-def _calibrated(flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle) -> SmoothedFlight:
-    """Return `flight` corrected for noise of the rotor speeds and for torque between rows."""
-    if rotors.noise is None:
+def _calibrated(
+    view: View, flight: SmoothedFlight, rotors: ActingRotors, vehicle: Vehicle
+) -> SmoothedFlight:
+    """Return a flight whose model is corrected for measured rotor speeds, if these drive a torque.
+
+    Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
+    less thrust would. The expected true input, given the measured one, does not (regression
+    calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4). The torque
+    between the rows of the log is added (see `torque_between_rows`).
+    """
+    if view.in_world or rotors.noise is None:
         return flight
     speed, noise = np.nan_to_num(rotors.speed), np.nan_to_num(rotors.noise)
     _, turned = wrench_difference(speed, np.zeros_like(speed), vehicle)
     _, noisy = wrench_difference(speed + noise, speed, vehicle)
-    flight = calibrated(flight, turned, noisy)
-    step_s = float(np.median(np.diff(flight.rows.time_s)))
-    between = 1.0 + torque_between_rows(vehicle, step_s)
-    return flight._replace(reliability=flight.reliability * between)
+    reliability = 1.0 + torque_between_rows(vehicle, float(np.median(np.diff(flight.rows.time_s))))
+    mean = flight.form.mean
+    if len(flight.form.middle_s) > 1:
+        variance = np.maximum(np.var(mean @ turned, axis=0), 1e-12)
+        reliability *= np.maximum(1.0 - np.mean((mean @ noisy) ** 2, axis=0) / variance, 0.0)
+    return flight._replace(reliability=reliability)
 
 
 def parted(
@@ -174,31 +176,27 @@ def parted(
     count = len(flights.names)
     if count > 1:
         inside = [number for number in range(count) if number not in held]
-        return (
-            {name: [part[number] for number in inside] for name, part in flights.smoothed.items()},
-            {name: [part[number] for number in held] for name, part in flights.smoothed.items()},
+        fitted_part, held_part = (
+            {name: [part[k] for k in numbers] for name, part in flights.smoothed.items()}
+            for numbers in (inside, held)
         )
+        return fitted_part, held_part
     fitted_part, held_part = {}, {}
     # The share is of the time in flight, since a log may begin or end on the ground.
     flown_s = flights.smoothed[flights.views[0].name][0].form.middle_s
     until_s = float(np.quantile(flown_s, limits.lone_fitted_share))
     for view in flights.views:
-        single = flights.smoothed[view.name][0]
-        rows, reliability = single.rows, single.reliability
-        early = rows.time_s <= until_s
+        (single,) = flights.smoothed[view.name]
+        early = single.rows.time_s <= until_s
         for part, chosen in ((fitted_part, early), (held_part, ~early)):
-            split = smoothed(view, _only(rows, chosen), limits)
+            rows = single.rows._replace(good=np.asarray(single.rows.good) & chosen)
+            split = smoothed(view, rows, limits)._replace(reliability=single.reliability)
             if not len(split.form.middle_s):
                 raise ValueError(
                     f"{flights.names[0]}: too short to hold a part of it out; fly longer"
                 )
-            part[view.name] = [split._replace(reliability=reliability)]
+            part[view.name] = [split]
     return fitted_part, held_part
-
-
-def _only(rows: FlightRows, chosen: np.ndarray) -> FlightRows:
-    """Return `rows`, of which only those `chosen` (N,) bool can be used."""
-    return rows._replace(good=np.asarray(rows.good) & chosen)
 
 
 def _floor(view: View, flights: Sequence[SmoothedFlight]) -> np.ndarray:
@@ -327,11 +325,14 @@ class ActingRotors(NamedTuple):
 
 def acting_rotors(
     log: FlightLog, vehicle: Vehicle, limits: Thresholds = THRESHOLDS
-) -> ActingRotors | None:
-    """Return the rotor speeds of `log`, measured or from commands; None where it has neither.
+) -> ActingRotors:
+    """Return the rotor speeds of `log`, measured or from commands.
 
     They are interpolated to every row, but not across holes (long times without a value). Commanded
     speeds pass through the vehicle's delay and rotor lag.
+
+    Raises:
+        ValueError: if no signal gives the rotor speeds.
     """
     noise = None
     if log.rotor_speed is not None:
@@ -349,7 +350,8 @@ def acting_rotors(
         speed = np.asarray(motor_speed(vehicle, log.pwm, voltage))
         return ActingRotors(_lagged(log, vehicle, speed), "motor commands and battery", True)
     if log.thrust_cmd is None:
-        return None
+        needs = "[motors] in the vehicle file" if log.pwm is not None else "thrust or rotors"
+        raise ValueError(f"{log.name}: no signal gives its rotor speeds; it needs {needs}")
     force = vehicle.mass * np.maximum(log.thrust_cmd, 0.0)
     torque_b = np.zeros((len(force), 3)) if log.torque_cmd_b is None else log.torque_cmd_b
     nominal, _ = nominal_quadrotor(vehicle)

@@ -96,15 +96,12 @@ def specific_force_w(log: FlightLog) -> np.ndarray | None:
 
 def posed(logs: Sequence[FlightLog]) -> list[FlightLog]:
     """Return `logs` of one vehicle; inertial ones get a pose from gyro and accelerometer."""
-    inertial_logs = iter(by_inertia([log for log in logs if is_inertial(log)]))
-    return [next(inertial_logs) if is_inertial(log) else log for log in logs]
-
-
-def by_inertia(logs: Sequence[FlightLog]) -> list[InertialLog]:
-    """Return inertial `logs` of one vehicle with their pose by gyro and accelerometer."""
-    flights = [_pieces(log) for log in logs]
-    drag = _fitted(flights) if flights else DRAG
-    return [_whole(log, pieces, drag) for log, pieces in zip(logs, flights, strict=True)]
+    flights = [_pieces(log) if is_inertial(log) else None for log in logs]
+    drag = _fitted([pieces for pieces in flights if pieces]) if any(flights) else DRAG
+    return [
+        _whole(log, pieces, drag) if pieces else log
+        for log, pieces in zip(logs, flights, strict=True)
+    ]
 
 
 def _fitted(flights: Sequence[Sequence[_Piece]]) -> np.ndarray:

@@ -158,28 +158,6 @@ def smoothed(view: View, rows: FlightRows, limits: Thresholds = THRESHOLDS) -> S
     return SmoothedFlight(rows, form, measured)
 
 
-def calibrated(
-    flight: SmoothedFlight, acceleration: np.ndarray, noise: np.ndarray
-) -> SmoothedFlight:
-    """Return a flight whose model is corrected for noise in the measured rotor speeds.
-
-    Noise in a model's input makes every slope smaller (errors in variables), as more inertia or
-    less thrust would. The expected true input, given the measured one, does not (regression
-    calibration; Carroll et al. 2006, Measurement Error in Nonlinear Models, Ch. 4).
-
-    Args:
-        flight: the flight in the torque view.
-        acceleration: (N, 3) angular acceleration by the measured rotor speeds [rad/s^2].
-        noise: (N, 3) change of this acceleration by simulated noise of the same size [rad/s^2].
-    """
-    mean = flight.form.mean
-    if len(flight.form.middle_s) < 2:
-        return flight
-    variance = np.var(mean @ acceleration, axis=0)
-    noise_share = np.mean((mean @ noise) ** 2, axis=0) / np.maximum(variance, 1e-12)
-    return flight._replace(reliability=np.maximum(1.0 - noise_share, 0.0))
-
-
 class WeakForm(NamedTuple):
     """M bumps over the N rows of a flight, as matrices that are applied to series of rows."""
 

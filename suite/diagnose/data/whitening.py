@@ -10,7 +10,7 @@ size of these errors. Start numbers are all nuisance parameters of a window: sta
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,12 +18,8 @@ from scipy.special import eval_legendre
 
 from suite.diagnose.data.colour import Noise, colour_filter
 from suite.diagnose.data.noise import rotor_noise
-from suite.diagnose.data.windows import (
-    KNOTS,
-    SLICES,
-    STATE,
-    FlightWindows,
-)
+from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows
+from suite.diagnose.estimate.block import Block
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 
@@ -139,13 +135,33 @@ def rotor_spread(windows: FlightWindows, limits: Thresholds = THRESHOLDS) -> flo
     return limits.rotor_knot_excess * noise * float(np.sqrt((KNOTS - 1) / max(rows, 1.0)))
 
 
-def whiten(whitening: Whitening, values: np.ndarray) -> np.ndarray:
-    """Return `values` (W, N, 19, K) as rows in units of noise (W, M, K); the prior's rows are 0."""
-    count, rows, channels, directions = values.shape
-    scaled = _filtered(values * whitening.weight[..., None], whitening.filters)
-    flat = scaled.reshape(count, rows * channels, directions)
-    prior_rows = np.zeros((count, len(whitening.prior), directions))
-    return np.concatenate([flat, prior_rows], axis=1)
+def block_of(
+    whitening: Whitening, linear: Linearisation, along: Sequence[int], windows: FlightWindows
+) -> Block:
+    """Return the block of `linear`, without the part that start numbers explain.
+
+    `along` are the parameters of its first slopes.
+    """
+    # Whiten residuals and slopes, and add the rows of the prior: their residuals are the changes of
+    # the rotor speeds, their slopes 0.
+    values = np.concatenate([linear.residual[..., None], linear.slope[..., : len(along)]], axis=-1)
+    rows = _filtered(values * whitening.weight[..., None], whitening.filters)
+    rows = rows.reshape(len(rows), -1, rows.shape[-1])
+    prior_rows = np.zeros((len(rows), len(whitening.prior), rows.shape[-1]))
+    prior_rows[..., 0] = -linear.offset[:, STATE:] * whitening.prior
+    rows = np.concatenate([rows, prior_rows], axis=1)
+    start_part = np.swapaxes(whitening.start, 1, 2) @ rows
+    start_change = np.linalg.solve(whitening.upper, start_part)
+    rows = rows - whitening.start @ start_part
+    return Block(
+        rows[..., 0],
+        rows[..., 1:],
+        tuple(along),
+        np.asarray(windows.flight),
+        np.asarray(windows.start_s),
+        start_change[..., 0],
+        start_change[..., 1:],
+    )
 
 
 def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -158,11 +174,6 @@ def _filtered(scaled: np.ndarray, filters: Mapping[str, np.ndarray]) -> np.ndarr
     return scaled
 
 
-def project_out_start(whitening: Whitening, white: np.ndarray) -> np.ndarray:
-    """Return the whitened rows `white` (W, M, K) without the part that start numbers explain."""
-    return white - whitening.start @ (np.swapaxes(whitening.start, 1, 2) @ white)
-
-
 def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
     """Return the energy (W, 19) of slow errors in a block's `residual` (W, M), by channel.
 
@@ -171,11 +182,3 @@ def slow_energy(whitening: Whitening, residual: np.ndarray) -> np.ndarray:
     rows = residual[:, : whitening.weight[0].size].reshape(whitening.weight.shape)
     amplitude = (np.swapaxes(rows, 1, 2)[:, :, None] @ whitening.slow)[:, :, 0]
     return (amplitude**2).sum(axis=2)
-
-
-def whitened_residual(whitening: Whitening, linear: Linearisation) -> np.ndarray:
-    """Return the residuals of `linear` in units of noise, (W, M, 1), with the prior's residuals."""
-    white = whiten(whitening, linear.residual[..., None])
-    if len(whitening.prior):
-        white[:, -len(whitening.prior) :, 0] = -linear.offset[:, STATE:] * whitening.prior
-    return white

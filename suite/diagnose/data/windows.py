@@ -9,7 +9,7 @@ commands, so that their speeds at the start are known. Arrays have few shapes, f
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -190,33 +190,13 @@ def cut(
     return FlightWindows(*(np.stack(field) for field in zip(*windows, strict=True))), warnings
 
 
-def take(windows: FlightWindows, chosen: Array) -> FlightWindows:
-    """Return the windows that are `chosen`, as indices or as (W,) bool."""
-    return FlightWindows(*(np.asarray(field)[chosen] for field in windows))
+def take(data: Any, chosen: Array) -> Any:
+    """Return the `chosen` windows of `data`, a named tuple of arrays (W, ...), such as windows.
 
-
-def trusted(
-    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
-) -> FlightWindows:
-    """Return `windows`, each shortened to the time in which the model stays near the flight.
-
-    Further away the linearisation does not hold: the model may have tipped over or be below the
-    ground. With the named effects it stays near for longer, and so windows become longer.
-    `residual` (W, N, 19) is measured - simulated.
+    They are chosen by indices or by (W,) bool. Fields that are None stay None.
     """
-    error = np.abs(residual)
-    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
-    far = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
-        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
-    )
-    far |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
-    row_s = np.asarray(windows.row_s)
-    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
-    for horizon_s in reversed(limits.trusted_horizons_s):
-        stays_near = ~(far & (row_s <= horizon_s)).any(axis=1)
-        until_s = np.where(stays_near, horizon_s, until_s)
-    in_time = (row_s <= until_s[:, None] + 1e-9)[..., None]
-    return windows._replace(valid=np.asarray(windows.valid) & in_time)
+    fields = (None if field is None else np.asarray(field)[chosen] for field in data)
+    return type(data)(*fields)
 
 
 def _start_rows(

@@ -19,41 +19,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.effects import EFFECTS
 from eval.effects.interface import Array, Sample
 from eval.effects.log_faults import to_true
 from eval.quadrotor.forces import wind_and_flow, wrench_on
-from eval.quadrotor.plant import Motion, Plant, accelerations, assemble, nominal_quadrotor
+from eval.quadrotor.plant import Motion, Plant, accelerations, assemble
 from eval.quadrotor.rotors import steady
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.steps import LONGEST_S
-from suite.diagnose.data.view import FlightRows, SmoothedFlight, View
+from suite.diagnose.data.view import FlightRows
 from suite.diagnose.estimate.block import Block, without_nuisance
 from suite.diagnose.estimate.gauss_newton import intervals95
-from suite.diagnose.estimate.parameters import (
-    ParameterLayout,
-    ParameterSpace,
-    effects_at,
-)
-from suite.diagnose.evidence.rollouts import VehicleArrays, direction_groups
+from suite.diagnose.estimate.parameters import ParameterLayout, ParameterSpace, effects_at
+from suite.diagnose.evidence.linearise import VehicleArrays, arrays_of, linearised, slopes_along
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
 CHUNK = 1024
-"""Number of rows in one call of the compiled model, which is fixed so that it is compiled once."""
+"""Number of rows in one call of the compiled model."""
 IMU_ACC = FlightRows._fields.index("imu_acc_w")
 """Place of the first field of `FlightRows` that is not an input of the model."""
 LEAST_CORRELATION = 0.05
 """Smaller autocorrelations count as 0."""
-
-
-class RowAccelerations(NamedTuple):
-    """Accelerations of the model on N rows."""
-
-    value: np.ndarray
-    """(N, 6) linear acceleration in world axes [m/s^2], and angular acceleration in body axes
-    [rad/s^2]."""
-    slope: np.ndarray
-    """(N, 6, K) derivative by K parameters."""
 
 
 class ForceModel:
@@ -65,31 +50,31 @@ class ForceModel:
         `voltage` says whether the rows have a battery voltage.
         """
         self.space = space
-        # Only effects that depend on the state alone: neither random nor with a state of their own.
-        base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
-        self._vehicle = VehicleArrays(*nominal_quadrotor(vehicle), base)
+        self._vehicle = arrays_of(vehicle, space)
         self._compiled = _accelerations(space.layout, voltage)
 
     def at(
         self, theta: np.ndarray, rows: FlightRows, indices: Sequence[int] | None = None
-    ) -> RowAccelerations:
-        """Return the accelerations at the parameters `theta` (P,), with slopes along `indices`.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the accelerations (N, 6) at `theta` (P,), and their slopes (N, 6, K).
 
-        With None as indices the slopes are along all parameters.
+        They are the linear acceleration in world axes [m/s^2], and the angular one in body axes
+        [rad/s^2]. The slopes are along the parameters at `indices`, or along all with None.
         """
-        count, directions = len(rows.time_s), np.eye(len(theta))
-        groups = [directions] if indices is None else direction_groups(directions, indices)
-        size = len(theta) if indices is None else len(indices)
-        values, slopes = [], []
-        with jax.enable_x64(True):
-            for first in range(0, count, CHUNK):
-                chunk = np.minimum(np.arange(first, first + CHUNK), count - 1)
-                inputs = FlightRows(*(np.asarray(field)[chunk] for field in rows[:IMU_ACC]))
-                results = [self._compiled(self._vehicle, theta, inputs, group) for group in groups]
-                values.append(np.asarray(results[0][0])[: count - first])
-                slope = np.concatenate([np.asarray(each) for _, each in results], axis=-1)
-                slopes.append(slope[: count - first, :, :size])
-        return RowAccelerations(np.concatenate(values), np.concatenate(slopes))
+        none, inputs = np.zeros((len(rows.time_s), 0)), FlightRows(*rows[:IMU_ACC])
+        return linearised(self._compiled, self._vehicle, theta, none, inputs, indices, CHUNK)
+
+
+@cache
+def _accelerations(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
+    """Return a compiled function that computes accelerations and their slopes for any vehicle."""
+
+    def accelerations_at(given: VehicleArrays, theta: Any, _: Any, rows: FlightRows) -> Any:
+        values = effects_at(layout, given.base, theta)
+        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0)
+        return jnp.concatenate(accelerations_on(plant, rows, voltage), axis=-1)
+
+    return jax.jit(slopes_along(accelerations_at))
 
 
 def accelerations_on(plant: Plant, rows: FlightRows, voltage: bool) -> tuple[Array, Array]:
@@ -108,24 +93,6 @@ def motion_of(plant: Plant, rows: FlightRows) -> Motion:
     """Return the motion (N, ...) on `rows`, without the faults of the log among plant.effects."""
     logged = Sample(rows.pos_w, rows.rot_w, rows.vel_w, rows.rate_b, 0.0 * rows.rate_b)
     return Motion(*to_true(plant.effects, logged)[:4])
-
-
-@cache
-def _accelerations(layout: ParameterLayout, voltage: bool) -> Callable[..., Any]:
-    """Return a compiled function that computes accelerations and their slopes for any vehicle."""
-
-    def accelerations_at(vehicle: VehicleArrays, theta: Any, rows: FlightRows) -> Any:
-        values = effects_at(layout, vehicle.base, theta)
-        plant = assemble(vehicle.nominal, vehicle.constants, values, LONGEST_S, 0.0)
-        return jnp.concatenate(accelerations_on(plant, rows, voltage), axis=-1)
-
-    def linearised(vehicle: VehicleArrays, theta: Any, rows: FlightRows, directions: Any) -> Any:
-        def along(direction: Any) -> Any:
-            return jax.jvp(lambda t: accelerations_at(vehicle, t, rows), (theta,), (direction,))
-
-        return jax.vmap(along, out_axes=(None, -1))(directions)
-
-    return jax.jit(linearised)
 
 
 class ViewData(NamedTuple):
@@ -159,56 +126,6 @@ class Weights(NamedTuple):
     base: np.ndarray | None = None
     """(3,) standard deviation of an error that all flights share, by axis; None if there is none.
     The mean of reference flights has such an error."""
-
-
-def compare(
-    view: View,
-    model: ForceModel,
-    theta: np.ndarray,
-    flights: Sequence[SmoothedFlight],
-    indices: Sequence[int] | None = None,
-) -> ViewData:
-    """Return the residuals of `flights` at `theta` (P,), with slopes along `indices`.
-
-    With None as indices the slopes are along all parameters.
-    """
-    parts = []
-    for number, flight in enumerate(flights):
-        accelerations = model.at(theta, flight.rows, indices)
-        mean, count = flight.form.mean, len(flight.form.middle_s)
-        # Mean accelerations of the model, and their slopes, by the bumps of the flight.
-        value = mean @ accelerations.value[:, view.columns]
-        slope = accelerations.slope[:, view.columns]
-        slope = (mean @ slope.reshape(len(slope), -1)).reshape(count, *slope.shape[1:])
-        value, slope = (_attenuated(part, flight.reliability) for part in (value, slope))
-        residual = flight.measured - value
-        if view.in_world:
-            to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
-            residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
-            slope = to_body @ slope
-        excluded = [axis for axis in range(3) if axis not in view.axes]
-        residual[:, excluded], slope[:, excluded] = 0.0, 0.0
-        # Uncertainty of a pose that was computed from gyro and accelerometer.
-        pose_slope_b = flight.rows.pose_slope_b if view.in_world else None
-        pose_slope = np.zeros((count, 3, 0))
-        if pose_slope_b is not None:
-            pose_slope = (mean @ pose_slope_b.reshape(len(pose_slope_b), -1)).reshape(count, 3, -1)
-        fields = (flight.form.middle_s, value, residual, slope, pose_slope)
-        parts.append(ViewData(np.full(count, number), *fields))
-    # Flights may have different numbers of unknowns of the pose: pad with zeros.
-    widest = max(part.pose_slope.shape[2] for part in parts)
-    for k, part in enumerate(parts):
-        padding = ((0, 0), (0, 0), (0, widest - part.pose_slope.shape[2]))
-        parts[k] = part._replace(pose_slope=np.pad(part.pose_slope, padding))
-    return ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))
-
-
-def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
-    """Return `series` (M, 3, ...) with deviations from its mean scaled by `reliability` (3,)."""
-    if not len(series) or (reliability == 1.0).all():
-        return series
-    mean = series.mean(axis=0)
-    return mean + reliability.reshape(3, *[1] * (series.ndim - 2)) * (series - mean)
 
 
 def means_of(values: np.ndarray, flight: np.ndarray) -> np.ndarray:
@@ -343,30 +260,14 @@ def block_of(data: ViewData, weights: Weights, stretch: np.ndarray, along: Seque
     )
 
 
-def error_share_removed(before: ViewData, after: ViewData, limits: Thresholds) -> float:
-    """Return the share of the squared error of `before` that the model of `after` removes.
-
-    Both are weighted by the noise estimated from `after`. In an estimate from `before`, a slow
-    effect would count as noise.
-    """
-    noise = weights_of(after, limits)
-    chi2_after, chi2_before = (
-        float((whitened(data, noise)[0] ** 2).sum()) for data in (after, before)
-    )
-    return 1.0 - chi2_after / chi2_before
-
-
 def successive_changes(data: ViewData) -> ViewData:
     """Return the changes of all values in `data` from each moment to the next of its flight."""
     step = np.diff(data.middle_s)
     usual_step = np.median(step[step > 0.0])
     neighbours = (np.diff(data.flight) == 0) & (step < 1.5 * usual_step)
     flight, middle_s, *series = data
-    return ViewData(
-        flight[1:][neighbours],
-        middle_s[1:][neighbours],
-        *(np.diff(one, axis=0)[neighbours] for one in series),
-    )
+    changes = (np.diff(one, axis=0)[neighbours] for one in series)
+    return ViewData(flight[1:][neighbours], middle_s[1:][neighbours], *changes)
 
 
 def fast_share(
@@ -397,3 +298,17 @@ def fast_share(
     hessian, gradient = equations.sums()
     share = 1.0 + float(gradient[0]) / max(float(hessian[0, 0]), 1e-300)
     return share, float(intervals95(equations).half_width[0])
+
+
+def fast_changes_agree(
+    data: ViewData, columns: Sequence[int], change: np.ndarray, limits: Thresholds
+) -> bool:
+    """Return whether fast changes confirm an effect; the arguments are those of `fast_share`.
+
+    They do not if they give less than a certain share of it, and significantly less than all of it.
+    Means of flights have no fast changes: they always agree.
+    """
+    if len(np.unique(data.flight)) == len(data.flight):
+        return True
+    share, half_width = fast_share(data, columns, change, limits)
+    return share >= limits.least_fast_share or share + half_width >= 1.0

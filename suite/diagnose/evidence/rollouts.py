@@ -8,31 +8,27 @@ at its start: 12 numbers of the state, and errors of the rotor speeds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from eval.effects import EFFECTS
-from eval.effects.interface import Constants
-from eval.quadrotor.loops import Loop, loop_of
-from eval.quadrotor.plant import Nominal, assemble, nominal_quadrotor
+from eval.quadrotor.plant import assemble
 from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.colour import Noise, measured_noise, residual_as_noise
 from suite.diagnose.data.steps import LONGEST_S, step_s
 from suite.diagnose.data.whitening import (
     Linearisation,
     Whitening,
+    block_of,
     make_whitening,
     slow_energy,
-    whiten,
-    whitened_residual,
 )
-from suite.diagnose.data.windows import KNOTS, STATE, FlightWindows, take, trusted
+from suite.diagnose.data.windows import KNOTS, SLICES, STATE, FlightWindows, take
 from suite.diagnose.estimate.block import Block, Estimate
 from suite.diagnose.estimate.gauss_newton import fit, gauss_newton_step
 from suite.diagnose.estimate.parameters import (
@@ -42,6 +38,14 @@ from suite.diagnose.estimate.parameters import (
     effects_at,
 )
 from suite.diagnose.evidence.evidence import Evidence, flights_agree
+from suite.diagnose.evidence.linearise import (
+    BATCH,
+    VehicleArrays,
+    arrays_of,
+    batches,
+    linearised,
+    slopes_along,
+)
 from suite.diagnose.evidence.rollout import Flown, at_knots, difference, fly_windows
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -121,6 +125,30 @@ def start_estimate(model: RolloutModel, windows: FlightWindows) -> Estimate:
     return Estimate(model.space.array("start"), np.zeros((len(windows.flight), model.free)))
 
 
+def trusted(
+    windows: FlightWindows, residual: np.ndarray, limits: Thresholds = THRESHOLDS
+) -> FlightWindows:
+    """Return `windows`, each shortened to the time in which the model stays near the flight.
+
+    Further away the linearisation does not hold: the model may have tipped over or be below the
+    ground. With the named effects it stays near for longer, and so windows become longer.
+    `residual` (W, N, 19) is measured - simulated.
+    """
+    error = np.abs(residual)
+    height = np.maximum(np.asarray(windows.row_pos_w)[..., 2], 0.0)
+    far = (error[..., SLICES["position"]].max(axis=-1) > limits.trusted_m) | (
+        error[..., SLICES["attitude"]].max(axis=-1) > limits.trusted_rad
+    )
+    far |= (error[..., 2] > limits.trusted_height_share * height) & (height > 0.0)
+    row_s = np.asarray(windows.row_s)
+    until_s = np.full(len(row_s), limits.trusted_horizons_s[-1])
+    for horizon_s in reversed(limits.trusted_horizons_s):
+        stays_near = ~(far & (row_s <= horizon_s)).any(axis=1)
+        until_s = np.where(stays_near, horizon_s, until_s)
+    in_time = (row_s <= until_s[:, None] + 1e-9)[..., None]
+    return windows._replace(valid=np.asarray(windows.valid) & in_time)
+
+
 def rollout_evidence(
     model: RolloutModel,
     windows: FlightWindows,
@@ -147,73 +175,31 @@ def rollout_evidence(
     return evidence, block_of(whitening, linear, indices, windows)
 
 
-def block_of(
-    whitening: Whitening, linear: Linearisation, along: Sequence[int], windows: FlightWindows
-) -> Block:
-    """Return the block of `linear`; `along` are the parameters of its first slopes."""
-    residual = whitened_residual(whitening, linear)
-    slope = whiten(whitening, linear.slope[..., : len(along)])
-    rows = np.concatenate([residual, slope], axis=2)
-    start_part = np.swapaxes(whitening.start, 1, 2) @ rows
-    start_change = np.linalg.solve(whitening.upper, start_part)
-    return Block(
-        (residual - whitening.start @ start_part[..., :1])[..., 0],
-        slope - whitening.start @ start_part[..., 1:],
-        tuple(along),
-        np.asarray(windows.flight),
-        np.asarray(windows.start_s),
-        start_change[..., 0],
-        start_change[..., 1:],
-    )
-
-
-def information(
-    linear: Linearisation, windows: FlightWindows, size: int, limits: Thresholds = THRESHOLDS
-) -> np.ndarray:
-    """Return the information (W, K) of each window on each of the first `size` parameters."""
-    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
-    whitening = make_whitening(linear, noise, windows, limits)
-    block = block_of(whitening, linear, range(size), windows)
-    return np.asarray((block.slope**2).sum(axis=1))
-
-
-def best_fit_error(
-    model: RolloutModel,
-    windows: FlightWindows,
-    linear: Linearisation,
-    limits: Thresholds,
-    enough: float = 0.0,
-) -> float:
-    """Return the mean squared error after a fit of all parameters; with noise alone it is 1.
+def is_hopeless(
+    model: RolloutModel, windows: FlightWindows, linear: Linearisation, limits: Thresholds
+) -> bool:
+    """Return whether even a fit of all parameters leaves the rollouts far from the flights.
 
     The fit uses `linear`, which has slopes along all parameters. It is inexact for large effects,
-    so if its error exceeds `enough`, some windows are fitted with the full model.
+    so if its error is too large, some windows are fitted with the full model.
     """
     evidence, block = rollout_evidence(model, windows, linear, limits)
 
-    def mean_error(chi2: float) -> float:
-        return chi2 / max(int(np.asarray(evidence.trusted.valid).sum()), 1)
+    def is_far(chi2: float) -> bool:
+        return chi2 > limits.hopeless_chi2 * max(int(evidence.trusted.valid.sum()), 1)
 
-    equations = block.equations
+    equations, start = block.equations, model.space.array("start")
     informed = np.flatnonzero(np.einsum("bkk->k", equations.hessian) > 1e-9).tolist()
-    start = model.space.array("start")
     _, fall = gauss_newton_step(equations.take(informed), start, model.space)
-    first = mean_error(float(equations.chi2.sum()) - fall)
-    if first <= enough:
-        return first
+    if not is_far(float(equations.chi2.sum()) - fall):
+        return False
     few = np.unique(np.linspace(0, len(windows.flight) - 1, limits.hopeless_windows).astype(int))
-    few_linear = Linearisation(*(field[few] for field in linear))
-    evidence, block = rollout_evidence(model, take(windows, few), few_linear, limits)
+    evidence, block = rollout_evidence(model, take(windows, few), take(linear, few), limits)
     at = Estimate(start, linear.offset[few])
     _, block = fit(evidence, at, informed, limits.hopeless_rounds, block, limits)
-    return min(first, mean_error(float((block.residual**2).sum())))
+    return is_far(float((block.residual**2).sum()))
 
 
-BATCH = 12
-"""Number of windows in one call, which is fixed so that the model is compiled once."""
-DIRECTIONS = 8
-"""Number of slopes in one call, fixed for the same reason. To compile a second, wider program takes
-longer than it saves, unless there are more than some 150 windows."""
 COMPILED = {"xla_cpu_use_fusion_emitters": False}
 """Options of the compiler XLA: its newer code for loops is no faster, and compiles half as fast."""
 
@@ -225,17 +211,6 @@ class KnotResponse(NamedTuple):
     """(W, N, 19, KNOTS * 6) change of the simulated values per m/s^2 and rad/s^2 in body axes."""
     knot: Flown
     """(W, KNOTS, ...) simulated state at the knots."""
-
-
-class VehicleArrays(NamedTuple):
-    """Contents of a vehicle file as arrays, so that one compiled rollout serves every vehicle."""
-
-    nominal: Nominal
-    constants: Constants
-    base: dict[str, Any]
-    """Values of every effect."""
-    loop: Loop | None = None
-    """A firmware's rate loop."""
 
 
 class RolloutModel:
@@ -260,17 +235,12 @@ class RolloutModel:
         errors of rotor speeds (4 at each knot if measured speeds are the input)."""
         self.starts = list(range(self.size, self.size + self.free))
         """Places of the start numbers among all directions, after the parameters."""
-        # Only effects that depend on the state alone: neither random nor with a state of their own.
-        base = {name: v for name, v in space.base.items() if EFFECTS[name].by_state}
-        self.given = VehicleArrays(*nominal_quadrotor(vehicle), base, loop_of(vehicle))
+        self.given = arrays_of(vehicle, space)
         self.dt = step_s(vehicle)
         """About the length of a step [s]."""
         self.integrator = integrator
-        self._kind = (space.layout, rotor_input, voltage, integrator)
-        self._linear = _slopes(*self._kind)
-        self.fly: Callable[..., Any] = partial(_flight(*self._kind), self.given)
-        """Takes (theta, offset, windows, push) to (simulated - measured, the simulated
-        states); the caller compiles it."""
+        kind = (space.layout, rotor_input, voltage, integrator)
+        _, self._linear, self._respond = compiled(*kind)
 
     def residual(self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows) -> np.ndarray:
         """Return measured - simulated (W, N, 19), with start numbers changed by `offset` (W, F)."""
@@ -280,11 +250,12 @@ class RolloutModel:
         self, theta: np.ndarray, offset: np.ndarray, windows: FlightWindows
     ) -> KnotResponse:
         """Return the response of the rows of each window to forces and torques at its knots."""
-        respond = _responses(*self._kind)
         with jax.enable_x64(True):
             parts = [
-                jax.tree.map(lambda x, n=count: np.asarray(x)[:n], respond(self.given, theta, x, w))
-                for x, w, count in batches(offset, windows)
+                jax.tree.map(
+                    lambda x, n=own: np.asarray(x)[:n], self._respond(self.given, theta, x, w)
+                )
+                for x, w, own in batches(offset, windows)
             ]
         return jax.tree.map(lambda *p: np.concatenate(p), *parts)
 
@@ -300,64 +271,31 @@ class RolloutModel:
         The slopes are along the parameters at `indices`; places in `starts` mean start numbers.
         With None they are along all parameters and then all start numbers.
         """
-        directions = np.eye(self.size + self.free)
-        count = len(directions if indices is None else indices)
-        groups = direction_groups(directions, indices)
-        values, slopes = [], []
-        with jax.enable_x64(True):
-            for x, w, own in batches(offset, windows):
-                results = [self._linear(self.given, theta, x, w, group) for group in groups]
-                values.append(np.asarray(results[0][0])[:own])
-                slopes.append(np.concatenate([np.asarray(r[1])[:own] for r in results], axis=-1))
-        slope = np.concatenate(slopes)[..., :count]
-        return Linearisation(-np.concatenate(values), slope, offset)
-
-
-def direction_groups(directions: np.ndarray, indices: Sequence[int] | None) -> list[np.ndarray]:
-    """Return rows of `directions` (all or those at `indices`) by `DIRECTIONS`, zero-padded."""
-    rows = directions if indices is None else directions[list(indices)]
-    groups = [rows[k : k + DIRECTIONS] for k in range(0, max(len(rows), 1), DIRECTIONS)]
-    return [np.pad(group, ((0, DIRECTIONS - len(group)), (0, 0))) for group in groups]
-
-
-def batches(
-    offset: np.ndarray, windows: FlightWindows
-) -> Iterator[tuple[np.ndarray, FlightWindows, int]]:
-    """Yield (offsets, windows, number) by `BATCH`; windows after `number` repeat the last one."""
-    count = len(windows.flight)
-    for first in range(0, count, BATCH):
-        rows = np.minimum(np.arange(first, first + BATCH), count - 1)
-        yield offset[rows], take(windows, rows), min(BATCH, count - first)
+        values, slope = linearised(self._linear, self.given, theta, offset, windows, indices, BATCH)
+        return Linearisation(-values, slope, offset)
 
 
 @cache
-def _slopes(
+def compiled(
     layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
-) -> Callable[..., Any]:
-    """Return the compiled function for residuals and slopes; it is kept, as compiling is slow."""
-    fly = _flight(layout, rotor_input, voltage, integrator)
+) -> tuple[Callable[..., Any], ...]:
+    """Return three functions of (vehicle, theta, offset, windows), kept as compiling is slow.
 
-    def linear(
-        given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows, directions: Any
-    ) -> Any:
-        size = len(layout)
+    The first gives simulated - measured and the simulated states, and takes a disturbance, too. The
+    second is that of `slopes_along`, and the third gives the response to disturbances at the knots.
+    """
 
-        def along(direction: Any) -> Any:
-            tangent = (direction[:size], jnp.tile(direction[size:], (BATCH, 1)))
-            return jax.jvp(lambda t, x: fly(given, t, x, windows)[0], (theta, offset), tangent)
-
-        values, slopes = jax.vmap(along, out_axes=(None, -1))(directions)
-        return values, slopes
-
-    return jax.jit(linear, compiler_options=COMPILED)
-
-
-@cache
-def _responses(
-    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
-) -> Callable[..., Any]:
-    """Return the compiled function that gives the response to disturbances at the knots."""
-    fly = _flight(layout, rotor_input, voltage, integrator)
+    def fly(
+        given: VehicleArrays,
+        theta: Any,
+        offset: Any,
+        windows: FlightWindows,
+        push: Any = None,
+    ) -> tuple[Any, Flown]:
+        values = effects_at(layout, given.base, theta)
+        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
+        flown = fly_windows(plant, values, rotor_input, voltage, integrator, offset, windows, push)
+        return difference(values, integrator, flown, windows), flown
 
     def respond(
         given: VehicleArrays, theta: Any, offset: Any, windows: FlightWindows
@@ -372,24 +310,5 @@ def _responses(
         _, flown = fly(given, theta, offset, windows)
         return KnotResponse(slopes, at_knots(flown, windows))
 
-    return jax.jit(respond, compiler_options=COMPILED)
-
-
-def _flight(
-    layout: ParameterLayout, rotor_input: bool, voltage: bool, integrator: str
-) -> Callable[..., tuple[Any, Flown]]:
-    """Return a function that gives simulated - measured of windows, and the simulated states."""
-
-    def fly(
-        given: VehicleArrays,
-        theta: Any,
-        offset: Any,
-        windows: FlightWindows,
-        push: Any = None,
-    ) -> tuple[Any, Flown]:
-        values = effects_at(layout, given.base, theta)
-        plant = assemble(given.nominal, given.constants, values, LONGEST_S, 0.0, given.loop)
-        flown = fly_windows(plant, values, rotor_input, voltage, integrator, offset, windows, push)
-        return difference(values, integrator, flown, windows), flown
-
-    return fly
+    linear = slopes_along(lambda *inputs: fly(*inputs)[0])
+    return fly, *(jax.jit(each, compiler_options=COMPILED) for each in (linear, respond))

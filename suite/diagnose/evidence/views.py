@@ -28,13 +28,12 @@ from suite.diagnose.evidence.moments import (
     ViewData,
     Weights,
     block_of,
-    compare,
-    error_share_removed,
-    fast_share,
+    fast_changes_agree,
     means_of,
     stretch_numbers,
     validation_groups,
     weights_of,
+    whitened,
 )
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 
@@ -82,13 +81,44 @@ class ViewEvidence(Evidence):
 
         With None as indices the slopes are along all parameters.
         """
-        data = compare(self.view, self.model, theta, self.flights, indices)
+        parts = [self._residuals(n, theta, indices) for n in range(len(self.flights))]
+        # Flights may have different numbers of unknowns of the pose: pad with zeros.
+        widest = max(part.pose_slope.shape[2] for part in parts)
+        for k, part in enumerate(parts):
+            padding = ((0, 0), (0, 0), (0, widest - part.pose_slope.shape[2]))
+            parts[k] = part._replace(pose_slope=np.pad(part.pose_slope, padding))
+        data = ViewData(*(np.concatenate(field) for field in zip(*parts, strict=True)))
         if self.carried is not None:
             data = data._replace(residual=data.residual - self.carried)
         if not self.means:
             return data
         flight, *others = (means_of(field, data.flight) for field in data)
         return ViewData(flight.astype(int), *others)
+
+    def _residuals(self, number: int, theta: np.ndarray, indices: Sequence[int] | None) -> ViewData:
+        """Return the residuals of one flight at `theta` (P,), with slopes along `indices`."""
+        view, flight = self.view, self.flights[number]
+        value, slope = self.model.at(theta, flight.rows, indices)
+        mean, count = flight.form.mean, len(flight.form.middle_s)
+
+        def means(series: np.ndarray) -> np.ndarray:
+            """Return the means (M, ...) of `series` (N, ...) by the bumps of the flight."""
+            return (mean @ series.reshape(len(series), -1)).reshape(count, *series.shape[1:])
+
+        value, slope = (
+            _attenuated(means(part[:, view.columns]), flight.reliability) for part in (value, slope)
+        )
+        residual, pose_slope = flight.measured - value, np.zeros((count, 3, 0))
+        if view.in_world:
+            to_body = np.swapaxes(flight.rows.rot_w[flight.form.middle_row], 1, 2)
+            residual, value = ((to_body @ part[..., None])[..., 0] for part in (residual, value))
+            slope = to_body @ slope
+            if flight.rows.pose_slope_b is not None:
+                pose_slope = means(flight.rows.pose_slope_b)
+        excluded = [axis for axis in range(3) if axis not in view.axes]
+        residual[:, excluded], slope[:, excluded] = 0.0, 0.0
+        fields = (flight.form.middle_s, value, residual, slope, pose_slope)
+        return ViewData(np.full(count, number), *fields)
 
     def linearise(self, at: Estimate, indices: Sequence[int] | None = None) -> ViewBlock:
         """Return the block at `at`, with slopes along `indices`; see `Evidence`."""
@@ -121,9 +151,17 @@ class ViewEvidence(Evidence):
         assert isinstance(before, ViewBlock) and isinstance(after, ViewBlock)
         if at_bound(self.space, at.theta, candidate) or not flights_agree(gains):
             return None
-        share = error_share_removed(before.data, after.data, self.limits)
-        change = at.theta - self.space.array("start")
-        consistent = fast_changes_agree(after, candidate.indices, change, self.limits)
+        # Both errors are weighted by the noise estimated with the candidate: in an estimate without
+        # it, a slow effect would count as noise.
+        noise = weights_of(after.data, self.limits)
+        chi2_after, chi2_before = (
+            float((whitened(block.data, noise)[0] ** 2).sum()) for block in (after, before)
+        )
+        share = 1.0 - chi2_after / chi2_before
+        indices = list(candidate.indices)
+        columns = [after.along.index(index) for index in indices]
+        change = (at.theta - self.space.array("start"))[indices]
+        consistent = fast_changes_agree(after.data, columns, change, self.limits)
         return share if share >= self.limits.least_view_share and consistent else None
 
     def preference(self, at: Estimate, candidate: Candidate) -> tuple[float, ...]:
@@ -139,25 +177,12 @@ class ViewEvidence(Evidence):
         return ViewBlock(**vars(block_of(data, self.weights, stretch, along)), data=data)
 
 
-def fast_changes_agree(
-    block: ViewBlock, indices: Sequence[int], change: np.ndarray, limits: Thresholds
-) -> bool:
-    """Return whether fast changes are consistent with fitted parameters (see `fast_share`).
-
-    They are not consistent if they give less than a certain share of the fitted change, and
-    significantly less than all of it. Means of flights have no fast changes: always consistent.
-
-    Args:
-        block: block at the fit.
-        indices: places of the fitted parameters.
-        change: (P,) all fitted parameters minus those of the vehicle file.
-        limits: smallest share.
-    """
-    if len(np.unique(block.data.flight)) == len(block.data.flight):
-        return True
-    columns = [block.along.index(index) for index in indices]
-    share, half_width = fast_share(block.data, columns, change[list(indices)], limits)
-    return share >= limits.least_fast_share or share + half_width >= 1.0
+def _attenuated(series: np.ndarray, reliability: np.ndarray) -> np.ndarray:
+    """Return `series` (M, 3, ...) with deviations from its mean scaled by `reliability` (3,)."""
+    if not len(series) or (reliability == 1.0).all():
+        return series
+    mean = series.mean(axis=0)
+    return mean + reliability.reshape(3, *[1] * (series.ndim - 2)) * (series - mean)
 
 
 def view_candidates(among: Sequence[Candidate], block: Block) -> list[Candidate]:

@@ -12,8 +12,8 @@ from eval.view.comparison import ComparedFlight, Simulation, States, write_compa
 from suite.common.charts import png, titled
 from suite.diagnose.data.windows import FlightWindows, take
 from suite.diagnose.report.summary import superscripts
+from suite.diagnose.sources.rollout_source import RolloutSource
 from suite.diagnose.sources.source import Series
-from suite.diagnose.verdict.rollout_gap import Rollouts
 from tracks.geometry.rotation import exp_rot, rot_to_quat
 
 MEASURED, BEFORE, AFTER = "#1d2430", "#8b93a1", "#2463c9"
@@ -33,7 +33,7 @@ def series_chart(series: Series) -> bytes:
     return png(figure)
 
 
-def write_rollouts(path: Path, flown: Rollouts, fitted: np.ndarray | None) -> Path:
+def write_rollouts(path: Path, flown: RolloutSource, fitted: np.ndarray | None) -> Path:
     """Write held-out flights, measured and simulated in rollouts of 1 s, as a recording (.rrd).
 
     Args:

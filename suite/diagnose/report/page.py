@@ -30,6 +30,7 @@ from suite.diagnose.report.summary import (
     short_name,
     superscripts,
 )
+from suite.diagnose.sources.rollout_source import rollouts_of
 from tracks.common.grid import Cell, Grid
 
 TITLES = {
@@ -71,7 +72,7 @@ def page(diagnosis: Diagnosis, result: Mapping[str, Any], toml: str, files: set[
         toml: text of the vehicle file that was written.
         files: paths of those of `FILES` that exist.
     """
-    gap, flown = result["gap"], diagnosis.main.source.rollouts
+    gap, flown = result["gap"], rollouts_of(diagnosis.main)
     after = f" → {gap['after']:.3g}" if result["effects"] else ""
     facts = {
         "gap on held-out flights": superscripts(f"{gap['before']:.3g}{after} {gap['unit']}"),

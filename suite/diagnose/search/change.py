@@ -32,7 +32,6 @@ from suite.diagnose.evidence.moments import (
     Weights,
     block_of,
     centred,
-    compare,
     means_of,
     weights_of,
     whitened,
@@ -53,7 +52,7 @@ def _motion_inputs(task: ViewEvidence, theta: np.ndarray) -> np.ndarray:
         vel_b = flight.rows.vel_b
         speed = np.linalg.norm(vel_b, axis=1, keepdims=True)
         motion.append(flight.form.mean @ np.concatenate([vel_b, speed * vel_b], axis=1))
-    data = compare(task.view, task.model, theta, task.flights, ())
+    data = task.residuals(theta)
     inputs = np.concatenate([np.concatenate(motion), data.value], axis=1)
     return centred(inputs, data.flight)
 

@@ -69,7 +69,7 @@ def examine(
         labels = ", ".join(one.label for one in found.candidates)
         warnings.append(f"{labels}: withdrawn, held-out flights are no better for it")
         found, after = found.refitted(()), before
-    found, after, without, withdrawn = confirmed(source, found, (before, after))
+    found, after, without, withdrawn = confirmed(source, found, after)
     warnings += [
         f"{label}: withdrawn, held-out flights are no better for it" for label in withdrawn
     ]
@@ -126,20 +126,20 @@ def without_names(finding: Finding, seed: int) -> Finding:
 
 
 def confirmed(
-    source: Source, found: SearchResult, gaps: tuple[Gap, Gap]
+    source: Source, found: SearchResult, after: Gap
 ) -> tuple[SearchResult, Gap, dict[str, Gap], list[str]]:
     """Withdraw the effects that do not lower the gap on held-out flights, one at a time.
 
     If the error stays above the noise floor, model errors bias every parameter. An effect then has
     to lower the squared error by a share of the remaining error. An effect is kept if the held-out
-    flights are not sensitive to it, such as the ground effect in high flights. `gaps` are the gap
-    without any named effect and the gap with all of them.
+    flights are not sensitive to it, such as the ground effect in high flights. `after` is the gap
+    with all named effects.
 
     Returns:
         The result with the confirmed effects, the gap with them, the gap without each of them (by
         its label), and the labels of the withdrawn effects.
     """
-    (before, after), withdrawn, limits = gaps, list[str](), source.limits
+    withdrawn, limits = list[str](), source.limits
     while found.named:
         without = _without_each(source, found)
         # A mean score of 1 is noise; more is an error that no named effect explains. `excess` is
@@ -155,19 +155,13 @@ def confirmed(
         ]
         if not refused:
             return found, after, without, withdrawn
-        # Withdraw the effect whose loss costs least; the others may be confirmed without it.
-        label = min((one.label for one in refused), key=lambda k: float(without[k].energy.sum()))
-        withdrawn.append(label)
-        kept = tuple(named for named in found.named if named.candidate.label != label)
-        # Without the withdrawn effect another one may lose its influence, as a wind without a drag.
-        if kept:
-            found = found.refitted(kept)
-            kept = _effective(found)
-        if not kept:
-            return found.refitted(()), before, {}, withdrawn
-        if len(kept) < len(found.named):
-            withdrawn += [named.candidate.label for named in found.named if named not in kept]
-            found = found.refitted(kept)
+        # Withdraw the effect whose loss costs least; the others may be confirmed without it. Others
+        # may also lose their influence without it, as a wind without a drag.
+        lost = [min(refused, key=lambda one: float(without[one.label].energy.sum()))]
+        while lost:
+            withdrawn += [candidate.label for candidate in lost]
+            found = found.refitted([one for one in found.named if one.candidate not in lost])
+            lost = _without_influence(found)
         after = source.gap(found, found.estimate.theta)
     return found, after, {}, withdrawn
 
@@ -198,11 +192,8 @@ def relevant_part(
         if not too_small:
             return found, after, sizes, left_out
         left_out += [(name, sizes[name]) for name in too_small]
-        kept = tuple(named for named in found.named if named.candidate.name not in too_small)
-        if not kept:
-            return found.refitted(()), before, {}, left_out
-        found = found.refitted(kept)
-        after = source.gap(found, found.estimate.theta)
+        found = found.refitted([one for one in found.named if one.candidate.name not in too_small])
+        after = source.gap(found, found.estimate.theta) if found.named else before
     return found, after, {}, left_out
 
 
@@ -224,18 +215,14 @@ def control(source: Source, found: SearchResult) -> tuple[str, Gap] | None:
     return wrong.label, source.gap(found, theta)
 
 
-def _effective(found: SearchResult) -> tuple[NamedEffect, ...]:
-    """Return the named effects that influence these flights.
+def _without_influence(found: SearchResult) -> list[Candidate]:
+    """Return the named effects on which these flights have no information.
 
-    A wind without a drag has no influence: the flights have no information on it.
+    An example is a wind without a drag.
     """
     information = np.einsum("wkk->k", found.judged.equations.along_numbers(found.indices).hessian)
-    by_index = dict(zip(found.indices, information, strict=True))
-    return tuple(
-        named
-        for named in found.named
-        if any(by_index[index] > 0.0 for index in named.candidate.indices)
-    )
+    informed = {i for i, value in zip(found.indices, information, strict=True) if value > 0.0}
+    return [candidate for candidate in found.candidates if not informed & set(candidate.indices)]
 
 
 def _without_each(source: Source, found: SearchResult) -> dict[str, Gap]:

@@ -7,33 +7,35 @@ number of channels (position, attitude, velocity, rates, accelerometer, rotor sp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from eval.effects import EFFECTS
 from eval.effects.log_faults import pose_delay
+from eval.logs.flight_log import FlightLog
+from eval.vehicles.vehicle import Vehicle
 from suite.diagnose.data.flights import ready
 from suite.diagnose.data.view import FORCE
-from suite.diagnose.data.whitening import make_whitening
+from suite.diagnose.data.whitening import block_of, make_whitening
 from suite.diagnose.data.windows import (
+    LENGTH_S,
     SLICES,
     STATE_GROUPS,
     UNITS,
     FlightWindows,
+    cut,
+    take,
 )
 from suite.diagnose.estimate.gauss_newton import TINY, Z95, gauss_newton_step
-from suite.diagnose.estimate.parameters import Candidate, make_space
+from suite.diagnose.estimate.parameters import Candidate
 from suite.diagnose.estimate.permutation import folds_of
 from suite.diagnose.evidence.moments import ForceModel
-from suite.diagnose.evidence.rollouts import (
-    RolloutEvidence,
-    block_of,
-    rollout_evidence,
-)
+from suite.diagnose.evidence.rollouts import RolloutEvidence, RolloutModel, rollout_evidence
 from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.search.evaluation import Evaluation, SearchResult
-from suite.diagnose.sources.source import Remaining, Series, Source, sizes_by_effect
+from suite.diagnose.sources.source import Finding, Remaining, Series, Source, sizes_by_effect
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing, find_turbulence, residual_swing
@@ -42,21 +44,23 @@ from suite.diagnose.verdict.gap import (
     TORQUE_S,
     EffectSize,
     Gap,
+    from_true_starts,
+    measure,
+    overlap,
     remaining_share,
     rollout_size,
+    true_starts,
 )
 from suite.diagnose.verdict.residual_structure import (
     ResidualStructure,
     disturbance_equations,
     residual_structure,
 )
-from suite.diagnose.verdict.rollout_gap import (
-    Rollouts,
-    measure,
-    overlap,
-    true_starts,
-)
 
+SHOWN = 4
+"""Number of held-out flights in pictures and recordings."""
+ROUNDING_S = 1e-6
+"""Start times that differ by less are equal [s]."""
 SHAPES = 5
 """Largest number of shapes of the residual (functions of the state) in the report."""
 CLEAR_NOISE = 4.0
@@ -74,23 +78,33 @@ def of_rollouts(evaluation: Evaluation) -> RolloutEvidence:
 class RolloutSource(Source):
     """Rollouts of 1 s as a source; its gap is the error of rollouts on held-out flights."""
 
-    flown: Rollouts
-    """The flights, the model that simulates them, and their held-out windows."""
+    model: RolloutModel
+    """Model of the nominal vehicle."""
+    logs: Sequence[FlightLog]
+    vehicle: Vehicle
+    """The nominal vehicle, which the simulation uses."""
+    rotor_input: bool
+    """Whether measured rotor speeds are the model's input, not the commands."""
+    held: FlightWindows
+    """Overlapping 1 s windows of the held-out part."""
+    since_s: float
+    """Time in a flight at which its held-out part begins [s]; above 0 only for a single flight."""
     coarser: FlightWindows | None = None
     """The fitted windows, but with every second rotor speed only; None if commands are the input.
     The difference in the result shows how much the time between rotor speeds matters."""
     coarser_share: float = 0.5
     """Share of an effect's change under `coarser` that counts as the model's numerical error."""
 
-    @property
-    def rollouts(self) -> Rollouts:
-        """The simulated flights, see `Source`."""
-        return self.flown
+    def cut(self, stride_s: float, only: Sequence[int] | None = None) -> FlightWindows:
+        """Return windows that begin every `stride_s` [s], of all flights or those in `only`."""
+        settings = (self.rotor_input, stride_s, self.limits, self.model.integrator)
+        windows, _ = cut(self.logs, self.vehicle, *settings, only=only)
+        assert windows is not None  # the diagnosis has cut them before
+        return windows
 
     def gap(self, found: SearchResult, theta: np.ndarray) -> Gap:
         """Return the gap on the held-out flights, see `Source`."""
-        flights, noise = self.flown, of_rollouts(found.last).noise
-        return measure(flights.model, theta, flights.held, noise, self.limits)
+        return measure(self.model, theta, self.held, of_rollouts(found.last).noise, self.limits)
 
     def is_worse(self, before: Gap, after: Gap) -> bool:
         """Return whether the gap has grown by more than chance, see `Source`."""
@@ -101,13 +115,11 @@ class RolloutSource(Source):
 
         They are if the effect's fitted size should change their chi-square significantly.
         """
-        model, held = self.flown.model, self.flown.held
         theta, indices = found.estimate.theta, list(candidate.indices)
-        offset = true_starts(model, theta, held)
-        linear = model.linearise(theta, offset, held, [*indices, *model.starts])
-        whitening = make_whitening(linear, of_rollouts(found.last).noise, held, self.limits)
-        slope = block_of(whitening, linear, indices, held).slope
-        change = theta[indices] - self.flown.start[indices]
+        linear = from_true_starts(self.model, theta, self.held, indices)
+        whitening = make_whitening(linear, of_rollouts(found.last).noise, self.held, self.limits)
+        slope = block_of(whitening, linear, indices, self.held).slope
+        change = (theta - self.start.theta)[indices]
         # Windows overlap, and `overlap` makes each row count once.
         expected_chi2 = float(((slope @ change) ** 2).sum()) * overlap(self.limits)
         return bool(expected_chi2 > self.limits.shown_chi2)
@@ -119,7 +131,7 @@ class RolloutSource(Source):
         in time. The number of independent rollouts is therefore the held-out time in seconds.
         """
         force, torque, drift = self.limits.relevance
-        independent = max(len(self.flown.held.flight) * self.limits.gap_stride_s, 1.0)
+        independent = max(len(self.held.flight) * self.limits.gap_stride_s, 1.0)
         # A standard deviation of n normal errors has the relative standard error 1 / sqrt(2 n).
         upper = 1.0 + Z95 / np.sqrt(2.0 * independent)
 
@@ -146,7 +158,7 @@ class RolloutSource(Source):
         time constant) do not show all torque. The change then estimates the missing torque only to
         a factor of two, so twice the change is subtracted (`coarser_share`).
         """
-        model, estimate, indices = self.flown.model, found.estimate, found.indices
+        model, estimate, indices = self.model, found.estimate, found.indices
         windows = of_rollouts(found.last).trusted
         slope = model.linearise(estimate.theta, estimate.free, windows, indices).slope
         model_error = np.zeros(len(indices))
@@ -175,7 +187,7 @@ class RolloutSource(Source):
             return Remaining(False, share, details=details)
         # Slow errors are those that a low polynomial over a window describes: noise has few.
         slow = of_rollouts(found.last).slow_errors(found.last.block)
-        where = structure_where(slow, structure, self.flown.rotor_input, self.limits)
+        where = structure_where(slow, structure, self.rotor_input, self.limits)
         swing = self._swing(found.estimate.theta) if wind or where else None
         # Wind explains the structure, unless the force oscillates regularly.
         if wind and not swing:
@@ -188,7 +200,7 @@ class RolloutSource(Source):
         self, found: SearchResult, seed: int
     ) -> tuple[ResidualStructure, TestedEffect | None]:
         """Return the structure in the remaining error, and the wind that may cause it."""
-        evidence, limits, model = of_rollouts(found.last), self.limits, self.flown.model
+        evidence, limits, model = of_rollouts(found.last), self.limits, self.model
         windows, whitening = evidence.trusted, evidence.whitening
         equations = disturbance_equations(model, windows, whitening, found.estimate, limits)
         fold = folds_of(windows.flight, windows.start_s, limits.folds)
@@ -210,13 +222,12 @@ class RolloutSource(Source):
 
         It is searched for in all flights with the force view, which has one value at each time.
         """
-        flown = self.flown
         try:
-            flights = ready(flown.logs, flown.vehicle, self.limits).smoothed[FORCE.name]
+            flights = ready(self.logs, self.vehicle, self.limits).smoothed[FORCE.name]
         except ValueError:  # no flight meets the conditions of the force view
             return None
-        voltage = all(log.voltage is not None for log in flown.logs)
-        model = ForceModel(flown.vehicle, make_space(flown.vehicle), voltage)
+        voltage = all(log.voltage is not None for log in self.logs)
+        model = ForceModel(self.vehicle, self.space, voltage)
         return residual_swing(ViewEvidence(FORCE, model, flights, self.limits), theta)
 
     def explained_by_steps(self, found: SearchResult) -> bool:
@@ -224,7 +235,7 @@ class RolloutSource(Source):
 
         In a flight that MuJoCo simulated, pose and rates differ by about half a step in time.
         """
-        step_s = 1.0 / self.flown.vehicle.controller.frequency
+        step_s = 1.0 / self.vehicle.controller.frequency
         delays_s = pose_delays(found).values()
         return any(abs(delay_s) <= self.limits.integrator_share * step_s for delay_s in delays_s)
 
@@ -242,51 +253,53 @@ class RolloutSource(Source):
         share = np.where(is_raised, least / np.maximum(noise, TINY), 0.0)
         return float(min(share.max(), 1.0))
 
+    def simulated(self, fitted: np.ndarray | None) -> tuple[FlightWindows, dict[str, np.ndarray]]:
+        """Return 1 s windows of some held-out flights, and their errors by label of the model.
+
+        The errors are measured - simulated (W, N, 19). One entry is with the vehicle file's
+        parameters. If other parameters `fitted` (P,) are given, a second entry is with these.
+        """
+        windows = self.cut(LENGTH_S, np.unique(self.held.flight)[:SHOWN].tolist())
+        windows = take(windows, np.asarray(windows.start_s) >= self.since_s - ROUNDING_S)
+        series = {"simulated as given": self.start.theta}
+        if fitted is not None:
+            series["simulated with the named effects"] = fitted
+        return windows, {
+            label: self.model.residual(theta, true_starts(self.model, theta, windows), windows)
+            for label, theta in series.items()
+        }
+
     def series(self, found: SearchResult) -> Series:
         """Return a held-out flight along the axis with the clearest error, see `Source`."""
-        windows, simulated = self.flown.simulated(found.estimate.theta if found.named else None)
-        sigma = of_rollouts(found.last).noise.sigma
+        windows, simulated = self.simulated(found.estimate.theta if found.named else None)
         rows = np.asarray(windows.flight) == windows.flight[0]
-        measured = {
-            group: np.asarray(values)[rows]
-            for group, values in (
-                ("position", windows.row_pos_w),
-                ("velocity", windows.row_vel_w),
-                ("rates", windows.row_rate_b),
-            )
-        }
-        is_logged = np.asarray(windows.valid)[rows]
-        errors = {label: values[rows] for label, values in simulated.items()}
-        error_as_given = next(iter(errors.values()))
-
-        def relative_error(group: str, axis: int) -> float:
-            """Return the squared error beyond noise, divided by the variance of the motion."""
-            channel = SLICES[group].start + axis
-            known = is_logged[..., channel] & np.isfinite(error_as_given[..., channel])
-            if not known.any():
-                return -np.inf
-            error, motion = error_as_given[..., channel][known], measured[group][..., axis][known]
-            noise = float(sigma[channel]) ** 2
-            excess = float((error**2).mean() - CLEAR_NOISE * noise)
-            return excess / max(float(motion.var()), noise)
-
-        axes = [(group, axis) for group in measured for axis in range(3)]
-        group, axis = max(axes, key=lambda pair: relative_error(*pair))
-        channel = SLICES[group].start + axis
+        groups = ("position", "velocity", "rates")
+        channels = np.concatenate([np.r_[SLICES[group]] for group in groups])
+        measured = np.concatenate(
+            [windows.row_pos_w, windows.row_vel_w, windows.row_rate_b], axis=-1
+        )[rows]
+        is_logged = np.asarray(windows.valid)[rows][..., channels]
+        errors = {label: values[rows][..., channels] for label, values in simulated.items()}
+        # The axis with the largest squared error beyond noise, next to the variance of the motion.
+        error = np.ma.masked_invalid(np.where(is_logged, next(iter(errors.values())), np.nan))
+        motion = np.ma.array(measured, mask=error.mask).var(axis=(0, 1))
+        noise = of_rollouts(found.last).noise.sigma[channels] ** 2
+        excess = (error**2).mean(axis=(0, 1)) - CLEAR_NOISE * noise
+        channel = int((excess / np.ma.maximum(motion, noise)).filled(-np.inf).argmax())
+        group, axis = groups[channel // 3], "xyz"[channel % 3]
         time_s = (np.asarray(windows.start_s)[:, None] + np.asarray(windows.row_s))[rows]
-        value = np.where(is_logged[..., channel], measured[group][..., axis], np.nan)
+        value = np.where(is_logged, measured, np.nan)[..., channel]
 
         def line(values: np.ndarray) -> np.ndarray:
             """Return the rollouts as one line of a chart, with a break (NaN) after each."""
             return np.pad(values, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
 
-        frame = "body" if group == "rates" else "world"
-        lines = {label: line(value - error[..., channel]) for label, error in errors.items()}
         return Series(
             line(time_s),
             line(value),
-            lines,
-            f"{group.capitalize()} along {frame} {'xyz'[axis]} [{UNITS[group]}]",
+            {label: line(value - error[..., channel]) for label, error in errors.items()},
+            f"{group.capitalize()} along {'body' if group == 'rates' else 'world'} {axis} "
+            f"[{UNITS[group]}]",
             "A held-out flight in rollouts of a second from measured states, along the axis where "
             "the error is largest next to the motion.",
         )
@@ -347,3 +360,8 @@ def pose_delays(found: SearchResult) -> dict[str, float]:
     values = found.judged.evidence.space.effects(found.estimate.theta)
     named = dict.fromkeys(candidate.name for candidate in found.candidates)
     return {name: float(pose_delay({name: values[name]})) for name in named if EFFECTS[name].late}
+
+
+def rollouts_of(finding: Finding) -> RolloutSource | None:
+    """Return the source of `finding` if it is one of rollouts."""
+    return finding.source if isinstance(finding.source, RolloutSource) else None

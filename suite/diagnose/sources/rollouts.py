@@ -8,31 +8,27 @@ called windows; W is their number.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from eval.logs.flight_log import FlightLog
 from eval.vehicles.vehicle import Vehicle
+from suite.diagnose.data.colour import measured_noise
 from suite.diagnose.data.flights import choose_held_out
 from suite.diagnose.data.sampling import own_spacing_s
 from suite.diagnose.data.steps import has_firmware_loop, rows_show_torque
-from suite.diagnose.data.whitening import Linearisation
-from suite.diagnose.data.windows import (
-    LENGTH_S,
-    FlightWindows,
-    cut,
-    take,
-)
+from suite.diagnose.data.whitening import Linearisation, block_of, make_whitening
+from suite.diagnose.data.windows import LENGTH_S, cut, take
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import candidates, make_space
 from suite.diagnose.evidence.rollouts import (
     RolloutModel,
-    best_fit_error,
-    information,
+    is_hopeless,
     rollout_evidence,
     start_estimate,
 )
-from suite.diagnose.sources.rollout_source import RolloutSource
+from suite.diagnose.sources.rollout_source import ROUNDING_S, RolloutSource
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import (
@@ -40,12 +36,14 @@ from suite.diagnose.verdict.actuators import (
     integrator_of,
     rotors_are_input,
 )
-from suite.diagnose.verdict.rollout_gap import MEASURE, Rollouts, with_model_error
+from suite.diagnose.verdict.gap import with_model_error
 
 BASE_S, STRETCH_S = 5.0, 0.25
 """Estimated duration on two cores: fixed part, and for each stretch [s]."""
-ROUNDING_S = 1e-6
-"""Start times that differ by less are equal [s]."""
+MEASURE = (
+    "RMS of slow errors of 1 s rollouts on held-out data, start free within its noise, over "
+    "position, attitude, velocity and rates, in units of what measurement noise gives"
+)
 
 
 def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | None:
@@ -63,24 +61,22 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
     Raises:
         ValueError: if no flight can be used, or none with the chosen drive (model input).
     """
-    logs, vehicle = given.logs, given.vehicle
+    logs, vehicle, limits = given.logs, given.vehicle, given.limits
     if before or given.references or not (given.chosen or can_fly(logs, vehicle)):
         return None
     # Choose the input of the model: commands or measured rotor speeds.
     integrator = integrator_of(logs, given.integrator)
     rotor_input, warnings = rotors_are_input(logs, given.drive, vehicle), list[str]()
     if given.drive == "auto" and not rotor_input:
-        rotor_input = _needs_rotor_input(logs, vehicle, given.limits)
+        rotor_input = _needs_rotor_input(logs, vehicle, limits)
         if rotor_input:
             warnings.append(
                 "the nominal rate loop does not reproduce the measured rotor speeds, so these are "
                 "the model's input"
             )
     # Cut the flights into stretches, and simulate each with the given vehicle.
-    space, limits = make_space(vehicle), given.limits
-    voltage = all(log.voltage is not None for log in logs)
-    model = RolloutModel(vehicle, space, rotor_input, voltage, integrator)
-    windows, notes = cut(logs, vehicle, rotor_input, limits=limits, integrator=integrator)
+    windows_of = partial(cut, logs, vehicle, rotor_input, limits=limits, integrator=integrator)
+    windows, notes = windows_of()
     if windows is None:
         raise ValueError("no flight has a stretch of 1.3 s without holes; log more, or faster")
     warnings += notes
@@ -90,6 +86,8 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         f"{count} stretches of 1 s of {len(np.unique(windows.flight))} flights: about "
         f"{BASE_S + count * STRETCH_S:.0f} s, and half a minute more the first time on a machine"
     )
+    voltage = all(log.voltage is not None for log in logs)
+    model = RolloutModel(vehicle, make_space(vehicle), rotor_input, voltage, integrator)
     start = start_estimate(model, windows)
     linear = model.linearise(start.theta, start.free, windows, None)
     is_finite = _finite(linear, limits)
@@ -98,20 +96,18 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         warnings.append(f"{diverged} stretches left out: the model's flight from there diverges")
     # Estimate the model's numerical error from the same stretches with steps of twice the length.
     # Flights that a simulator flew with Euler steps, driven by commands, have no such error.
-    coarser = None
-    if integrator != "euler" or rotor_input:
-        coarser = cut(logs, vehicle, rotor_input, LENGTH_S, limits, integrator, windows)[0]
-    windows, linear = take(windows, is_finite), _take(linear, is_finite)
+    has_error = integrator != "euler" or rotor_input
+    coarser = take(windows_of(coarser=windows)[0], is_finite) if has_error else None
+    windows, linear = take(windows, is_finite), take(linear, is_finite)
     if coarser is not None:
-        coarser = take(coarser, is_finite)
-        limits = with_model_error(model, start, windows, linear, coarser, limits)
-    # Do not use rollouts if even all effects together leave them far from the flights.
-    most = limits.hopeless_chi2
-    if not given.chosen and best_fit_error(model, windows, linear, limits, most) > most:
+        limits = with_model_error(model, start.theta, windows, linear, coarser, limits)
+    if not given.chosen and is_hopeless(model, windows, linear, limits):
         given.say("no effect brings rollouts of 1 s near these flights: using force and torque")
         return None
-    # Choose which stretches are held out.
-    informed = information(linear, windows, model.size, limits)
+    # Choose which stretches are held out, by their information on each parameter.
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
+    informed = (block_of(whitening, linear, range(model.size), windows).slope ** 2).sum(axis=1)
     is_fitted, names = choose_held_out(logs, windows.flight, windows.start_s, informed, limits)
     count = int(is_fitted.sum())
     _check_count(count, limits)
@@ -121,14 +117,17 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
             "distribution is drawn from the measured noise"
         )
     fitted, not_fitted = take(windows, is_fitted), take(windows, ~is_fitted)
+    given.say(f"{count} stretches of 1 s to fit, {len(not_fitted.flight)} held out")
+    if not len(not_fitted.flight):
+        raise ValueError("no stretch can be held out: fly longer, or log a second flight")
+    # The gap is more precise with windows that overlap.
+    since_s = float(not_fitted.start_s.min())
+    held_flights = np.unique(not_fitted.flight).tolist()
+    held, _ = windows_of(stride_s=limits.gap_stride_s, only=held_flights)
+    assert held is not None
     # Effects on a signal that the logs lack, or that the model does not use, are not candidates.
     signals = {"acc_b"} if any(log.acc_b is not None for log in logs) else set()
-    single = candidates(space, voltage, signals if rotor_input else signals | {"command"})
-    given.say(f"{len(fitted.flight)} stretches of 1 s to fit, {len(not_fitted.flight)} held out")
-    held = _held_out(given, rotor_input, not_fitted, limits, integrator)
-    # Of a lone flight the end is held out, from `since_s` on.
-    is_lone_flight = bool(np.isin(held.flight, fitted.flight).any())
-    since_s = float(np.min(held.start_s)) if is_lone_flight else 0.0
+    single = candidates(model.space, voltage, signals if rotor_input else signals | {"command"})
     rows_are_dense = all(
         log.rotor_speed is None
         or rows_show_torque(vehicle, own_spacing_s(log.time_s, log.rotor_speed))
@@ -141,12 +140,18 @@ def by_rollouts(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | 
         unit="times the noise",
         measure=MEASURE,
         horizon_s=LENGTH_S,
-        weighed=rollout_evidence(model, fitted, _take(linear, is_fitted), limits),
+        weighed=rollout_evidence(model, fitted, take(linear, is_fitted), limits),
         start=start_estimate(model, fitted),
         candidates=[*single, *composites(single)],
         limits=limits,
         small_explains=True,
-        flown=Rollouts(model, logs, vehicle, rotor_input, held, since_s, limits),
+        model=model,
+        logs=logs,
+        vehicle=vehicle,
+        rotor_input=rotor_input,
+        held=take(held, held.start_s >= since_s - ROUNDING_S),
+        # Of a lone flight the end is held out.
+        since_s=since_s if np.isin(not_fitted.flight, fitted.flight).any() else 0.0,
         coarser=take(coarser, is_fitted) if coarser is not None and rotor_input else None,
         coarser_share=0.5 if rows_are_dense else 2.0,  # see `RolloutSource.sizes`
     )
@@ -194,11 +199,6 @@ def _check_count(count: int, limits: Thresholds) -> None:
         )
 
 
-def _take(linear: Linearisation, chosen: np.ndarray) -> Linearisation:
-    """Return the linearisation of the `chosen` windows (W,) only."""
-    return Linearisation(*(part[chosen] for part in linear))
-
-
 def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
     """Return which windows (W,) the model simulates without divergence.
 
@@ -214,23 +214,3 @@ def _finite(linear: Linearisation, limits: Thresholds) -> np.ndarray:
             "the model diverges on every flight: check the vehicle file and the frames"
         )
     return is_finite
-
-
-def _held_out(
-    given: DiagnosisInput,
-    rotor_input: bool,
-    windows: FlightWindows,
-    limits: Thresholds,
-    integrator: str,
-) -> FlightWindows:
-    """Return overlapping windows over the held-out time, for a more precise gap.
-
-    `windows` cover the same time without overlap.
-    """
-    if not len(windows.flight):
-        raise ValueError("no stretch can be held out: fly longer, or log a second flight")
-    flights = np.unique(windows.flight).tolist()
-    options = (rotor_input, limits.gap_stride_s, limits, integrator)
-    overlapping, _ = cut(given.logs, given.vehicle, *options, only=flights)
-    assert overlapping is not None
-    return take(overlapping, overlapping.start_s >= windows.start_s.min() - ROUNDING_S)

@@ -29,7 +29,6 @@ from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import TestedEffect
 from suite.diagnose.verdict.disturbances import Swing
 from suite.diagnose.verdict.gap import EffectSize, Gap, upper_size
-from suite.diagnose.verdict.rollout_gap import Rollouts
 
 LEAST_GAP = 1e-9
 """Lower limit of a gap minus its noise floor in a division, in the gap's unit."""
@@ -111,11 +110,6 @@ class Source(ABC):
     """A second source, which is searched if this one names nothing."""
 
     @property
-    def rollouts(self) -> Rollouts | None:
-        """The simulated flights, for recordings, plans and a fitted network, if there are any."""
-        return None
-
-    @property
     def space(self) -> ParameterSpace:
         """The catalogue's parameters."""
         return self.weighed[0].space
@@ -167,10 +161,6 @@ class Source(ABC):
         size has no physical unit; then no effect counts as too small.
         """
         return {}
-
-    def explained_by_steps(self, found: SearchResult) -> bool:
-        """Return whether a simulator's time steps may cause the named effects."""
-        return False
 
     def model_error(self, found: SearchResult) -> float | None:
         """Return the share of the noise floor that is the model's numerical error, if known."""

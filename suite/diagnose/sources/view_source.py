@@ -144,18 +144,22 @@ class ViewSource(Source):
             return Shares(closed, np.maximum(closed, 0.0), np.zeros(3), power, spread)
         # Fit one black box to the error of the given vehicle, and a second one to the error that
         # remains with the named effects. Both are tested on the held-out flights.
-        start = evidence.residuals(found.start.theta)
-        fitted = evidence.residuals(found.estimate.theta)
-        inputs = np.concatenate([inputs_of(flight) for flight in evidence.flights])
-        held_inputs = np.concatenate([inputs_of(flight) for flight in self.held.flights])
-        black_box = fit_black_box(inputs, start.residual, start.flight)
-        second_box = fit_black_box(inputs, fitted.residual, fitted.flight)
+        inputs, held_inputs = (
+            np.concatenate([inputs_of(flight) for flight in flights])
+            for flights in (evidence.flights, self.held.flights)
+        )
+
+        def unpredicted(theta: np.ndarray, held: np.ndarray) -> np.ndarray:
+            """Return the `held` residual (M, 3) without the part that a black box predicts."""
+            fitted = evidence.residuals(theta)
+            return held - held_inputs @ fit_black_box(inputs, fitted.residual, fitted.flight)
+
         closed, explainable, with_both = (
             closed_share(before.residual, error, before.flight)
             for error in (
                 after.residual,
-                before.residual - black_box.predict(held_inputs),
-                after.residual - second_box.predict(held_inputs),
+                unpredicted(found.start.theta, before.residual),
+                unpredicted(found.estimate.theta, after.residual),
             )
         )
         variance = (centred(before.residual, before.flight) ** 2).mean(axis=0)
@@ -259,29 +263,17 @@ RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge weights that are tried, relative to the weight of the data."""
 
 
-class BlackBox(NamedTuple):
-    """A fitted ridge regression of an error on K inputs."""
-
-    scale: np.ndarray
-    """(K,) standard deviations of the inputs."""
-    weight: np.ndarray
-    """(K, 3) weights of the scaled inputs."""
-
-    def predict(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the predicted error (M, 3) for `inputs` (M, K)."""
-        return (inputs / self.scale) @ self.weight
-
-
 def inputs_of(flight: SmoothedFlight) -> np.ndarray:
     """Return the inputs (M, K) of the black box for one flight, averaged over its windows."""
     return flight.form.mean @ _features(flight.rows)
 
 
-def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> BlackBox:
-    """Fit the black box that explains `error` (M, 3) best in cross-validation over flights.
+def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> np.ndarray:
+    """Return the weights (K, 3) with which `inputs` (M, K) explain `error` (M, 3) best.
 
-    Each flight's mean (its trim) is subtracted from the inputs (M, K) and from the error. `flight`
-    (M,) is the number of each row's flight. A single flight is split into thirds.
+    They are those of a ridge regression, chosen in cross-validation over flights. Each flight's
+    mean (its trim) is subtracted from inputs and error. `flight` (M,) is the number of each row's
+    flight. A single flight is split into thirds.
     """
     groups = validation_groups(flight)
     inputs, error = centred(inputs, flight), centred(error, flight)
@@ -293,20 +285,19 @@ def fit_black_box(inputs: np.ndarray, error: np.ndarray, flight: np.ndarray) -> 
         square = scaled[rows].T @ scaled[rows] + ridge * rows.sum() * np.eye(scaled.shape[1])
         return np.linalg.solve(square, scaled[rows].T @ error[rows])
 
-    # Squared error (3,) on the left-out groups, for each ridge weight.
-    held_errors = []
-    for ridge in RIDGES:
-        total = np.zeros(3)
-        for group in np.unique(groups):
-            held = groups == group
-            total += ((error[held] - scaled[held] @ solve(~held, ridge)) ** 2).sum(axis=0)
-        held_errors.append(total)
+    def held_error(ridge: float) -> np.ndarray:
+        """Return the squared error (3,) on the groups, each left out of the fit in turn."""
+        left_out = [groups == group for group in np.unique(groups)]
+        errors = [error[rows] - scaled[rows] @ solve(~rows, ridge) for rows in left_out]
+        return (np.concatenate(errors) ** 2).sum(axis=0)
+
     # Each axis takes its best ridge weight, or weights of 0 if even that predicts worse than 0.
+    held_errors = [held_error(ridge) for ridge in RIDGES]
     best = np.argmin(held_errors, axis=0)
     all_rows = np.ones(len(groups), bool)
     columns = [solve(all_rows, RIDGES[k])[:, axis] for axis, k in enumerate(best)]
     zero_is_better = (error**2).sum(axis=0) <= np.min(held_errors, axis=0)
-    return BlackBox(scale, np.where(zero_is_better, 0.0, np.stack(columns, axis=1)))
+    return np.where(zero_is_better, 0.0, np.stack(columns, axis=1)) / scale[:, None]
 
 
 def closed_share(before: np.ndarray, after: np.ndarray, flight: np.ndarray) -> np.ndarray:

@@ -7,17 +7,16 @@ the reference flights instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from eval.effects import EFFECTS
-from eval.logs.flight_log import FlightLog
 from suite.diagnose.data.flights import ViewFlights, choose_held_out, parted, ready
 from suite.diagnose.data.inertial import UNSEEN, is_inertial
-from suite.diagnose.data.view import FORCE, View
+from suite.diagnose.data.view import View
 from suite.diagnose.estimate.composites import composites
 from suite.diagnose.estimate.parameters import Candidate, candidates, make_space
 from suite.diagnose.evidence.moments import ForceModel
@@ -30,7 +29,6 @@ from suite.diagnose.search.change import (
 )
 from suite.diagnose.sources.source import DiagnosisInput, Source, SourceSet
 from suite.diagnose.sources.view_source import MotionSource, ViewSource
-from suite.diagnose.thresholds import Thresholds
 from suite.diagnose.verdict.actuators import find_rotor_lag
 
 BASE_S, ROW_S = 5.0, 4e-4
@@ -69,31 +67,45 @@ def by_views(given: DiagnosisInput, before: Sequence[Source]) -> SourceSet | Non
         allowed = [one for one in allowed if EFFECTS[one.name].wind is None]
         limits = replace(limits, least_view_share=limits.least_inertial_share)
         not_shown = [f"without a position these flights do not show {what}" for what in UNSEEN]
+    evidence = {
+        view.name: ViewEvidence(view, model, flights.smoothed[view.name], limits)
+        for view in flights.views
+    }
     # `earlier` is the evidence of the reference flights by view; empty if there are none.
-    earlier, spread, left_out = _references(given, flights, model, limits)
+    earlier, spread, left_out = _references(given, flights, evidence)
     rows = min(sum(len(log.time_s) for log in logs), limits.most_rows)
     about = ", ".join(view.about for view in flights.views)
     given.say(f"views: {about}; by {flights.source}; {rows} rows: "
               f"about {BASE_S + rows * ROW_S:.0f} s")  # fmt: skip
-    held_indices, held_names = _choose_held_out(logs, flights, model, limits)
-    fitted, held = parted(flights, held_indices, limits)
-    partial = any(log.partial for log in [*logs, *references])  # logs that lack a required signal
+    # Choose the held-out flights by their information, so that the fitted flights keep enough.
+    first = evidence[flights.views[0].name]
+    block = first.estimate_noise(first.start)[1]
+    information = (block.slope**2).sum(axis=1)
+    start_s = np.zeros(len(information))
+    _, held_names = choose_held_out(logs, block.flight, start_s, information, limits)
+    held_numbers = [k for k, log in enumerate(logs) if log.name in held_names]
+    fitted, held = parted(flights, held_numbers, limits)
     # Make one source for each view.
     sources = []
-    for view in flights.views:
-        evidence = ViewEvidence(view, model, fitted[view.name], limits)
-        held_evidence = replace(evidence, flights=held[view.name])
-        floor = flights.floor[view.name]
-        if spread is None:
-            force_flights = flights.smoothed[FORCE.name]
-            all_flights = replace(evidence, flights=force_flights) if view.in_world else None
-            source = _since_file(evidence, held_evidence, all_flights, allowed, floor)
-        else:
-            reference = earlier[view.name]
-            source = _since_reference(reference, evidence, held_evidence, spread, allowed, floor)
-            # Of partial logs only the means of flights are compared.
-            source = replace(source, fallback=None) if partial else source
-        sources.append(source)
+    for name, one in evidence.items():
+        to_fit, held_out = (replace(one, flights=part[name]) for part in (fitted, held))
+        shared = {**_descriptions(one.view), "limits": limits, "floor": flights.floor[name]}
+        if spread is not None:
+            # Of logs that lack a required signal only the means of flights are compared.
+            partial = any(log.partial for log in [*logs, *references])
+            sources.append(
+                _since_reference(earlier[name], to_fit, held_out, spread, allowed, partial, shared)
+            )
+            continue
+        weighed = to_fit.estimate_noise(to_fit.start)
+        tried = view_candidates([*allowed, *composites(allowed)], weighed[1])
+        whole = one if one.view.in_world else None
+        sources.append(
+            ViewSource(
+                weighed=weighed, start=to_fit.start, candidates=tried, held=held_out,
+                all_flights=whole, **shared,
+            )
+        )  # fmt: skip
     lag = None if references else find_rotor_lag(logs, vehicle, limits)
     return SourceSet(
         tuple(sources),
@@ -115,61 +127,39 @@ def _descriptions(view: View) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _since_file(
-    evidence: ViewEvidence,
-    held: ViewEvidence,
-    all_flights: ViewEvidence | None,
-    allowed: Sequence[Candidate],
-    floor: np.ndarray,
-) -> ViewSource:
-    """Return the source that compares the flights of `evidence` with the vehicle file.
-
-    Args:
-        evidence: the flights to fit.
-        held: the held-out flights.
-        all_flights: both together, for a force view.
-        allowed: effects that the search may try.
-        floor: (3,) standard deviation of a mean acceleration that measurement noise causes.
-    """
-    weighed = evidence.estimate_noise(evidence.start)
-    return ViewSource(
-        weighed=weighed,
-        start=evidence.start,
-        candidates=view_candidates([*allowed, *composites(allowed)], weighed[1]),
-        limits=evidence.limits,
-        held=held,
-        floor=floor,
-        all_flights=all_flights,
-        **_descriptions(evidence.view),
-    )
-
-
 def _since_reference(
     reference: ViewEvidence,
     evidence: ViewEvidence,
     held: ViewEvidence,
     spread: RotorSpread,
     allowed: Sequence[Candidate],
-    floor: np.ndarray,
+    means_only: bool,
+    shared: dict[str, Any],
 ) -> ViewSource:
     """Return the source that searches for a change since the `reference` flights.
 
     It compares means of flights. If no mean has changed, its fallback searches for a change that
-    shows only in motion. `spread` is how much the rotors' thrusts vary between the flights of one
-    vehicle. The other arguments are those of `_since_file`.
+    shows only in motion.
+
+    Args:
+        reference: the flights before the change.
+        evidence: the flights to fit.
+        held: the held-out flights.
+        spread: how much the rotors' thrusts vary between the flights of one vehicle.
+        allowed: effects that the search may try.
+        means_only: whether there is no fallback.
+        shared: fields of both sources.
     """
     difference, start = change_evidence(reference, evidence.flights, spread)
     weighed = difference.relinearise(start)
-    shared: dict[str, Any] = {
-        **_descriptions(evidence.view), "weighed": weighed, "start": start, "floor": floor,
-        "limits": evidence.limits, "names_small": True,
-    }  # fmt: skip
+    shared = {**shared, "weighed": weighed, "start": start, "names_small": True}
     in_motion = MotionSource(
         candidates=allowed, held=held, reference=reference, fitted=evidence, **shared
     )
     means = replace(less_reference_residual(reference, start.theta, held.flights), means=True)
     compared = view_candidates(allowed, weighed[1])
-    return ViewSource(candidates=compared, held=means, fallback=in_motion, **shared)
+    fallback = None if means_only else in_motion
+    return ViewSource(candidates=compared, held=means, fallback=fallback, **shared)
 
 
 def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
@@ -185,9 +175,9 @@ def _spread_words(spread: RotorSpread | None, count: int) -> tuple[str, ...]:
 
 
 def _references(
-    given: DiagnosisInput, flights: ViewFlights, model: ForceModel, limits: Thresholds
+    given: DiagnosisInput, flights: ViewFlights, evidence: Mapping[str, ViewEvidence]
 ) -> tuple[dict[str, ViewEvidence], RotorSpread | None, tuple[str, ...]]:
-    """Prepare the reference flights.
+    """Prepare the reference flights, to be compared with `flights` and their `evidence` by view.
 
     Returns:
         Their evidence by view, the spread between flights, and a note for each unusable flight.
@@ -197,8 +187,7 @@ def _references(
     """
     if not given.references:
         return {}, None, ()
-    # `before` and `earlier` are the flights before the change, `flights` and `later` those after.
-    before = ready(given.references, given.vehicle, limits, given.logs)
+    before = ready(given.references, given.vehicle, given.limits, given.logs)
     if len(before.names) < 2:
         raise ValueError(
             "; ".join(
@@ -215,12 +204,8 @@ def _references(
             f"{_view_words(before)}, the others by {flights.source} and {_view_words(flights)}: "
             "log the same signals in both"
         )
-    earlier = {
-        view.name: ViewEvidence(view, model, before.smoothed[view.name], limits)
-        for view in flights.views
-    }
-    later = [replace(one, flights=flights.smoothed[name]) for name, one in earlier.items()]
-    return earlier, rotor_spread([*earlier.values(), *later]), before.notes
+    earlier = {n: replace(one, flights=before.smoothed[n]) for n, one in evidence.items()}
+    return earlier, rotor_spread([*earlier.values(), *evidence.values()]), before.notes
 
 
 def _view_words(flights: ViewFlights) -> str:
@@ -229,18 +214,3 @@ def _view_words(flights: ViewFlights) -> str:
         f"{view.name} (along {''.join('xyz'[k] for k in view.axes)}, means of {view.width_s:g} s)"
         for view in flights.views
     )
-
-
-def _choose_held_out(
-    logs: Sequence[FlightLog], flights: ViewFlights, model: ForceModel, limits: Thresholds
-) -> tuple[list[int], list[str]]:
-    """Return the indices and the names of the held-out flights.
-
-    They are chosen by their information on the parameters, so that the fitted flights keep enough.
-    """
-    view = flights.views[0]
-    evidence = ViewEvidence(view, model, flights.smoothed[view.name], limits)
-    block = evidence.estimate_noise(evidence.start)[1]
-    informed = (block.slope**2).sum(axis=1)
-    _, names = choose_held_out(logs, block.flight, np.zeros(len(informed)), informed, limits)
-    return [k for k, log in enumerate(logs) if log.name in names], names

@@ -1,9 +1,19 @@
 """Error of a model on held-out flights (the gap), and the size of an effect on these flights.
 
 The gap is the RMS error of a model on held-out flights, which took no part in any fit. It is
-compared with the error that measurement noise alone gives (the noise floor). Each kind of evidence
-(`suite/diagnose/sources/`) has its own gap. That of rollouts is computed from the slow errors of
-simulated stretches of 1 s, that of force or torque from the errors of mean accelerations.
+compared with the error that measurement noise alone gives (the noise floor). That of force or
+torque is the error of mean accelerations. That of rollouts, which simulate 1 s from a measured
+start state, is the slow part of their errors, divided by the slow errors that noise alone gives; so
+1 means noise only. "Slow" errors are the projections of a rollout's errors on Legendre polynomials
+of time, in which a wrong model shows more than white noise; the start state is free within its
+noise. The plain errors from the measured start states are reported as well, in metres and so on.
+Their noise floor is the noise of the start states, carried through the rollout by the model's
+Jacobian.
+
+The model's own numerical error is estimated by step doubling (Hairer, Norsett & Wanner 1993, Sec.
+II.4). A rollout with time steps of twice the length, and with every second rotor speed, differs
+from the usual rollout by several times the error of the usual one. The part of this difference that
+no change of the start state explains is a lower limit of the noise.
 
 The size of an effect is how much it changes these flights. With little noise every difference is
 significant, even the model's numerical errors. So an effect is not named, however small its
@@ -13,13 +23,30 @@ p-value, if the upper end of the 95 % interval of its size is below all threshol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from suite.diagnose.data.windows import SLICES, FlightWindows
+from eval.effects.log_faults import pose_delay
+from suite.diagnose.data.colour import Noise, measured_noise
+from suite.diagnose.data.whitening import (
+    Linearisation,
+    block_of,
+    make_whitening,
+    rotor_spread,
+    slow_energy,
+)
+from suite.diagnose.data.windows import LENGTH_S, SLICES, STATE, STATE_GROUPS, FlightWindows
+from suite.diagnose.evidence.rollouts import RolloutModel
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
+
+HORIZONS_S = (0.1, 0.5, 1.0)
+"""Times after the start at which plain errors of rollouts are reported [s]."""
+ACC_ROW = 9
+"""The acceleration at a window's start is computed from the velocities there and in this row,
+counted among the rows with a velocity."""
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -96,6 +123,147 @@ def _bootstrap_means(values: np.ndarray, seed: int, limits: Thresholds) -> np.nd
     block_start = rng.integers(0, max(len(values) - block + 1, 1), (limits.bootstrap_draws, blocks))
     rows = np.minimum(block_start[..., None] + np.arange(block), len(values) - 1)
     return values[rows.reshape(limits.bootstrap_draws, -1)].mean(axis=1)
+
+
+def measure(
+    model: RolloutModel,
+    theta: np.ndarray,
+    windows: FlightWindows,
+    noise: Noise,
+    limits: Thresholds = THRESHOLDS,
+) -> Gap:
+    """Return the gap of `model` on `windows` at the parameters `theta` (P,), given the noise."""
+    return gap_of(from_true_starts(model, theta, windows), windows, noise, limits)
+
+
+def from_true_starts(
+    model: RolloutModel, theta: np.ndarray, windows: FlightWindows, indices: Sequence[int] = ()
+) -> Linearisation:
+    """Return the residuals of `windows` from their true start states (see `true_starts`).
+
+    The slopes are along the parameters at `indices` and then along the start numbers.
+    """
+    offset = true_starts(model, theta, windows)
+    return model.linearise(theta, offset, windows, [*indices, *model.starts])
+
+
+def gap_of(
+    linear: Linearisation,
+    windows: FlightWindows,
+    noise: Noise,
+    limits: Thresholds = THRESHOLDS,
+) -> Gap:
+    """Return the gap of the residuals in `linear`, which has slopes along the start states only.
+
+    The score contains pose, velocity and rates only. The energy, by which models are compared,
+    contains every fitted channel, because a bias of the accelerometer changes no other channel.
+    """
+    whitening = make_whitening(linear, noise, windows, limits)
+    residual = block_of(whitening, linear, (), windows).residual
+    slow = slow_energy(whitening, residual)
+    score = slow[:, :STATE].sum(axis=1) / whitening.slow_freedom[:, :STATE].sum(axis=1)
+    free_noise = start_noise(noise.sigma, windows, linear.offset.shape[1], limits)
+    channels = {}
+    for horizon_s in HORIZONS_S:
+        nearest = np.abs(np.asarray(windows.row_s) - horizon_s).argmin(axis=1)
+        rows = (np.arange(len(nearest)), nearest)
+        error = linear.residual[rows][:, :STATE]
+        floor = np.maximum(noise_floor(linear.slope[rows][:, :STATE], free_noise), 1e-12)
+        channels[f"{horizon_s:g} s"] = {
+            name: Channel(*(rms_length(part[:, SLICES[name]]) for part in (error, floor)))
+            for name in STATE_GROUPS
+        }
+    return Gap(score, slow.sum(axis=1), channels)
+
+
+def overlap(limits: Thresholds) -> float:
+    """Return the weight of a window in sums, so that rows in several windows count once."""
+    return limits.gap_stride_s / LENGTH_S
+
+
+def true_starts(model: RolloutModel, theta: np.ndarray, windows: FlightWindows) -> np.ndarray:
+    """Return the true start states minus the logged ones, (W, F), given the delay of logged poses.
+
+    The delay is an effect (the clock offset) with its value in `theta` (P,). Over the delay,
+    position and attitude change by velocity and rates, and the velocity by the acceleration.
+    """
+    delay_s = pose_delay(model.space.effects(theta))
+    offset = np.zeros((len(windows.flight), model.free))
+    offset[:, :3] = delay_s * windows.vel_w
+    offset[:, 3:6] = delay_s * windows.rate_b
+    has_vel = np.asarray(windows.valid)[:, :, SLICES["velocity"].start]
+    row_rank = np.minimum(ACC_ROW, has_vel.sum(axis=1))[:, None]
+    row = (has_vel & (np.cumsum(has_vel, axis=1) == row_rank)).argmax(axis=1)
+    window = np.arange(len(row))
+    span_s = np.asarray(windows.row_s)[window, row][:, None]
+    acc_w = (np.asarray(windows.row_vel_w)[window, row] - windows.vel_w) / np.maximum(span_s, 1e-3)
+    offset[:, 6:9] = delay_s * np.where(has_vel.any(axis=1, keepdims=True), acc_w, 0.0)
+    return offset
+
+
+def start_noise(
+    sigma: np.ndarray, windows: FlightWindows, free: int, limits: Thresholds = THRESHOLDS
+) -> np.ndarray:
+    """Return the standard deviation (F,) of the errors of a window's start numbers.
+
+    Start numbers are the 12 of the start state, and then errors of the rotor speeds. `free` is
+    their number F, and `sigma` (19,) the noise of the channels.
+    """
+    noise = np.zeros(free)
+    noise[:STATE] = np.where(np.isfinite(sigma), sigma, 0.0)[:STATE]
+    if free > STATE:
+        noise[STATE:] = rotor_spread(windows, limits)
+    return noise
+
+
+def noise_floor(slope: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the RMS errors (..., 12) that a perfect model would still have.
+
+    They have two causes: the noise of the measured start state, carried to this row by `slope`, and
+    the noise of the measurement in the row itself. `slope` (..., 12, F) is the derivative of a
+    row's state by the F numbers of the start state, and `noise` (F,) their noise. The first 12
+    entries of `noise` serve for both causes.
+    """
+    return np.sqrt(noise[:STATE] ** 2 + ((slope * noise) ** 2).sum(axis=-1))
+
+
+def with_model_error(
+    model: RolloutModel,
+    theta: np.ndarray,
+    windows: FlightWindows,
+    linear: Linearisation,
+    coarser: FlightWindows,
+    limits: Thresholds,
+) -> Thresholds:
+    """Return `limits` with the lower limits of the noise raised to the numerical error.
+
+    Args:
+        model: the model that simulates the windows.
+        theta: (P,) parameters at which `linear` was computed.
+        windows: W stretches.
+        linear: residuals and slopes of `windows` along all parameters and start numbers.
+        coarser: the same stretches with longer steps and fewer rotor speeds.
+        limits: thresholds of the diagnosis.
+    """
+    noise = measured_noise(linear.residual, linear.start_slope, windows, limits)
+    whitening = make_whitening(linear, noise, windows, limits)
+    # Difference by longer steps, in units of noise, without changes of the start state.
+    difference = model.residual(theta, linear.offset, coarser) - linear.residual
+    finite = np.isfinite(difference).all(axis=(1, 2), keepdims=True)
+    difference = np.where(finite, difference, 0.0)
+    unexplained = block_of(whitening, linear._replace(residual=difference), (), windows).residual
+    _, rows, channels = difference.shape
+    over_noise = unexplained[:, : rows * channels].reshape(difference.shape)
+    sigma = np.where(np.isfinite(noise.sigma), noise.sigma, 0.0)
+    valid = np.asarray(windows.valid) & finite
+    energy = (np.where(valid, over_noise * sigma, 0.0) ** 2).sum(axis=(0, 1))
+    # Mean of each channel, and then of each group of channels (three or four of one sensor).
+    power = energy / np.maximum(valid.sum(axis=(0, 1)), 1)
+    least = [
+        max(floor, float(np.sqrt(power[channel].mean())))
+        for floor, channel in zip(limits.least_noise, SLICES.values(), strict=True)
+    ]
+    return replace(limits, least_noise=tuple(least))
 
 
 FORCE_S, TORQUE_S = 0.5, 0.1

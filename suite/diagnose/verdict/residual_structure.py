@@ -16,9 +16,9 @@ import numpy as np
 from scipy.stats import gamma
 
 from eval.effects.interface import GRAVITY
-from suite.diagnose.data.whitening import Whitening, project_out_start, whiten, whitened_residual
+from suite.diagnose.data.whitening import Whitening, block_of
 from suite.diagnose.data.windows import KNOTS, FlightWindows
-from suite.diagnose.estimate.block import Estimate, products
+from suite.diagnose.estimate.block import Estimate
 from suite.diagnose.estimate.permutation import permutation_test
 from suite.diagnose.evidence.rollout import Flown
 from suite.diagnose.evidence.rollouts import RolloutModel
@@ -78,10 +78,11 @@ def disturbance_equations(
     """
     response = model.respond(estimate.theta, estimate.free, windows)
     linear = model.linearise(estimate.theta, estimate.free, windows, [])
-    residual = project_out_start(whitening, whitened_residual(whitening, linear))
-    slope = project_out_start(whitening, whiten(whitening, response.slope))
+    columns = range(response.slope.shape[-1])
+    disturbed = linear._replace(slope=response.slope)
+    equations = block_of(whitening, disturbed, columns, windows).equations
     shapes = shape_library(response.knot, np.asarray(windows.start_s), limits)
-    return DisturbanceEquations(*products(slope, residual), response.knot, shapes)
+    return DisturbanceEquations(equations.hessian, equations.gradient, response.knot, shapes)
 
 
 def residual_structure(

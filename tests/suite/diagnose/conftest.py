@@ -12,6 +12,7 @@ from eval.quadrotor.vehicle_file import save_vehicle
 from suite.cli import main
 from suite.diagnose import run
 from suite.diagnose.diagnose import diagnose
+from suite.diagnose.sources.rollout_source import rollouts_of
 from tests.support.diagnosis_flights import fly_all
 from tests.support.real_flights import VEHICLE, flights
 from tests.support.vehicles import PLAIN, with_effects, with_lag
@@ -73,7 +74,7 @@ def found_drag(drag):
 @pytest.fixture(scope="session")
 def flown(drag):
     """Return its rollouts."""
-    return drag.main.source.rollouts
+    return rollouts_of(drag.main)
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,8 @@ from eval.flights.simulate import SENSORS, fly, log_of
 from eval.flights.trajectory import Trajectory
 from suite.diagnose.data.windows import SLICES, cut
 from suite.diagnose.estimate.parameters import candidates, make_space
-from suite.diagnose.evidence.rollouts import RolloutModel
-from suite.diagnose.verdict.rollout_gap import true_starts
+from suite.diagnose.evidence.rollouts import RolloutModel, compiled
+from suite.diagnose.verdict.gap import true_starts
 from tests.support.faults import with_imu_fault
 from tests.support.vehicles import PLAIN, with_effects, with_lag
 
@@ -35,11 +35,12 @@ def test_a_fault_from_a_package_is_a_candidate_and_in_the_simulated_log(monkeypa
         true[names.index(("imu_fault", "turn", k))] = value
     true[names.index(("imu_fault", "scale", None))] = 1.04
     true[names.index(("imu_fault", "late", None))] = 0.01
-    fly_model = jax.jit(model.fly)
+    fly_model = jax.jit(compiled(space.layout, False, False, "euler")[0])
     with jax.enable_x64(True):
         off = [
-            np.asarray(fly_model(theta, true_starts(model, theta, windows), windows)[0])
+            np.asarray(fly_model(model.given, theta, offset, windows)[0])
             for theta in (start, true)
+            for offset in [true_starts(model, theta, windows)]
         ]
     for channel in ("position", "attitude", "velocity", "rates"):
         before, after = (np.sqrt((o[..., SLICES[channel]] ** 2).mean()) for o in off)

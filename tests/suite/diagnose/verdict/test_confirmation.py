@@ -26,7 +26,7 @@ def test_a_name_that_held_out_flights_contradict_is_withdrawn_and_one_that_they_
 ):
     def judged(found):
         after = found_drag.source.gap(found, found.estimate.theta)
-        return after, confirmed(found_drag.source, found, (found_drag.before, after))
+        return after, confirmed(found_drag.source, found, after)
 
     _, (kept, _, _, gone) = judged(spoilt(found_drag, 1e-4))
     assert gone == [] and "torque_trim" in [one.label for one in kept.candidates]
@@ -40,13 +40,13 @@ def test_a_name_that_held_out_flights_contradict_is_withdrawn_and_one_that_they_
 
 
 def test_where_the_model_lacks_something_a_name_must_explain_a_share_of_the_rest(found_drag):
-    found, before, after = found_drag.search, found_drag.before, found_drag.after
+    found, after = found_drag.search, found_drag.after
     # As if the rest were so large that the gap without the drag is a fifth larger only.
     raised = found_drag.without["linear_drag"].energy.sum() / 1.2 / after.energy.sum()
     after = after._replace(score=raised * after.score, energy=raised * after.energy)
     misfit = replace(of_rollouts(found.judged), misfit_is_noise=True)
     off = replace(found, judged=found.judged._replace(evidence=misfit))
-    withdrawn = [confirmed(found_drag.source, one, (before, after))[3] for one in (found, off)]
+    withdrawn = [confirmed(found_drag.source, one, after)[3] for one in (found, off)]
     assert withdrawn == [[], ["linear_drag"]]
 
 

@@ -76,8 +76,8 @@ def test_a_views_size_is_in_its_own_unit():
 
 def test_a_gap_matters_beyond_its_noise_by_more_than_the_thresholds(found_drag):
     def matters(error, floor, count=400, limits=LIMITS):
-        flown = replace(found_drag.source.flown, held=SimpleNamespace(flight=np.zeros(count)))
-        source = replace(found_drag.source, flown=flown, limits=limits)
+        held = SimpleNamespace(flight=np.zeros(count))
+        source = replace(found_drag.source, held=held, limits=limits)
         groups = dict.fromkeys(("position", "velocity", "rates"), Channel(error, floor))
         return source.is_relevant(found_drag.before._replace(
             channels=dict.fromkeys(("0.1 s", "0.5 s", "1 s"), groups)))  # fmt: skip
@@ -93,8 +93,8 @@ def test_where_rollouts_as_given_are_near_enough_no_name_matters(found_drag):
         for horizon, groups in found_drag.before.channels.items()
     }
     near, source = found_drag.before._replace(channels=none), found_drag.source
-    held = source.flown.held._replace(flight=np.zeros(400, int))
-    source = replace(source, flown=replace(source.flown, held=held))
+    held = source.held._replace(flight=np.zeros(400, int))
+    source = replace(source, held=held)
     found, after, _, out = relevant_part(source, found_drag.search, (near, found_drag.after))
     assert found.named == () and after is near
     ((name, size),) = out

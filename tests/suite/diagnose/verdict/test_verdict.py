@@ -11,7 +11,7 @@ from suite.diagnose.sources.rollout_source import of_rollouts, structure_where
 from suite.diagnose.sources.source import Remaining
 from suite.diagnose.thresholds import THRESHOLDS, Thresholds
 from suite.diagnose.verdict.disturbances import Swing, _likelihood, find_turbulence
-from suite.diagnose.verdict.gap import Gap, remaining_share
+from suite.diagnose.verdict.gap import Gap, measure, noise_floor, remaining_share
 from suite.diagnose.verdict.residual_structure import (
     AXES,
     DisturbanceEquations,
@@ -20,7 +20,6 @@ from suite.diagnose.verdict.residual_structure import (
     disturbance_equations,
     residual_structure,
 )
-from suite.diagnose.verdict.rollout_gap import measure, noise_floor
 
 
 def slow_errors(size=1.0):
@@ -112,7 +111,7 @@ def test_a_diagnosis_is_measured_on_what_was_held_out(drag, found_drag, flown):
 
 def test_without_the_name_its_shape_is_left(found_drag, flown):
     found, details = found_drag.search, found_drag.remaining.details
-    evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start)
+    evidence, bare = of_rollouts(found.last), found.estimate._replace(theta=flown.start.theta)
     windows = evidence.trusted
     equations = disturbance_equations(flown.model, windows, evidence.whitening, bare)
     fold = np.arange(len(windows.flight)) % 5

@@ -28,7 +28,7 @@ def test_a_drag_is_named_and_closes_what_any_model_could(by_views):
 
 @pytest.mark.parametrize(("scale", "count"), [(0.9, 1), (1.0, 0)])
 def test_a_thrust_that_the_force_view_excludes_is_contradicted(by_views, scale, count):
-    force, space = by_views.findings[0].search, by_views.space
+    force, space = by_views.findings[0].search, by_views.main.source.space
     (one,) = [c for c in candidates(space, False, ()) if c.name == "thrust_scale"]
     theta = space.array("start")
     theta[list(one.indices)] = scale
@@ -83,10 +83,10 @@ def test_a_black_box_explains_what_depends_on_the_motion_and_no_noise(by_views):
     inputs = np.concatenate([inputs_of(flight) for flight in fitted])
     flight = force.last.block.data.flight
     noise = np.random.default_rng(0).standard_normal((len(flight), 3))
-    said = fit_black_box(inputs, noise, flight).predict(inputs)
+    said = inputs @ fit_black_box(inputs, noise, flight)
     assert closed_share(noise, noise - said, flight).max() < 0.2
     real = 2.0 * inputs[:, [0, 1, 2]] + 0.1 * noise
-    left = real - fit_black_box(inputs, real, flight).predict(inputs)
+    left = real - inputs @ fit_black_box(inputs, real, flight)
     assert closed_share(real, left, flight).min() > 0.8
     assert np.abs(centred(real, flight)[flight == 0].mean(axis=0)).max() < 1e-12
 

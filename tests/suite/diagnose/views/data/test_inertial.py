@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from eval.logs.flight_log import FlightLog
 from eval.quadrotor.vehicle_file import load_vehicle
 from suite.diagnose.data.flights import completed, ready
-from suite.diagnose.data.inertial import by_inertia
+from suite.diagnose.data.inertial import posed
 from suite.diagnose.data.view import SPECIFIC, TORQUE
 from suite.diagnose.estimate.parameters import make_space
-from suite.diagnose.evidence.moments import ForceModel, compare
+from suite.diagnose.evidence.moments import ForceModel
+from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.identify.identify import identify
 from tests.support.diagnosis_flights import fly
 from tests.support.real_flights import VEHICLE
@@ -56,7 +57,7 @@ def flown(seed=0, end_s=10.0, bias=1.0, speed=1.0, gyro_walk=0.0, acc_noise=0.2)
 @pytest.mark.parametrize("end_s", [10.0, 40.0])
 def test_gyro_and_accelerometer_give_the_velocity(end_s):
     log, vel_w, rot = flown(end_s=end_s)
-    (found,) = by_inertia([log])
+    (found,) = posed([log])
     off = found.vel_w - vel_w
     assert np.sqrt((off**2).mean()) < 0.3
     lean = (rot.as_matrix()[:, :, 2] * found.rot_w[:, :, 2]).sum(axis=1)
@@ -68,7 +69,7 @@ def test_a_flight_may_begin_on_its_side():
     log = flown(end_s=2.0)[0]
     about_y = Rotation.from_euler("y", 90.0, degrees=True)
     turned = {"rate_b": about_y.apply(log.rate_b), "acc_b": about_y.apply(log.acc_b)}
-    (found,) = by_inertia([replace(log, **turned)])
+    (found,) = posed([replace(log, **turned)])
     force_w = (found.rot_w[0] @ turned["acc_b"][:10].mean(axis=0)) / 9.81
     assert force_w == pytest.approx([0.0, 0.0, 1.0], abs=0.1)
 
@@ -116,6 +117,6 @@ def test_a_rate_loop_faster_than_the_log_does_not_look_like_inertia():
     log = fly(vehicle, 0, duration_s=4.0, noise=0.0, motors=True)
     space = make_space(vehicle)
     model, smoothed = ForceModel(vehicle, space, voltage=False), ready([log], vehicle).smoothed
-    data = compare(TORQUE, model, space.array("start"), smoothed[TORQUE.name], [])
+    data = ViewEvidence(TORQUE, model, smoothed[TORQUE.name]).residuals(space.array("start"))
     share = (data.value * data.residual).sum(axis=0) / (data.value**2).sum(axis=0)
     assert share == pytest.approx([0.0] * 3, abs=0.0015)

@@ -1,8 +1,5 @@
 """The model on measured rows, weights of flights with a trim each, and slow and fast changes."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -22,14 +19,14 @@ from suite.diagnose.evidence.moments import (
     ForceModel,
     ViewData,
     Weights,
-    compare,
+    fast_changes_agree,
     fast_share,
     successive_changes,
     validation_groups,
     weights_of,
     whitened,
 )
-from suite.diagnose.evidence.views import fast_changes_agree
+from suite.diagnose.evidence.views import ViewEvidence
 from suite.diagnose.thresholds import THRESHOLDS
 from tests.support.real_flights import VEHICLE, flights
 
@@ -48,11 +45,12 @@ def made(rng, count=6, moments=200, trim=(0.5, 0.0, 2.0), scatter=0.3):
 def test_slopes_are_those_of_finite_differences():
     model, theta = ForceModel(VEHICLE, SPACE, False), SPACE.array("start")
     smoothed = ready(flights(1, duration_s=4.0), VEHICLE).smoothed[FORCE.name]
-    first = compare(FORCE, model, theta, smoothed)
+    evidence = ViewEvidence(FORCE, model, smoothed)
+    first = evidence.residuals(theta, None)
     for index in (0, 10, 25):
         moved = theta.copy()
         moved[index] += 1e-5
-        change = compare(FORCE, model, moved, smoothed).value - first.value
+        change = evidence.residuals(moved).value - first.value
         assert np.allclose(change / 1e-5, first.slope[..., index], atol=1e-4, rtol=1e-3)
 
 
@@ -111,7 +109,7 @@ def data_of(residual, slope):
     return ViewData(flight, middle_s, slope, residual, slope[..., None], none)
 
 
-def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, np.ndarray]:
+def fitted(slow, *, closed_loop, seed=0) -> tuple[ViewData, np.ndarray]:
     """Return the fit of a thrust scale under motors that answer a slow force, or less thrust."""
     rng = np.random.default_rng(seed)
     slow = slow * gaussian_filter1d(rng.standard_normal((ROWS, 3)), 20.0, axis=0) * 8.0
@@ -120,15 +118,14 @@ def fitted(slow, *, closed_loop, seed=0) -> tuple[Any, np.ndarray]:
     measured = motors + slow if closed_loop else 0.6 * motors
     lacks = measured + 0.1 * noise - motors
     away = float((lacks * motors).sum() / (motors**2).sum())
-    data = data_of(lacks - away * motors, motors)
-    return SimpleNamespace(along=(0,), data=data), np.array([away])
+    return data_of(lacks - away * motors, motors), np.array([away])
 
 
 @pytest.mark.parametrize("slow", [1.0, 3.0])
 def test_a_slow_force_that_motors_answer_is_no_weak_thrust(slow):
     found, away = fitted(slow, closed_loop=True)
     assert away[0] < -0.3, "it does look like less thrust"
-    share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
+    share, half_width = fast_share(found, [0], away, THRESHOLDS)
     assert share + half_width < 0.3
     assert not fast_changes_agree(found, [0], away, THRESHOLDS)
 
@@ -136,7 +133,7 @@ def test_a_slow_force_that_motors_answer_is_no_weak_thrust(slow):
 def test_less_thrust_is_so_for_slow_and_fast_changes():
     found, away = fitted(1.0, closed_loop=False)
     assert away[0] == pytest.approx(-0.4, abs=0.02)
-    share, half_width = fast_share(found.data, [0], away, THRESHOLDS)
+    share, half_width = fast_share(found, [0], away, THRESHOLDS)
     assert share == pytest.approx(1.0, abs=3.0 * half_width) and half_width < 0.1
     assert fast_changes_agree(found, [0], away, THRESHOLDS)
 
@@ -151,5 +148,5 @@ def test_changes_reach_across_no_hole_and_no_two_flights():
     np.testing.assert_array_equal(found.slope, 0.0)
     # Means of flights have no changes, which contradicts nothing.
     fit, away = fitted(1.0, closed_loop=True)
-    means: Any = SimpleNamespace(along=(0,), data=ViewData(*(f[[0, -1]] for f in fit.data)))
+    means = ViewData(*(field[[0, -1]] for field in fit))
     assert fast_changes_agree(means, [0], away, THRESHOLDS)
