@@ -81,7 +81,9 @@ def test_what_killed_processes_left_is_swept_and_what_is_being_written_stays(tmp
     assert alive.exists() and other.exists() and not dead.exists() and not older.exists()
 
 
-@pytest.mark.parametrize(("writer", "alive"), [(DEAD, False), (os.getpid(), True)])
+@pytest.mark.parametrize(
+    ("writer", "alive"), [(DEAD, False), (os.getpid(), True)], ids=["dead", "alive"]
+)
 def test_a_whole_folder_left_aside_is_put_in_place_unless_its_writer_lives(tmp_path, writer, alive):
     part = part_of(tmp_path, "state", f"{writer}-", "replaced", "state/new")
     files.sweep_parts(tmp_path)
