@@ -42,10 +42,13 @@ def test_others_are_refused_with_what_is_allowed(text):
 
 
 class Stubborn(ValueError):
-    """One that cannot be made of what it says, so that it cannot travel."""
+    """An error that cannot be pickled, so that it cannot travel."""
 
     def __init__(self, name, value):
         super().__init__(f"{name} is {value}")
+
+    def __reduce__(self):
+        raise TypeError("cannot be pickled")
 
 
 def test_an_error_travels_with_where_it_came_up():
