@@ -15,7 +15,8 @@ import pytest
 from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
 from eval.envs.gymnasium_env import ID, RaceEnv, RaceVectorEnv
 from eval.envs.race import ACTION_LIMIT
@@ -265,6 +266,28 @@ def test_environments_and_vehicles_travel(copied):
     assert np.array_equal(first["image"], second["image"])
     assert again.render().shape == (360, 640, 3) and again.render().max() > 0
     assert copied(RaceVectorEnv(2, rules=SHORT)).num_envs == 2
+
+
+@pytest.mark.slow
+def test_processes_fly_what_one_process_flies():
+    def make():
+        return RaceEnv(track="circular", level=3, rules=SHORT)
+
+    # A process that has loaded JAX runs threads, and must not be forked.
+    envs = AsyncVectorEnv([make, make], context="spawn"), SyncVectorEnv([make, make])
+    firsts = [env.reset(seed=4)[0] for env in envs]
+    assert not np.array_equal(firsts[0]["image"][0], firsts[0]["image"][1])
+    for _ in range(3):
+        one, other = (env.step(np.full((2, 3), 0.1, np.float32))[0] for env in envs)
+        assert all(np.array_equal(one[key], other[key]) for key in one)
+    for env in envs:
+        env.close()
+
+
+def test_wrappers_flatten_and_stack_observations():
+    env = FrameStackObservation(FlattenObservation(RaceEnv(rules=SHORT)), 2)
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (2, 12 + 24 * 32) and env.observation_space.contains(seen)
 
 
 sb3 = pytest.mark.skipif(

@@ -141,6 +141,13 @@ def test_mistakes_of_unit_are_reported_from_the_flights(change, action, fault):
     assert found["decisions"] >= 5 and (found["limited"] > 0.5) == (fault == "action_limited")
 
 
+def test_a_scaled_policy_flies_as_the_plain_one():
+    plain = flown(Changed(lambda a: a))
+    scaled = flown(Changed(lambda a: a / 20, PolicySpec(action=ActionSpec(scale=(20.0,)))))
+    assert scaled.gates_passed == plain.gates_passed
+    assert scaled.pos_x == pytest.approx(plain.pos_x, abs=1e-4)
+
+
 def test_a_vehicle_too_heavy_to_climb_is_no_gravity_in_the_action():
     heavy = replace(VEHICLE, mass=2.7 * VEHICLE.mass)
     result = flown(Pursuit(), rules=Rules(time_limit_s=3.0), vehicle=heavy)
