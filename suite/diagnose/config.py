@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from suite.common.options import Advanced, Command
+from suite.diagnose.thresholds import THRESHOLDS
 from tracks.input.ranges import Range, Seed
 
 
@@ -31,7 +32,9 @@ class Config(Command):
     integrator: Advanced[Literal["auto", "continuous", "euler"]] = "auto"
     """How the flights were made: continuous (every real flight) or euler (MuJoCo's steps of the
     rate loop's period); auto reads it from the logs."""
-    relevance: Advanced[Annotated[tuple[float, float, float], Range(0.0, 1e6)]] = (0.05, 0.5, 0.025)
+    relevance: Advanced[Annotated[tuple[float, float, float], Range(0.0, 1e6)]] = (
+        THRESHOLDS.relevance
+    )
     """Thresholds of practical relevance: force [m/s^2], torque over inertia [rad/s^2], drift after
     a second [m]. An effect below all three is left out. 0 0 0 reports everything significant."""
     plan: bool = False
