@@ -41,3 +41,8 @@ def fly_on(policy, *tracks, vehicle, world="mujoco", seeds=(0,), record=None, **
         lambda result, flight: flights.update({result.trial: flight}), record, named,
     )  # fmt: skip
     return results, [flights[trial] for trial in trials]
+
+
+def end_of(result):
+    """Return the position (x, y, z) at the end of a trial [m]."""
+    return [result.pos_x, result.pos_y, result.pos_z]

@@ -28,6 +28,7 @@ from eval.view import colours
 from eval.worlds.trial import Rules, TrialSpec
 from policies.contract import read_contract
 from policies.spec import PolicySpec
+from tests.support.courses import end_of
 from tests.support.pilots import Pursuit
 from tests.support.pixels import share
 from tracks.geometry.camera import Camera
@@ -102,9 +103,8 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
         over, total = terminated or truncated, total + reward
     assert (info["gates"], info["ended_by"]) == (expected.gates_passed, expected.ended_by)
     assert terminated == (expected.ended_by != "timeout")
-    end = np.array(expected[10:13])
     # The action was divided and multiplied on its way.
-    assert env._races._world.progress.pos_w[0] == pytest.approx(end, abs=1e-5)
+    assert env._races._world.progress.pos_w[0] == pytest.approx(end_of(expected), abs=1e-5)
 
     if spec is not EVEN:  # dm_control's period is one number of steps
         return
@@ -115,7 +115,7 @@ def test_environments_fly_what_the_judge_flies(trial, spec):
         step = other.step(pursue(policy, step.observation))
         summed += step.reward
     assert step.discount == (1.0 if expected.ended_by == "timeout" else 0.0)
-    assert np.array_equal(other.physics.race.progress.pos_w[0], end)
+    assert np.array_equal(other.physics.race.progress.pos_w[0], end_of(expected))
     assert summed == pytest.approx(total, abs=1e-4)
 
 

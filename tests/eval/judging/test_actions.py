@@ -14,7 +14,7 @@ from eval.worlds.trial import Rules
 from policies.block_policy import BlockPolicy
 from policies.policy import load_policy
 from policies.spec import ActionSpec, PolicySpec
-from tests.support.courses import fly_on, straight
+from tests.support.courses import end_of, fly_on, straight
 from tests.support.pilots import Pursuit, Steady
 
 VEHICLE = load_vehicle("reference")
@@ -24,11 +24,6 @@ RULES = Rules(time_limit_s=1.5)
 def flown(policy, world="mujoco", track=None, rules=RULES, vehicle=VEHICLE):
     how = {"vehicle": vehicle, "world": world, "slots": 1, "workers": 1, "rules": rules}
     return fly_on(policy, track or straight(), **how)[0][0]
-
-
-def end_of(result):
-    """Return the position at the end of a flight [m]."""
-    return [result.pos_x, result.pos_y, result.pos_z]
 
 
 def test_the_first_action_of_every_kind_carries_the_weight_and_turns_nothing():
@@ -109,8 +104,7 @@ def test_rates_turn_the_body_about_its_own_axes(axis, way):
     result = flown(policy, track=straight(height=30.0), rules=Rules(time_limit_s=0.6))
     lag_s = 1 / VEHICLE.controller.rate_gain[0] + VEHICLE.rotors.time_constant
     drift = GRAVITY * 0.5 * (0.6 - lag_s) ** 3 / 6
-    found = [result.pos_x, result.pos_y]
-    np.testing.assert_allclose(found, drift * np.array(way), atol=0.1 * drift)
+    np.testing.assert_allclose(end_of(result)[:2], drift * np.array(way), atol=0.1 * drift)
 
 
 @dataclass
