@@ -143,7 +143,7 @@ def _without_doubted(rows: dict[str, np.ndarray], finding: Finding) -> dict[str,
     doubt is read as its fix says, or left out where the fix is no reading.
     """
     signal = SIGNALS.get(finding.signal)
-    if finding.fault == "accelerometer_axes":
+    if finding.fault == "accelerometer_axes" and not {"pos", "quat"} <= rows.keys():
         return rows  # `check_gyro_signs` needs it to decide on the axes of the whole body
     if not finding.is_open or signal not in rows:
         return rows

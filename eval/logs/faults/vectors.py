@@ -15,7 +15,7 @@ from eval.importers.frames import conjugate, rotate
 from eval.logs.faults.finding import Finding, unseen
 from eval.logs.faults.pose import CALM_RATE, WIDTH_S, Rows, turns_of
 from eval.logs.faults.reading import option, read_as
-from eval.logs.faults.relation import LEAST, Match, match, pooled_scale, rms, smooth
+from eval.logs.faults.relation import LEAST, SEEN, Match, match, pooled_scale, rms, smooth
 from eval.logs.velocity import velocity_from_position
 
 DEG = float(np.pi / 180.0)
@@ -55,6 +55,9 @@ CALM_SPEED = 0.3
 GOOD, BAD, TIMES_BETTER = 0.35, 0.6, 2.0
 """Relative residuals: a signal fits below the first and does not fit above the second. Another
 reading must lower the residual by the third factor."""
+SIGNS = {"": "", "-x,-y,-z": "of the other sign", "x,-y,-z": "in forward-right-down axes",
+         "-x,y,z": "with axes -x,y,z", "x,-y,z": "with axes x,-y,z"}  # fmt: skip
+"""Signs of an accelerometer's axes that a mistake could have made -> in words."""
 SIMPLER = 0.03
 """Penalty on the relative residual of an accelerometer's unusual readings, so that the usual ones
 are chosen where both fit."""
@@ -263,7 +266,7 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
     readings = {
         (steps, scale): smooth(time_s, read_as("acc", acc, steps or "1", lambda: quat), WIDTH_S)
         / scale
-        for steps in ("", "-x,-y,-z", "x,-y,-z", "-x,y,z", "x,-y,z", "from-world", "plus-gravity")
+        for steps in (*SIGNS, "from-world", "plus-gravity")
         for scale in {1.0, factor}
         if steps != "plus-gravity" or scale == 1.0
     }
@@ -295,17 +298,43 @@ def check_accelerometer(rows: Rows, body_is_frd: bool = False) -> list[Finding]:
         text = f"{figures}, and no unit, sign or frame of it fits"
         return [Finding("doubt", "accelerometer", text, "accelerometer_unit", ratio, sure)]
     steps, scale = best
-    words = {"": "", "-x,-y,-z": "of the other sign", "x,-y,-z": "in forward-right-down axes",
-             "from-world": "in world axes", "plus-gravity": "without gravity"}  # fmt: skip
+    words = {**SIGNS, "from-world": "in world axes", "plus-gravity": "without gravity"}
     reasons = [unit] if scale != 1.0 else []
-    reasons += [words.get(steps, f"with axes {steps}")] if steps else []
+    reasons += [words[steps]] if steps else []
     text = f"{figures}, but by {100 * residual[best]:.0f} % if it is {' and '.join(reasons)}"
     fault = "accelerometer_unit" if scale != 1.0 else "accelerometer_axes"
     fault = "accelerometer_gravity" if steps == "plus-gravity" else fault
     parts = [f"{1.0 / scale:.10g}"] if scale != 1.0 else []
     fix = option(("acc", "+".join([*parts, *([steps] if steps else [])])))
     size_ = scale if scale != 1.0 else None
+    others = [] if body_is_frd and steps == first else _same_fit(steps, readings[best], force)
+    if others:
+        text = f"{text}; {' or '.join(words[other] for other in others)} fits as well"
+        fix = f"{fix} if it is {words[steps]}, or {', or '.join(others)}"
+        return [Finding("doubt", "accelerometer", text, fault, size_, 0.95, fix)]
     return [Finding("corrected", "accelerometer", text, fault, size_, 0.98, fix)]
+
+
+def _same_fit(steps: str, acc: np.ndarray, force: np.ndarray) -> list[str]:
+    """Return the signs of the axes, other than `steps`, that fit the flight as well.
+
+    They differ only along axes on which the force is too small to show a sign. Along body x and y
+    it consists of drag alone.
+
+    Args:
+        steps: a key of `SIGNS`; others have no alternatives.
+        acc: (T, 3) accelerometer, read with these signs [m/s^2].
+        force: (T, 3) force per mass along the path [m/s^2].
+    """
+    if not steps or steps not in SIGNS:
+        return []
+    rows = np.isfinite(acc).all(axis=1) & np.isfinite(force).all(axis=1)
+    acc, force = acc[rows], force[rows]
+    size = np.sqrt(np.sum(acc**2, axis=0) * np.sum(force**2, axis=0))
+    seen = np.sum(acc * force, axis=0) > SEEN * size
+    here = np.array(steps.split(","))
+    differs = {other: here != other.split(",") for other in SIGNS if other not in ("", steps)}
+    return [other for other, changed in differs.items() if not (changed & seen).any()]
 
 
 def _unit_of(ratio: float, within: float) -> tuple[str, float]:

@@ -1,9 +1,11 @@
 """Every kind of fault is named, its fix restores the flight, and good flights stay as they are."""
 
+import re
 from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from eval.logs.faults.catalogue import FAULTS
 from eval.logs.faults.check import CLOCK, DRIVE, POSE, CheckContext, check_files, run_checks
@@ -76,6 +78,24 @@ def test_a_fault_is_named_and_its_fix_restores_the_flight(name):
                 np.testing.assert_allclose(alike, 1.0, atol=1e-9)
             else:
                 np.testing.assert_allclose(fixed[signal], right[signal], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("end", [8.0, 12.0, 16.0])
+@pytest.mark.parametrize("wrong", ["acc=-x,-y,-z", "acc=x,-y,-z"])
+def test_an_axis_without_force_does_not_show_its_sign(wrong, end):
+    right = good(end=end)
+    findings, readings = checked(read_rows(right, parse_readings((wrong,))))
+    assert named(findings) == {"accelerometer_axes"} and not readings
+    (finding,) = (f for f in findings if f.is_open)
+    assert {"-x,-y,-z", "x,-y,-z"} <= set(re.split("[ =]", finding.fix))
+    # In a body that is pitched by 10 degrees, thrust has a part along x, which shows its sign.
+    pitch = Rotation.from_euler("y", 10.0, degrees=True)
+    flown = Rotation.from_quat(right["quat"], scalar_first=True)
+    right["quat"] = (flown * pitch).as_quat(scalar_first=True)
+    right |= {name: pitch.inv().apply(right[name]) for name in ("acc", "rate", "cmd_rate")}
+    wrong_rows = read_rows(right, parse_readings((wrong,)))
+    _, readings = checked(wrong_rows)
+    np.testing.assert_allclose(read_rows(wrong_rows, readings)["acc"], right["acc"])
 
 
 @pytest.mark.parametrize("seed", range(3))
