@@ -62,26 +62,25 @@ def float64():
         yield
 
 
-def folder_of(path: Path) -> str:
-    """Return the folder that a test is run with: one of `TOGETHER`, or the one it is in."""
-    folder = path.relative_to(ROOT / "tests").parent.as_posix()
-    inside = [one for one in TOGETHER if folder == one or folder.startswith(f"{one}/")]
-    return max(inside, key=len, default=folder)
+def run_with(path: Path) -> str:
+    """Return what a test file is run with: a folder of `TOGETHER`, or the file alone."""
+    name = path.relative_to(ROOT / "tests").as_posix()
+    return max((one for one in TOGETHER if name.startswith(f"{one}/")), key=len, default=name)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the folders that take longest first."""
+    """Run the folders that take longest first, and single files last: they end at one time."""
     order = {name: number for number, name in enumerate(TOGETHER)}
-    items.sort(key=lambda item: order.get(folder_of(item.path), len(order)))
+    items.sort(key=lambda item: order.get(run_with(item.path), len(order)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Run a folder's tests in one process with `--dist loadgroup`; pytest 9.2 ignores marks."""
+    """Share folders and files among processes with `--dist loadgroup`; pytest 9.2 ignores marks."""
     from xdist.scheduler import LoadScopeScheduling
 
-    class FolderScheduling(LoadScopeScheduling):
+    class SharedScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return folder_of(ROOT / nodeid.partition("::")[0])
+            return run_with(ROOT / nodeid.partition("::")[0])
 
-    return FolderScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
+    return SharedScheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
