@@ -40,17 +40,14 @@ def features(worlds: Worlds, body: DynamicsState, target: jax.Array) -> jax.Arra
     at which the gate's plane is reached at constant velocity; the opening's width; the number of
     remaining gates (up to 2); and the commanded speed, if the policy has that input.
 
-    F is `feature_count`. Gates and obstacles are evaluated without gradient.
+    F is `feature_count`.
     """
     gates = worlds.scene.gates
     gate, _ = target_gate(gates, target)
     following, _ = target_gate(gates, target, ahead=1)
     times = jnp.asarray(AHEAD_S)[:, None]
     path_w = body.pos_w[:, None] + times * body.vel_w[:, None]
-    fixed_w = jax.lax.stop_gradient(path_w)
-    distance, away_w = nearest_obstacle(worlds.scene, fixed_w, NEAR)
-    # The second term is 0 in value; it gives the distance its gradient, as in `gap_beyond`.
-    distance = distance + ((path_w - fixed_w) * away_w).sum(-1)
+    distance, away_w = nearest_obstacle(worlds.scene, path_w, NEAR)
     pos_g = to_local(gate.rot_w, body.pos_w - gate.center_w)
     vel_g = to_local(gate.rot_w, body.vel_w)
     half_width = gate.opening_g.max((1, 2))[:, None]
