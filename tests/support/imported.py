@@ -21,16 +21,8 @@ def flight(hz=200.0, end=8.0, noise=0.0, seed=0):
     """The columns of a good table as arrays by signal."""
     truth = known_flight.fly(np.arange(0, end, 1 / hz))
     rng = np.random.default_rng(seed)
-    parts = {
-        "time": truth.time,
-        "pos": truth.pos,
-        "quat": truth.quat,
-        "vel": truth.vel,
-        "rate": truth.rate,
-        "acc": truth.acc,
-        "cmd_thrust": truth.thrust[:, None],
-        "cmd_rate": truth.cmd_rate,
-    }
+    same = ("time", "pos", "quat", "vel", "rate", "acc", "cmd_rate")
+    parts = {name: getattr(truth, name) for name in same} | {"cmd_thrust": truth.thrust[:, None]}
     if noise:
         sizes = {"pos": 0.003, "vel": 0.05, "rate": 0.05, "acc": 0.5, "quat": 0.0015}
         for name, size in sizes.items():

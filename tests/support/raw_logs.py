@@ -15,7 +15,7 @@ FIELDS = (
 )
 
 
-def write_raw(path, truth, fine=10, poles=12, dead=0):
+def write_raw(path, truth, fine=10, poles=12):
     """Write a raw Blackbox log of whole (I) frames, each field as a zigzag variable byte."""
     degrees = np.rad2deg(1.0)
     erpm = truth.motor[:, [1, 0, 2, 3]] * 60 / (2 * np.pi) * poles / 2 / 100

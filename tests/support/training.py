@@ -25,14 +25,8 @@ from tracks.geometry.scene import Boxes, Gates, Rods, Scene, Spheres
 
 SPEC = PolicySpec(camera=Camera(width=20, height=20), hidden_size=8)
 KEY = jax.random.key(5)
-ALIKE = {
-    "mass_std": 0.0,
-    "lag_spread": 0.0,
-    "drag_spread": 0.0,
-    "delay_spread_s": 0.0,
-    "gain_spread": 0.0,
-    "wind_std": (0.0, 0.0, 0.0),
-}
+SPREADS = ("mass_std", "lag_spread", "drag_spread", "delay_spread_s", "gain_spread")
+ALIKE = {**dict.fromkeys(SPREADS, 0.0), "wind_std": (0.0, 0.0, 0.0)}
 """Settings of a quadrotor whose worlds all have the vehicle file's."""
 
 

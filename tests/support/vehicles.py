@@ -25,14 +25,9 @@ PLAIN = Vehicle(
     controller=Controller(rate_gain=(20.0, 20.0, 8.0), frequency=500.0),
 )
 """Rotors without lag, no effects."""
+FIRMWARES = {"kind": "crazyflie", "settings": KINDS["crazyflie"].Settings()}
 REMEMBERING = replace(
-    PLAIN,
-    controller=replace(
-        PLAIN.controller,
-        kind="crazyflie",
-        settings=KINDS["crazyflie"].Settings(),
-        rate_gain=(1.0, 1.0, 1.0),
-    ),
+    PLAIN, controller=replace(PLAIN.controller, rate_gain=(1.0, 1.0, 1.0), **FIRMWARES)
 )
 """With a firmware's rate loop: integrators and filters that no log tells of."""
 

@@ -20,8 +20,6 @@ from tests.support.faults import ImuFault, with_imu_fault
 from tests.support.vehicles import PLAIN, at_rest, drawn_effects, with_effects, with_lag
 from tracks.geometry.rotation import exp_rot
 
-# All four rotors at 1000 rad/s push 1.6 N each; their torques about z cancel.
-SPEED = np.full(4, 1000.0)
 MOVING = Motion(np.zeros(3), np.eye(3), np.array([3.0, -2.0, 1.0]), np.array([1.0, 2.0, -0.5]))
 
 
@@ -84,9 +82,6 @@ def test_an_effect_of_another_package_may_have_a_motion_of_its_own(monkeypatch, 
     assert not WHEEL.nameable and not WHEEL.by_state, "no stretch of a flight can begin with it"
     with pytest.raises(ValueError, match="effects.* motion of its own.*leave it out"):
         plant_step(plant, state._replace(carried={}), motion, inputs, 0.0)
-
-
-FAULT = ImuFault((0.0, 0.0, 0.2), 1.1, 0.01)
 
 
 def test_a_shifted_series_goes_on_beyond_its_ends_as_it_began_and_ended():

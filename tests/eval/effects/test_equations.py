@@ -92,12 +92,9 @@ def test_drags_take_the_true_mass():
 
 
 def test_ground_effect():
-    low = at_rest(0.05)
-    # g (r / 4 z)^2 = (0.0635 / 0.2)^2 = 0.10080625
-    near(added(low, ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 6.4 * (1 / 0.89919375 - 1)])
-    # Capped at a factor of 1.5, also on and below the ground.
-    near(added(at_rest(0.01), ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 3.2])
-    near(added(at_rest(-0.2), ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, 3.2])
+    """By g (r / 4 z)^2 = (0.0635 / 0.2)^2 = 0.10080625; at most 1.5, also on and below ground."""
+    for height, push in ((0.05, 6.4 * (1 / 0.89919375 - 1)), (0.01, 3.2), (-0.2, 3.2)):
+        near(added(at_rest(height), ground_effect=(1.0, 0.0635))[0], [0.0, 0.0, push])
 
 
 def test_ground_effect_is_felt_by_each_rotor_at_its_own_height():
@@ -113,6 +110,8 @@ def test_ground_effect_is_felt_by_each_rotor_at_its_own_height():
 
 def test_constant_wind_acts_through_drag_only():
     near(added(constant_wind=((1.0, 0.0, 0.0),))[0], 0.0)
+    # Gusts without random numbers are absent.
+    near(added(gusts=(2.0, 4.0), linear_drag=((0.3, 0.2, 0.1),))[0], [-0.675, 0.3, -0.075])
     still = Motion(np.zeros(3), YAWED, np.zeros(3), np.zeros(3))
     wind: dict[str, Any] = {"constant_wind": ((1.0, 0.0, 0.5),), "linear_drag": ((0.3, 0.2, 0.1),)}
     # Facing world y, the wind along world x comes from the left and blows to the right.
@@ -141,10 +140,6 @@ def test_gusts_have_their_intensity_colour_and_mean():
     # At 8 m/s of airspeed the wind of 4 m length forgets itself in 0.5 s, here 25 steps.
     kept = (winds[25:] * winds[:-25]).mean(axis=(0, 1)) / (winds**2).mean(axis=(0, 1))
     np.testing.assert_allclose(kept, np.exp(-1.0), atol=0.05)
-
-
-def test_gusts_without_noise_are_absent():
-    near(added(gusts=(2.0, 4.0), linear_drag=((0.3, 0.2, 0.1),))[0], [-0.675, 0.3, -0.075])
 
 
 def test_motor_lag_replaces_the_time_constant():
@@ -184,25 +179,20 @@ def test_battery_sag():
     near(wrench(by_voltage, time_s=50.0).force_b[2], 6.4 * 0.95)
 
 
-def test_mass_offset():
-    plant = make_plant(with_effects(mass_offset=(0.1,)), 0.002)
-    hover = Command(np.array(9.81), np.zeros(3))
-    _, acting = plant_step(plant, hover_state(plant, ()), at_rest(), Inputs(hover), 0.0)
-    acc, _ = accelerations(plant, at_rest(), acting)
-    near(acc, [0.0, 0.0, 9.81 * 0.75 / 0.85 - 9.81])
-
-
-def test_inertia_scale_and_rate_gain():
+def test_mass_offset_inertia_scale_and_rate_gain():
     start, command = at_rest(), Command(np.array(9.81), np.array([1.0, -1.0, 0.5]))
-    cases: list[tuple[dict[str, Any], list[float]]] = [
-        ({}, [20.0, -20.0, 4.0]),
-        ({"inertia_scale": ((0.8, 1.25, 2.0),)}, [25.0, -16.0, 2.0]),
-        ({"rate_gain": ((0.5, 1.5, 2.0),)}, [10.0, -30.0, 8.0]),
+    cases: list[tuple[dict[str, Any], float, list[float]]] = [
+        ({}, 0.0, [20.0, -20.0, 4.0]),
+        ({"mass_offset": (0.1,)}, 9.81 * 0.75 / 0.85 - 9.81, [20.0, -20.0, 4.0]),
+        ({"inertia_scale": ((0.8, 1.25, 2.0),)}, 0.0, [25.0, -16.0, 2.0]),
+        ({"rate_gain": ((0.5, 1.5, 2.0),)}, 0.0, [10.0, -30.0, 8.0]),
     ]
-    for effects, expected in cases:
+    for effects, climb, turn in cases:
         plant = make_plant(with_effects(**effects), 0.002)
         _, acting = plant_step(plant, hover_state(plant, ()), start, Inputs(command), 0.0)
-        near(accelerations(plant, start, acting)[1], expected)
+        found = accelerations(plant, start, acting)
+        near(found[0], [0.0, 0.0, climb])
+        near(found[1], turn)
 
 
 def test_gyroscopic_terms_of_the_true_inertia():
@@ -213,10 +203,8 @@ def test_gyroscopic_terms_of_the_true_inertia():
 
 
 def test_rotors_that_turn_as_their_command_says_push_nothing_by_spinning_up():
-    plant = make_plant(with_effects(rotor_spin_up=(1e-5,)), 0.002)
-    still = Motion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-    inputs = Inputs(command=Command(np.asarray(9.81), np.zeros(3)))
-    near(plant_step(plant, hover_state(plant, ()), still, inputs, 0.0)[1].torque_b, 0.0)
+    hover, spinning = Command(np.asarray(9.81), np.zeros(3)), with_effects(rotor_spin_up=(1e-5,))
+    near(wrench(spinning, at_rest(), None, command=hover).torque_b, 0.0)
 
 
 def test_weak_motors_are_written_by_their_numbers():

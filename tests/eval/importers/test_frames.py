@@ -121,14 +121,11 @@ def test_full_throttle_is_what_is_told_or_built_or_felt(felt, options, full, by)
 
 
 @pytest.mark.parametrize("found", [thrust_rows(), thrust_rows(25.0, count=50)])
-def test_where_nothing_tells_the_scale_thrust_is_left_out(found):
+def test_where_nothing_tells_the_scale_thrust_is_left_out_and_one_that_is_there_stays(found):
     (finding,) = thrust_command(found, ImportOptions())
     assert "cmd_thrust" not in found and finding.status == "doubt"
     assert "give --vehicle FILE or --full-thrust" in finding.evidence
-
-
-def test_a_thrust_that_is_there_stays():
-    found = thrust_rows() | {"cmd_thrust": np.ones((200, 1))}
+    found["cmd_thrust"] = np.ones((len(found["throttle"]), 1))
     assert thrust_command(found, ImportOptions(full_thrust=20.0)) == []
     assert (found["cmd_thrust"] == 1.0).all()
 
@@ -146,13 +143,10 @@ def motor_rows():
     return {"motor": np.array([[10.0, 20.0, 30.0, 40.0]]), "motor_cmd": np.array([[1.0, 2, 3, 4]])}
 
 
-def test_without_places_the_order_stays():
+def test_places_in_any_unit_set_the_order_the_vehicles_own_before_the_shipped_ones():
     found = motor_rows()
     assert order_motors(found, None, None) == [] == order_motors({}, SHIPPED_ORDER, None)
     np.testing.assert_array_equal(found["motor"], [[10, 20, 30, 40]])
-
-
-def test_places_in_any_unit_set_the_order_the_vehicles_own_before_the_shipped_ones():
     backwards = tuple((90.0 * x, 70.0 * y) for x, y in reversed(SHIPPED_ORDER))
     hubs = PLAIN.rotors.position
     turned = replace(PLAIN.rotors, position=(hubs[1], hubs[2], hubs[3], hubs[0]))

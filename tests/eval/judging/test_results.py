@@ -59,15 +59,11 @@ def test_journal_resumes_after_a_kill(tmp_path):
     with Journal(path, about) as journal:
         assert list(journal.done.values()) == ROWS
     assert path.read_bytes().startswith(whole)
-
-
-def test_journal_cut_within_its_first_line_starts_again(tmp_path):
-    path = tmp_path / JOURNAL
-    path.write_text('{"about": {"pol')
-    with Journal(path, {"policy": "ours"}) as journal:
+    path.write_text('{"about": {"pol')  # killed within the first line
+    with Journal(path, about) as journal:
         assert not journal.done
         journal.append(ROWS[0])
-    with Journal(path, {"policy": "ours"}) as journal:
+    with Journal(path, about) as journal:
         assert list(journal.done) == [TrialSpec("zigzag", 3, 0)]
 
 
@@ -129,14 +125,11 @@ def test_paired_differences_are_on_the_same_trials():
     assert "theirs - ours" in markdown_table(summary)
 
 
-def test_cells_do_not_depend_on_what_else_is_in_the_table():
+def test_cells_do_not_depend_on_what_else_is_in_the_table_and_count_late_answers():
     lost = result(5, False, difficulty=1)
     none, beside = summarise([lost, *ROWS])["cells"]
     assert beside == summarise(ROWS)["cells"][0]
     assert math.isnan(none.lap_s.value), "no trial of the other cell was finished"
-
-
-def test_late_answers_are_counted_beside_the_endings():
     late = [result(seed, False)._replace(ended_by="timeout", late_actions=1) for seed in (7, 8)]
     summary = summarise([*ROWS, *late])
     (cell,) = summary["cells"]

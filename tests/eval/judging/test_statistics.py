@@ -51,11 +51,8 @@ def test_paired_success_published(table, value, low, high):
     first, second = pairs(*table)
     turned = paired_success(second, first)
     assert turned[:3] == pytest.approx((-found.value, -found.high, -found.low))
-
-
-def test_paired_success_without_discordance_still_has_width():
-    found = paired_success(*pairs(10, 0, 0, 0))
-    assert found.value == 0 and found.low < 0 < found.high and found.p_value == 1
+    none = paired_success(*pairs(10, 0, 0, 0))
+    assert none.value == 0 and none.low < 0 < none.high and none.p_value == 1
 
 
 @pytest.mark.parametrize(

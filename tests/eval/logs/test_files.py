@@ -126,15 +126,13 @@ def test_a_log_of_too_many_rows_is_refused_unread(tmp_path, kind, monkeypatch):
         read_flight(path)
 
 
-def test_of_more_cells_than_fit_only_known_columns_are_read(tmp_path, monkeypatch):
+def test_of_more_cells_than_fit_only_known_columns_are_read_or_all_are_refused(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(files, "MOST_CELLS", 1000)
     table = {"time": np.zeros(400)} | {f"u{k}": np.zeros(400) for k in range(26)}
     read, _, warnings = files.read_columns(write_table(tmp_path / "wide.parquet", table))
     assert list(read) == ["time"] and "26 of 27 columns are left out" in warnings[0]
-
-
-def test_more_cells_than_fit_are_refused_by_their_number(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "MOST_CELLS", 1000)
     for kind in KINDS:
         path = write_table(tmp_path / f"in.{kind}", columns())
         with pytest.raises(FlightLogError, match=r"15. rows of \d+ columns; at most 1,000"):
@@ -227,12 +225,8 @@ def test_values_at_the_limits_are_taken():
     log = log_from_columns(table, {}, "a")
     np.testing.assert_allclose(np.linalg.norm(log.quat_wxyz, axis=1), 1, atol=1e-12)
     assert log.pos_w[0, 2] == 100e3
-
-
-def test_rows_are_counted_as_in_the_file_where_some_have_no_time():
-    table = columns()
-    table["time"][:3] = np.nan
-    table["rate_z"][10] = 500
+    # Rows are counted as in the file, where some have no time.
+    table["time"][:3], table["rate_z"][10] = np.nan, 500
     with pytest.raises(FlightLogError, match="row 11"):
         log_from_columns(table, {}, "a")
 

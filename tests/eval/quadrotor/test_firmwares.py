@@ -10,20 +10,15 @@ import pytest
 from eval.quadrotor import loops
 from eval.quadrotor.loops import betaflight, crazyflie, px4
 from eval.quadrotor.loops.filters import Pair, butterworth, layout_of, pt1, settled
-from eval.quadrotor.plant import Command, Motion, make_plant
+from eval.quadrotor.plant import Command, make_plant
 from eval.quadrotor.stepper import Inputs, hover_state, rollout, step
 from eval.quadrotor.vehicle_file import load_vehicle, parse_vehicle, vehicle_table
+from tests.support.vehicles import at_rest
 
 LAYOUT = layout_of(load_vehicle("crazyflie21").rotors)
-UNFILTERED = replace(
-    betaflight.Settings(),
-    gyro_lpf1_static_hz=0.0,
-    gyro_lpf2_static_hz=0.0,
-    dterm_lpf1_static_hz=0.0,
-    dterm_lpf2_static_hz=0.0,
-    rc_smoothing_setpoint_cutoff=0.0,
-    iterm_relax_cutoff=0.0,
-)
+LOW_PASSES = [f"{of}_lpf{k}_static_hz" for of in ("gyro", "dterm") for k in (1, 2)]
+CUTOFFS = (*LOW_PASSES, "rc_smoothing_setpoint_cutoff", "iterm_relax_cutoff")
+UNFILTERED = betaflight.Settings(**dict.fromkeys(CUTOFFS, 0.0))
 PLAIN = replace(px4.Settings(), IMU_GYRO_CUTOFF=0.0, IMU_DGYRO_CUTOFF=0.0)
 DEFAULTS = {betaflight: UNFILTERED, crazyflie: crazyflie.Settings(), px4: PLAIN}
 RIGHT_LEFT, ROOT = np.array([-1.0, -1.0, 1.0, 1.0]), 2.0**-0.5
@@ -97,12 +92,9 @@ def test_two_looks_of_the_crazyflie_by_hand():
     I 500 x 0.021772396 = 10.886198, D -2.5 x 0.5729578 / 0.002 = -716.197: 583.844.
     """
     state = crazyflie.start((), np)
-    state, motor = look(crazyflie, state, 0.5, [0.1, 0.0, 0.0])
-    share = 0.5 * 1438.124 / 65535
-    np.testing.assert_allclose(motor, 0.5 + share * np.array([-1, -1, 1, 1]), atol=1e-7)
-    state, motor = look(crazyflie, state, 0.5, [0.1, 0.0, 0.0], [0.01, 0.0, 0.0])
-    share = 0.5 * 583.844 / 65535
-    np.testing.assert_allclose(motor, 0.5 + share * np.array([-1, -1, 1, 1]), atol=1e-7)
+    for rate_x, pwm in ((0.0, 1438.124), (0.01, 583.844)):
+        state, motor = look(crazyflie, state, 0.5, [0.1, 0.0, 0.0], [rate_x, 0.0, 0.0])
+        np.testing.assert_allclose(motor, 0.5 + 0.5 * pwm / 65535 * RIGHT_LEFT, atol=1e-7)
 
 
 def test_the_crazyflies_yaw_counts_whole_and_against_the_spin():
@@ -112,19 +104,17 @@ def test_the_crazyflies_yaw_counts_whole_and_against_the_spin():
     np.testing.assert_allclose(motor, 0.5 + share * np.array([-1, 1, -1, 1]), atol=1e-7)
 
 
-def test_the_crazyflies_limit_of_0_is_none_as_in_the_firmware():
-    free = crazyflie.Settings(roll_ilimit=0.0)
-    state = crazyflie.start((), np)._replace(integral=np.array([40.0, 0.0, 0.0]))
-    state, _ = look(crazyflie, state, 0.5, [0.1, 0.0, 0.0], STILL, free)
-    np.testing.assert_allclose(state.integral[0], 40.0 + 5.729578 * 0.002)
-
-
-def test_the_crazyflies_integral_is_limited_and_full_motors_lower_all():
-    state = crazyflie.start((), np)._replace(integral=np.array([33.2999, 0.0, 0.0]))
+def test_the_crazyflies_integral_is_limited_but_by_0_and_full_motors_lower_all():
+    start = crazyflie.start((), np)
+    state = start._replace(integral=np.array([33.2999, 0.0, 0.0]))
     state, motor = look(crazyflie, state, 0.95, [1.0, 0.0, 0.0])
     np.testing.assert_allclose(state.integral[0], 33.3)
     # P 14323.94 + I 16650 = 30973.94: 0.95 +- 0.236316, lowered by 0.186316.
     np.testing.assert_allclose(motor, [0.527368, 0.527368, 1.0, 1.0], atol=1e-5)
+    # A limit of 0 is none, as in the firmware.
+    free, state = crazyflie.Settings(roll_ilimit=0.0), start._replace(integral=np.array([40, 0, 0]))
+    state, _ = look(crazyflie, state, 0.5, [0.1, 0.0, 0.0], STILL, free)
+    np.testing.assert_allclose(state.integral[0], 40.0 + 5.729578 * 0.002)
 
 
 def test_three_looks_of_px4_by_hand():
@@ -141,32 +131,30 @@ def test_three_looks_of_px4_by_hand():
     np.testing.assert_allclose(motor, 0.5 + torque * ROOT * RIGHT_LEFT, atol=1e-9)
 
 
-def test_thrust_gives_way_to_roll_and_yaw_to_thrust():
-    """0.98 +- 0.0707: lowered by 0.0507. Full thrust with 0.1 of yaw: lowered by 0.1."""
-    given = px4.allocate(LAYOUT, np.asarray(0.98), np.array([0.1, 0.0, 0.0]))
-    np.testing.assert_allclose(given, 1.0 - 0.1 * ROOT * (1.0 - RIGHT_LEFT), atol=1e-9)
-    given = px4.allocate(LAYOUT, np.asarray(1.0), np.array([0.0, 0.0, 0.1]))
-    np.testing.assert_allclose(given, [0.8, 1.0, 0.8, 1.0], atol=1e-9)
-
-
-def test_without_airmode_no_thrust_is_added_for_roll():
-    """At 0.02 of thrust roll is taken back until the lowest motors are at zero: +-0.02."""
-    given = px4.allocate(LAYOUT, np.asarray(0.02), np.array([0.1, 0.0, 0.0]))
-    np.testing.assert_allclose(given, 0.02 + 0.02 * RIGHT_LEFT, atol=1e-9)
-
-
-def test_no_integral_of_px4_into_saturation():
-    state, _ = look(px4, None, 0.0, [1.0, 0.0, 0.0])
-    assert state.lost[0] > 0.1
-    after, _ = look(px4, state, 0.0, [1.0, 0.0, 0.0])
-    np.testing.assert_allclose(after.integral, state.integral)
+@pytest.mark.parametrize(
+    ("thrust", "torque", "motors"),
+    [
+        # 0.98 +- 0.0707: lowered by 0.0507. Full thrust with 0.1 of yaw: lowered by 0.1.
+        (0.98, [0.1, 0.0, 0.0], 1.0 - 0.1 * ROOT * (1.0 - RIGHT_LEFT)),
+        (1.0, [0.0, 0.0, 0.1], [0.8, 1.0, 0.8, 1.0]),
+        # Without airmode roll is taken back until the lowest motors are at zero.
+        (0.02, [0.1, 0.0, 0.0], 0.02 + 0.02 * RIGHT_LEFT),
+    ],
+)
+def test_thrust_gives_way_to_roll_and_yaw_to_thrust_and_none_is_added(thrust, torque, motors):
+    given = px4.allocate(LAYOUT, np.asarray(thrust), np.array(torque))
+    np.testing.assert_allclose(given, motors, atol=1e-9)
 
 
 def test_no_integral_of_px4_into_what_the_clip_takes_from_yaw():
     """Torque 0.54 at a thrust of 0.6: 1.14 and 0.06, lowered by 0.14 to 1 and -0.08, clipped to 0.
 
-    Of the 0.54 there are 0.5 left.
+    Of the 0.54 there are 0.5 left. Nor into a roll that no thrust allows.
     """
+    state, _ = look(px4, None, 0.0, [1.0, 0.0, 0.0])
+    assert state.lost[0] > 0.1
+    after, _ = look(px4, state, 0.0, [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(after.integral, state.integral)
     settings = replace(PLAIN, MC_YAWRATE_P=0.54)
     state, motor = look(px4, None, 0.6, [0.0, 0.0, 1.0], STILL, settings)
     np.testing.assert_allclose(motor, [0.0, 1.0, 0.0, 1.0], atol=1e-9)
@@ -234,20 +222,16 @@ def inputs(count, rate_b):
     return Inputs(command=Command(np.full(count, 9.81), rate))
 
 
-def still():
-    return Motion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-
-
 @pytest.mark.parametrize("kind", loops.KINDS)
 def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
     plant = make_plant(vehicle(kind), DT)
     given = inputs(160, [1.0, -0.7, 0.4])
-    state, motion, rates = hover_state(plant, ()), still(), []
+    state, motion, rates = hover_state(plant, ()), at_rest(), []
     for k in range(160):
         now = jax.tree.map(lambda value, k=k: value[k], given)
         state, motion, _ = step(plant, state, motion, now, k * DT)
         rates.append(motion.rate_b)
-    flown = jax.jit(rollout)(plant, still(), given)
+    flown = jax.jit(rollout)(plant, at_rest(), given)
     np.testing.assert_allclose(flown.motion.rate_b[1:], np.array(rates), atol=2e-3)
     np.testing.assert_allclose(rates[-1][:2], [1.0, -0.7], atol=0.3)
     assert rates[-1][2] > 0.05
@@ -261,13 +245,13 @@ def test_numpy_and_jax_fly_the_same_and_follow_the_rates(kind):
 def test_a_batch_flies_as_each_alone_and_has_gradients(kind):
     plant = make_plant(vehicle(kind), DT)
     given = inputs(60, [1.0, 0.0, 0.0])
-    motion = jax.tree.map(lambda v: np.stack([v, v]), still())
+    motion = jax.tree.map(lambda v: np.stack([v, v]), at_rest())
     motion = motion._replace(rate_b=np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     both = jax.tree.map(lambda v: np.stack([v, v], axis=1), given)
     flown = jax.jit(rollout)(plant, motion, both)
 
     def last(rate_x):
-        start = still()._replace(rate_b=jnp.array([rate_x, 0.0, 0.0]))
+        start = at_rest()._replace(rate_b=jnp.array([rate_x, 0.0, 0.0]))
         rate_b = rollout(plant, start, given).motion.rate_b
         return rate_b[-1, 0], rate_b
 
@@ -294,7 +278,7 @@ def test_rate_gain_scales_the_whole_loop():
     full = make_plant(vehicle("px4"), DT)
     given = inputs(56, [1.0, 1.0, 0.0])
     fly = jax.jit(rollout)
-    slow, fast = (fly(plant, still(), given).motion.rate_b[-1] for plant in (weak, full))
+    slow, fast = (fly(plant, at_rest(), given).motion.rate_b[-1] for plant in (weak, full))
     np.testing.assert_allclose(slow[0], 0.5 * fast[0], rtol=0.1)
     np.testing.assert_allclose(slow[1], fast[1], rtol=0.01)
 

@@ -61,13 +61,6 @@ def test_an_impossible_vehicle_is_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_motors_that_cannot_hover_are_refused_where_a_firmware_drives_them():
-    table = vehicle_file.vehicle_table(vehicle_file.load_vehicle("crazyflie21"))
-    table["motors"]["thrust"] = [0.0, 0.05]
-    with pytest.raises(ValueError, match=r"motors.thrust = .*too weak to hover; .* gives 0.05"):
-        vehicle_file.parse_vehicle(table)
-
-
 REFUSED = [
     ("mass", 0.0, "mass = 0.0.*must be from"),
     ("mass", float("nan"), "mass is nan.*finite"),
@@ -136,15 +129,6 @@ def test_a_vehicle_that_flies_passes_and_is_a_key():
 MAP = MotorMap(thrust=(0.2, 0.6), voltage=4.0)
 
 
-def test_thrust_goes_with_command_and_voltage():
-    """u = 0.5 x 3/4 = 0.375; T = 0.2 x 0.375 + 0.6 x 0.140625 = 0.159375 N."""
-    command = np.full((1, 4), 0.5)
-    np.testing.assert_allclose(motor_thrust(MAP, command, np.array([3.0])), 0.159375)
-    np.testing.assert_allclose(motor_thrust(MAP, command), 0.25)
-    made_up_for = replace(MAP, voltage_exponent=0.0)
-    np.testing.assert_allclose(motor_thrust(made_up_for, command, np.array([3.0])), 0.25)
-
-
 def test_a_thrust_has_one_command():
     command = np.array([0.0, 0.3, 1.0])
     for curve in ((0.2, 0.6), (0.0, 0.8), (0.5, 0.0)):
@@ -152,11 +136,15 @@ def test_a_thrust_has_one_command():
         np.testing.assert_allclose(command_of_thrust(curve, thrust), command, atol=1e-9)
 
 
-def test_speed_is_that_of_the_thrust():
-    vehicle = replace(PLAIN, motors=MAP)
-    speed = motor_speed(vehicle, np.full((2, 4), 0.5), np.array([3.0, 4.0]))
+def test_thrust_goes_with_command_and_voltage_and_speed_with_the_thrust():
+    """u = 0.5 x 3/4 = 0.375; T = 0.2 x 0.375 + 0.6 x 0.140625 = 0.159375 N."""
+    vehicle, command = replace(PLAIN, motors=MAP), np.full((2, 4), 0.5)
+    speed = motor_speed(vehicle, command, np.array([3.0, 4.0]))
     thrust = vehicle.rotors.thrust_coefficient * speed**2
-    np.testing.assert_allclose(thrust[:, 0], [0.159375, 0.25])
+    np.testing.assert_allclose(thrust.T, [[0.159375, 0.25]] * 4)
+    np.testing.assert_allclose(motor_thrust(MAP, command), 0.25)
+    made_up_for = replace(MAP, voltage_exponent=0.0)
+    np.testing.assert_allclose(motor_thrust(made_up_for, command, np.array([3.0, 4.0])), 0.25)
     with pytest.raises(ValueError, match=r"no \[motors\]"):
         motor_speed(PLAIN, np.zeros((1, 4)))
 
@@ -167,6 +155,7 @@ def test_motors_come_back_from_a_file_and_wrong_ones_are_refused():
     assert vehicle_file.parse_vehicle(table) == crazyflie
     for motors, reason in (
         ({"thrust": [0.1, 0.1]}, r"\[motors\] has no 'voltage'"),
+        ({**table["motors"], "thrust": [0.0, 0.05]}, "too weak to hover; .* gives 0.05"),
         ({"thrust": [0.1, -0.1], "voltage": 4.0}, "must grow"),
         ({"thrust": [0.1, 0.1], "voltage": 4.0, "volts": 1.0}, "Did you mean 'voltage'"),
     ):
@@ -240,32 +229,21 @@ def test_effects_on_the_body():
     np.testing.assert_allclose(model.opt.gravity[:2], [-0.1962, 0.0981], rtol=1e-3)
 
 
-def test_only_the_box_collides():
+def test_only_the_box_collides_and_visuals_do_not_block_rays():
     model = compiled(PLAIN, ground=True)
     data = mujoco.MjData(model)
-    data.qpos[2] = 0.026
-    mujoco.mj_forward(model, data)
-    assert data.ncon == 0
-    data.qpos[2] = 0.024
-    mujoco.mj_forward(model, data)
-    assert data.ncon > 0
-    assert {model.geom(g).name for c in data.contact for g in c.geom} == {"", COLLIDES}
+    level, on_its_side = [1.0, 0.0, 0.0, 0.0], [np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0]
     # On its side the arms would touch first, at 0.1 m.
-    data.qpos[2:] = [0.066, np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0]
-    mujoco.mj_forward(model, data)
-    assert data.ncon == 0
-
-
-def test_visuals_do_not_block_rays():
-    model = compiled(PLAIN, ground=True)
-    data = mujoco.MjData(model)
+    for height, quat, touches in ((0.026, level, 0), (0.066, on_its_side, 0), (0.024, level, 1)):
+        data.qpos[2:] = [height, *quat]
+        mujoco.mj_forward(model, data)
+        assert (data.ncon > 0) == touches
+    assert {model.geom(g).name for c in data.contact for g in c.geom} == {"", COLLIDES}
     data.qpos[2] = 3.0
     mujoco.mj_forward(model, data)
     hit, distance = np.zeros(1, np.int32), np.zeros(1)
-    above = np.array([0.075, 0.1, 3.5])  # straight above a rotor disk
-    mujoco.mj_multiRay(
-        model, data, above, np.array([0.0, 0, -1]), None, True, -1, hit, distance, None, 1, 10.0
-    )
+    above, down = np.array([0.075, 0.1, 3.5]), np.array([0.0, 0, -1])  # above a rotor disk
+    mujoco.mj_multiRay(model, data, above, down, None, True, -1, hit, distance, None, 1, 10.0)
     assert distance[0] == pytest.approx(3.5)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from eval.quadrotor.plant import Motion, Wrench
 from eval.worlds import slots, trial
@@ -34,29 +35,24 @@ def test_the_last_gate_finishes_unless_something_is_hit_in_the_same_step():
     assert (through.ended[0], through.gates[0], through.v_max[0]) == (trial.FINISHED, 2, 5.0)
     hit = judged(AFTER, BEFORE, passed=1, contact=True)
     assert (hit.ended[0], hit.gates[0], hit.v_max[0]) == (trial.COLLISION, 1, 0.0)
+    assert judged(AFTER, BEFORE).gates[0] == 0, "a gate out of its turn"
+    # Past the last gate the last is next.
+    course = trial.Course(Gates(*(np.stack([field] * 3) for field in GATES)), np.full(3, 2))
+    assert trial.next_gate(course, np.array([0, 1, 5])).center_w[:, 0].tolist() == [1.0, 2.0, 2.0]
 
 
-def test_a_gate_out_of_its_turn_does_not_count():
-    assert judged(AFTER, BEFORE).gates[0] == 0
-
-
-def test_upside_down_late_and_lost():
-    assert judged((0, 0, 1), rot_w=np.diag([1.0, -1.0, -1.0])[None]).ended[0] == trial.TIPPED
+def test_late_and_lost():
     assert judged((0, 0, 1), step=9999).ended[0] == trial.FLYING
     assert judged((0, 0, 1), step=10000).ended[0] == trial.TIMEOUT
     lost = judged((np.nan, 0, 1), (0, 0, 1), diverged=True)
     assert lost.ended[0] == trial.DIVERGED and np.isfinite(lost.pos_w).all()
 
 
-def leaning(angle_deg):
-    """Return the attitude (1, 3, 3) of a body that is rolled by an angle."""
+@pytest.mark.parametrize(("angle_deg", "tipped"), [(89.9, 0), (90.1, 1), (180.0, 1)])
+def test_a_trial_ends_as_tipped_from_90_degrees_on_and_not_before(angle_deg, tipped):
     cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    return np.array([[[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]]])
-
-
-def test_a_trial_ends_as_tipped_from_90_degrees_on_and_not_before():
-    assert judged((0, 0, 1), rot_w=leaning(89.9)).ended[0] == trial.FLYING
-    assert judged((0, 0, 1), rot_w=leaning(90.1)).ended[0] == trial.TIPPED
+    rolled = np.array([[[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]]])
+    assert judged((0, 0, 1), rot_w=rolled).ended[0] == (trial.TIPPED if tipped else trial.FLYING)
     on_its_side = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]])
     assert judged((0, 0, 1), rot_w=on_its_side).ended[0] == trial.FLYING
 
@@ -78,18 +74,16 @@ def test_what_is_no_state_and_no_wrench():
     )
 
 
-def test_past_the_last_gate_the_last_is_next():
-    course = trial.Course(Gates(*(np.stack([field] * 3) for field in GATES)), np.full(3, 2))
-    assert trial.next_gate(course, np.array([0, 1, 5])).center_w[:, 0].tolist() == [1.0, 2.0, 2.0]
-
-
 TRIAL = trial.TrialSpec("zigzag", 3, 7)
 
 
-def test_a_layout_holds_every_track():
+def test_a_layout_holds_every_track_and_padding_repeats_the_last_gate():
     layout = layout_of([straight(tuple(range(1, 12)))])
     assert layout.gates == 11 and layout.corners == 4
     assert layout.solids == layout_of([]).solids
+    padded = slots.pad_gates(GATES, 4, 6)
+    np.testing.assert_array_equal(padded.center_w[:, 0], [1.0, 2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(padded.opening_g[:, 3:], padded.opening_g[:, 3:4].repeat(3, 1))
 
 
 def test_a_track_with_meshes_is_a_group_of_its_own():
@@ -98,13 +92,6 @@ def test_a_track_with_meshes_is_a_group_of_its_own():
     trials = [TRIAL._replace(track=name) for name in ("zigzag", "m.toml", "a.toml", "m.toml")]
     assert slots.slot_groups(trials, tracks) == [[0, 2], [1, 3]]
     assert slots.slot_groups([], {}) == []
-
-
-def test_padding_repeats_the_last_gate():
-    gates = straight((1.0, 2.0)).scene.gates
-    padded = slots.pad_gates(gates, 4, 6)
-    np.testing.assert_array_equal(padded.center_w[:, 0], [1.0, 2.0, 2.0, 2.0])
-    np.testing.assert_array_equal(padded.opening_g[:, 3:], padded.opening_g[:, 3:4].repeat(3, 1))
 
 
 def test_a_trials_random_numbers_are_its_own_for_each_use():

@@ -18,9 +18,7 @@ from policies.spec import NoAnswer, PolicyError
 from tests.support.policy_files import action_of
 
 PROGRAM = "models/model.json"
-
 WEIGHTS = "data/weights/model_weights_config.json"
-
 SAMPLES = "data/sample_inputs/model.pt"
 
 

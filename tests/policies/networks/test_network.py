@@ -15,19 +15,12 @@ from policies.networks.network import LEAK
 from policies.spec import PolicySpec
 
 SPEC = PolicySpec(rate_hz=15.0)
-
 SMALL = PolicySpec(rate_hz=33.0, hidden_size=64)
-
 SECOND = replace(SMALL, second_gate=True)
-
 AXIS = replace(SMALL, gate_axis=True)
-
 BOTH = replace(SECOND, gate_axis=True)
-
 PACED = replace(AXIS, speed_input=True, speed=0.5)
-
 CLIMB_B = jnp.asarray([1.0, 0.0, 1.0])
-
 ADAMW = optax.adamw(2e-3, b2=0.99, weight_decay=1e-2)
 
 

@@ -24,21 +24,17 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_the_path_beside_keeps_the_suffix_and_missing_folders_are_made(tmp_path):
-    target = tmp_path / "deep" / "b.parquet"
+def test_files_and_folders_are_replaced_whole_and_missing_folders_made(tmp_path):
+    target, folder = tmp_path / "deep" / "b.parquet", tmp_path / "deep" / "checkpoint"
     with files.replacing_file(target) as beside:
         assert beside.suffix == ".parquet" and not target.exists()
         beside.write_bytes(b"x")
     assert target.read_bytes() == b"x"
-
-
-def test_a_folder_is_replaced_whole(tmp_path):
-    target = tmp_path / "checkpoint"
     for step in ("1", "2"):
-        with files.replacing_folder(target) as beside:
+        with files.replacing_folder(folder) as beside:
             (beside / f"step_{step}").write_text(step)
-    assert [p.name for p in target.iterdir()] == ["step_2"]
-    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint"]
+    assert [p.name for p in folder.iterdir()] == ["step_2"]
+    assert {p.name for p in folder.parent.iterdir()} == {"b.parquet", "checkpoint"}
 
 
 @dataclass

@@ -15,9 +15,7 @@ from tracks.geometry.clearance import distances, nearest_obstacle
 from tracks.geometry.scene import counts, stack
 
 BALL = 1e-3
-
 all_distances = jax.jit(distances)
-
 nearest = jax.jit(nearest_obstacle, static_argnames="limits")
 
 

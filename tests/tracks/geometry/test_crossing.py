@@ -12,7 +12,6 @@ from tracks.geometry.crossing import crossing, is_inside, is_near
 from tracks.geometry.gates import rectangle, regular_polygon
 
 SQUARE = rectangle(1.0, 1.0)
-
 seeds = st.integers(0, 10_000)
 
 

@@ -9,7 +9,6 @@ from tracks.geometry.field import attractive_field, magnetic_field
 from tracks.geometry.gates import rectangle, regular_polygon
 
 UPRIGHT = (np.zeros(3), np.eye(3))
-
 SQUARE = rectangle(1.0, 1.0)
 
 
